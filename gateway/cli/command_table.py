@@ -10,7 +10,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -178,6 +178,14 @@ class LazyGroup(TyperGroup):
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
         """Return all names, in the order of the table."""
         return [*COMMANDS]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command; the error for an unknown name suggests the nearest."""
+        self.commands = cast(Any, dict.fromkeys(COMMANDS))
+        try:
+            return super().resolve_command(ctx, args)
+        finally:
+            self.commands = {}
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return a command; only its summary while a list is made."""

@@ -10,7 +10,7 @@ reports their outcome.
 | opening   | failed                             | blocked   | announce why                      |
 | recording | not wanted any more                | idle      | close, announce                   |
 | recording | part too large or too old          | opening   | close, open the next part         |
-| recording | the clock turns out to be wrong *  | opening   | close, rename, open the next part |
+| recording | the clock turns out to be wrong *  | opening   | close, correct, open the next     |
 | recording | too little free space, or failed   | blocked   | close, announce why               |
 | blocked   | retry is due and there is space    | opening   | open the next part                |
 | blocked   | not wanted any more                | idle      | announce                          |
@@ -131,14 +131,11 @@ class Announce:
 
 
 @dataclass(frozen=True, slots=True)
-class Rename:
-    """Rename the files of a session, all closed, after the true time of its start."""
-
-    session: str
-    to_session: str
+class CorrectTimes:
+    """Correct the times of the files of the session, all closed; it keeps its announced name."""
 
 
-SessionAction = OpenPart | ClosePart | Announce | Rename
+SessionAction = OpenPart | ClosePart | Announce | CorrectTimes
 
 
 def session_name(unix_us: int) -> str:
@@ -193,7 +190,6 @@ class Session:
         self._settings = settings
         self._in_flight = False
         self._asked: bool | None = None
-        self._begun_us = 0
         self._opened_us = 0
         self._retry_us = 0
         self._corrected = False
@@ -272,20 +268,20 @@ class Session:
         """
         match self.state:
             case SessionState.IDLE if self.wanted:
-                self.name, self.part, self._begun_us = session_name(unix_us), 0, now_us
+                self.name, self.part = session_name(unix_us), 0
                 self._corrected = False
                 if self._is_short(free_bytes):
                     return self._stop_short(now_us)
                 return self._open_next()
             case SessionState.RECORDING:
-                return self._poll_recording(now_us, unix_us, part_bytes, free_bytes, jumped)
+                return self._poll_recording(now_us, part_bytes, free_bytes, jumped=jumped)
             case SessionState.BLOCKED:
                 return self._poll_blocked(now_us, free_bytes)
             case _:
                 return []
 
     def _poll_recording(
-        self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, jumped: bool
+        self, now_us: int, part_bytes: int, free_bytes: int, *, jumped: bool
     ) -> list[SessionAction]:
         if not self.wanted:
             self.state = SessionState.IDLE
@@ -296,8 +292,7 @@ class Session:
         too_old = age_us > s.rotate_min * 60 * US_PER_S
         if jumped and not self._corrected:
             self._corrected = True
-            old, self.name = self.name, session_name(unix_us - (now_us - self._begun_us))
-            return [ClosePart(), Rename(old, self.name), *self._open_next()]
+            return [ClosePart(), CorrectTimes(), *self._open_next()]
         if too_old or part_bytes > s.rotate_mb * 1e6:
             self._corrected = False
             return [ClosePart(), *self._open_next()]

@@ -9,7 +9,16 @@ from typing import Final
 import numpy as np
 
 from gateway.flightlog.damaged_times import DAY_US
-from gateway.flightlog.table.cells import FIX_LAT, FIX_LON, FIX_OK, FloatArray, has_group
+from gateway.flightlog.table.cells import (
+    FIX_LAT,
+    FIX_LON,
+    FIX_OK,
+    NAV_LAT,
+    NAV_LON,
+    FloatArray,
+    has_group,
+    has_position,
+)
 from gateway.flightlog.table.row import BARO, GPS, MAG, NAV, RAW, SI
 from gateway.flightlog.table.table import TableBlock, TableFault, TableHeader, TableMark
 from gateway.flightlog.tlog.tlog import Batch, TlogIndex
@@ -23,8 +32,9 @@ GAP_US: Final = 2 * US_PER_S
 """Every vehicle sends a heartbeat a second: a longer silence is a gap."""
 MAX_GAPS: Final = 1000
 STEP_US: Final = US_PER_S // 2
-"""Positions nearer in time than this are not summed: at rest their noise would be a distance."""
+"""Interval of the positions between which the distance is summed."""
 LEAST_STEP_M: Final = 1.0
+"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
 
 MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
 HEARTBEAT_ID: Final = 0
@@ -87,22 +97,33 @@ class FileInfo:
 
 
 @dataclass(slots=True)
-class GroundWay:
-    """Sum up the distance between positions."""
+class GroundDistance:
+    """The distance over ground: the one definition, for every command and page.
+
+    Steps of `LEAST_STEP_M` or more between positions `STEP_US` apart are summed. The positions are
+    the fused ones (GLOBAL_POSITION_INT, or the states of a table); the GPS fixes of a table that
+    has no states.
+    """
 
     distance_m: float = 0.0
-    last: tuple[int, float, float] | None = None
+    _sampled_us: int | None = None
+    _last: tuple[float, float] | None = None
+
+    def is_due(self, time_us: int) -> bool:
+        """Return whether a position of this time counts."""
+        return self._sampled_us is None or not 0 <= time_us - self._sampled_us < STEP_US
 
     def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
-        """Add a position, unless it is too near the last one in time or place."""
-        if self.last is not None:
-            if 0 <= time_us - self.last[0] < STEP_US:
-                return
-            step_m = math.hypot(*displacement_m(*self.last[1:], lat_deg, lon_deg, 0.0))
+        """Add a position, if it is due."""
+        if not self.is_due(time_us):
+            return
+        self._sampled_us = time_us
+        if self._last is not None:
+            step_m = math.hypot(*displacement_m(*self._last, lat_deg, lon_deg, 0.0))
             if step_m < LEAST_STEP_M:
                 return
             self.distance_m += step_m
-        self.last = (time_us, lat_deg, lon_deg)
+        self._last = (lat_deg, lon_deg)
 
 
 @dataclass(slots=True)
@@ -169,7 +190,7 @@ class TlogSummary:
         self._index = TlogIndex()
         self._counts: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[int, tuple[int, int]] = {}
-        self._ways: dict[int, GroundWay] = {}
+        self._ways: dict[int, GroundDistance] = {}
         self._span, self._gaps = TimesSpan(), _Gaps()
 
     def add(self, batch: Batch) -> None:
@@ -213,9 +234,9 @@ class TlogSummary:
         )
 
     def _add_position(self, batch: Batch, i: int) -> None:
-        way = self._ways.setdefault(int(batch.origins[i]) >> 8, GroundWay())
+        way = self._ways.setdefault(int(batch.origins[i]) >> 8, GroundDistance())
         time_us = int(batch.time_us[i])
-        if way.last is not None and 0 <= time_us - way.last[0] < STEP_US:
+        if not way.is_due(time_us):
             return
         _, lat, lon = _POSITION.unpack(payload_of(batch.frame(i), _POSITION.size))
         if lat or lon:
@@ -228,7 +249,7 @@ class TlogSummary:
             system_id=system_id,
             mav_type=mav_type,
             autopilot=autopilot,
-            distance_m=self._ways.get(system_id, GroundWay()).distance_m,
+            distance_m=self._ways.get(system_id, GroundDistance()).distance_m,
             rates=tuple(
                 _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
                 for key in sorted(counts)
@@ -245,7 +266,7 @@ class TableSummary:
         self._counts: Counter[str] = Counter()
         self._damaged_bytes = self._unfinished_bytes = 0
         self._last_us: int | None = None
-        self._way = GroundWay()
+        self._of_states, self._of_fixes = GroundDistance(), GroundDistance()
         self._span, self._gaps = TimesSpan(), _Gaps()
 
     def add(self, block: TableBlock, header: TableHeader | None) -> None:
@@ -269,7 +290,7 @@ class TableSummary:
             system_id=self._header.vehicle_id if self._header else 1,
             mav_type=None,
             autopilot=None,
-            distance_m=self._way.distance_m,
+            distance_m=(self._of_states if self._counts["state"] else self._of_fixes).distance_m,
             rates=tuple(
                 _rate(name, self._counts[name], duration_s)
                 for name in ("imu", "mag", "baro", "gps", "state")
@@ -306,7 +327,10 @@ class TableSummary:
         self._gaps.add_all(times_us)
         fixed = cells[:, FIX_OK] == 1.0
         for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
-            self._way.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+            self._of_fixes.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+        placed = cells[has_position(cells)]
+        for time_us, lat_deg, lon_deg in placed[:, [0, NAV_LAT, NAV_LON]].tolist():
+            self._of_states.add(int(time_us), lat_deg, lon_deg)
 
 
 def payload_of(frame: bytes, size: int) -> bytes:

@@ -166,13 +166,13 @@ class Track:
         return frame if system_id is None else readdress(frame, system_id)
 
     def _read_from(self, offset: int) -> Iterator[Batch]:
-        scanner = TlogScanner(offset)
+        scanner, timeline = TlogScanner(offset), self._source.index.timeline
         size = SEEK_BYTES
         while data := self._source.read(offset, size):
-            yield scanner.feed(data)
+            yield timeline.apply(scanner.feed(data))
             offset += len(data)
             size = BLOCK_BYTES
-        yield scanner.feed(b"", final=True)
+        yield timeline.apply(scanner.feed(b"", final=True))
 
 
 def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:

@@ -12,9 +12,9 @@ from gateway.edges.disk.recording_streams import (
     Progress,
     kind_of,
     other_format,
-    read_batches,
     read_blocks,
 )
+from gateway.edges.disk.tlog_source import open_tlog
 from gateway.flightlog.summary import FileInfo, TableSummary, TlogSummary
 from gateway.flightlog.table.table import TableReader
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
@@ -48,10 +48,11 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
     """
     kind, size = kind_of(file), file.stat().st_size
     if kind is FileKind.TLOG:
-        tlog = TlogSummary()
-        for batch in read_batches(file, progress):
+        tlog, source = TlogSummary(), open_tlog(file)
+        for batch in source.batches(progress):
             tlog.add(batch)
         found = tlog.result(size)
+        found = replace(found, remarks=(*source.remarks, *found.remarks))
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found

@@ -7,6 +7,8 @@ from typing import Final
 import msgspec
 
 from gateway.edges.disk.recording_streams import FileKind, kind_of, read_ends
+from gateway.edges.disk.tlog_source import HEAD_BYTES, Layout, layout_of, read_batches
+from gateway.flightlog.damaged_times import DAY_US
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableReader
 from gateway.flightlog.tlog.recorded_commands import is_station
@@ -57,6 +59,13 @@ def _tlog_span(file: Path) -> tuple[int, int, set[int]]:
             stream.seek(begin)
             # The end begins within a record; the scanner finds the next one.
             index.add(TlogScanner(begin).feed(stream.read(END_BYTES), final=True))
+        stream.seek(0)
+        is_odd = layout_of(stream.read(HEAD_BYTES)) is not Layout.TLOG
+    if is_odd or (index.last_us or 0) - (index.first_us or 0) > DAY_US:
+        # Its clock was set meanwhile, or it is no plain tlog: only all of it shows its length.
+        index = TlogIndex()
+        for batch in read_batches(file):
+            index.add(batch)
     if index.first_us is None or index.last_us is None:
         raise ValueError("holds no record")
     vehicles = {o >> 8 for o in index.origins if not is_station(o, index.stations)}

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 
 from gateway.aircraft import AircraftSettings
-from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
+from gateway.edges.disk.recording_streams import FileKind, encoding_of, kind_of, read_chunks
 from gateway.estimation.alignment.latency_of_log import GpsLatency, estimate_latency
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import ReferenceSettings
@@ -139,7 +139,8 @@ def facts_of(file: Path) -> dict[str, float]:
     facts: dict[str, float] = {}
     if kind_of(file) is not FileKind.CSV:
         return facts
-    head = next(read_chunks(file), b"").decode("utf-8-sig", errors="replace")
+    begin = next(read_chunks(file), b"")
+    head = begin.decode(encoding_of(begin), errors="replace")
     for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
         for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
             try:

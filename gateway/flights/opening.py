@@ -90,6 +90,7 @@ def open_flights(
                 tlog = TlogFile(file, options.progress, flight.answers, options.unpacked_limit)
                 opened.callback(tlog.close)
                 flight.sources.append(tlog)
+                flight.remarks += [f"{file}: {remark}" for remark in tlog.remarks]
         else:
             fusion = RecordedFusion(parts, options)
             for frame in fusion.introduction():

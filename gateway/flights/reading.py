@@ -21,12 +21,13 @@ from gateway.edges.disk.recording_streams import (
     PARQUET,
     FileKind,
     Progress,
+    encoding_of,
     kind_of,
     other_format,
-    read_batches,
     read_blocks,
     read_chunks,
 )
+from gateway.edges.disk.tlog_source import open_tlog
 from gateway.flightlog.damaged_times import ORDER_US
 from gateway.flightlog.table.autopilot import AutopilotReader
 from gateway.flightlog.table.cells import TIMES
@@ -71,6 +72,8 @@ class ReadOptions:
     system_id: int | None = None
     """The vehicle of a tlog to take."""
     progress: Progress | None = None
+    sensors: tuple[tuple[str, int], ...] = ()
+    """Which of several sensors of a kind to take: ("GPS", 1) is the second."""
     unpacked_limit: int = MAX_UNPACKED
     """Maximum unpacked size of a packed file that is read as a whole, in bytes."""
 
@@ -204,11 +207,16 @@ def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
         ) from error
 
 
-def recorded_frames(paths: Iterable[Path], progress: Progress | None) -> Iterator[TlogRecord]:
-    """Yield the records of tlogs, merged by time."""
+def recorded_frames(
+    paths: Iterable[Path], progress: Progress | None, remarks: list[str] | None = None
+) -> Iterator[TlogRecord]:
+    """Yield the records of tlogs, merged by time; remarks about their times are added."""
+    sources = [open_tlog(path) for path in paths]
+    if remarks is not None:
+        remarks += [f"{source.path}: {text}" for source in sources for text in source.remarks]
     streams = [
-        (record for batch in read_batches(path, progress) for record in batch.records())
-        for path in paths
+        (record for batch in source.batches(progress) for record in batch.records())
+        for source in sources
     ]
     return heapq.merge(*streams, key=lambda record: record.time_us)
 
@@ -220,19 +228,22 @@ def csv_reader(options: ReadOptions) -> CsvReader:
 
 
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
-    rest, number = b"", 0
+    decoder = codecs.getincrementaldecoder(_encoding_of(path))(errors="replace")
+    rest, number = "", 0
     for data in read_chunks(path, progress):
-        *lines, rest = (rest + data).split(b"\n")
-        if not number:
-            lines = [line.removeprefix(codecs.BOM_UTF8) for line in lines]
-        yield from (line.decode(errors="replace") for line in lines)
+        *lines, rest = (rest + decoder.decode(data)).split("\n")
+        yield from lines
         number += len(lines)
         if len(rest) > MAX_LINE:
             raise FlightError(
                 f"{path}: line {number + 1} is longer than {MAX_LINE >> 20} MB; it is no CSV"
             )
-    if rest:
-        yield rest.decode(errors="replace")
+    if rest := rest + decoder.decode(b"", final=True):
+        yield rest
+
+
+def _encoding_of(path: Path) -> str:
+    return encoding_of(next(read_chunks(path), b""))
 
 
 def _open_table(path: Path, options: ReadOptions) -> RecordedTable:
@@ -262,12 +273,18 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     try:
         first = next(rows, None)
     except ValueError as error:
-        raise FlightError(f"{path}: {error}; name its columns with --columns MAP") from error
+        encoding = _encoding_of(path).removesuffix("-sig").upper()
+        raise FlightError(
+            f"{path}, read as {encoding}: {error}; name its columns with --columns MAP"
+        ) from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
 
     def told() -> Iterator[TableRow]:
         yield from rows
+        if reader.skipped:
+            text = counted(reader.skipped, "line")
+            table.remarks.append(f"{path}: left out {text} of text before the column names")
         if reader.faults:
             table.remarks.append(
                 f"{path}: left out {counted(reader.faults, 'line')} that cannot be read"
@@ -301,7 +318,8 @@ def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> I
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     reader = AutopilotReader(options.system_id)
-    batches = read_batches(path, options.progress, strict=True)
+    source = open_tlog(path)
+    batches = source.batches(options.progress, strict=True)
     blocks = chain(map(reader.feed, batches), [None])
     stream = (reader.flush() if cells is None else cells for cells in blocks)
     first = next((cells for cells in stream if len(cells)), None)
@@ -310,7 +328,8 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
             f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )
     header = _header_of_today(options, reader.system_id or 1, reader.unix_us_at_zero)
-    return RecordedTable(header, map(TableBlock, chain([first], stream)))
+    remarks = [f"{path}: {remark}" for remark in source.remarks]
+    return RecordedTable(header, map(TableBlock, chain([first], stream)), remarks)
 
 
 def table_of_rows(

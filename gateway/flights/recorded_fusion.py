@@ -1,6 +1,7 @@
 """Recorded flights through the pipeline again, to rows or to the frames it would have sent."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -118,9 +119,11 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
     if kind is FileKind.OTHER:
         return None
     head, tail = read_ends(file)
+    rows: list[TableRow] = []
     if kind is FileKind.CSV:
         lines = (head + tail).decode(errors="replace").splitlines()
-        rows = list(csv_reader(options).rows(lines))
+        with suppress(ValueError):
+            rows = list(csv_reader(options).rows(lines))
         zero_us = 0
     else:
         reader = TableReader()

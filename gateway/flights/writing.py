@@ -80,7 +80,7 @@ class FlightToWrite:
         """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
         if not self.is_mavlink:
             return _within(self._sent(), self._limits)
-        recorded = recorded_frames(self.files, self.options.progress)
+        recorded = recorded_frames(self.files, self.options.progress, self._remarks)
         first = next(recorded, None)
         if first is None:
             raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")

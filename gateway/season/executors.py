@@ -50,6 +50,20 @@ class Executor(Protocol):
         ...
 
 
+class ThisProcess:
+    """Do little work in the calling process, which would not repay starting others."""
+
+    def run(
+        self, work: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result | WorkFailed]]:
+        """See `Executor`."""
+        for number, item in enumerate(items):
+            try:
+                yield number, work(item)
+            except Exception as error:  # noqa: BLE001 - it fails this item alone
+                yield number, failure_of(error)
+
+
 class LocalProcesses:
     """Processes of this machine.
 

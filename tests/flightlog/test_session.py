@@ -6,9 +6,9 @@ from gateway.flightlog.session import (
     RETRY_US,
     Announce,
     ClosePart,
+    CorrectTimes,
     OpenPart,
     RecordingSettings,
-    Rename,
     Session,
     SessionAction,
     SessionState,
@@ -99,13 +99,12 @@ def test_large_or_old_parts_are_followed_by_the_next(now_us: int, size: int) -> 
     assert session.opened(now_us) == []
 
 
-def test_a_clock_that_was_wrong_renames_what_there_is() -> None:
+def test_wrong_clock_corrects_the_times_and_keeps_the_announced_name() -> None:
     session = recording()
     actions = session.poll(
         60_000_000, UNIX_US + 86_460_000_000, part_bytes=0, free_bytes=MUCH, jumped=True
     )
-    renamed = "20260612-142530"
-    assert actions == [ClosePart(), Rename(NAME, renamed), OpenPart(renamed, 2)]
+    assert actions == [ClosePart(), CorrectTimes(), OpenPart(NAME, 2)]
 
 
 def test_a_full_disk_blocks_until_there_is_room_again() -> None:

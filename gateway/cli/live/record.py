@@ -12,6 +12,7 @@ from gateway.cli.support.asking import AskingTyper, ask, is_running
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    read_options,
     read_settings,
 )
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
@@ -28,7 +29,10 @@ from gateway.flightlog.session import SessionState
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from gateway.flights.glance import Glance
+    from gateway.season.catalogue.catalogue_file import FlightFigures
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
@@ -172,19 +176,55 @@ def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance
     return ((recording, glance(recording.files)) for recording in recordings)
 
 
+def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]]":
+    """Bring the catalogue of the recordings up to date, and take their figures from it."""
+    from gateway.season.catalogue.catalogue_file import CatalogueError, figures_of
+    from gateway.season.catalogue.indexing import index_folder
+    from gateway.season.executors import ThisProcess
+
+    folder = recordings[0].files[0].parent
+    console = console_of(stderr=True)
+    with console.status("reading new recordings") as shown:
+
+        def show(done: int, total: int) -> None:
+            shown.update(f"reading new recordings: {done} of {total} files")
+
+        try:
+            index_folder(folder, read_options(read_settings(None)), ThisProcess(), show)
+            return figures_of(folder)
+        except (CatalogueError, OSError) as error:
+            console.print(f"no figures of the flights: {error}")
+            return {}
+
+
 def _list(recordings: list[Recording]) -> None:
-    grid = table_of("recording", "length", "vehicles", "MB", "last written (UTC)", "path")
+    grid = table_of(
+        "recording", "length", "vehicles", "km", "height, m", "loss", "MB", "last written (UTC)",
+        "path",
+    )  # fmt: skip
+    figures = _figures(recordings)
     for recording, look in _looked_at(recordings):
+        flown = figures.get(recording.name, {})
+        each = [flown.get(vehicle) for vehicle in look.vehicles]
         when = civil_time(recording.modified_s * US_PER_S)
         grid.add_row(
             recording.name,
             UNKNOWN if look.duration_s is None else _clock(look.duration_s),
             " ".join(map(str, look.vehicles)) or UNKNOWN,
+            _each(each, lambda f: f"{f.distance / 1000:.2f}" if f.distance is not None else ""),
+            _each(each, lambda f: f"{f.highest:.0f}" if f.highest is not None else ""),
+            _each(each, lambda f: f"{f.loss:.1%}" if f.loss is not None else ""),
             f"{recording.size / 1e6:.2f}",
             UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
             _path(recording),
         )
     console_of().print(grid)
+
+
+def _each(figures: "list[FlightFigures | None]", text: "Callable[[FlightFigures], str]") -> str:
+    """Write one figure for each vehicle."""
+    texts = ((figure and text(figure)) or UNKNOWN for figure in figures)
+    return " ".join(texts) or UNKNOWN
 
 
 def _clock(seconds: float) -> str:

@@ -1,7 +1,7 @@
 """`mavgate catalogue`: the catalogue of all recordings under a folder."""
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,6 +14,7 @@ from gateway.cli.support.named_recordings import folder_of
 from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
+from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
 from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import LocalProcesses
@@ -127,8 +128,10 @@ def show(
     geojson: GeojsonOption = False,
     config: ConfigOption = None,
 ) -> None:
-    """Show all that the catalogue knows of one recording."""
+    """Show all that the catalogue knows of one recording; `last` is the newest."""
     place = _place(folder, config)
+    with suppress(RecordingError):
+        name = find_recording(place, name).name
     quoted = name.replace("'", "''")
     where = f"name = '{quoted}' or path = '{quoted}'"
     with _asking():

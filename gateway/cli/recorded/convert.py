@@ -14,6 +14,7 @@ from gateway.cli.support.recording_options import (
     ForceOption,
     FromOption,
     PositionOption,
+    SensorOption,
     SettingsOption,
     SmoothOption,
     ToOption,
@@ -21,6 +22,7 @@ from gateway.cli.support.recording_options import (
     progress_of,
     read_column_map,
     read_range,
+    read_sensors,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -51,6 +53,7 @@ def convert(
     begin: FromOption = None,
     end: ToOption = None,
     columns: ColumnsOption = None,
+    sensor: SensorOption = None,
     fuse: Annotated[
         bool,
         typer.Option("--fuse", help="Fuse a table again instead of using its recorded states."),
@@ -92,6 +95,7 @@ def convert(
             position=position,
             columns=read_column_map(columns),
             system_id=system,
+            sensors=read_sensors(sensor),
             progress=advance,
         )
         limits = read_range(begin, end)

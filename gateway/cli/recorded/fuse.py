@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -14,10 +14,12 @@ from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     ForceOption,
+    SensorOption,
     SmoothOption,
     print_remarks,
     progress_of,
     read_column_map,
+    read_sensors,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -42,7 +44,10 @@ from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new
 from gateway.records import FusionState
 from gateway.replay import header_for
-from gateway.units import counted
+from gateway.units import US_PER_S, counted
+
+LEAST_RATE_HZ: Final = 10.0
+"""A hand-held or flying tracker turns within a tenth of a second."""
 
 
 def register(app: typer.Typer) -> None:
@@ -65,6 +70,7 @@ def fuse_log(
         typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
     ] = None,
     columns: ColumnsOption = None,
+    sensor: SensorOption = None,
     gps_latency_s: Annotated[
         float | None,
         typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
@@ -98,6 +104,7 @@ def fuse_log(
             choice="current" if config is not None else settings,
             columns=read_column_map(columns),
             progress=advance,
+            sensors=read_sensors(sensor),
         )
         table = joined_tables([open_rows(part, options) for part in files])
         aircraft = aircraft_for(files, table, options, gps_latency_s)
@@ -121,7 +128,27 @@ def fuse_log(
         write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
     print_remarks(table.remarks)
     name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-    console_of(stderr=True).print(f"{out}: {counted(len(time_us), 'sample')} fused by {name}")
+    _report(file, time_us, f"{out}: ", f" fused by {name}")
+
+
+def _report(file: Path, time_us: IntArray, before: str, behind: str) -> None:
+    """Print count and rate of the samples, and warn if they are too few."""
+    console, rate_hz = console_of(stderr=True), _rate_hz(time_us)
+    count = counted(len(time_us), "sample")
+    console.print(f"{before}{count} at {rate_hz:.3g} Hz{behind}")
+    if 0.0 < rate_hz < LEAST_RATE_HZ:
+        console.print(
+            f"{file}: its IMU samples come at {rate_hz:.2g} Hz; below {LEAST_RATE_HZ:.0f} Hz the "
+            "turns between them are not seen, so attitude and position may be wrong",
+            style="yellow",
+        )
+
+
+def _rate_hz(time_us: IntArray) -> float:
+    """Return the rate of samples by their median interval; 0 of a single one."""
+    intervals_us = np.diff(time_us)
+    intervals_us = intervals_us[intervals_us > 0]
+    return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0
 
 
 def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:

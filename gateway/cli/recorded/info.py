@@ -27,9 +27,9 @@ from gateway.edges.disk.recording_streams import (
     FileKind,
     Progress,
     kind_of,
-    read_batches,
     read_blocks,
 )
+from gateway.edges.disk.tlog_source import open_tlog
 from gateway.flightlog.moment import civil_time
 from gateway.flightlog.summary import MENDED, FileInfo, VehicleInfo
 from gateway.flightlog.table.table import (
@@ -104,12 +104,12 @@ def recover(
 
     The checksum of every frame is checked. The damaged file is never changed.
     """
-    target = out or file.with_name(f"{file.stem}.recovered{file.suffix}")
     console = console_of()
     left_out: list[str] = []
     with progress_of([file]) as advance, refusing():
         is_tlog = kind_of(file) is FileKind.TLOG
         kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
+        target = out or file.with_name(f"{file.stem}.recovered{kept}")
         if out is not None and out.suffix == other:
             refuse(f"{out}: {file} is repaired as a {kept}; first that, then `mavgate convert` it")
         sound = _sound_records if is_tlog else _sound_lines
@@ -122,14 +122,18 @@ def recover(
     if len(left_out) > SHOWN:
         console.print(f"and {counted(len(left_out) - SHOWN, 'more place')}")
     verdict = (
-        "nothing was damaged" if not left_out else f"{counted(before - size, 'byte')} left out"
+        "nothing was damaged"
+        if not left_out
+        else f"{counted(max(before - size, 0), 'byte')} left out"
     )
     console.print(f"{target}: {size} of {before} bytes; {verdict}")
 
 
 def _sound_records(file: Path, advance: Progress, report: Report) -> Iterator[bytes]:
-    found = False
-    for batch in read_batches(file, advance, strict=True):
+    found, source = False, open_tlog(file)
+    for remark in source.remarks:
+        console_of().print(f"{file}: {remark}")
+    for batch in source.batches(advance, strict=True):
         for run in batch.damage:
             report(f"at byte {run.offset}: {counted(run.size, 'byte')} without a record")
         if batch.unfinished:

@@ -1,6 +1,6 @@
 """Shared by the commands on recordings: options, progress, and errors for bad files."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,6 +11,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
+from gateway.flightlog.autopilots.ardupilot_log import SENSORS
 from gateway.flightlog.moment import Moment, parse_moment
 from gateway.flightlog.table.column_map import ColumnMap
 from gateway.flights.flight_terms import FlightError, Position, SettingsChoice
@@ -35,6 +36,14 @@ ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --
 ColumnsOption = Annotated[
     Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
 ]
+SensorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sensor",
+        help="Of a DataFlash log: gps=2 for the second GPS; so with imu, mag and baro. "
+        "By default the first with data.",
+    ),
+]
 SettingsOption = Annotated[
     SettingsChoice,
     typer.Option("--settings", help="Fuse tables with the recorded or the current settings."),
@@ -58,6 +67,17 @@ def read_column_map(path: Path | None) -> ColumnMap | None:
         raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise FlightError(f"{path}: is no column map: {error}") from error
+
+
+def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
+    """Read --sensor; raises FlightError if one is invalid."""
+    found = []
+    for text in texts or ():
+        kind, _, number = text.partition("=")
+        if kind.upper() not in SENSORS or number not in ("1", "2", "3"):
+            raise FlightError(f"--sensor {text}: write imu, mag, baro or gps, and =1, =2 or =3")
+        found.append((kind.upper(), int(number) - 1))
+    return tuple(found)
 
 
 def read_moment(text: str | None) -> Moment | None:

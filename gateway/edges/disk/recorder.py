@@ -29,15 +29,15 @@ from gateway.edges.disk.part_files import (
     free_bytes_near,
     reason_of,
 )
-from gateway.edges.disk.recordings import RecordingError, move_recording, part_of
+from gateway.edges.disk.recordings import RecordingError, find_recording, move_recording, part_of
 from gateway.edges.disk.restamp import Restamper, clear_copies
 from gateway.edges.disk.worker import begin_worker, done_by
 from gateway.flightlog.session import (
     Announce,
     ClosePart,
+    CorrectTimes,
     OpenPart,
     RecordingSettings,
-    Rename,
     Session,
     SessionAction,
     SessionState,
@@ -322,8 +322,8 @@ class Recorder:
             match action:
                 case ClosePart():
                     await self._close_part(closing, is_last=opening is None)
-                case Rename():
-                    await self._rename(action)
+                case CorrectTimes():
+                    await self._correct_times()
                 case OpenPart():
                     following += await self._open_part(action)
                 case Announce():
@@ -376,15 +376,14 @@ class Recorder:
         if is_last:
             await asyncio.shield(asyncio.wrap_future(closing))
 
-    async def _rename(self, action: Rename) -> None:
-        """Rename a session after its true time, and queue its finished parts to be shifted."""
+    async def _correct_times(self) -> None:
+        """Queue the finished parts of the session to be shifted to the true time."""
         await self._restamped()
-        old, new = action.session, action.to_session
         try:
-            # Not by the thread that syncs the part before; the next part's sync keeps the names.
-            found = await done_by(self._writer, move_recording, self.folder, old, new)
+            # Not by the thread that syncs the part before.
+            found = await done_by(self._writer, find_recording, self.folder, self._session.name)
         except (OSError, RecordingError) as error:
-            log.warning("Recording %s keeps its name and times: %s", old, error)
+            log.warning("Recording %s keeps its times: %s", self._session.name, error)
             return
         true_us = self._civil.offset_us or 0
         for path in found.files:

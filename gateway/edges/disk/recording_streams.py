@@ -15,7 +15,6 @@ from tempfile import NamedTemporaryFile, gettempdir
 from typing import IO, BinaryIO, Final, cast
 
 from gateway.flightlog.table.table import MAX_LINE, TableBlock, TableReader
-from gateway.flightlog.tlog.tlog import Batch, TlogScanner
 
 CHUNK: Final = 1 << 20
 SNIFF: Final = 512
@@ -26,6 +25,9 @@ MAX_HEAD: Final = 4 * MAX_LINE
 MAX_UNPACKED: Final = 1 << 30
 """Bytes to which a packed file may be unpacked at once, unless the settings give another limit; a
 megabyte of gzip can hold a gigabyte of zeros."""
+ERASED: Final = b"\xff"
+"""Flash memory that was erased and never written, as in front of a log that was copied whole."""
+MAX_ERASED: Final = 1 << 20
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
 """The first bytes tell that a file is packed, whatever its name."""
@@ -52,21 +54,36 @@ def _begins(*heads: bytes) -> Callable[[bytes], bool]:
 PARQUET: Final = "Parquet"
 OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
     "ULog": _begins(b"ULog\x01\x12\x35"),
-    "DataFlash": _begins(b"\xa3\x95", b"FMT,"),
+    "DataFlash": lambda head: head.startswith((b"\xa3\x95", b"FMT,")) or b"\nFMT, 1" in head,
     PARQUET: _begins(b"PAR1"),
 }
 """Whether a file that begins with these bytes is of a format, by the format's name."""
 
 
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text by its byte order mark or its zeros; UTF-8 by default."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    sample = head[: SNIFF & ~1]
+    even, odd = sample[::2], sample[1::2]
+    for letters, zeros, encoding in ((even, odd, "utf-16-le"), (odd, even, "utf-16-be")):
+        if letters and letters.isascii() and all(letters) and not any(zeros):
+            return encoding
+    return "utf-8-sig"
+
+
 def kind_of(path: Path) -> FileKind:
     """Recognise a file by its first bytes; raises OSError if it cannot be read."""
     head = first_bytes(path)
+    if encoding_of(head) != "utf-8-sig":
+        return FileKind.CSV
     if any(knows(head) for knows in OTHER_FORMATS.values()):
         return FileKind.OTHER
     if head.startswith((b"# mavgate table", b"time_us,")):
         return FileKind.TABLE
     is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
-    return FileKind.TLOG if is_binary or b"," not in head else FileKind.CSV
+    has_cells = any(delimiter in head for delimiter in (b",", b";", b"\t"))
+    return FileKind.CSV if has_cells and not is_binary else FileKind.TLOG
 
 
 def other_format(path: Path) -> str:
@@ -81,7 +98,14 @@ def other_format(path: Path) -> str:
 def first_bytes(path: Path) -> bytes:
     """Return the begin of a file, unpacked, by which its format is known; raises OSError."""
     with open_unpacked(path) as (file, _):
-        return file.read(SNIFF).removeprefix(codecs.BOM_UTF8)
+        head = file.read(SNIFF)
+        for _ in range(MAX_ERASED // SNIFF):
+            if head.strip(ERASED) or not head:
+                break
+            head = file.read(SNIFF)
+        if head[:2] == ERASED * 2:
+            head = head.lstrip(ERASED) + file.read(SNIFF)
+        return head.removeprefix(codecs.BOM_UTF8)
 
 
 def is_packed(path: Path) -> bool:
@@ -243,16 +267,6 @@ def read_ends(path: Path) -> tuple[bytes, bytes]:
             while data := file.read(CHUNK):
                 tail = tail[-TAIL:] + data
     return head, tail[-TAIL:].partition(b"\n")[2]
-
-
-def read_batches(
-    path: Path, progress: Progress | None = None, *, strict: bool = False
-) -> Iterator[Batch]:
-    """Read a tlog batch by batch; see `TlogScanner`."""
-    scanner = TlogScanner(strict=strict)
-    for data in read_chunks(path, progress):
-        yield scanner.feed(data)
-    yield scanner.feed(b"", final=True)
 
 
 def read_blocks(path: Path, reader: TableReader, progress: Progress | None) -> Iterator[TableBlock]:

@@ -9,9 +9,9 @@ from gateway.edges.disk.recording_streams import (
     Progress,
     is_packed,
     open_descriptor,
-    read_chunks,
     temporary_copy,
 )
+from gateway.edges.disk.tlog_source import Layout, TlogSource, open_tlog
 from gateway.flightlog.answers import LogAnswers
 from gateway.flightlog.tlog.tlog import TlogIndex, TlogScanner
 
@@ -49,14 +49,18 @@ class TlogFile:
         unpacked_limit: int = MAX_UNPACKED,
     ) -> None:
         self.path = path
-        self._file = _unpacked(path, unpacked_limit) if is_packed(path) else open_descriptor(path)
-        self.index = TlogIndex()
+        source = open_tlog(path)
+        self.remarks = source.remarks
+        """What the user should know of its times."""
+        is_plain = source.layout is Layout.TLOG and not is_packed(path)
+        self._file = open_descriptor(path) if is_plain else _plain_copy(source, unpacked_limit)
+        self.index = TlogIndex(source.timeline)
         scanner = TlogScanner()
         offset = 0
         data = b" "
         while data:
             data = self.read(offset, READ_SIZE)
-            batch = scanner.feed(data, final=not data)
+            batch = source.timeline.apply(scanner.feed(data, final=not data))
             self.index.add(batch)
             if answers is not None:
                 answers.note(batch, self.index.stations)
@@ -85,7 +89,7 @@ class TlogFile:
         os.close(self._file)
 
 
-def _unpacked(path: Path, limit: int) -> int:
-    """Open a copy, since a packed file cannot be read at any position."""
-    with temporary_copy(path, read_chunks(path, None, limit)) as plain:
+def _plain_copy(source: TlogSource, limit: int) -> int:
+    """Open a copy, since only a plain tlog can be read at any position."""
+    with temporary_copy(source.path, source.chunks(None, limit)) as plain:
         return os.dup(plain.fileno())

@@ -2,11 +2,13 @@
 
 IMU, MAG (milligauss, offsets taken off), BARO, GPS with the accuracies of GPA, and what the
 autopilot estimated: ATT, POS and the velocities of its Kalman filter (XKF1, of old NKF1). All in
-body FRD and NED, in µs since the start. Of several sensors of a kind the first is taken.
+body FRD and NED, in µs since the start. Of several sensors of a kind one is taken; firmware before
+3.3 counts milliseconds (TimeMS, and T in GPS), and names the second sensor IMU2, GPS2 and so on.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, Final
 
 from msgspec.structs import replace
@@ -40,12 +42,46 @@ AHEAD_US: Final = 3_600 * US_PER_S
 """And so has one that jumps ahead by more."""
 BELIEVED: Final = 50
 """So many messages in a row that agree about another time are right: the clock has leaped."""
+LEAST_BELIEVED: Final = 3
+"""And so many that nothing follows."""
 FIX_2D: Final = 2
 SENSOR_NUMBERS: Final = ("I", "C")
 """Columns with the number of the sensor, or Kalman filter, of a message."""
+KINDS: Final = {
+    "IMU": "IMU", "IMU2": "IMU", "IMU3": "IMU", "MAG": "MAG", "MAG2": "MAG", "MAG3": "MAG",
+    "BARO": "BARO", "BAR2": "BARO", "BAR3": "BARO", "GPS": "GPS", "GPS2": "GPS",
+    "GPA": "GPA", "GPA2": "GPA",
+}  # fmt: skip
+"""Kind of sensor by the name of its messages."""
+SENSORS: Final = ("IMU", "MAG", "BARO", "GPS")
+"""Kinds of which a log may hold several."""
+ROLLOVER_US: Final = 1024 * WEEK_US
+FIRST_LOG_US: Final = 1_262_304_000 * US_PER_S
+"""The year 2010: nobody wrote this format before, so a receiver with an earlier date has lost count
+of the weeks, which begin again every 1024."""
 
 Message = Any
 """With the columns of its format as attributes, in the units of the format."""
+
+
+def sensor_of(name: str, message: Message) -> int:
+    """Return which sensor, or Kalman filter, sent a message; counted from 0."""
+    number = next((n for column in SENSOR_NUMBERS if (n := getattr(message, column, None))), 0)
+    return int(number) or (int(name[-1]) - 1 if name in KINDS and name[-1].isdigit() else 0)
+
+
+def in_era(unix_us: int) -> int:
+    """Add the weeks that a GPS receiver has lost count of."""
+    lost = -(-(FIRST_LOG_US - unix_us) // ROLLOVER_US) if unix_us < FIRST_LOG_US else 0
+    return unix_us + lost * ROLLOVER_US
+
+
+def _own_us(name: str, message: Message) -> int:
+    """Return a message's time on the autopilot's clock."""
+    time_us = getattr(message, "TimeUS", None)
+    if time_us is not None:
+        return int(time_us)
+    return 1000 * int(message.T if KINDS.get(name) == "GPS" else message.TimeMS)
 
 
 class ArdupilotReader:
@@ -55,19 +91,26 @@ class ArdupilotReader:
     ----------
     vehicle_id : int
         Vehicle id of the records.
+    sensors : mapping of str to int
+        Which sensor to take of each of `SENSORS`, counted from 0; by default the first.
     """
 
-    def __init__(self, vehicle_id: int) -> None:
+    def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
         self.dropped = 0
         """Messages with an impossible time."""
         self.leaps = 0
-        """How often the autopilot's clock jumped by more than that."""
+        """How often the autopilot's clock jumped forward by more than that."""
+        self.restarts = 0
+        """How often it began again."""
+        self.is_rolled_over = False
+        """Whether a receiver has lost count of the weeks."""
         self.zero_us: int | None = None
         """The autopilot's time at the records' zero."""
         self._vehicle_id = vehicle_id
         self._newest_us = 0
-        self._odd_us = self._odd_count = 0
-        """The newest time that was not believed, and how many agreed about it."""
+        self._sensors = {**sensors, "GPA": sensors.get("GPS", 0)}
+        self._held: list[tuple[int, str, Message]] = []
+        """Messages whose times agree with each other, but not with those before."""
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
         """The newest fix, which waits for its accuracies."""
@@ -83,7 +126,7 @@ class ArdupilotReader:
     @property
     def names(self) -> set[str]:
         """Names of the messages that are used."""
-        return set(self._handlers)
+        return {*self._handlers, *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Imported]:
         """Take the next message.
@@ -99,43 +142,50 @@ class ArdupilotReader:
         list of Imported
             What it holds, in the order of time; nothing for most messages.
         """
-        handler = self._handlers.get(name)
-        if handler is None or any(getattr(message, number, 0) for number in SENSOR_NUMBERS):
+        kind = KINDS.get(name, name)
+        if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
             return []
-        time_us = self._time(int(message.TimeUS))
-        if time_us is None:
-            return []
-        waited = [] if name == "GPA" else self.flush()
-        return [*waited, *handler(message, time_us)]
+        own_us = _own_us(name, message)
+        if self.zero_us is None:
+            self.zero_us = own_us
+        if -LATE_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
+            self._drop_held()
+            return self._take(own_us, kind, message)
+        if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
+            self._drop_held()
+        self._held.append((own_us, kind, message))
+        return self._follow() if len(self._held) == BELIEVED else []
 
     def flush(self) -> list[Imported]:
+        """Return what still waits at the end of the log."""
+        held = self._follow() if len(self._held) >= LEAST_BELIEVED else []
+        self._drop_held()
+        return [*held, *self._flush_fix()]
+
+    def _take(self, own_us: int, kind: str, message: Message) -> list[Imported]:
+        """Handle a message at its time on the records' clock, which never goes back."""
+        self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
+        waited = [] if kind == "GPA" else self._flush_fix()
+        return [*waited, *self._handlers[kind](message, self._newest_us)]
+
+    def _flush_fix(self) -> list[Imported]:
         """Return the fix that waits for its accuracies, if one does."""
         fix, self._fix = self._fix, None
         return [] if fix is None else [fix]
 
-    def _time(self, own_us: int) -> int | None:
-        """Convert a message's time to the records' growing clock; None if damaged."""
-        if self.zero_us is None:
-            self.zero_us = own_us
-        time_us = own_us - self.zero_us
-        if not -LATE_US <= time_us - self._newest_us <= AHEAD_US:
-            if not self._has_leaped(own_us):
-                self.dropped += 1
-                return None
-            # The records' clock never goes back: a log that begins anew continues.
-            self.zero_us += min(time_us - self._newest_us, 0)
-            time_us = own_us - self.zero_us
-        self._odd_count = 0
-        self._newest_us = max(self._newest_us, time_us)
-        return self._newest_us
+    def _drop_held(self) -> None:
+        self.dropped += len(self._held)
+        self._held.clear()
 
-    def _has_leaped(self, own_us: int) -> bool:
-        """Return whether enough messages in a row have such an odd time."""
-        agrees = abs(own_us - self._odd_us) <= LATE_US
-        self._odd_us, self._odd_count = own_us, self._odd_count + 1 if agrees else 1
-        has_leaped = self._odd_count == BELIEVED
-        self.leaps += has_leaped
-        return has_leaped
+    def _follow(self) -> list[Imported]:
+        """Follow the clock to the times of the held messages, and handle these."""
+        held, self._held = self._held, []
+        step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
+        self.leaps += step_us > 0
+        self.restarts += step_us < 0
+        # A log that begins again goes on from where it was.
+        self.zero_us = (self.zero_us or 0) + min(step_us, 0)
+        return [record for one in held for record in self._take(*one)]
 
     def _imu(self, m: Message, time_us: int) -> list[Imported]:
         mag, self._mag = self._mag, None
@@ -166,13 +216,18 @@ class ArdupilotReader:
         course_rad = math.radians(m.GCrs)
         level = (m.Spd * math.cos(course_rad), m.Spd * math.sin(course_rad))
         utc_us = None
-        if m.GWk and has_fix:
-            utc_us = GPS_EPOCH_UNIX_US + m.GWk * WEEK_US + m.GMS * 1000 - LEAP_US
+        # Before 3.3 TimeMS is the time of the week.
+        week, week_ms = getattr(m, "GWk", 0) or getattr(m, "Week", 0), getattr(m, "GMS", None)
+        week_ms = m.TimeMS if week_ms is None else week_ms
+        if week and has_fix:
+            counted_us = GPS_EPOCH_UNIX_US + week * WEEK_US + week_ms * 1000 - LEAP_US
+            utc_us = in_era(counted_us)
+            self.is_rolled_over |= utc_us != counted_us
         self._fix = GpsFix(
             time_us=time_us,
             node=NodeId(self._vehicle_id, 1),
             node_time_us=time_us,
-            itow_ms=m.GMS,
+            itow_ms=week_ms,
             fix_type=fix_type,
             fix_ok=has_fix,
             satellites=m.NSats,
@@ -194,7 +249,7 @@ class ArdupilotReader:
         """Join a fix with the receiver's accuracies, which follow it."""
         fix = self._fix
         if fix is None or fix.time_us != time_us:
-            return self.flush()
+            return self._flush_fix()
         north, east, down = fix.vel_n_mps
         self._fix = replace(
             fix,
@@ -203,7 +258,7 @@ class ArdupilotReader:
             v_acc_m=m.VAcc or NAN,
             speed_acc_mps=m.SAcc or NAN,
         )
-        return self.flush()
+        return self._flush_fix()
 
     def _position(self, m: Message, time_us: int) -> list[Imported]:
         self._place = (time_us, m.Lat, m.Lng, m.Alt)

@@ -24,7 +24,7 @@ from gateway.flightlog.table.row import (
     SI,
     WHOLE_COLUMNS,
 )
-from gateway.records import GpsFixType
+from gateway.records import GpsFixType, NavFlags
 from gateway.units import counted
 
 FloatArray = NDArray[np.float64]
@@ -49,6 +49,7 @@ _HEAD: Final = slice(1, len(HEAD_COLUMNS))
 NODE_ID, NODE_TIME, FLAGS = (_AT[n] for n in ("node_id", "node_time_us", "imu_flags"))
 _FIX_TYPE, FIX_OK = _AT["gps_fix_type"], _AT["gps_fix_ok"]
 FIX_LAT, FIX_LON = _AT["gps_lat_dege7"], _AT["gps_lon_dege7"]
+NAV_LAT, NAV_LON, NAV_FLAGS = _AT["nav_lat_deg"], _AT["nav_lon_deg"], _AT["nav_flags"]
 
 _OF_NUMBERS: Final = b"0123456789.,-+eE\n"
 _COMMA, _NEWLINE = b",\n"
@@ -61,6 +62,12 @@ _LEAST_LARGE: Final = 1e16
 def has_group(cells: FloatArray, group: slice) -> BoolArray:
     """Tell which rows hold a group of columns, such as `RAW`."""
     return ~np.isnan(cells[:, group.start])
+
+
+def has_position(cells: FloatArray) -> BoolArray:
+    """Return which rows hold a state with a valid position."""
+    flags = np.nan_to_num(cells[:, NAV_FLAGS]).astype(np.int64)
+    return np.asarray((flags & int(NavFlags.POSITION_VALID)) != 0)
 
 
 def read_lines(text: bytes, width: int) -> FloatArray | None:

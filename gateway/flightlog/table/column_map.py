@@ -2,8 +2,11 @@
 
 import csv
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, islice
 from typing import Annotated, Final
+
+from msgspec.structs import replace
 
 from gateway.flightlog.damaged_times import is_damaged
 from gateway.flightlog.table.row import COLUMNS, TableRow, check_times
@@ -31,6 +34,11 @@ VECTORS: Final = tuple(
 """Of each all axes are needed, or none."""
 NEEDED: Final = frozenset({"time_us"}).union(*VECTORS[:2])
 """Without these there is nothing to fuse."""
+DELIMITERS: Final = {",": "commas", ";": "semicolons", "\t": "tabs"}
+MAX_HEAD_LINES: Final = 200
+"""The names of the columns are looked for in so many lines."""
+MAX_SHOWN: Final = 200
+"""Characters of the found names in an error."""
 LATE_US: Final = 60 * US_PER_S
 """What was measured so long before or after its line has a damaged time, or another clock's."""
 
@@ -79,11 +87,16 @@ class CsvReader:
         self, column_map: ColumnMap, vehicle_id: int = 1, *, lenient: bool = False
     ) -> None:
         self._columns = {
-            name: Column(column=column) if isinstance(column, str) else column
+            name: Column(column=column.strip())
+            if isinstance(column, str)
+            else replace(column, column=column.column.strip())
             for name, column in column_map.columns.items()
         }
         self._vehicle_id = vehicle_id
         self._lenient = lenient
+        self._is_decimal_comma = False
+        self.skipped = 0
+        """Lines of text before that with the names of the columns."""
         self.faults = 0
         """Lines that could not be read, or whose time is not between those beside them."""
 
@@ -93,7 +106,8 @@ class CsvReader:
         Parameters
         ----------
         lines : iterable of str
-            Its lines; those that begin with `#` are left out.
+            Its lines; those that begin with `#` are left out, and lines of text before the names
+            of the columns are counted. Values are separated by commas, semicolons or tabs.
 
         Yields
         ------
@@ -104,11 +118,12 @@ class CsvReader:
         ValueError
             If the file lacks a column that it must have.
         """
-        table = csv.DictReader(line for line in lines if not line.startswith("#"))
-        try:
-            self._check(set(table.fieldnames or ()))
-        except csv.Error as error:
-            raise ValueError(f"no line of column names: {error}") from error
+        kept = (line for line in lines if not line.startswith("#"))
+        head = [*islice(kept, MAX_HEAD_LINES)]
+        delimiter, names, begin = self._find_names(head)
+        self.skipped = begin - 1
+        self._is_decimal_comma = delimiter != ","
+        table = csv.DictReader(chain(head[begin:], kept), names, delimiter=delimiter)
         before: TableRow | None = None
         held: TableRow | None = None
         for row in self._readable(table):
@@ -134,20 +149,54 @@ class CsvReader:
             except (ValueError, TypeError, OverflowError, csv.Error):
                 self.faults += 1
 
-    def _check(self, names: set[str]) -> None:
-        """Compare the map with the file's columns; raises ValueError if one is missing."""
-        found = {ours: theirs for ours, theirs in self._columns.items() if theirs.column in names}
+    def _find_names(self, head: Sequence[str]) -> tuple[str, list[str], int]:
+        """Find the line with the names of the columns.
+
+        Returns
+        -------
+        delimiter : str
+        names : list of str
+        begin : int
+            Number of the line behind it.
+
+        Raises
+        ------
+        ValueError
+            If no line has all names; it states the ones that the likeliest line lacks.
+        """
+        best: tuple[int, int, str, list[str]] | None = None
+        for number, line in enumerate(head):
+            for delimiter in DELIMITERS if line.strip() else ():
+                names = _cells_of(line, delimiter)
+                found = self._found(names)
+                if not self._absent(found):
+                    self._columns = found
+                    return delimiter, names, number + 1
+                if best is None or (len(found), len(names)) > best[:2]:
+                    best = (len(found), len(names), delimiter, names)
+        if best is None:
+            raise ValueError("the file has no line of column names")
+        _, _, delimiter, names = best
+        missing = sorted(self._columns[ours].column for ours in self._absent(self._found(names)))
+        raise ValueError(
+            f"the file has no column {', '.join(missing)}; found, separated by "
+            f"{DELIMITERS[delimiter]}: {', '.join(names)[:MAX_SHOWN]}"
+        )
+
+    def _found(self, names: Sequence[str]) -> dict[str, Column]:
+        there = set(names)
+        return {ours: c for ours, c in self._columns.items() if c.column in there}
+
+    def _absent(self, found: Mapping[str, Column]) -> set[str]:
         absent = self._columns.keys() - found.keys()
-        if self._lenient:
-            absent &= NEEDED | _begun(found)
-        if absent:
-            missing = sorted(self._columns[ours].column for ours in absent)
-            raise ValueError(f"the file has no column {', '.join(missing)}")
-        self._columns = found
+        return absent & (NEEDED | _begun(found)) if self._lenient else absent
+
+    def _number(self, text: str) -> float:
+        return float(text.replace(",", ".") if self._is_decimal_comma else text)
 
     def _row(self, cells: Mapping[str, str]) -> TableRow:
         value = {
-            name: float(cells[c.column]) * c.scale + c.offset
+            name: self._number(cells[c.column]) * c.scale + c.offset
             for name, c in self._columns.items()
             if (cells[c.column] or "").strip()
         }
@@ -216,6 +265,14 @@ class CsvReader:
             pdop=value.get("gps_pdop", NAN),
             utc_us=None if math.isnan(utc_us) else round(utc_us),
         )
+
+
+def _cells_of(line: str, delimiter: str) -> list[str]:
+    """Split a line; one that is no CSV has no cells."""
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])]
+    except csv.Error:
+        return []
 
 
 def _begun(names: Iterable[str]) -> frozenset[str]:

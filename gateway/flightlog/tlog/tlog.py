@@ -3,7 +3,7 @@
 from array import array
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -19,6 +19,7 @@ from gateway.flightlog.tlog.tlog_scan import (
     lacks_end,
     scan,
 )
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import is_station_heartbeat
 
 STRIDE: Final = 256
@@ -26,6 +27,12 @@ STRIDE: Final = 256
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
 MAX_DAMAGE_RUNS: Final = 1000
 """Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+
+BACK_US: Final = 60 * US_PER_S
+"""Frames of two links may be out of order by seconds; a clock that was set back shows more."""
+FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
+"""The year 2000: an earlier time counts from the start of a clock."""
+MAX_JUMPS: Final = 1000
 
 HEARTBEAT_ID: Final = 0
 
@@ -221,6 +228,66 @@ class TlogScanner:
         return count
 
 
+@dataclass(frozen=True, slots=True)
+class ClockJump:
+    """A step of a recording's clock, which the timeline leaves out."""
+
+    offset_us: int
+    """Time since the first record at which it happened."""
+    step_us: int
+
+
+class Timeline:
+    """One growing time for a tlog whose clock was set while it was written.
+
+    A step of the clock between two records that is longer than a day, or goes back by more than a
+    minute, is a jump: the time runs on without it. The date is that of the first stretch between
+    jumps whose clock showed a possible civil date; without one it is that of the first stretch.
+    """
+
+    def __init__(self) -> None:
+        self.jumps: list[ClockJump] = []
+        self._begins: list[int] = []
+        self._shifts_us: list[int] = []
+        self._first_us = 0
+        self._last_us: int | None = None
+        self._date_shift_us: int | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Take in the recorded times of the next batch of the file."""
+        if not len(batch):
+            return
+        times_us = batch.time_us
+        if self._last_us is None:
+            self._first_us = int(times_us[0])
+            self._begin(batch, 0, 0)
+            self._last_us = self._first_us
+        steps_us = np.diff(times_us, prepend=self._last_us)
+        for record in np.flatnonzero((steps_us > DAY_US) | (steps_us < -BACK_US)).tolist():
+            if len(self.jumps) == MAX_JUMPS:
+                break
+            step_us, shift_us = int(steps_us[record]), self._shifts_us[-1]
+            now_us = int(times_us[record]) - step_us + shift_us
+            self.jumps.append(ClockJump(now_us - self._first_us, step_us))
+            self._begin(batch, record, shift_us - step_us)
+        self._last_us = int(times_us[-1])
+
+    def _begin(self, batch: Batch, record: int, shift_us: int) -> None:
+        self._begins.append(batch.offset + int(batch.starts[record]))
+        self._shifts_us.append(shift_us)
+        if self._date_shift_us is None and int(batch.time_us[record]) >= FIRST_CIVIL_US:
+            self._date_shift_us = shift_us
+
+    def apply(self, batch: Batch) -> Batch:
+        """Return a batch of the same file with corrected times."""
+        if not self.jumps or not len(batch):
+            return batch
+        shifts_us = np.array(self._shifts_us) - (self._date_shift_us or 0)
+        at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
+        corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
+        return replace(batch, time_us=corrected)
+
+
 class TlogIndex:
     """Index of a file: where to begin reading for a time, and a summary.
 
@@ -229,7 +296,9 @@ class TlogIndex:
     time so far, which never does.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, timeline: Timeline | None = None) -> None:
+        self.timeline = timeline or Timeline()
+        """Corrects the times of batches that are read again."""
         self.count = 0
         """Records."""
         self.size = 0

@@ -4,20 +4,29 @@ import contextlib
 import io
 import re
 from collections.abc import Callable, Iterator
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
-from gateway.edges.disk.recording_streams import read_chunks, temporary_copy
-from gateway.flightlog.autopilots.ardupilot_log import ArdupilotReader
+from gateway.edges.disk.recording_streams import ERASED, read_chunks, temporary_copy
+from gateway.flightlog.autopilots.ardupilot_log import (
+    FIX_2D,
+    KINDS,
+    SENSORS,
+    ArdupilotReader,
+    in_era,
+    sensor_of,
+)
 from gateway.flightlog.table.row import Imported, RowBuilder, TableRow
 from gateway.flights.flight_terms import FlightError
 from gateway.flights.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.units import US_PER_S, counted
 
 MAGIC: Final = b"\xa3\x95"
+MAX_LOOKED_AT: Final = 20_000
+"""Messages of a kind that are read to find the first sensor with data: an hour of GPS."""
 SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
 _AS_TEXT: Final = bytes(range(128)) + b"?" * 128
 _SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
@@ -48,8 +57,9 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     named = (log.params.get(name) for name in SYSTEM_IDS)
     known = next((int(value) for value in named if value is not None), 1)
     vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
-    reader = ArdupilotReader(vehicle_id)
-    remarks: list[str] = []
+    sensors = _sensors_of(log, heard) | dict(options.sensors)
+    reader = ArdupilotReader(vehicle_id, sensors)
+    remarks = [f"{path}: uses {kind} {number + 1}" for kind, number in sensors.items() if number]
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
@@ -64,11 +74,38 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     if first is None:
         raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
     # By the first week and time of GPS; 0 without one.
-    unix_us = round(log.clock.timebase * US_PER_S) if log.clock.timebase else None
+    unix_us = in_era(round(log.clock.timebase * US_PER_S)) if log.clock.timebase else None
     zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
     table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
     table.remarks = remarks
     return table
+
+
+def _sensors_of(log: Any, heard: _Complaints) -> dict[str, int]:
+    """Find the first sensor of each kind that has data; a GPS that has a fix."""
+    found: dict[str, int] = {}
+    for kind in SENSORS:
+        names = {name for name, of in KINDS.items() if of == kind}
+        seen: set[int] = set()
+        for message in islice(_each(log, heard, names), MAX_LOOKED_AT):
+            if kind != "GPS" or getattr(message, "Status", 0) >= FIX_2D:
+                seen.add(sensor_of(message.get_type(), message))
+            if 0 in seen:
+                break
+        found[kind] = min(seen, default=0)
+    return found
+
+
+def _each(log: Any, heard: _Complaints, names: set[str]) -> Iterator[Any]:
+    """Yield the messages of these names up to the first damage, and go back to the begin."""
+    log.type_list = None
+    try:
+        while message := heard.quietly(lambda: log.recv_match(type=names, strict=True)):
+            yield message
+    except Exception:  # noqa: BLE001 - as for `_open`
+        return
+    finally:
+        log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
 
 
 def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
@@ -78,6 +115,9 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
     """
     content = read_chunks(path, options.progress, options.unpacked_limit)
     first = next(content, b"")
+    while first and not first.strip(ERASED):
+        first = next(content, b"")
+    first = first.lstrip(ERASED) if first[:2] == ERASED * 2 else first
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text
     # A byte that is not text must not stop the reading.
@@ -142,4 +182,8 @@ def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[
     if broken := reader.dropped + heard.messages:
         yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
     if reader.leaps:
-        yield f"its clock leaped {counted(reader.leaps, 'time')}"
+        yield f"its clock jumped forward {counted(reader.leaps, 'time')}"
+    if reader.restarts:
+        yield f"the autopilot restarted {counted(reader.restarts, 'time')}; its times run on"
+    if reader.is_rolled_over:
+        yield "its GPS receiver counts 1024 weeks too few; its dates are corrected"

@@ -197,6 +197,40 @@ def find_flights(folder: Path, where: str = "") -> list[Row]:
         return [dict(zip(COLUMNS, row, strict=True)) for row in rows]
 
 
+class FlightFigures(msgspec.Struct, frozen=True):
+    """Distance over ground in m, greatest height in m, share of lost samples; None if unknown."""
+
+    distance: float | None = None
+    highest: float | None = None
+    loss: float | None = None
+
+
+def figures_of(folder: Path) -> dict[str, dict[int, FlightFigures]]:
+    """Sum up each recording from its catalogue, by name and vehicle.
+
+    Tables and tlogs of a recording hold the same flight: of each figure the table's is taken. The
+    parts of a recording are added up.
+    """
+    parts: dict[tuple[str, int], list[Row]] = {}
+    for row in find_flights(folder, "error IS NULL AND vehicle IS NOT NULL"):
+        parts.setdefault((row["name"], row["vehicle"]), []).append(row)
+    found: dict[str, dict[int, FlightFigures]] = {}
+    for (name, vehicle), rows in parts.items():
+        kind = max((row["kind"] for row in rows), key=lambda kind: (kind == "table", str(kind)))
+        of_kind = [row for row in rows if row["kind"] == kind]
+
+        def known(column: str, rows: list[Row] = of_kind) -> list[Any]:
+            return [row[column] for row in rows if row[column] is not None]
+
+        distances, losses = known("distance"), known("loss")
+        found.setdefault(name, {})[vehicle] = FlightFigures(
+            sum(distances) if distances else None,
+            max(known("highest"), default=None),
+            sum(losses) / len(losses) if losses else None,
+        )
+    return found
+
+
 def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
     """Lay the tracks of flights out as GeoJSON; see `find_flights`."""
     with _asked(folder) as db:

@@ -18,10 +18,10 @@ from gateway.edges.disk.recording_streams import (
     kind_of,
     open_recording,
     other_format,
-    read_batches,
     read_chunks,
 )
 from gateway.edges.disk.recordings import as_text, recording_name
+from gateway.edges.disk.tlog_source import read_batches
 from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.flights.reading import ReadOptions, open_rows
 from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile

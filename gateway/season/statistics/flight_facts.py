@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.flightlog.damaged_times import DAY_US
 from gateway.flightlog.moment import civil_time
-from gateway.flightlog.summary import GroundWay
+from gateway.flightlog.summary import GroundDistance
 from gateway.geometry.angle import wrap_180
 from gateway.season.statistics.track_shape import Place, simplified
 from gateway.units import US_PER_S
@@ -82,18 +82,23 @@ class FlightTally:
     """Gathers what is known of one vehicle while its recording goes by."""
 
     def __init__(self) -> None:
-        self._way = GroundWay()
-        self._points: list[tuple[int, float, float, float, float]] = []
+        self.way = GroundDistance()
+        self.points: list[tuple[int, float, float, float, float]] = []
         self._gps_us: list[int] = []
         self._fixed: list[bool] = []
         self.faults = 0
 
     def add_position(self, time_us: int, place: Place, speed_mps: float) -> None:
         """Take a position in: latitude and longitude in deg, height in m, ground speed in m/s."""
-        if self._points and 0 <= time_us - self._points[-1][0] < POINT_US:
+        self.way.add(time_us, place[0], place[1])
+        if self.points and 0 <= time_us - self.points[-1][0] < POINT_US:
             return
-        self._points.append((time_us, *place, speed_mps))
-        self._way.add(time_us, place[0], place[1])
+        self.points.append((time_us, *place, speed_mps))
+
+    def prefer_positions_of(self, other: "FlightTally") -> None:
+        """Use the positions of another tally, if it has any."""
+        if other.points:
+            self.points, self.way = other.points, other.way
 
     def add_gps(self, time_us: int, *, fixed: bool) -> None:
         """Note that the receiver sent something, and whether it had a fix."""
@@ -110,9 +115,9 @@ class FlightTally:
         """
         outages, lost_s = self._outages(end_us)
         known = FlightFacts(gps_outages=outages, gps_lost=lost_s, faults=self.faults)
-        if not self._points:
+        if not self.points:
             return known
-        points = np.array(self._points, np.float64)
+        points = np.array(self.points, np.float64)
         lat, lon, alt, speed = points[:, 1:].T
         height = alt - alt[0]
         west, east = _longitudes(lon)
@@ -120,7 +125,7 @@ class FlightTally:
         takeoff = max(int(flying[0]) - 1, 0) if len(flying) else None
         return msgspec.structs.replace(
             known,
-            distance=self._way.distance_m,
+            distance=self.way.distance_m,
             highest=_greatest(height),
             fastest=_greatest(speed),
             lat_min=float(lat.min()),
@@ -133,7 +138,7 @@ class FlightTally:
 
     def track(self) -> list[Place]:
         """Return the way as few places as show it."""
-        return simplified([(lat, lon, alt) for _, lat, lon, alt, _ in self._points])
+        return simplified([(lat, lon, alt) for _, lat, lon, alt, _ in self.points])
 
     def _outages(self, end_us: int | None) -> tuple[int | None, float | None]:
         times = np.array(self._gps_us, np.int64)

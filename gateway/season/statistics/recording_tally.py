@@ -8,7 +8,13 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from gateway.flightlog.summary import GLOBAL_POSITION_INT_ID, HEARTBEAT_ID, TimesSpan, payload_of
+from gateway.flightlog.summary import (
+    GLOBAL_POSITION_INT_ID,
+    HEARTBEAT_ID,
+    STEP_US,
+    TimesSpan,
+    payload_of,
+)
 from gateway.flightlog.table.row import TableRow
 from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, TableReader
 from gateway.flightlog.tlog.recorded_commands import is_station
@@ -49,7 +55,7 @@ class RowsTally:
     """Sums up a table, or the rows that another format was read as."""
 
     def __init__(self) -> None:
-        self._tally = FlightTally()
+        self._tally, self._states = FlightTally(), FlightTally()
         self._span = TimesSpan()
         self._last_us = 0
         self._nodes: dict[int, NodeStatus] = {}
@@ -60,7 +66,7 @@ class RowsTally:
         self._last_us = max(time_us, self._last_us)
 
     def add(self, row: TableRow) -> None:
-        """Take a whole row in: its fix, or else its state."""
+        """Take a whole row in: its fix, and its state."""
         fix, state = row.gps, row.state
         if fix is not None:
             self._tally.add_gps(fix.time_us, fixed=fix.fix_ok)
@@ -68,10 +74,10 @@ class RowsTally:
                 place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
                 speed_mps = float(np.hypot(*fix.vel_n_mps[:2]))
                 self._tally.add_position(fix.time_us, (*place, fix.alt_amsl_m), speed_mps)
-        elif state is not None and NavFlags.POSITION_VALID in state.flags:
+        if state is not None and NavFlags.POSITION_VALID in state.flags:
             speed_mps = float(np.hypot(*state.vel_n_mps[:2]))
             place3 = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
-            self._tally.add_position(state.time_us, place3, speed_mps)
+            self._states.add_position(row.time_us, place3, speed_mps)
 
     def add_status(self, status: NodeStatus) -> None:
         """Count what a node reports as failed since its last report."""
@@ -87,6 +93,7 @@ class RowsTally:
         first_us = self._span.first_us
         if first_us is None:
             return []
+        self._tally.prefer_positions_of(self._states)
         head = header or TableHeader()
         zero_us = head.unix_us_at_zero
         known = msgspec.structs.replace(
@@ -113,7 +120,7 @@ class TableSkimmer:
         self._places: tuple[int, int, int, int] | None = None
         """Where the time, the node's time, the fix and the state stand in a row."""
         self._state_us = 0
-        """From when on the next state adds something new."""
+        """Time of the next state that is read."""
 
     def feed(self, data: bytes) -> None:
         """Take the next chunk of the file."""
@@ -155,10 +162,7 @@ class TableSkimmer:
         if node_us is not None:
             self._node_us.append(node_us)
         self._tally.add_time(time_us)
-        if has_state and time_us >= self._state_us:
-            self._state_us = time_us + US_PER_S
-            has_fix = True
-        if has_fix:
+        if has_fix or (has_state and time_us >= self._state_us):
             self._read(line)
 
     def _read(self, line: bytes) -> None:
@@ -169,6 +173,10 @@ class TableSkimmer:
         match event:
             case TableRow():
                 self._tally.add(event)
+                state = event.state
+                is_placed = state is not None and NavFlags.POSITION_VALID in state.flags
+                if is_placed and event.time_us >= self._state_us:
+                    self._state_us = event.time_us + STEP_US
             case NodeStatus():
                 self._tally.add_status(event)
             case TableFault(is_cut=False):

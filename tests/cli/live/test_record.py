@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import RecorderVerbs
+from gateway.season.catalogue.catalogue_file import CATALOGUE_NAME
 from tests.conftest import ManualClock
 from tests.edges.disk.test_recorder import Bench
 from tests.flightlog.frames import make_frames
@@ -59,7 +60,7 @@ async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
     assert '"name":"first"' in await run("list", "--json")
     assert "first_01.tlog" in await run("delete", "first", "--yes")
     assert f"no recordings in {gateway.recorder.folder}" in await run("list")
-    assert list(gateway.recorder.folder.iterdir()) == []
+    assert [path.name for path in gateway.recorder.folder.iterdir()] == [CATALOGUE_NAME]
 
 
 async def test_a_start_that_records_nothing_is_told_by_its_exit_code(gateway: Bench) -> None:

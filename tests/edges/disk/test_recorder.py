@@ -266,7 +266,7 @@ async def test_a_disk_that_hangs_costs_recording_not_memory(bench: Bench) -> Non
     assert bench.troubles == ["Recording stopped: disk is too slow"]
 
 
-async def test_names_and_times_are_put_right_once_gps_tells_them(
+async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
     bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
@@ -284,8 +284,9 @@ async def test_names_and_times_are_put_right_once_gps_tells_them(
     bench.recorder.close()
     files = sorted(bench.recorder.folder.iterdir())
     table = files.pop(2)
-    assert [path.name for path in files] == [f"{NAME}_0{n}.tlog" for n in (1, 2, 3)]
-    assert table.name == f"{NAME}_02_v3.csv"
+    name = "19700101-000001"
+    assert [path.name for path in files] == [f"{name}_0{n}.tlog" for n in (1, 2, 3)]
+    assert table.name == f"{name}_02_v3.csv"
     reader = TableReader()
     reader.feed(table.read_bytes())
     assert reader.header is not None

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway.edges.disk.part_files import PartFiles
-from gateway.flightlog.session import RETRY_US, ClosePart, OpenPart, Rename
+from gateway.flightlog.session import RETRY_US, ClosePart, CorrectTimes, OpenPart
 from tests.conftest import ManualClock
 from tests.edges.disk.test_recorder import FRAMES, NAME, Bench, frames_of
 
@@ -194,14 +194,14 @@ async def test_a_recording_that_gets_its_true_time_waits_for_no_sync(
     part = bench.recorder._part
     assert part is not None
     bench.send(FRAMES[5:7])
-    actions = [ClosePart(), Rename(part.session, "true"), OpenPart("true", part.number + 1)]
+    actions = [ClosePart(), CorrectTimes(), OpenPart(part.session, part.number + 1)]
     await asyncio.wait_for(bench.recorder._perform(actions), FAR_S / 2)
     for frame in FRAMES[7:]:
         bench.send([frame])
         await asyncio.wait_for(bench.turn(), FAR_S)
     assert frames_of(bench.recorder.folder) == FRAMES
     names = sorted(path.name for path in bench.recorder.folder.glob("*.tlog"))
-    assert names == ["true_01.tlog", "true_02.tlog"]
+    assert names == [f"{part.session}_0{number}.tlog" for number in (1, 2)]
     disk.may_end.set()
     bench.recorder.close()
     assert disk.most == 1
