@@ -1,6 +1,7 @@
 # make demo   the gateway on its built-in simulated receiver, until interrupted
 # make test   every test, the firmware's included
 # make lint   formatting, lint and types
+# make firmware   the ready-made images of `mavgate flash`; make deb builds them too
 # make deb    a Debian package with the service, in dist/
 # make fuzz   odd input to all that reads any, with new values, for five minutes
 # make lock   write the lock files anew from pyproject.toml
@@ -8,7 +9,7 @@
 .PHONY: demo test lint deb fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
-FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck
+FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck avrdude arduino-core-avr
 
 demo: .venv/.run
 	.venv/bin/mavgate demo
@@ -25,7 +26,7 @@ test: .venv/.dev
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
 
-deb: .venv/.run
+deb: .venv/.run firmware
 	tools/make_deb.sh dist
 
 fuzz: .venv/.dev
@@ -45,7 +46,7 @@ HEADLESS := $(foreach package,opencv-python vtk wxpython quantized-mesh-tile sha
 
 firmware:
 	tools/apt_install.sh $(FIRMWARE_PACKAGES)
-	$(MAKE) -C firmware
+	$(MAKE) -C firmware images
 
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache

@@ -51,6 +51,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "panel": FOUNDATION | STAGES | {"status", "edges", "flights", "analysis", "season"} | EDGES,
     "fleet": FOUNDATION | STAGES | {"edges", "output"} | EDGES,
     "config": FOUNDATION | STAGES | JOINED | {"edges", "panel", "fleet", "output"} | EDGES,
+    "flashing": FOUNDATION | {"wire", "live"},
     "live": FOUNDATION
     | STAGES
     | JOINED
@@ -62,7 +63,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"replay", "status", "edges", "flights", "config", "player", "analysis"}
-    | {"extensions", "panel", "fleet", "season", "output"}
+    | {"extensions", "panel", "fleet", "flashing", "season", "output"}
     | EDGES,
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""

@@ -52,6 +52,7 @@ def library() -> ctypes.CDLL:
         "board_free": (None, (pointer,)),
         "board_connect": (None, (pointer, _SPI, _TWI, _PIN)),
         "board_load": (None, (pointer, ctypes.c_char_p, u32)),
+        "board_start_at": (None, (pointer, u32)),
         "board_reset": (None, (pointer, u8)),
         "board_run": (ctypes.c_int, (pointer, u64)),
         "board_cycle": (u64, (pointer,)),
@@ -73,15 +74,20 @@ def library() -> ctypes.CDLL:
     return lib
 
 
-def read_hex(path: Path) -> bytes:
-    """Read the code of an Intel HEX file that begins at address 0."""
-    code = bytearray()
+def read_hex(path: Path) -> tuple[bytes, int]:
+    """Read an Intel HEX file: all bytes from address 0 on, and the address of the first record.
+
+    Not with `intelhex`: it refuses optiboot's file, which holds its version twice.
+    """
+    code, start = bytearray(), None
     for line in path.read_text(encoding="ascii").split():
         record = bytes.fromhex(line[1:])
         size, address, kind = record[0], int.from_bytes(record[1:3], "big"), record[3]
         if kind == 0:
+            start = address if start is None else start
+            code += b"\xff" * (address + size - len(code))
             code[address : address + size] = record[4 : 4 + size]
-    return bytes(code)
+    return bytes(code), start or 0
 
 
 def read_symbols(path: Path) -> dict[str, int]:
@@ -99,7 +105,7 @@ class Mcu:
     Parameters
     ----------
     program : Path
-        The `.hex` file; the `.elf` beside it gives the symbols.
+        The `.hex` file, of a program or a bootloader; the `.elf` beside it gives the symbols.
     frequency_hz : int
         What the program was built for.
     """
@@ -117,8 +123,10 @@ class Mcu:
         self._board = self._lib.board_new(frequency_hz)
         # ctypes keeps no reference to a callback: these must live as long as the board.
         self._callbacks = (_SPI(self._spi), _TWI(self._twi), _PIN(self._pin))
-        code = read_hex(program)
+        code, start = read_hex(program)
         self._lib.board_load(self._board, code, len(code))
+        # A program that begins elsewhere is a bootloader, where the chip's fuses let it start.
+        self._lib.board_start_at(self._board, start)
         self._lib.board_connect(self._board, *self._callbacks)
         self._bytes = ctypes.create_string_buffer(_UART_OUT)
         self._cycles = (ctypes.c_uint64 * _UART_OUT)()

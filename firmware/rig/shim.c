@@ -321,6 +321,12 @@ void board_load(board_t *board, const uint8_t *code, uint32_t size)
     board->avr->data[MCUSR] = 1; /* power-on */
 }
 
+/* Where the chip starts after a reset: its fuses BOOTRST and BOOTSZ. */
+void board_start_at(board_t *board, uint32_t address)
+{
+    board->avr->reset_pc = board->avr->pc = address;
+}
+
 /* Restarts the chip as the cause (bits of MCUSR) would; the cycle counter goes on. */
 void board_reset(board_t *board, uint8_t cause)
 {

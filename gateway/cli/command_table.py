@@ -52,6 +52,10 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "live.setup",
         "Check the settings and those of the aircraft, or print all settings with their defaults.",
     ),
+    "flash": CommandEntry(
+        "live.flash",
+        "Write a ready-made program with its settings to a board, or read them back.",
+    ),
     "doctor": CommandEntry(
         "live.doctor",
         "Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.",

@@ -1,0 +1,233 @@
+"""`mavgate flash`: write a ready-made program with its settings to a board, or read them back."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, Final, get_args
+
+import msgspec
+import typer
+
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.flashing.settings_block import (
+    USED_BY,
+    BoardSettings,
+    Program,
+    SettingsBlock,
+    default_pipe,
+)
+from gateway.flashing.upload import (
+    CLOCKS_MHZ,
+    FlashError,
+    block_of,
+    find_bootloader,
+    image_path,
+    read_flash,
+    read_image,
+    require_bootloader,
+    reserved,
+    with_settings,
+    write_flash,
+)
+from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.output import write_new
+from gateway.settings import Field, fields_of
+
+FIELDS: Final = {field.name: field for field in fields_of(BoardSettings)}
+OPTIONS: Final = {
+    "vehicle_id": "--vehicle",
+    "node_id": "--node",
+    "radio_pipe": "--pipe",
+    "radio_channel": "--channel",
+    "radio_kbps": "--rate",
+    "radio_power_dbm": "--power",
+    "radio_address": "--address",
+    "imu_send_hz": "--send-rate",
+    "imu_raw": "--raw",
+    "accel_range_g": "--accel-range",
+    "gyro_range_dps": "--gyro-range",
+    "gps_rate_hz": "--gps-rate",
+    "gps_dynamic_model": "--gps-model",
+}
+
+console = console_of()
+
+
+class Board(StrEnum):
+    """The programs as they are named on the command line."""
+
+    IMU = "imu"
+    GPS = "gps"
+    RECEIVER = "receiver"
+
+
+def _allowed(field: Field) -> str:
+    literals = ", ".join(map(str, get_args(field.type.__origin__)))
+    return f"{literals or field.range} {field.unit}".strip()
+
+
+def _option(name: str) -> Any:
+    field, flags = FIELDS[name], [OPTIONS[name]]
+    if name == "imu_raw":
+        flags = ["--raw/--filtered"]
+    allowed = "" if name in ("imu_raw", "radio_address") else f" {_allowed(field)}."
+    return typer.Option(*flags, help=f"{field.meaning}{allowed}", show_default=False)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command()(flash)
+
+
+def flash(
+    board: Annotated[
+        Board | None, typer.Argument(help="Program to write; without it, list the boards.")
+    ] = None,
+    *,
+    port: Annotated[
+        str, typer.Option("--port", "-p", help="As serial.port: device, usb:VID:PID or auto.")
+    ] = "auto",
+    show: Annotated[
+        bool, typer.Option("--show", help="Read a board's program, version and settings back.")
+    ] = False,
+    keep: Annotated[
+        bool, typer.Option("--keep", help="Keep the board's present settings where not given.")
+    ] = False,
+    clock: Annotated[int, typer.Option("--clock", help="Crystal: 16 or 8 MHz.")] = 16,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Write the image to this file, not to a board."),
+    ] = None,
+    vehicle: Annotated[int | None, _option("vehicle_id")] = None,
+    node: Annotated[int | None, _option("node_id")] = None,
+    pipe: Annotated[int | None, _option("radio_pipe")] = None,
+    channel: Annotated[int | None, _option("radio_channel")] = None,
+    rate: Annotated[int | None, _option("radio_kbps")] = None,
+    power: Annotated[int | None, _option("radio_power_dbm")] = None,
+    address: Annotated[str | None, _option("radio_address")] = None,
+    send_rate: Annotated[int | None, _option("imu_send_hz")] = None,
+    raw: Annotated[bool | None, _option("imu_raw")] = None,
+    accel_range: Annotated[int | None, _option("accel_range_g")] = None,
+    gyro_range: Annotated[int | None, _option("gyro_range_dps")] = None,
+    gps_rate: Annotated[int | None, _option("gps_rate_hz")] = None,
+    gps_model: Annotated[int | None, _option("gps_dynamic_model")] = None,
+) -> None:
+    """Write a ready-made program with its settings to a board, or read them back.
+
+    Needs avrdude, and no compiler. Listing, reading and writing restart the board.
+    """
+    given = (vehicle, node, pipe, channel, rate, power, _address(address), send_rate, raw)
+    given += (accel_range, gyro_range, gps_rate, gps_model)
+    changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
+    try:
+        if show:
+            _show(port)
+        elif board is None:
+            _list()
+        else:
+            _write(Program[board.name], changes, port=port, keep=keep, clock=clock, output=output)
+    except (FlashError, PortNotFoundError, OSError) as error:
+        refuse(str(error))
+
+
+def _address(text: str | None) -> int | None:
+    try:
+        return None if text is None else int(text, 16)
+    except ValueError:
+        refuse(f"--address {text}: eight hexadecimal digits, such as d35ac396")
+
+
+def _list() -> None:
+    """List the serial ports and the bootloader behind each USB adapter."""
+    found = list_serial_ports()
+    if not found:
+        refuse("this machine has no serial port: connect a board by USB")
+    table = table_of("device", "USB id", "adapter", "bootloader", left=4)
+    for port in found:
+        answer = _bootloader_text(port.device) if port.usb_id else "not asked"
+        table.add_row(port.device, port.usb_id, port.description, answer)
+    console.print(table)
+    console.print("Next: `mavgate flash imu --port DEVICE`, or gps, or receiver")
+
+
+def _bootloader_text(device: str) -> str:
+    try:
+        with reserved(device):
+            loader = find_bootloader(device)
+    except FlashError as error:
+        return str(error).removeprefix(f"{device}: ")
+    return "no answer" if loader is None else f"{loader.name}, {loader.baud} baud"
+
+
+def _show(port: str) -> None:
+    """Print the program, version and settings of a board."""
+    device = find_port(port, list_serial_ports())
+    with reserved(device):
+        block = block_of(read_flash(device, require_bootloader(device)))
+    _print(device, block)
+
+
+def _write(
+    program: Program,
+    changes: dict[str, Any],
+    *,
+    port: str,
+    keep: bool,
+    clock: int,
+    output: Path | None,
+) -> None:
+    """Patch an image and write it to a board or a file."""
+    if clock not in CLOCKS_MHZ:
+        refuse(f"--clock {clock}: 16 or 8")
+    image = read_image(image_path(program, clock))
+    block = block_of(image)
+    if output is not None:
+        settings = _changed(program, block.settings, changes)
+        write_new(output, [with_settings(image, settings)])
+        return
+    device = find_port(port, list_serial_ports())
+    with reserved(device):
+        loader = require_bootloader(device)
+        before = block.settings
+        if keep:
+            before = _kept(block_of(read_flash(device, loader)), program)
+        before = msgspec.structs.replace(before, soft_restart=loader.leaves_watchdog_on)
+        settings = _changed(program, before, changes)
+        write_flash(device, loader, with_settings(image, settings))
+    _print(device, block_of(image))
+
+
+def _kept(block: SettingsBlock, program: Program) -> BoardSettings:
+    if block.program is not program:
+        refuse(f"--keep: the board holds the program {block.program.name.lower()}")
+    return block.settings
+
+
+def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -> BoardSettings:
+    """Check and apply the options that were given."""
+    for name, value in changes.items():
+        option = OPTIONS[name]
+        if name not in USED_BY[program]:
+            refuse(f"{option}: the program {program.name.lower()} has no such setting")
+        try:
+            msgspec.convert(value, FIELDS[name].type)
+        except msgspec.ValidationError:
+            refuse(f"{option} {value}: must be {_allowed(FIELDS[name])}")
+    after = msgspec.structs.replace(before, **changes)
+    if "vehicle_id" in changes and "radio_pipe" not in changes:
+        pipe = default_pipe(program, after.vehicle_id)
+        after = msgspec.structs.replace(after, radio_pipe=pipe)
+    return after
+
+
+def _print(device: str, block: SettingsBlock) -> None:
+    """Print a table of what is on a board."""
+    major, minor = block.firmware_version
+    name = block.program.name.lower()
+    console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")
+    table = table_of("setting", "value", "unit", "option", left=4)
+    for field in USED_BY[block.program]:
+        value: object = getattr(block.settings, field)
+        text = f"{value:08x}" if field == "radio_address" else str(value)
+        table.add_row(field, text, FIELDS[field].unit, OPTIONS.get(field, ""))
+    console.print(table)

@@ -1,0 +1,1 @@
+"""Firmware images: the settings in them, and writing them to a board with avrdude."""
