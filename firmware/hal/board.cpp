@@ -47,6 +47,20 @@ void board_start() {
 
 void board_feed_watchdog() { wdt_reset(); }
 
+void board_restart_softly() { WDTCSR |= 1 << WDIE; }
+
+// Every source of interrupts off, as after a reset; the start-up code does the rest. The cause is
+// handed over as optiboot does.
+ISR(WDT_vect, ISR_NAKED) {
+    wdt_disable();
+    EIMSK = 0;
+    TIMSK1 = 0;
+    UCSR0B = 0;
+    TWCR = 0;
+    ADCSRA = 0;
+    __asm__ __volatile__("mov r2, %0\n\tclr r1\n\tjmp 0" : : "r"(static_cast<uint8_t>(1 << WDRF)));
+}
+
 void board_wait_ms(uint8_t ms) {
     const uint32_t until_us = clock_us() + 1000UL * ms;
     while (!clock_passed(clock_us(), until_us)) {

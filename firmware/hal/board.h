@@ -14,6 +14,11 @@ bool board_started_cold();
 void board_start();
 void board_feed_watchdog();
 
+// Has the watchdog restart the program by an interrupt, which then jumps to its start. For old
+// bootloaders: after a reset by the watchdog they leave it on, at 16 ms, and never get past it. Only a
+// program that hangs with interrupts off is still reset.
+void board_restart_softly();
+
 // Asleep for about this long, watchdog fed: for set-up alone.
 void board_wait_ms(uint8_t ms);
 

@@ -21,6 +21,9 @@ void stored_settings_load(const SettingsImage *image) {
         board_feed_watchdog();
         led_blink(LED_SETTINGS_DAMAGED, clock_us());
     }
+    if (block.soft_restart != 0) {
+        board_restart_softly();
+    }
 }
 
 const SettingsBlock &stored_settings() { return block; }

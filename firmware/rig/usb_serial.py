@@ -7,6 +7,8 @@ never runs ahead of true time, because bootloaders and avrdude have timeouts.
 
 import contextlib
 import ctypes
+import functools
+import itertools
 import os
 import pty
 import select
@@ -14,7 +16,6 @@ import subprocess
 import termios
 import time
 import tty
-from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -32,6 +33,7 @@ PIECE_S: Final = 0.001
 READ_SIZE: Final = 256
 BITS_PER_BYTE: Final = 10
 SPEED_TOLERANCE: Final = 0.04
+SKIPPED_NUMBERS: Final = 48
 _IN_OPEN: Final = 0x20
 """Linux `inotify`: the file was opened."""
 SPEEDS: Final = {
@@ -52,10 +54,9 @@ class UsbSerial:
         self._board = board
         self._bench = board.setup.bench
         self._take = board.take_bytes if isinstance(board, Receiver) else board.mcu.uart_take
-        self._master, slave = pty.openpty()
-        tty.setraw(slave)
-        self.path = os.ttyname(slave)
-        os.close(slave)
+        self._master, self._slave = _seldom_used_pty()
+        tty.setraw(self._slave)
+        self.path = os.ttyname(self._slave)
         os.set_blocking(self._master, False)
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
@@ -63,12 +64,13 @@ class UsbSerial:
         self._opened = libc.inotify_init1(os.O_NONBLOCK)
         libc.inotify_add_watch(self._opened, self.path.encode(), _IN_OPEN)
         self._line_free_ps = 0
-        self._ahead_of_s = time.monotonic() - self._bench.now_ps / PS_PER_S
+        self._opening = 0
+        self._ahead_of_s = 0.0
 
     def close(self) -> None:
         """Remove the pseudo-terminal."""
-        os.close(self._opened)
-        os.close(self._master)
+        for file in (self._opened, self._slave, self._master):
+            os.close(file)
 
     def run_while(self, process: subprocess.Popen[str], limit_s: float) -> int:
         """Run the bench until a program that uses the port has ended; returns its exit code.
@@ -78,6 +80,8 @@ class UsbSerial:
         TimeoutError
             If it takes longer than `limit_s` of simulated time.
         """
+        # The bench may have run alone meanwhile.
+        self._ahead_of_s = time.monotonic() - self._bench.now_ps / PS_PER_S
         end_ps = self._bench.now_ps + round(limit_s * PS_PER_S)
         while process.poll() is None:
             if self._bench.now_ps > end_ps:
@@ -85,13 +89,6 @@ class UsbSerial:
                 raise TimeoutError(f"{process.args} runs for more than {limit_s} s")
             self.run(PIECE_S)
         return process.returncode
-
-    def run_until(self, done: Callable[[], bool], limit_s: float) -> bool:
-        """Run the bench until something holds, for at most so much simulated time."""
-        end_ps = self._bench.now_ps + round(limit_s * PS_PER_S)
-        while not done() and self._bench.now_ps < end_ps:
-            self.run(PIECE_S)
-        return done()
 
     def run(self, seconds: float) -> None:
         """Pass the bytes of both directions, and run the bench on."""
@@ -110,6 +107,8 @@ class UsbSerial:
     def _hear(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.read(self._opened, READ_SIZE)
+            termios.tcflush(self._slave, termios.TCIFLUSH)  # what the last program left unread
+            self._opening += 1
             self._board.reset(EXTERNAL)
         if not dict(self._poll.poll(0)).get(self._master, 0) & select.POLLIN:
             return
@@ -119,9 +118,25 @@ class UsbSerial:
         byte_ps = round(BITS_PER_BYTE * PS_PER_S / self._board.mcu.uart_baud)
         self._line_free_ps = max(self._line_free_ps, self._bench.now_ps)
         for byte in data:
-            self._bench.at(self._line_free_ps, lambda byte=byte: self._board.mcu.uart_feed(byte))
+            self._bench.at(self._line_free_ps, functools.partial(self._feed, byte, self._opening))
             self._line_free_ps += byte_ps
+
+    def _feed(self, byte: int, opening: int) -> None:
+        if opening == self._opening:
+            self._board.mcu.uart_feed(byte)
 
     def _same_speed(self) -> bool:
         host = SPEEDS.get(termios.tcgetattr(self._master)[4], 0)
         return abs(self._board.mcu.uart_baud - host) <= SPEED_TOLERANCE * host
+
+
+def _seldom_used_pty() -> tuple[int, int]:
+    """Open a pseudo-terminal of a high number.
+
+    The lowest free number may be that of a receiver which a gateway on this machine still tries to
+    open again.
+    """
+    opened = [pty.openpty() for _ in range(SKIPPED_NUMBERS + os.getpid() % SKIPPED_NUMBERS)]
+    for file in itertools.chain.from_iterable(opened[:-1]):
+        os.close(file)
+    return opened[-1]

@@ -1,6 +1,6 @@
 """A board's bootloader, and `avrdude`, which writes and reads the chip's flash through it.
 
-Every access resets the board: its USB adapter pulls the reset line whenever a program opens the port.
+Every access resets the board: its USB adapter does so whenever a program opens the port.
 """
 
 import contextlib
@@ -42,6 +42,8 @@ SYNC_TRIES: Final = 12
 SYNC_WAIT_S: Final = 0.1
 """Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
 AVRDUDE_LIMIT_S: Final = 180.0
+AVRDUDE_TRIES: Final = 2
+"""A board that restarts slowly can miss the first requests."""
 
 
 class FlashError(Exception):
@@ -165,10 +167,10 @@ def require_bootloader(device: str) -> Bootloader:
     found = find_bootloader(device)
     if found is None:
         raise FlashError(
-            f"{device}: no bootloader answers. Is it a Nano or Pro Mini with ATmega328P? Disconnect "
-            "the GPS receiver from D0 and D1 while flashing; on a board without automatic reset, "
-            "press reset as the command starts. A board without a bootloader needs an ISP "
-            "programmer: write the image with --output and avrdude -c usbasp"
+            f"{device}: no bootloader answers. Is it a Nano or Pro Mini with ATmega328P? "
+            "Disconnect the GPS receiver from D0 and D1 while flashing; on a board without "
+            "automatic reset, press reset as the command starts. A board without a bootloader "
+            "needs an ISP programmer: write the image with --output and avrdude -c usbasp"
         )
     return found
 
@@ -201,9 +203,14 @@ def _avrdude(device: str, bootloader: Bootloader, *what: str) -> None:
         raise FlashError("avrdude is not installed: sudo apt-get install avrdude")
     speed = ("-b", str(bootloader.baud))
     command = [program, "-c", "arduino", "-p", CHIP, "-P", device, *speed, *what]
-    try:
-        code = subprocess.run(command, check=False, timeout=AVRDUDE_LIMIT_S).returncode
-    except subprocess.TimeoutExpired as error:
-        raise FlashError(f"{device}: avrdude took more than {AVRDUDE_LIMIT_S:.0f} s") from error
-    if code:
-        raise FlashError(f"{device}: avrdude failed, see above; try again, with a short USB cable")
+    for _ in range(AVRDUDE_TRIES):
+        try:
+            code = subprocess.run(command, check=False, timeout=AVRDUDE_LIMIT_S).returncode
+        except subprocess.TimeoutExpired as error:
+            raise FlashError(f"{device}: avrdude took over {AVRDUDE_LIMIT_S:.0f} s") from error
+        if code == 0:
+            return
+    raise FlashError(
+        f"{device}: avrdude failed {AVRDUDE_TRIES} times, see above; use a short USB cable, and "
+        "disconnect everything else from D0 and D1"
+    )

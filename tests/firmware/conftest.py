@@ -32,8 +32,8 @@ def bench(programs: Path) -> Iterator[Callable[..., Bench]]:
     """Make benches: boards on one time line, their frames decoded."""
     made: list[Bench] = []
 
-    def make(**setup: Any) -> Bench:
-        made.append(Bench(Setup(**{"build": programs, **setup})))
+    def make(receiver: str = "receiver", **setup: Any) -> Bench:
+        made.append(Bench(Setup(**{"build": programs, **setup}), receiver))
         return made[-1]
 
     yield make

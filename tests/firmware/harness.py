@@ -25,11 +25,13 @@ class Bench:
     Parameters
     ----------
     setup : Setup
+    receiver : str
+        The receiver's program.
     """
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: Setup, receiver: str = "receiver") -> None:
         self.setup = setup
-        self.receiver = Receiver(setup)
+        self.receiver = Receiver(setup, program=receiver)
         self.boards: list[Board] = [self.receiver]
         self.frames: list[tuple[float, RadioFrame]] = []
         """Every radio frame with the time of its last byte in seconds."""

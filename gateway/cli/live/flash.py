@@ -116,8 +116,9 @@ def flash(
 
     Needs avrdude, and no compiler. Listing, reading and writing restart the board.
     """
-    given = (vehicle, node, pipe, channel, rate, power, _address(address), send_rate, raw)
-    given += (accel_range, gyro_range, gps_rate, gps_model)
+    radio = (pipe, channel, rate, power, _address(address))
+    sensors = (send_rate, raw, accel_range, gyro_range, gps_rate, gps_model)
+    given: tuple[object, ...] = (vehicle, node, *radio, *sensors)
     changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
     try:
         if show:

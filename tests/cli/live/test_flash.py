@@ -1,0 +1,99 @@
+"""`mavgate flash` without a board: images to files, and everything that it refuses."""
+
+from pathlib import Path
+
+import pytest
+from intelhex import IntelHex
+from typer.testing import CliRunner, Result
+
+from gateway.cli.app import app
+from gateway.flashing import upload
+from gateway.flashing.settings_block import find_block
+from gateway.live.serial_port import Port
+from tests.flashing.test_settings_block import BLOCK, image_with, sealed
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Images of one program, and a machine without serial ports."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    image = IntelHex()
+    image.puts(0, image_with(sealed(BLOCK)))
+    for mhz in (16, 8):
+        image.write_hex_file(str(folder / f"imu_{mhz}mhz.hex"))
+    monkeypatch.setattr(upload, "IMAGES", folder)
+    monkeypatch.setattr("gateway.cli.live.flash.list_serial_ports", list[Port])
+    return folder
+
+
+def flash(*words: str) -> Result:
+    return CliRunner().invoke(app, ["flash", *words])
+
+
+def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.hex"
+    done = flash(
+        "imu", "-o", str(out), "--vehicle", "2", "--channel", "80", "--address", "00c0ffee"
+    )
+    assert done.exit_code == 0, done.output
+    block = find_block(IntelHex(str(out)).tobinstr(start=0))
+    settings = block.settings
+    assert (settings.vehicle_id, settings.radio_channel, settings.radio_pipe) == (2, 80, 2)
+    assert settings.radio_address == 0x00C0FFEE
+    assert settings.imu_send_hz == 60
+    before = IntelHex(str(images / "imu_16mhz.hex")).tobinstr()
+    after = IntelHex(str(out)).tobinstr()
+    assert before[:104] == after[:104]
+    assert before[138:] == after[138:]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["imu", "--vehicle", "32"], "--vehicle 32: must be 1 to 31"),
+        (["imu", "--rate", "500"], "--rate 500: must be 250, 1000, 2000 kbit/s"),
+        (["imu", "--power", "3"], "--power 3: must be -18, -12, -6, 0 dBm"),
+        (["imu", "--gps-rate", "5"], "--gps-rate: the program imu has no such setting"),
+        (["imu", "--address", "xyz"], "--address xyz"),
+        (["imu", "--clock", "20"], "--clock 20: 16 or 8"),
+        (["gps"], "make firmware"),
+        (["--show"], "no port fits 'auto'"),
+        ([], "no serial port"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_wrong_option_ends_with_the_reason(
+    images: Path, tmp_path: Path, words: list[str], message: str
+) -> None:
+    out = [] if not words or words[0] == "--show" else ["-o", str(tmp_path / "out.hex")]
+    done = flash(*words, *out)
+    assert done.exit_code == 2
+    assert message in done.output
+    assert not (tmp_path / "out.hex").exists()
+
+
+def test_port_that_another_program_holds_is_left_alone(images: Path) -> None:
+    import fcntl
+    import os
+    import pty
+
+    master, slave = pty.openpty()
+    try:
+        fcntl.flock(slave, fcntl.LOCK_EX)
+        done = flash("imu", "--port", os.ttyname(slave))
+    finally:
+        os.close(master)
+        os.close(slave)
+    assert done.exit_code == 2
+    assert "another program has it open" in done.output
+
+
+def test_missing_avrdude_is_named_with_the_way_to_install_it(
+    images: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    with pytest.raises(upload.FlashError, match="apt-get install avrdude"):
+        upload.write_flash("/dev/null", upload.BOOTLOADERS[0], b"")

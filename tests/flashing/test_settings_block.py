@@ -1,0 +1,116 @@
+"""The settings block: found, decoded, patched and refused."""
+
+import itertools
+
+import msgspec
+import pytest
+
+from gateway.flashing.settings_block import (
+    MAGIC,
+    SIZE,
+    USED_BY,
+    BoardSettings,
+    Program,
+    SettingsBlockError,
+    default_pipe,
+    find_block,
+    patch,
+)
+from gateway.wire.framing import crc16
+
+BLOCK = bytes.fromhex(
+    "6d617667617465"  # magic
+    "01 01 10 01 02"  # version, program, MHz, firmware 1.2
+    "05 03 02 50 fa00 01 3c 04030201 01 03 00 0a 06 01 0000"
+)
+"""Written by hand from firmware/common/settings_block.h."""
+SETTINGS = BoardSettings(
+    vehicle_id=5,
+    node_id=3,
+    radio_pipe=2,
+    radio_channel=80,
+    radio_kbps=250,
+    radio_power_dbm=-12,
+    imu_send_hz=60,
+    radio_address=0x01020304,
+    imu_raw=True,
+    accel_range_g=16,
+    gyro_range_dps=250,
+    gps_rate_hz=10,
+    gps_dynamic_model=6,
+    soft_restart=True,
+)
+
+
+def sealed(block: bytes) -> bytes:
+    return block + crc16(block).to_bytes(2, "little")
+
+
+def image_with(block: bytes) -> bytes:
+    return b"\x0c\x94" * 52 + block + b"\xff" * 300
+
+
+def test_block_is_found_and_every_field_decoded() -> None:
+    found = find_block(image_with(sealed(BLOCK)))
+    assert (found.offset, found.program) == (104, Program.IMU)
+    assert (found.clock_mhz, found.firmware_version) == (16, (1, 2))
+    assert found.settings == SETTINGS
+
+
+def test_patch_changes_the_block_alone_and_reads_back() -> None:
+    image = image_with(sealed(BLOCK))
+    others = (
+        BoardSettings(),
+        BoardSettings(vehicle_id=31, radio_channel=125, radio_address=0xFFFFFFFF),
+        BoardSettings(radio_kbps=2000, radio_power_dbm=-18, accel_range_g=2, gyro_range_dps=2000),
+    )
+    for settings in others:
+        offset, block = patch(image, settings)
+        assert len(block) == SIZE
+        patched = image[:offset] + block + image[offset + SIZE :]
+        assert find_block(patched).settings == settings
+        assert find_block(patched).firmware_version == (1, 2)
+
+
+def test_any_damaged_byte_is_detected() -> None:
+    block = sealed(BLOCK)
+    for place in range(SIZE):
+        damaged = bytearray(block)
+        damaged[place] ^= 0x10
+        with pytest.raises(SettingsBlockError, match=r"damaged|no settings block"):
+            find_block(image_with(bytes(damaged)))
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (b"", "no settings block"),
+        (b"\xff" * 32768, "no settings block"),
+        (MAGIC, "damaged"),
+        (sealed(BLOCK[:7] + b"\x02" + BLOCK[8:]), "version 2"),
+        (sealed(BLOCK[:8] + b"\x09" + BLOCK[9:]), "out of range"),
+        (sealed(BLOCK[:12] + b"\x20" + BLOCK[13:]), "out of range"),
+        (sealed(BLOCK[:18] + b"\x04" + BLOCK[19:]), "out of range"),
+    ],
+    ids=["empty", "erased", "cut", "version", "program", "vehicle", "power"],
+)
+def test_unusable_block_is_refused_with_the_reason(image: bytes, message: str) -> None:
+    with pytest.raises(SettingsBlockError, match=message):
+        find_block(image)
+
+
+def test_the_magic_word_elsewhere_does_not_hide_the_block() -> None:
+    image = b"see mavgate.example " + image_with(sealed(BLOCK))
+    assert find_block(image).settings == SETTINGS
+
+
+def test_pipes_of_three_vehicles_differ() -> None:
+    kinds = (Program.IMU, Program.GPS)
+    pipes = [default_pipe(kind, vehicle) for vehicle in (1, 2, 3) for kind in kinds]
+    assert pipes == [0, 1, 2, 3, 4, 5]
+    assert {default_pipe(kind, n) for kind, n in itertools.product(kinds, range(1, 32))} == {*pipes}
+
+
+def test_every_setting_is_used_by_a_program() -> None:
+    used = {name for names in USED_BY.values() for name in names}
+    assert used == {field.name for field in msgspec.structs.fields(BoardSettings)}
