@@ -261,6 +261,12 @@ class Pipeline:
         """Requests whose signature was wrong, old, or repeated."""
         return sum(a.vehicle.faults[BAD_SIGNATURE] for a in self._ever())
 
+    def on_stall(self, stalled_us: int, now_us: int) -> None:
+        """Excuse sensors and nodes for a time in which this program was not running."""
+        for each in self._ever():
+            each.vehicle.health.on_stall(stalled_us, now_us)
+        self._heard_us = {key: us + stalled_us for key, us in self._heard_us.items()}
+
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; this is announced."""
         actions: list[Action] = []

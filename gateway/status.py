@@ -67,5 +67,7 @@ class Snapshot:
     """Whether the receiver is the simulated one."""
     aircraft: tuple[AircraftStatus, ...] = ()
     recorder: RecorderStatus | None = None
+    slow_s: float = 0.0
+    """How late the event loop was at most while the computer is too slow; 0 while it keeps up."""
     requests: tuple[LoggedRequest, ...] = ()
     """Requests of clients that were refused, failed or had no answer."""

@@ -30,6 +30,7 @@ from gateway.flightlog.table.table import TableHeader
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
+from gateway.live.loop_lag import LoopLag
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort
@@ -79,6 +80,8 @@ class Daemon:
         Frames of a simulated receiver, instead of the serial port.
     """
 
+    _timer: asyncio.TimerHandle | None = None
+
     def __init__(
         self,
         settings: GatewaySettings,
@@ -125,7 +128,7 @@ class Daemon:
         heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *heard, self.now_us)
         self._sent: Counter[int] = Counter()
-        self._timer: asyncio.TimerHandle | None = None
+        self._lag = LoopLag()
 
     def _make_pipeline(self, aircraft: Mapping[int, AircraftSettings]) -> Pipeline:
         places, stamps = self._places.load(), self._stamps.load()
@@ -237,6 +240,7 @@ class Daemon:
             aircraft=tuple(status_of(one) for _, one in aircraft),
             recorder=self._recorder.status(),
             requests=self._pipeline.failed_requests,
+            slow_s=self._lag.longest_us / US_PER_S if self._lag.is_slow else 0.0,
         )
 
     def _serve_metrics(self) -> None:
@@ -323,6 +327,7 @@ class Daemon:
         loop = asyncio.get_running_loop()
         self._timer = loop.call_later(LONGEST_WAIT_S, self._poll)
         now_us = self.now_us()
+        self._watch_loop(now_us)
         self._perform(self._pipeline.poll(now_us))
         for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
             # After its first heartbeat, before which ground stations ignore its messages.
@@ -334,6 +339,22 @@ class Daemon:
         wait_s = min(max(wait_s, SHORTEST_WAIT_S), LONGEST_WAIT_S)
         self._timer.cancel()
         self._timer = loop.call_later(wait_s, self._poll)
+        self._lag.expect(self.now_us() + round(wait_s * US_PER_S))
+
+    def _watch_loop(self, now_us: int) -> None:
+        """Report once that the event loop is starved, and excuse the nodes for a stall."""
+        report = self._lag.update(now_us)
+        if report.stalled_us:
+            self._pipeline.on_stall(report.stalled_us, now_us)
+        if not report.changed:
+            return
+        if self._lag.is_slow:
+            text = f"This computer is too slow: {self._lag.longest_us / US_PER_S:.1f} s late"
+            log.warning("%s; samples are lost here, not by the radio", text)
+        else:
+            text = "This computer keeps up again"
+            log.info(text)
+        self._announce(self._lag.is_slow, text)
 
     def _perform(self, actions: Sequence[Action]) -> None:
         """Carry out the actions of the pure stages, frames first."""

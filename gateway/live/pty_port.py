@@ -13,8 +13,12 @@ from typing import Final
 from gateway.simulator.timed_frame import TimedFrame
 
 MAX_LATE_S: Final = 1.0
-"""A loop delayed for longer, as by a suspended machine, continues where it was: catching up would
-delay the loop even more."""
+"""A frame that is later is dropped, as a receiver drops what nobody reads: sending it would delay
+the loop even more, and pausing the clocks of the nodes would look like a restart of them."""
+SUSPENDED_S: Final = 60.0
+"""A loop delayed for longer, as by a suspended machine, continues where it was."""
+DROPS_AT_ONCE: Final = 64
+"""Dropped frames cost little more than the generator that makes them."""
 
 MAX_BATCH: Final = 4
 """Frames written at once before the loop's other work gets its turn: some have to be made first."""
@@ -44,7 +48,7 @@ class PtyPort:
         self.written = 0
         """Frames written completely."""
         self.dropped = 0
-        """Frames dropped because nobody reads and the terminal is full."""
+        """Frames dropped because the terminal is full, or because they were late."""
         self.ended = asyncio.Event()
         """Set after the last frame, and by closing."""
         self._frames = frames
@@ -81,7 +85,8 @@ class PtyPort:
         """Write the frames due and wait for the next."""
         loop = asyncio.get_running_loop()
         self._timer = None
-        for _ in range(MAX_BATCH):
+        budget = MAX_BATCH * DROPS_AT_ONCE
+        while budget > 0:
             if self._next is None:
                 self._next = next(self._frames, None)
             if self._next is None:
@@ -92,9 +97,13 @@ class PtyPort:
             if late_s < 0.0:
                 self._timer = loop.call_at(due_s, self._advance)
                 return
-            if late_s > MAX_LATE_S:
-                self._start_s += late_s
-            self._write(self._next.data)
+            if MAX_LATE_S < late_s <= SUSPENDED_S:
+                self.dropped += 1
+                budget -= MAX_BATCH
+            else:
+                self._start_s += late_s if late_s > SUSPENDED_S else 0.0
+                self._write(self._next.data)
+                budget -= DROPS_AT_ONCE
             self._next = None
         self._timer = loop.call_soon(self._advance)
 

@@ -11,6 +11,9 @@ sum of distances to the points.
 | ------------------------------------------------------ | -------------------------------------- |
 | stamp agrees with the arrival, any number of wraps on  | unwraps it, adds the point             |
 | stamp is late, or early, by less than RESTART_JUMP_US  | the same: a queue, not a restart       |
+| stamp is late by more, but goes on from the last one   | the same, for DRAIN_US at most: the    |
+|                                                        | local computer stood still, and reads  |
+|                                                        | what its buffers kept                  |
 | stamp disagrees by more                                | the remote restarted: starts again     |
 | packet seems to come before it was sent                | waits for a second one that agrees     |
 
@@ -39,6 +42,11 @@ LONGEST_QUEUE_US: Final = 500_000
 """What a clock has moved beyond this is no queue."""
 RESTART_JUMP_US: Final = 1_500_000
 """More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
+MAX_STALL_US: Final = 60_000_000
+"""How long the local computer may have stood still, in which the remote clock went on."""
+DRAIN_US: Final = 3_000_000
+"""Until then the buffers have been read; stamps that are still so late are those of a remote that
+restarted, or whose clock stood still."""
 AHEAD_US: Final = 50_000
 """More than the line can err by between two packets. Either the line was learned in a queue, and
 the next packets say the same, or a single stamp is wrong and must not move all that follow."""
@@ -54,15 +62,16 @@ class ClockTracker:
 
     def __init__(self) -> None:
         self.restarts = 0
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._last_remote_us: int | None = None
         self._last_arrival_us = 0
         self._buckets: list[_Point] = []
         self._line = _Point(0, 0)
         self._skew = 0.0
         self._suspect_us: int | None = None
+        self._late_since_us: int | None = None
 
     @property
     def skew_ppm(self) -> float:
@@ -85,6 +94,9 @@ class ClockTracker:
             The stamp on the local clock, in µs; never later than the arrival.
         """
         remote_us = self._unwrap(remote_u32, arrival_us)
+        if self._is_stale(remote_us, arrival_us):
+            self._restart()
+            remote_us = remote_u32
         local_us = self._to_local(remote_us) if self._buckets else arrival_us
         if local_us - arrival_us <= AHEAD_US:
             self._suspect_us = None
@@ -109,11 +121,31 @@ class ClockTracker:
             elapsed_us = arrival_us - self._last_arrival_us
             error_us = remote_u32 - self._last_remote_us - elapsed_us
             error_us = (error_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
-            if abs(error_us) <= RESTART_JUMP_US + MAX_SKEW * elapsed_us:
-                return self._last_remote_us + elapsed_us + error_us
-            self._forget()
-            self.restarts += 1
+            remote_us = self._last_remote_us + elapsed_us + error_us
+            slack_us = RESTART_JUMP_US + MAX_SKEW * elapsed_us
+            if abs(error_us) <= slack_us or self._goes_on(remote_us, arrival_us, slack_us):
+                return remote_us
+            self._restart()
         return remote_u32
+
+    def _restart(self) -> None:
+        self._reset()
+        self.restarts += 1
+
+    def _goes_on(self, remote_us: int, arrival_us: int, slack_us: float) -> bool:
+        """Return whether a stamp continues the last one on the known line, though read late."""
+        assert self._last_remote_us is not None
+        late_us = arrival_us - self._to_local(remote_us)
+        return remote_us > self._last_remote_us and -slack_us <= late_us <= MAX_STALL_US
+
+    def _is_stale(self, remote_us: int, arrival_us: int) -> bool:
+        """Return whether stamps have been too late for longer than buffers explain."""
+        if not self._buckets or arrival_us - self._to_local(remote_us) <= RESTART_JUMP_US:
+            self._late_since_us = None
+            return False
+        if self._late_since_us is None:
+            self._late_since_us = arrival_us
+        return arrival_us - self._late_since_us > DRAIN_US
 
     def _add(self, remote_us: int, delta_us: int) -> bool:
         """Take in a point if beside the drift it is its bucket's soonest; tell whether it is."""

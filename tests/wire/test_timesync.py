@@ -133,3 +133,34 @@ def test_absurd_drift_is_held(rng: np.random.Generator) -> None:
     for stamp, arrival in zip(stamps, arrivals, strict=True):
         tracker.observe(int(stamp), int(arrival))
     assert tracker.skew_ppm == pytest.approx(10_000.0, rel=0.02)
+
+
+def follow(tracker: ClockTracker, begin_s: float, end_s: float, rate_hz: int = 100) -> list[int]:
+    """Read packets of a clock that began 2 s after the local one, without delay."""
+    steps = range(round(begin_s * rate_hz), round(end_s * rate_hz))
+    times = [step * 1_000_000 // rate_hz for step in steps]
+    return [tracker.observe(time_us, time_us + 2_000_000) - time_us for time_us in times]
+
+
+@pytest.mark.parametrize("stall_s", [3, 20])
+@pytest.mark.parametrize("buffered", [0, 1, 100])
+def test_stall_of_the_local_computer_is_no_restart(stall_s: int, buffered: int) -> None:
+    """The kernel keeps the first packets of a stall; the rest are lost."""
+    tracker = ClockTracker()
+    follow(tracker, 0.0, 20.0)
+    resumed_us = (22 + stall_s) * 1_000_000
+    for step in range(buffered):
+        time_us = 20_000_000 + step * 10_000
+        assert tracker.observe(time_us, resumed_us + step * 100) == time_us + 2_000_000
+    assert set(follow(tracker, 20.1 + stall_s, 40.0 + stall_s)) == {2_000_000}
+    assert (tracker.restarts, tracker.skew_ppm) == (0, pytest.approx(0.0, abs=1.0))
+
+
+def test_remote_that_restarted_with_a_clock_beyond_its_last_one_is_relearned() -> None:
+    """After 1 s of operation and 20 s without power its stamps seem to be 20 s late."""
+    tracker = ClockTracker()
+    follow(tracker, 0.0, 1.0)
+    times = [1_200_000 + step * 10_000 for step in range(500)]
+    found = [tracker.observe(time_us, time_us + 22_000_000) - time_us for time_us in times]
+    assert tracker.restarts == 1
+    assert found[-1] == 22_000_000

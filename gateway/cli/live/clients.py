@@ -150,6 +150,10 @@ def _summary(snapshot: Record) -> str:
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     radio = f"radio: {counted(received, 'payload')}, {lost} lost"
     lines = [f"up {up}, receiver {receiver}", f"{serial}; {radio}"]
+    if snapshot["slow_s"]:
+        lines.append(
+            f"this computer is too slow: up to {snapshot['slow_s']:.1f} s late, samples are lost"
+        )
     lines += [
         f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "
         f"{_number(state['alt_amsl_m'], '.1f')} m"

@@ -65,6 +65,8 @@ class Health:
         self._nav_flags = NavFlags(0)
         self._load_permille = 0
         self._nodes: tuple[NodeLink, ...] = ()
+        self._excused_us: dict[int, int] = {}
+        """End of the last stall of the gateway, by node."""
         self._received = 0
         self._lost = 0
         self._drop_rate = 0.0
@@ -116,6 +118,16 @@ class Health:
         self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
         self._received, self._lost = received, lost
         return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
+
+    def on_stall(self, stalled_us: int, now_us: int) -> None:
+        """Do not count a time in which the gateway was not running as silence of a sensor."""
+        begin_us = now_us - stalled_us
+        for sensor, seen_us in self._seen_us.items():
+            if begin_us - seen_us <= self.silent_us:
+                self._seen_us[sensor] = seen_us + stalled_us
+        silent = self.silent_nodes(begin_us)
+        for node_id in self.known_nodes() - silent:
+            self._excused_us[node_id] = now_us
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
         """Return whether a sensor was heard recently."""
@@ -193,11 +205,14 @@ class Health:
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:
         """Return the nodes that were heard once and are silent now."""
-        return frozenset(
-            link.node.node_id
+        newest_us = {
+            link.node.node_id: max(
+                link.last_time_us, self._excused_us.get(link.node.node_id, link.last_time_us)
+            )
             for link in self._nodes
-            if link.received and now_us - link.last_time_us > self.silent_us
-        )
+            if link.received
+        }
+        return frozenset(n for n, us in newest_us.items() if now_us - us > self.silent_us)
 
     def node_name(self, node_id: int) -> str:
         """Name a node by its sensors, as far as it has reported them."""

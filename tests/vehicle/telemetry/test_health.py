@@ -126,6 +126,21 @@ def test_losses_of_this_aircraft_only() -> None:
     assert health.sys_status(0).drop_rate_comm == 0
 
 
+def test_stall_of_the_gateway_is_no_silence_of_a_sensor() -> None:
+    health = healthy()
+    health.on_link(report(link(), link(GPS_NODE, last_time_us=-9_000_000)))
+    health.on_stall(5_000_000, 6_500_000)
+    assert health.sensors(6_500_000)[2] & ALL == ALL
+    assert health.silent_nodes(6_500_000) == {GPS_NODE.node_id}, "it was silent before"
+    assert health.silent_nodes(9_000_000) == {IMU_NODE.node_id, GPS_NODE.node_id}
+
+
+def test_sensor_that_was_silent_before_a_stall_stays_so() -> None:
+    health = healthy()
+    health.on_stall(5_000_000, 60_000_000)
+    assert not health.sensors(60_000_000)[2] & ALL
+
+
 def test_silent_nodes() -> None:
     health = healthy()
     never = link(NodeId(1, 2), received=0, last_time_us=0)
