@@ -18,7 +18,7 @@ import tomlkit
 
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.fleet.fleet_settings import FleetSettings
+from gateway.fleet.settings import FleetSettings
 from gateway.flightlog.session import RecordingSettings
 from gateway.hub.settings import HubSettings
 from gateway.live.serial_port import SerialSettings

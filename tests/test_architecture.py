@@ -69,7 +69,13 @@ MAY_IMPORT: dict[str, set[str]] = {
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
 PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"replay", "status", "aircraft_status", "hub"}
-IMPURE_PARTS = {"hub/hub.py", "hub/router.py", "hub/accepting.py", "hub/transports"}
+IMPURE_PARTS = {
+    "hub/hub.py",
+    "hub/router.py",
+    "hub/accepting.py",
+    "hub/transports",
+    "hub/transports/zenoh",
+}
 """Impure parts of pure packages."""
 PURE_FOLDERS = {"panel/state", "season/statistics"}
 """Pure parts of packages that are not."""

@@ -43,7 +43,7 @@ ATTITUDE = 30
 
 ROUTER = """
 import sys
-from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+from gateway.hub.transports.zenoh.session import open_session, session_config
 session = open_session(session_config(sys.argv[1], "", "router"))
 print("open", flush=True)
 sys.stdin.read()
@@ -77,8 +77,8 @@ def load(ways, rate, seconds):
 GENERATOR = (
     LOAD
     + """
-from gateway.edges.hub.fleet_link.site_keys import out_key, presence_key
-from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+from gateway.hub.transports.zenoh.keys import out_key, presence_key
+from gateway.hub.transports.zenoh.session import open_session, session_config
 import zenoh
 session = open_session(session_config(sys.argv[1], ""))
 ways, tokens = [], []

@@ -29,7 +29,7 @@ def main() -> None:
 
 def _leave_what_hangs() -> None:
     """Exit here if a thread still waits for Zenoh: Python would wait for it too."""
-    link = sys.modules.get("gateway.edges.hub.fleet_link.zenoh_threads")
+    link = sys.modules.get("gateway.hub.transports.zenoh.session")
     if link is None or link.end_calls():
         return
     end = sys.exception()

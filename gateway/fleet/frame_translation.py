@@ -1,25 +1,26 @@
-"""Frames of a site with the ids that its vehicles have here, and back.
+"""Translate the frames of a site to the system ids of its vehicles here, and back.
 
-Changed are the sender in the header, the system that a message addresses and those that it names;
-the checksum is made anew. A signature covers both: with the site's key it is checked first and made
-anew, with the link and the time stamp that it had; without the key a signed frame passes only if
+The translation changes the sender in the header, the system that a message addresses, and systems
+that it names in a parameter: the vehicle to follow, the target of a camera. Then it computes the
+checksum again. A signature covers all of that: with the site's passphrase it is checked first and
+renewed with the same link and timestamp; without the passphrase a signed frame passes only if
 nothing changes.
 """
 
-import hashlib
-import hmac
+import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as dialect
 
 from gateway.fleet.id_map import IdMap
-from gateway.fleet.loop_watch import LoopWatch
-from gateway.fleet.named_systems import changes_of_names
+from gateway.fleet.loop_detection import LoopDetection
+from gateway.fleet.signatures import SiteSignatures
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
+from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, offset_of
 from gateway.wire.mavlink_splitter import (
     SIGNATURE_SIZE,
     START_V2,
@@ -30,51 +31,88 @@ from gateway.wire.mavlink_splitter import (
     target_of,
 )
 
-HASH_BYTES: Final = 6
 SEQUENCE_MASK: Final = 0xFF
 RATE_MARKS: Final = 6
-"""Five seconds between the first and the last."""
+"""Marks a second apart: rates are averaged over five seconds."""
 MAX_LOST: Final = 128
-"""A greater step is a restart rather than a loss."""
+"""A larger step of the sequence number is a restart rather than a loss."""
 MAX_OVERTAKEN: Final = 32
-"""Texts and answers have a higher priority on the way: what they overtake comes late, but comes."""
+"""Texts and answers have a higher priority on the way: frames that they overtake arrive late."""
+MAX_SENDERS: Final = 1024
+"""Components of a site whose sequence numbers are remembered; more are forged."""
+LAST_ID: Final = 255
+
+Change = tuple[int, bytes]
+"""Offset in the payload, and the new bytes there."""
+
+COMMANDS: Final = {
+    dialect.MAV_CMD_DO_FOLLOW: (1,),
+    dialect.MAV_CMD_DO_SET_ROI_SYSID: (1,),
+    dialect.MAV_CMD_DO_GUIDED_MASTER: (1,),
+    dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE: (1, 3),
+    dialect.MAV_CMD_ARM_AUTHORIZATION_REQUEST: (1,),
+}
+"""Commands, and which of their parameters are system ids."""
+CARRIERS: Final[tuple[Any, ...]] = (
+    dialect.MAVLink_command_long_message,
+    dialect.MAVLink_command_int_message,
+    dialect.MAVLink_mission_item_message,
+    dialect.MAVLink_mission_item_int_message,
+)
+COMMAND_OFFSETS: Final = {message.id: offset_of(message, "command") for message in CARRIERS}
+PARAM_OFFSETS: Final = {
+    message.id: [offset_of(message, f"param{number}") for number in range(1, 5)]
+    for message in CARRIERS
+}
+GIMBALS: Final[Any] = dialect.MAVLink_gimbal_manager_status_message
+FIELD_OFFSETS: Final = {
+    GIMBALS.id: [
+        offset_of(GIMBALS, field) for field in ("primary_control_sysid", "secondary_control_sysid")
+    ]
+}
+NAMING: Final = COMMAND_OFFSETS.keys() | FIELD_OFFSETS.keys()
+"""Messages that may name a system."""
 
 
 @dataclass(slots=True)
 class TranslationCounters:
-    """Frames that could not pass."""
+    """Dropped frames by cause."""
 
     unmapped: int = 0
     """No id is left for their vehicle."""
     unknown: int = 0
-    """Their message is unknown, so that no checksum can be made."""
+    """Unknown message, so its checksum cannot be computed."""
     signed: int = 0
-    """They are signed, would change, and there is no passphrase."""
+    """Signed, would have to change, and there is no passphrase."""
+    unsigned: int = 0
+    """Unsigned, though the site has a passphrase."""
     forged: int = 0
-    """Their signature is not of the site's passphrase."""
+    """Not signed with the site's passphrase."""
+    replayed: int = 0
+    """Signed, but the timestamp was used already or is too old."""
     looped: int = 0
-    """They had been here, and came back through the site."""
+    """Sent from here, and returned through the site."""
 
 
 @dataclass(slots=True)
 class VehicleTraffic:
-    """What came of one vehicle."""
+    """Received frames of one vehicle."""
 
     frames: int = 0
     lost: int = 0
     """By the gaps in its sequence numbers."""
     heard_us: int = 0
     marks: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RATE_MARKS))
-    """When it was looked at in the last seconds, and how many frames there were then."""
+    """Times of the last seconds, and the number of frames until then."""
 
     def rate_hz(self, now_us: int) -> float:
-        """Return the frames a second of the last seconds."""
+        """Return the average rate of the last seconds, in frames a second."""
         since_us, before = self.marks[0]
         return (self.frames - before) * US_PER_S / max(now_us - since_us, US_PER_S)
 
 
 class _CannotPassError(Exception):
-    """A frame stays here; the argument names the counter."""
+    """A frame cannot be translated; the argument names the counter."""
 
 
 class FrameTranslation:
@@ -86,73 +124,89 @@ class FrameTranslation:
         Its name.
     ids : IdMap
         Shared by all sites.
-    key : bytes, optional
-        32 bytes, of the site's passphrase.
-    loops : LoopWatch, optional
+    signatures : SiteSignatures, optional
+        Of the site's passphrase; all its frames must be signed then.
+    loops : LoopDetection, optional
         Shared by all sites.
     """
 
     def __init__(
-        self, site: str, ids: IdMap, key: bytes | None = None, loops: LoopWatch | None = None
+        self,
+        site: str,
+        ids: IdMap,
+        signatures: SiteSignatures | None = None,
+        loops: LoopDetection | None = None,
     ) -> None:
         self._site = site
         self._ids = ids
-        self._key = key
-        self._loops = loops or LoopWatch()
+        self._signatures = signatures
+        self._loops = loops or LoopDetection()
         self._sequences: dict[tuple[int, int], int] = {}
         self.counters = TranslationCounters()
         self.traffic: dict[int, VehicleTraffic] = {}
         """By system id at the site."""
 
     def mark(self, now_us: int) -> None:
-        """Note where the counts are, about once a second: rates are of the last seconds."""
+        """Record the counts for the rates; called about once a second."""
         for traffic in self.traffic.values():
             traffic.marks.append((now_us, traffic.frames))
 
     def from_site(self, frame: bytes, now_us: int, *, is_own: bool = False) -> bytes | None:
-        """Return a frame of the site as it is to be seen here; None if it cannot pass.
+        """Return a frame of the site with the ids of this side; None if it is dropped.
 
         Parameters
         ----------
         frame : bytes
-            As it came.
+            As it was published.
         now_us : int
             Gateway time.
         is_own : bool, optional
             Whether the site's gateway made it, so that it has not been here before; any other frame
             may have come to the site from the ground stations here.
+
+        Returns
+        -------
+        bytes or None
         """
+        if self._signatures is not None and (rejection := self._signatures.check(frame, now_us)):
+            self._count(rejection)
+            return None
         origin = origin_of(frame)
         vehicle = (self._site, origin[0])
         if not is_own:
             has_id = self.id_of(origin[0]) is not None
-            if self._loops.is_back(frame, vehicle, has_id=has_id, now_us=now_us):
+            if self._loops.is_returned(frame, vehicle, has_id=has_id, now_us=now_us):
                 self.counters.looped += 1
                 return None
         own_id = self._ids.id_of(*vehicle)
         if own_id is None:
             self.counters.unmapped += 1
             return None
-        self._note(frame, origin, now_us)
+        self._update_traffic(frame, origin, now_us)
         given = self._rewritten(frame, own_id, self._id_here)
         if given is not None:
-            self._loops.note_given(given, vehicle, now_us)
+            self._loops.record_given(given, vehicle, now_us)
         return given
 
     def to_site(self, frame: bytes, now_us: int) -> tuple[int, bytes] | None:
         """Return the system at the site that a frame is for (0: all) and the frame for it.
 
-        None for one that cannot pass, or is for another site's vehicle: one that has got its id
-        from a vehicle of this site, where it may be a third one's.
+        None for one that cannot be translated, or is for another site's vehicle: that one has got
+        its id from a vehicle of this site, where it may be a third one's.
         """
         sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
         addressed = self._ids.vehicle_of(target)
         if addressed is not None and addressed[0] != self._site:
             return None
+        signatures = self._signatures
+        # The site itself checks for replays: it knows all its streams.
+        if signatures is not None and is_signed(frame) and not signatures.is_genuine(frame):
+            self._count("forged")
+            return None
         changed = self._rewritten(frame, sender, self._id_there)
         if changed is None:
             return None
-        self._loops.note_sent(frame, changed, now_us)
+        self._loops.record_sent(frame, changed, now_us)
         return self._id_there(target), changed
 
     def id_of(self, system_id: int) -> int | None:
@@ -168,13 +222,15 @@ class FrameTranslation:
 
     def _rewritten(self, frame: bytes, sender: int, rename: Callable[[int], int]) -> bytes | None:
         try:
-            return rewrite(frame, sender, rename, self._key)
+            return rewrite(frame, sender, rename, self._signatures)
         except _CannotPassError as error:
-            counter = str(error)
-            setattr(self.counters, counter, getattr(self.counters, counter) + 1)
+            self._count(str(error))
             return None
 
-    def _note(self, frame: bytes, origin: tuple[int, int], now_us: int) -> None:
+    def _count(self, counter: str) -> None:
+        setattr(self.counters, counter, getattr(self.counters, counter) + 1)
+
+    def _update_traffic(self, frame: bytes, origin: tuple[int, int], now_us: int) -> None:
         traffic = self.traffic.setdefault(origin[0], VehicleTraffic())
         if not traffic.marks:
             traffic.marks.append((now_us, 0))
@@ -187,10 +243,16 @@ class FrameTranslation:
                 return
             gap = sequence - before - 1 & SEQUENCE_MASK
             traffic.lost += gap if gap < MAX_LOST else 0
-        self._sequences[origin] = sequence
+        if before is not None or len(self._sequences) < MAX_SENDERS:
+            self._sequences[origin] = sequence
 
 
-def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes | None) -> bytes:
+def rewrite(
+    frame: bytes,
+    sender: int,
+    rename: Callable[[int], int],
+    signatures: SiteSignatures | None,
+) -> bytes:
     """Return a frame in which systems have other ids; the same object if nothing changes.
 
     Parameters
@@ -198,11 +260,15 @@ def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes 
     frame : bytes
         A complete frame.
     sender : int
-        Who it is from.
+        System id of its new sender.
     rename : callable
-        Turns the id of a system that it addresses or names into the other one; 0 stays 0.
-    key : bytes or None
-        What signatures are checked and made with.
+        Turns the id of an addressed or named system into the other one; 0 stays 0.
+    signatures : SiteSignatures or None
+        Renews the signature of a changed frame.
+
+    Returns
+    -------
+    bytes
 
     Raises
     ------
@@ -210,10 +276,6 @@ def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes 
         If it cannot be changed.
     """
     signed = is_signed(frame)
-    if signed and key is not None:
-        wanted = hashlib.sha256(key + frame[:-HASH_BYTES]).digest()[:HASH_BYTES]
-        if not hmac.compare_digest(wanted, frame[-HASH_BYTES:]):
-            raise _CannotPassError("forged")
     target = rename(target_of(frame)[0])
     names = changes_of_names(frame, rename)
     if sender == origin_of(frame)[0] and target == target_of(frame)[0] and not names:
@@ -221,7 +283,7 @@ def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes 
     message_id = message_id_of(frame)
     if message_id not in CRC_EXTRA:
         raise _CannotPassError("unknown")
-    if signed and key is None:
+    if signed and signatures is None:
         raise _CannotPassError("signed")
     version_2 = frame[0] == START_V2
     changed = bytearray(frame[: -SIGNATURE_SIZE if signed else len(frame)])
@@ -234,7 +296,47 @@ def rewrite(frame: bytes, sender: int, rename: Callable[[int], int], key: bytes 
         changed[head + at : head + at + len(value)] = value
     crc = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(bytes(changed[1:-2])))
     changed[-2:] = crc.to_bytes(2, "little")
-    if not signed or key is None:
+    if not signed or signatures is None:
         return bytes(changed)
-    body = bytes(changed) + frame[-SIGNATURE_SIZE:-HASH_BYTES]
-    return body + hashlib.sha256(key + body).digest()[:HASH_BYTES]
+    return signatures.renewed(bytes(changed), frame)
+
+
+def changes_of_names(frame: bytes, rename: Callable[[int], int]) -> list[Change]:
+    """Return the changes of a payload that names systems which get other ids.
+
+    Parameters
+    ----------
+    frame : bytes
+        A complete frame.
+    rename : callable
+        Turns the id of a system into its other one.
+
+    Returns
+    -------
+    list of (int, bytes)
+        Offset in the payload, and the new bytes there.
+    """
+    message_id = message_id_of(frame)
+    if message_id not in NAMING:
+        return []
+    head, size = 10 if frame[0] == START_V2 else 6, frame[1]
+    payload = frame[head : head + size]
+    if message_id in FIELD_OFFSETS:
+        return _bytes_changed(payload, FIELD_OFFSETS[message_id], rename)
+    at = COMMAND_OFFSETS[message_id]
+    # MAVLink 2 cuts zeros off at the end of a payload.
+    command = int.from_bytes(payload[at : at + 2], "little")
+    found: list[Change] = []
+    for number in COMMANDS.get(command, ()):
+        offset = PARAM_OFFSETS[message_id][number - 1]
+        (value,) = struct.unpack_from("<f", payload, offset)
+        if 0 < value <= LAST_ID and (fresh := rename(int(value))) != value:
+            found.append((offset, struct.pack("<f", fresh)))
+    return found
+
+
+def _bytes_changed(
+    payload: bytes, offsets: list[int], rename: Callable[[int], int]
+) -> list[Change]:
+    named = ((at, payload[at]) for at in offsets if at < len(payload) and payload[at])
+    return [(at, bytes((rename(was),))) for at, was in named if rename(was) != was]

@@ -1,23 +1,37 @@
-"""Which system id a vehicle of a site has here: two fields both have an aircraft 1."""
+"""System ids of the vehicles of all sites, and the file that keeps them.
 
+Two sites may both have an aircraft 1, so each vehicle gets a system id of its own at the fleet.
+"""
+
+import logging
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Final, NamedTuple
+
+import msgspec
+
+from gateway.edges.disk.worker import begin_worker, done_by
+from gateway.hub.endpoint import SITE_NAME
+from gateway.output import write_new
+from gateway.reasons import reason_of
+
+log = logging.getLogger(__name__)
 
 FIRST_ID: Final = 1
 LAST_ID: Final = 249
-"""From 250 on there are ground stations."""
-MAX_WAITING: Final = 20_000
-"""Vehicles without an id that are kept in mind: all of many sites."""
+"""Ids from 250 on are of ground stations."""
+MAX_WAITING: Final = 4096
+"""Vehicles without an id that are remembered and listed."""
 LEFT_OUT: Final = 0
-"""In the place of an id: a vehicle that shall have none."""
+"""Instead of an id: a vehicle that is excluded."""
 
 Vehicle = tuple[str, int]
 """Site and system id there."""
 
 
 class Handover(NamedTuple):
-    """An id that another vehicle has from now on."""
+    """An id that was passed to another vehicle."""
 
     own_id: int
     former: Vehicle
@@ -25,27 +39,30 @@ class Handover(NamedTuple):
 
 
 class IdMap:
-    """System ids given once and kept as long as there are enough.
+    """System ids assigned once and kept as long as there are enough.
 
-    A vehicle keeps the id that it has at its site if nobody else has it here, else it gets the
-    lowest that is free. No site gets more than are left for the others, so that one alone cannot
-    use up all. Where none is left, `make_room` finds who has gone.
+    A vehicle keeps the id that it has at its site if that is free here, else it gets the lowest
+    free one. No site gets more than `per_site`, nor more than are left for the others. Where none
+    is left, `make_room` finds a vehicle that is no longer received.
 
     Parameters
     ----------
     known : mapping
-        Ids given before, by vehicle; `LEFT_OUT` for those that shall have none.
+        Ids assigned before, by vehicle; `LEFT_OUT` for excluded ones.
+    per_site : int
+        Most ids of one site.
     """
 
-    def __init__(self, known: Mapping[Vehicle, int] | None = None) -> None:
+    def __init__(self, known: Mapping[Vehicle, int] | None = None, per_site: int = LAST_ID) -> None:
+        self._per_site = per_site
         self._ids: dict[Vehicle, int] = {}
         self._vehicles: dict[int, Vehicle] = {}
         self.version = 0
-        """Counts the changes, so that the keeper knows when to write."""
+        """Number of changes, so that the file is written only after one."""
         self.unmapped: set[Vehicle] = set()
-        """Vehicles for which there is no id left."""
+        """Vehicles for which no id is left."""
         self.left_out: set[Vehicle] = set()
-        """Vehicles that shall have none."""
+        """Vehicles excluded by the operator."""
         for vehicle, own_id in (known or {}).items():
             if own_id == LEFT_OUT:
                 self.left_out.add(vehicle)
@@ -53,14 +70,15 @@ class IdMap:
                 self._give(vehicle, own_id)
 
     def id_of(self, site: str, system_id: int) -> int | None:
-        """Return the id of a vehicle here, giving it one if it is new; None if it has none."""
+        """Return the id of a vehicle here, assigning one to a new vehicle; None if it has none."""
         vehicle = (site, system_id)
         own_id = self._ids.get(vehicle)
         if own_id is not None or not system_id:
             return own_id
         if vehicle in self.unmapped or vehicle in self.left_out:
             return None
-        if self._shares()[site] >= LAST_ID - len(self._ids):
+        share = self._shares()[site]
+        if share >= self._per_site or share >= LAST_ID - len(self._ids):
             if len(self.unmapped) < MAX_WAITING:
                 self.unmapped.add(vehicle)
             return None
@@ -70,22 +88,22 @@ class IdMap:
         return free
 
     def make_room(self, heard_us: Mapping[Vehicle, int], silent_since_us: int) -> "Handover | None":
-        """Give a vehicle that waits the id of one that was not heard for long.
+        """Pass an id of a vehicle that is no longer received to one that waits for an id.
 
-        That is one of the same site, or of a site that has more ids. Who is heard keeps its id:
-        ground stations would command another vehicle by it.
+        The former vehicle is of the same site, or of a site that has more ids. A vehicle that is
+        received keeps its id: ground stations would command another vehicle by it.
 
         Parameters
         ----------
         heard_us : mapping
-            When vehicles were last heard; one that is not in it never was.
+            Time of the newest frame of each vehicle; none for one that was never received.
         silent_since_us : int
-            Who was heard before is forgotten.
+            A vehicle without a frame since then may lose its id.
 
         Returns
         -------
-        Handover, optional
-            What was changed, if anything.
+        Handover or None
+            The change, if there was one.
         """
         shares = self._shares()
         silent = [each for each in self._ids if heard_us.get(each, 0) < silent_since_us]
@@ -93,7 +111,8 @@ class IdMap:
         one_of_site = {each[0]: each for each in self.unmapped}
         for site in sorted(one_of_site, key=lambda each: shares[each]):
             for former in silent:
-                if former[0] == site or shares[former[0]] > shares[site]:
+                may_grow = shares[site] < self._per_site and shares[former[0]] > shares[site]
+                if former[0] == site or may_grow:
                     own_id = self._ids.pop(former)
                     self._give(one_of_site[site], own_id)
                     return Handover(own_id, former, one_of_site[site])
@@ -104,16 +123,16 @@ class IdMap:
         return self._ids.get((site, system_id))
 
     def vehicle_of(self, own_id: int) -> Vehicle | None:
-        """Return whose id it is."""
+        """Return the vehicle that has an id."""
         return self._vehicles.get(own_id)
 
     def set_by_hand(self, site: str, system_id: int, own_id: int) -> None:
-        """Give a vehicle an id; whoever had it gets another, as far as there is one.
+        """Assign an id to a vehicle; its former holder gets another, if one is free.
 
         Raises
         ------
         ValueError
-            If it is none for a vehicle.
+            If the id is not `FIRST_ID` to `LAST_ID`.
         """
         if not FIRST_ID <= own_id <= LAST_ID:
             raise ValueError(f"id {own_id} is not {FIRST_ID} to {LAST_ID}")
@@ -132,18 +151,18 @@ class IdMap:
             self.id_of(*holder)
 
     def leave_out(self, site: str, system_id: int) -> None:
-        """Take a vehicle's id away and give it none again; the next one that waits gets it."""
+        """Exclude a vehicle for good; the next waiting one gets its id."""
         vehicle = (site, system_id)
         own_id = self._ids.pop(vehicle, None)
         if own_id is not None:
             del self._vehicles[own_id]
         self.left_out.add(vehicle)
-        # Whoever waits asks anew with its next frame.
+        # A waiting vehicle asks again with its next frame.
         self.unmapped.clear()
         self.version += 1
 
     def items(self) -> list[tuple[Vehicle, int]]:
-        """Return all vehicles with their ids in the order of these, first those left out."""
+        """Return all vehicles in the order of their ids, excluded ones first."""
         out = [(vehicle, LEFT_OUT) for vehicle in sorted(self.left_out)]
         return out + sorted(self._ids.items(), key=lambda item: item[1])
 
@@ -159,3 +178,85 @@ class IdMap:
         self.unmapped.discard(vehicle)
         self.left_out.discard(vehicle)
         self.version += 1
+
+
+class IdsFile:
+    """The file of the ids, `{"SITE/SYSTEM": id, …}`; 0 for an excluded vehicle.
+
+    Parameters
+    ----------
+    file : Path
+        Its path; created with the first id.
+    per_site : int
+        Most ids of one site.
+
+    Raises
+    ------
+    ValueError
+        If the file is malformed.
+    """
+
+    def __init__(self, file: Path, per_site: int = LAST_ID) -> None:
+        self.file = file
+        """Its path."""
+        self.ids = IdMap(_read(file), per_site)
+        self._kept = self.ids.version
+        self._worker = begin_worker("ids")
+        self._trouble = ""
+
+    async def keep(self) -> str:
+        """Write changed ids, and wait until they are on the disk.
+
+        Returns
+        -------
+        str
+            Why they could not be written, also logged; empty if they were. The next call retries.
+        """
+        version = self.ids.version
+        if version != self._kept:
+            reason = await done_by(self._worker, self._write, self._text())
+            self._record(version, reason)
+        return self._trouble
+
+    def close(self) -> None:
+        """Write changed ids, and end; waits for the disk."""
+        self._worker.shutdown(wait=True)
+        if self.ids.version != self._kept:
+            self._record(self.ids.version, self._write(self._text()))
+
+    def _text(self) -> bytes:
+        table = {f"{site}/{system}": own_id for (site, system), own_id in self.ids.items()}
+        return msgspec.json.format(msgspec.json.encode(table)) + b"\n"
+
+    def _write(self, text: bytes) -> str:
+        try:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            write_new(self.file, [text], overwrite=True)
+        except OSError as error:
+            return reason_of(error)
+        return ""
+
+    def _record(self, version: int, reason: str) -> None:
+        if not reason:
+            self._kept = max(self._kept, version)
+        elif reason != self._trouble:
+            log.warning("%s: %s; new ids are lost when the fleet ends", self.file, reason)
+        self._trouble = reason
+
+
+def _read(file: Path) -> dict[Vehicle, int]:
+    try:
+        table = msgspec.json.decode(file.read_bytes(), type=dict[str, int])
+    except FileNotFoundError:
+        return {}
+    except (OSError, msgspec.DecodeError) as error:
+        raise ValueError(f"{file}: {error}") from error
+    ids: dict[Vehicle, int] = {}
+    for vehicle, own_id in table.items():
+        site, _, system = vehicle.rpartition("/")
+        if not SITE_NAME.fullmatch(site) or not system.isdecimal():
+            raise ValueError(f"{file}: {vehicle!r} is not SITE/SYSTEM")
+        if own_id != LEFT_OUT and own_id in ids.values():
+            raise ValueError(f"{file}: id {own_id} is there twice")
+        ids[site, int(system)] = own_id
+    return ids

@@ -1,33 +1,35 @@
-"""Recordings of the sites, asked for over the fleet's session: lists, pieces, digests."""
+"""Control verbs for the recordings of the sites: lists, pieces of files, digests."""
 
 import asyncio
 import logging
+from collections.abc import Callable
 from typing import Final
 
 import msgspec
 
-from gateway.edges.hub.fleet_link.recording_answers import RecordingQuery, RemoteRecording
-from gateway.edges.hub.fleet_link.site_keys import recordings_key
-from gateway.fleet.fleet_session import (
+from gateway.fleet.session import (
+    Decoded,
     FleetSession,
     NoAnswerError,
     QueryRefusedError,
     key_pattern,
 )
 from gateway.hub.endpoint import SITE_NAME
+from gateway.hub.transports.zenoh.keys import recordings_key
+from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
 from gateway.live.control_socket import ControlError, ControlServer
 
 log = logging.getLogger(__name__)
 
 LIST_TIMEOUT_S: Final = 5.0
 PIECE_TIMEOUT_S: Final = 8.0
-"""For 4 KiB on a line of 10 kbit/s; well within the wait of whoever asks the control socket."""
+"""4 KiB on a line of 10 kbit/s; less than the timeout of the control socket's client."""
 DIGEST_TIMEOUT_S: Final = 300.0
-"""For gigabytes from a slow card."""
+"""Gigabytes on a slow card."""
 
 
 class SitePattern(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which sites; without a pattern all that the fleet shows."""
+    """Names of sites; without a pattern all that the fleet shows."""
 
     site: str = ""
 
@@ -42,7 +44,7 @@ class PieceParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class DigestParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The beginning of a file of a site's recording."""
+    """The first `size` bytes of a file of a site's recording."""
 
     site: str
     file: str
@@ -55,14 +57,14 @@ class RemoteRecordings:
     Parameters
     ----------
     session : FleetSession
-        Over which sites are asked.
+        Session over which sites are queried.
     """
 
     def __init__(self, session: FleetSession) -> None:
         self._session = session
 
     def register(self, server: ControlServer) -> None:
-        """Offer the verbs on a socket."""
+        """Register the verbs at a control socket."""
         server.register("fleet.recordings", SitePattern, self._list)
         server.register("fleet.piece", PieceParams, self._piece)
         server.register("fleet.digest", DigestParams, self._digest)
@@ -74,14 +76,11 @@ class RemoteRecordings:
                 patterns = [key_pattern(params.site)]
         except ValueError as error:
             raise ControlError(str(error)) from error
+        query = RecordingQuery()
+        asked = (self._query(each, query, LIST_TIMEOUT_S, _list_from) for each in patterns)
         found: dict[str, list[RemoteRecording]] = {}
-        asked = (self._query(pattern, RecordingQuery(), LIST_TIMEOUT_S) for pattern in patterns)
         for answers in await asyncio.gather(*asked):
-            for site, data in answers.items():
-                try:
-                    found[site] = msgspec.json.decode(data, type=list[RemoteRecording])
-                except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-                    log.warning("site %s answers for its recordings with no list: %s", site, error)
+            found |= {site: listed for site, listed in answers.items() if listed is not None}
         return found
 
     async def _piece(self, params: PieceParams) -> dict[str, bytes | None]:
@@ -96,13 +95,28 @@ class RemoteRecordings:
     async def _ask_one(self, site: str, query: RecordingQuery, timeout_s: float) -> bytes | None:
         if not SITE_NAME.fullmatch(site):
             raise ControlError(f"{site!r} is no name of a site")
-        return (await self._query(site, query, timeout_s)).get(site)
+        return (await self._query(site, query, timeout_s, lambda _, data: data)).get(site)
 
-    async def _query(self, site: str, query: RecordingQuery, timeout_s: float) -> dict[str, bytes]:
+    async def _query(
+        self,
+        site: str,
+        query: RecordingQuery,
+        timeout_s: float,
+        decode: Callable[[str, bytes], Decoded],
+    ) -> dict[str, Decoded]:
         payload = msgspec.json.encode(query)
         try:
-            return await self._session.query(recordings_key(site), payload, timeout_s)
+            return await self._session.query(recordings_key(site), payload, timeout_s, decode)
         except NoAnswerError:
             return {}
         except QueryRefusedError as error:
             raise ControlError(str(error)) from error
+
+
+def _list_from(site: str, data: bytes) -> list[RemoteRecording] | None:
+    """Decode the list of a site; None, with a warning, if it is malformed."""
+    try:
+        return msgspec.json.decode(data, type=list[RemoteRecording])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        log.warning("site %s: malformed list of recordings: %s", site, error)
+        return None

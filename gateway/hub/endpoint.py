@@ -142,7 +142,7 @@ class Endpoint:
     budget: int = 0
     """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
     trusted: bool | None = None
-    """Whether its clients may change state; None: loopback and configured peers may."""
+    """Whether its clients may change state; None: loopback and configured peers except fleets."""
     origins: frozenset[str] = frozenset()
     """Pages of other machines that may connect by WebSocket, as browsers name them."""
     path: str = "/"

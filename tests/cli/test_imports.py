@@ -12,7 +12,7 @@ NEVER = {"IPython", "bokeh", "dask", "fsspec", "matplotlib", "mcap", "nicegui", 
 HEAVY = {"asyncio", "llvmlite", "numba", "numpy", "pymavlink", "scipy"}
 """What no small command needs; the gateway itself is made of some of it."""
 RUN_MAY_NOT = {
-    "gateway.fleet.fleet_server",
+    "gateway.fleet.server",
     "gateway.panel.panel_server",
     "numba",
     "prometheus_client",

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.fleet.fleet_server import FleetServer
-from gateway.fleet.fleet_settings import FleetSettings, SiteSettings
+from gateway.fleet.server import FleetServer
+from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
 from tests.hub.conftest import LIMIT_S, Rig, Sender, Station, rig
 from tests.ports import free_port
@@ -35,12 +35,24 @@ class World:
     def open_site(
         self, name: str, options: str = "", recordings: Path | None = None, beside: str = ""
     ) -> Any:
+        url = f"zenoh:{self.place}?site={name}{options}"
+        return self.add_site(name, url, beside=beside, recordings=recordings)
+
+    def add_site(
+        self,
+        name: str,
+        url: str,
+        *,
+        system: int = 1,
+        beside: str = "",
+        recordings: Path | None = None,
+    ) -> Any:
         incoming: list[Any] = []
         rig = Rig()
         rig.clock = self.rig.clock
         rig.incoming = incoming
-        endpoints = [f"zenoh:{self.place}?site={name}{options}", *filter(None, [beside])]
-        hub = rig.hub(*endpoints, recordings=recordings)
+        rig.vehicle = rig.sender(system)
+        hub = rig.hub(url, *filter(None, [beside]), recordings=recordings)
         self.rig.closing += rig.closing
         self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
         return hub

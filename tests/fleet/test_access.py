@@ -1,68 +1,133 @@
-"""The router of docs/fleet.md as it stands there: a site writes its own keys only."""
+"""Mutual TLS with the commands and files of docs/fleet.md as they stand there."""
 
 import re
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
-from gateway.edges.hub.fleet_link.zenoh_session import open_session, session_config
+from gateway.config import load
+from gateway.fleet.server import FleetServer
+from gateway.hub.transports.zenoh.session import open_session, session_config
+from tests.fleet.conftest import World
+from tests.hub.conftest import LIMIT_S, Rig, rig
 from tests.ports import free_port
 
 zenoh = pytest.importorskip("zenoh")
 
+__all__ = ["rig"]
+
 pytestmark = pytest.mark.io
 
 DOC = Path(__file__).resolve().parents[2] / "docs" / "fleet.md"
-PATIENCE_S = 60.0
+NEW_CA = (
+    "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 2 "
+    "-subj /CN=mavgate-fleet -keyout ca.key -out ca.pem && "
+    "openssl req -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -subj /CN=field-1 "
+    "-keyout field-1.key -out field-1.csr && printf extendedKeyUsage=clientAuth > ext && "
+    "openssl x509 -req -in field-1.csr -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 "
+    "-extfile ext -out field-1.pem"
+)
 
 
-def openssl(folder: Path, *words: str) -> None:
-    subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
+@dataclass
+class Documented:
+    """The section of the document, with its paths and addresses replaced by those of the test."""
 
+    folder: Path
+    locator: str
+    site_url: str
 
-def certify(folder: Path, name: str) -> None:
-    """Make a key and a certificate that the authority vouches for."""
-    new = ("req", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-    openssl(folder, *new, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", f"/CN={name}")
-    (folder / "names").write_text("subjectAltName=DNS:localhost,IP:127.0.0.1")
-    sign = ("x509", "-req", "-in", f"{name}.csr", "-CA", "ca.pem", "-CAkey", "ca.key", "-days", "2")
-    openssl(folder, *sign, "-CAcreateserial", "-extfile", "names", "-out", f"{name}.pem")
+    def site_file(self, name: str, keys: Path | None = None) -> Path:
+        """Write the documented configuration of a site for another name or folder of keys."""
+        text = (self.folder / "site.json5").read_text().replace("field-1", name)
+        if keys is not None:
+            text = re.sub(rf'"{self.folder}/(field-1\.\w+)"', rf'"{keys}/\1"', text)
+        file = self.folder / f"site-{name}{'-other' if keys else ''}.json5"
+        file.write_text(text)
+        return file
 
 
 @pytest.fixture(scope="module")
-def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("keys")
-    new = ("req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
-    openssl(folder, *new, "-keyout", "ca.key", "-out", "ca.pem", "-subj", "/CN=ca", "-days", "2")
-    for name in ("router", "field-1", "field-2", "office"):
-        certify(folder, name)
-    return folder
-
-
-def written(folder: Path, number: int, **names: str) -> Path:
-    """Take a configuration out of the document, its files replaced by ours."""
-    blocks = re.findall(r"^    \{\n(?:    .*\n|\n)*?    \}$", DOC.read_text(), re.MULTILINE)
-    text = re.sub(r'"/etc/\w+/([\w.-]+)"', lambda m: f'"{folder}/{m[1]}"', blocks[number])
-    for old, new in names.items():
-        text = text.replace(old.replace("_", "-"), new)
-    file = folder / f"{number}-{'-'.join(names.values())}.json5"
-    file.write_text(text)
-    return file
+def documented(tmp_path_factory: pytest.TempPathFactory) -> Documented:
+    """Run the documented commands and write the documented files."""
+    folder, port = tmp_path_factory.mktemp("etc"), free_port()
+    section = DOC.read_text().split("## Mutual TLS\n")[1].split("\n## ")[0]
+    commands = []
+    for language, text in re.findall(r"^```(\w+)\n(.*?)^```$", section, re.MULTILINE | re.DOTALL):
+        text = text.replace("/etc/mavgate", str(folder)).replace("fleet.example", "localhost")
+        text = text.replace("0.0.0.0", "127.0.0.1").replace(":7447", f":{port}")
+        if language == "sh":
+            commands.append(text)
+        else:
+            [name] = re.findall(rf"^(?://|#) {folder}/(\S+)$", text, re.MULTILINE)
+            (folder / name).write_text(text)
+    setup, add = commands
+    subprocess.run(["bash", "-euc", setup], check=True, capture_output=True)
+    [url] = re.findall(r"mavgate clients add '(.*)'", add)
+    return Documented(folder, f"tls/localhost:{port}", url)
 
 
 @pytest.fixture
-def join(keys: Path) -> Iterator[Callable[[str], Any]]:
-    """Open the router, then a session for whoever has a certificate."""
-    place = f"tls/localhost:{free_port()}"
-    opened = [open_session(session_config(place, str(written(keys, 1)), "router"))]
+async def world(
+    rig: Rig, documented: Documented, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Any:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    settings = load(documented.folder / "fleet.toml")
+
+    fleet_settings = replace(settings.fleet, ids_file=str(tmp_path / "ids.json"))
+    fleet = FleetServer(
+        fleet_settings, replace(settings.hub, endpoints=("udp-listen:127.0.0.1:0",))
+    )
+    await fleet.start()
+    yield World(rig, fleet, documented.locator, rig.station(fleet._hub.listening_ports()[0]))
+    fleet.close()
+    for close in rig.closing:
+        close()
+    rig.closing.clear()
+
+
+async def test_documented_site_is_shown_and_commanded_through_the_documented_fleet(
+    world: World, documented: Documented
+) -> None:
+    world.add_site("field-1", documented.site_url)
+    await world.until(lambda: world.systems() == {1})
+    world.station.say(world.station.sender.command(1, 1))
+    await world.until(lambda: bool(world.commands("field-1")))
+    assert world.heard["field-1"][-1].trusted
+    assert world.fleet._session.warning == ""
+
+
+async def test_certificate_of_one_site_gives_no_access_to_another(
+    world: World, documented: Documented
+) -> None:
+    world.add_site("field-1", documented.site_url)
+    options = f"&config={documented.site_file('field-2')}"
+    # The certificate of field-2, the name of field-1.
+    url = f"zenoh:{documented.locator}?site=field-1{options}"
+    world.add_site("thief", url, system=66)
+    world.add_site("field-2", url.replace("site=field-1", "site=field-2"), system=2)
+    await world.until(lambda: {1, 2} <= world.systems())
+    await world.until(lambda: len(world.got) > 300)
+    assert world.systems() == {1, 2}
+    names = {site["name"]: site["sessions"] for site in world.fleet.status()["sites"]}
+    assert names == {"field-1": 1, "field-2": 1}
+
+
+@pytest.fixture
+def join(documented: Documented) -> Iterator[Callable[[str], Any]]:
+    """Open the documented router without a fleet, then a session for each certificate."""
+    router_file = str(documented.folder / "fleet.json5")
+    opened = [open_session(session_config(documented.locator, router_file, "router"))]
 
     def make(name: str) -> Any:
-        file = written(keys, 0, field_1=name)
-        opened.append(open_session(session_config(place, str(file))))
+        file = str(documented.site_file(name))
+        opened.append(open_session(session_config(documented.locator, file)))
         return opened[-1]
 
     yield make
@@ -70,66 +135,33 @@ def join(keys: Path) -> Iterator[Callable[[str], Any]]:
         session.close()
 
 
-def heard(session: Any, key: str) -> list[tuple[str, bytes]]:
-    """Note what comes on a key."""
+def test_client_without_certificate_of_the_authority_is_refused(
+    join: Callable[[str], Any], documented: Documented, tmp_path: Path
+) -> None:
+    assert join("field-1").info.routers_zid()
+    one_way = tmp_path / "one-way.json5"
+    one_way.write_text(
+        f'{{transport: {{link: {{tls: {{root_ca_certificate: "{documented.folder}/ca.pem"}}}}}}}}'
+    )
+    subprocess.run(["bash", "-euc", NEW_CA], check=True, capture_output=True, cwd=tmp_path)
+    foreign = documented.site_file("field-1", tmp_path)
+    for file in (one_way, foreign):
+        with pytest.raises(OSError, match="or a certificate does not fit"):
+            open_session(session_config(documented.locator, str(file)))
+
+
+def test_site_reads_and_writes_its_own_keys_only(join: Callable[[str], Any]) -> None:
+    first, second = join("field-1"), join("field-2")
     got: list[tuple[str, bytes]] = []
-    session.declare_subscriber(
-        key, lambda sample: got.append((str(sample.key_expr), sample.payload.to_bytes()))
-    )
-    return got
-
-
-def until(condition: Callable[[], bool], *shown: object) -> None:
-    """Wait for a condition; if it never holds, say what there is instead."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s, shown
+    for key in ("mavlink/field-1/1/out", "mavlink/field-2/1/out"):
+        second.declare_subscriber(
+            key, lambda sample: got.append((str(sample.key_expr), sample.payload.to_bytes()))
+        )
+    end_s = time.monotonic() + LIMIT_S
+    while len(got) < 20:
+        assert time.monotonic() < end_s
+        first.put("mavlink/field-1/1/out", b"telemetry of field-1")
+        first.put("mavlink/field-2/1/out", b"forged")
+        second.put("mavlink/field-2/1/out", b"own")
         time.sleep(0.02)
-
-
-def test_a_site_writes_its_own_keys_only(join: Callable[[str], Any]) -> None:
-    office, site = join("office"), join("field-1")
-    out = heard(office, "mavlink/*/*/out")
-    tokens: list[str] = []
-    office.liveliness().declare_subscriber(
-        "mavlink/*/site/*", lambda sample: tokens.append(str(sample.key_expr)), history=True
-    )
-    # A token ends with its object.
-    kept = [site.liveliness().declare_token(f"mavlink/field-{k}/site/x") for k in (1, 2)]
-    asked = site.declare_queryable("mavlink/field-1/ping", lambda q: q.reply(q.key_expr, b"here"))
-    orders, others = heard(site, "mavlink/field-1/*/in"), heard(site, "mavlink/field-2/*/out")
-
-    def both() -> bool:
-        site.put("mavlink/field-2/1/out", b"forged")
-        site.put("mavlink/field-1/1/out", b"own")
-        office.put("mavlink/field-1/1/in", b"order")
-        office.put("mavlink/field-2/1/out", b"another's")
-        return bool(out and orders and tokens)
-
-    until(both, out, orders, tokens)
-    replies = [r.ok.payload.to_bytes() for r in office.get("mavlink/field-1/ping") if r.ok]
-    assert replies == [b"here"]
-    site.put("mavlink/field-1/1/out", b"last")
-    until(lambda: out[-1][1] == b"last", out)
-    assert {key for key, data in out if data in (b"own", b"last", b"forged")} == {
-        "mavlink/field-1/1/out"
-    }
-    assert set(tokens) == {"mavlink/field-1/site/x"}
-    assert {data for _, data in orders} == {b"order"}
-    assert b"another's" not in {data for _, data in others}, "nor does it read another's"
-    for one in (asked, *kept):
-        one.undeclare()
-
-
-def test_a_certificate_that_no_rule_names_may_nothing(join: Callable[[str], Any]) -> None:
-    office, stranger, site = join("office"), join("field-2"), join("field-1")
-    out = heard(office, "mavlink/*/*/out")
-
-    def said() -> bool:
-        stranger.put("mavlink/field-2/1/out", b"stranger")
-        stranger.put("mavlink/field-1/1/out", b"stranger")
-        site.put("mavlink/field-1/1/out", b"own")
-        return len(out) > 20
-
-    until(said, out)
-    assert {data for _, data in out} == {b"own"}
+    assert set(got) == {("mavlink/field-2/1/out", b"own")}

@@ -4,11 +4,12 @@ import asyncio
 import base64
 import hashlib
 import json
+import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from unittest.mock import AsyncMock, MagicMock
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,13 +18,14 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.support import fetching
 from gateway.cli.support.fetching import FetchError, PiecePace, RecordingFetch
-from gateway.edges.hub.fleet_link.query_answers import RefusedQueryError
-from gateway.edges.hub.fleet_link.recording_answers import (
+from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
+from gateway.hub.transports.zenoh import site_queries
+from gateway.hub.transports.zenoh.site_queries import (
     MAX_PIECE,
     RecordingAnswers,
+    RefusedQueryError,
     RemoteRecording,
 )
-from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
 from gateway.live.control_socket import ControlError, request
 from tests.fleet.conftest import World
 from tests.hub.conftest import LIMIT_S
@@ -54,7 +56,7 @@ def over(world: World) -> Callable[[str, dict[str, Any], float], Any]:
 
 
 async def opened(world: World, folder: Path) -> None:
-    world.open_site("field-a", recordings=folder)
+    world.open_site("field-a", "&trusted=yes", recordings=folder)
     await world.until(lambda: bool(world.systems()))
 
 
@@ -82,7 +84,7 @@ class TestOverTheSession:
         assert (await run(*words)).exit_code == 0
         assert (to / NAME).read_bytes() == CONTENT
         assert sorted(path.name for path in to.iterdir()) == [NAME, "flight_01_v1.csv"]
-        assert f"{NAME} was here already" in (await run(*words)).output
+        assert f"{NAME} already complete" in (await run(*words)).output
         (to / NAME).write_bytes(b"other")
         refused = await run(*words)
         assert refused.exit_code == 2
@@ -121,7 +123,7 @@ class TestOverTheSession:
         gone.set()
         await world.until(retried.is_set)
         assert [path.name for path in to.iterdir()] == [f".{NAME}.part"], "nothing looks whole"
-        world.open_site("field-a", recordings=folder)
+        world.open_site("field-a", "&trusted=yes", recordings=folder)
         assert await spoken_for(world, task) is True
         assert (to / NAME).read_bytes() == CONTENT
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
@@ -155,21 +157,27 @@ class TestOverTheSession:
         assert min(offset for offset in asked if offset >= 0) == have
         assert (tmp_path / "fetched" / NAME).read_bytes() == CONTENT
 
-    async def test_who_is_not_trusted_gets_none(self, world: World, folder: Path) -> None:
-        world.open_site("field-a", "&trusted=no", recordings=folder)
+    async def test_site_that_does_not_trust_its_fleet_offers_no_recordings(
+        self, world: World, folder: Path
+    ) -> None:
+        world.open_site("field-a", recordings=folder)
         await world.until(lambda: bool(world.systems()))
         work = asyncio.to_thread(over(world), "fleet.recordings", {"site": "field-a"}, 20.0)
         assert await spoken_for(world, asyncio.create_task(work)) == {}
 
 
-async def test_a_site_that_answers_with_no_list_hides_no_others() -> None:
+async def test_malformed_list_of_one_site_hides_no_others() -> None:
     sound = b'[{"name":"one","files":[],"modified_s":1.5}]'
     answers = {
         "no_text": b'[{"name":"\xff"}]',
         "deep": b'[{"name":"a","files":[],"modified_s":1,"x":' + b"[" * 100_000,
         "sound": sound,
     }
-    session = MagicMock(patterns=["*"], query=AsyncMock(return_value=answers))
+
+    async def query(key: str, payload: bytes, timeout_s: float, decode: Any) -> Any:
+        return {site: decode(site, data) for site, data in answers.items()}
+
+    session = MagicMock(patterns=["*"], query=query)
     found = await RemoteRecordings(session)._list(SitePattern())
     assert found == {"sound": [RemoteRecording("one", [], 1.5)]}
 
@@ -199,6 +207,42 @@ class TestAnswers:
     def test_what_is_no_query(self, folder: Path, asked: bytes) -> None:
         with pytest.raises(RefusedQueryError):
             RecordingAnswers(folder)(asked)
+
+    @pytest.mark.parametrize("digest", [False, True])
+    def test_file_that_is_not_regular_is_refused_without_waiting(
+        self, folder: Path, digest: bool
+    ) -> None:
+        os.mkfifo(folder / "pipe_01.tlog")
+        (folder / "folder_01.tlog").mkdir()
+        for name in ("pipe_01.tlog", "folder_01.tlog"):
+            asked = json.dumps({"file": name, "size": 10, "digest": digest}).encode()
+            with pytest.raises(RefusedQueryError, match="no regular file"):
+                RecordingAnswers(folder)(asked)
+        listed = json.loads(RecordingAnswers(folder)(b""))
+        sizes = {file["name"]: file["size"] for each in listed for file in each["files"]}
+        assert sizes[NAME] == SIZE
+        assert not sizes.keys() & {"pipe_01.tlog", "folder_01.tlog", "link_01.tlog"}
+
+    def test_list_leaves_out_the_oldest_recordings_beyond_its_limit(
+        self, folder: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for number in range(20):
+            path = folder / f"old{number:02}_01.tlog"
+            path.write_bytes(b"x")
+            os.utime(path, (number, number))
+        monkeypatch.setattr(site_queries, "MAX_LIST", 500)
+        answer = RecordingAnswers(folder)(b"")
+        assert len(answer) <= 500
+        names = [each["name"] for each in json.loads(answer)]
+        assert "flight" in names
+        assert "old00" not in names
+
+    def test_query_above_its_limit_is_refused_unread(self) -> None:
+        query = MagicMock()
+        query.payload.__len__.return_value = site_queries.MAX_QUERY + 1
+        with pytest.raises(RefusedQueryError, match="at most 4096 bytes"):
+            site_queries.QueryAnswers._payload_of(query)
+        query.payload.to_bytes.assert_not_called()
 
     def test_pieces_and_digests(self, folder: Path) -> None:
         answer = RecordingAnswers(folder)

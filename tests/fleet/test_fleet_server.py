@@ -14,10 +14,12 @@ from pathlib import Path
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.fleet import fleet_server, ids_file
-from gateway.fleet.fleet_server import FleetServer
-from gateway.fleet.fleet_settings import FleetSettings
+from gateway.fleet import id_map
+from gateway.fleet import server as fleet_server
 from gateway.fleet.id_map import LAST_ID
+from gateway.fleet.server import FleetServer
+from gateway.fleet.settings import FleetSettings
+from gateway.fleet.signatures import EPOCH_2015_US, TICK_US
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, request
 from gateway.vehicle.signing import key_from_passphrase
@@ -52,8 +54,8 @@ async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: Wo
 async def test_vehicles_that_were_not_heard_for_long_keep_nobody_out(
     world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(fleet_server, "KEEP_S", 0.01)
-    monkeypatch.setattr(fleet_server, "FORGET_US", 0)
+    monkeypatch.setattr(fleet_server, "POLL_S", 0.01)
+    monkeypatch.setattr(fleet_server, "ABANDONED_US", 0)
     for system_id in range(1, LAST_ID + 1):
         world.fleet._ids.set_by_hand("field-many", system_id, system_id)
     world.open_site("field-a")
@@ -61,7 +63,7 @@ async def test_vehicles_that_were_not_heard_for_long_keep_nobody_out(
     (own_id,) = world.systems()
     assert world.fleet._ids.vehicle_of(own_id) == ("field-a", 1)
     assert (
-        f"id {own_id} of field-many/{own_id}, long not heard, is that of field-a/1 now"
+        f"id {own_id} of field-many/{own_id}, not received for an hour, is now of field-a/1"
         in caplog.text
     )
 
@@ -70,15 +72,15 @@ async def test_sites_that_have_gone_make_room_for_others(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_server, "MAX_SITES", 3)
-    fleet, now_us = world.fleet, fleet_server.FORGET_US
+    fleet, now_us = world.fleet, fleet_server.ABANDONED_US
     for name in ("field-1", "field-2", "field-3", "field-4"):
-        fleet._note_session(name, "token", True)
-    fleet._note_session("field-2", "token", False)
+        fleet._handle_presence(name, "token", True)
+    fleet._handle_presence("field-2", "token", False)
     assert (sorted(fleet._sites), fleet._bad_names) == (["field-1", "field-2", "field-3"], 1)
     fleet._make_room(now_us // 2)
     assert "field-2" in fleet._sites
     fleet._make_room(now_us + fleet._now_us())
-    fleet._note_session("field-4", "token", True)
+    fleet._handle_presence("field-4", "token", True)
     assert sorted(fleet._sites) == ["field-1", "field-3", "field-4"]
     assert {client.name for client in fleet._hub.clients()} >= set(fleet._sites)
     assert "field-2" not in {client.name for client in fleet._hub.clients()}
@@ -110,7 +112,7 @@ async def test_a_site_goes_and_that_is_reported_once(world: World) -> None:
         world.say()
         await asyncio.sleep(0.01)
     texts = [m.text for m in world.got if m.get_type() == "STATUSTEXT"]
-    assert texts == ["Site field-b is gone"]
+    assert texts == ["Site field-b disconnected"]
     gone = {site["name"]: site["is_here"] for site in world.fleet.status()["sites"]}
     assert gone == {"field-a": True, "field-b": False}
 
@@ -126,24 +128,32 @@ async def test_what_a_site_is_fed_with_ends_after_one_round(world: World) -> Non
     assert [(each["system_id"], each["id"]) for each in site["vehicles"]] == [(1, 7)]
     assert [own_id for _, own_id in world.fleet._ids.items()] == [7]
     assert len(world.commands("field-a")) == 1
-    assert "looped frames ended" in await run("fleet", "status")
+    assert "looped frames dropped" in await run("fleet", "status")
 
 
-async def test_signed_frames_are_checked_and_sealed_anew(world: World) -> None:
+async def test_unsigned_forged_and_replayed_frames_of_a_site_with_passphrase_are_dropped(
+    world: World,
+) -> None:
     hub = world.open_site("field-s")
     world.open_site("field-a")
     vehicle = world.rig.sender(1, signed=True)
     vehicle.link.signing.secret_key = key_from_passphrase("secret")
+    now_ticks = (time.time_ns() // 1000 - EPOCH_2015_US) // TICK_US
+    vehicle.link.signing.timestamp = now_ticks
     world.vehicles["field-s"] = vehicle
     await world.until(lambda: len(world.systems()) == 2)
     forged = world.rig.sender(1, signed=True)
-    hub.send(world.rig.out(forged.attitude()))
+    recorded = vehicle.attitude()
+    for frame in (forged.attitude(), world.rig.sender(1).attitude(), recorded, recorded):
+        hub.send(world.rig.out(frame))
 
-    def told() -> int:
+    def counts() -> list[int]:
         sites = {site["name"]: site for site in world.fleet.status()["sites"]}
-        return int(sites["field-s"]["forged"])
+        return [sites["field-s"][kind] for kind in ("forged", "unsigned", "replayed")]
 
-    await world.until(lambda: told() > 0)
+    await world.until(lambda: counts() == [1, 1, 1])
+    shown = await run("fleet", "status")
+    assert "frames of field-s dropped: 1 unsigned, 1 forged, 1 replayed" in shown
 
 
 async def test_garbage_and_names_that_are_none(world: World) -> None:
@@ -183,8 +193,8 @@ async def test_an_id_that_the_disk_does_not_keep_is_an_error(
 
     params = {"site": "field-a", "system_id": 1, "own_id": 77}
     with monkeypatch.context() as patch:
-        patch.setattr(ids_file, "write_new", refuse)
-        with pytest.raises(ControlError, match=r"not kept: .*fleet\.json: No space left"):
+        patch.setattr(id_map, "write_new", refuse)
+        with pytest.raises(ControlError, match=r"not saved: .*fleet\.json: No space left"):
             await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", params)
     await world.until(Path(settings.ids_file).exists)
     assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}

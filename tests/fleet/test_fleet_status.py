@@ -79,7 +79,7 @@ async def test_a_vehicle_that_is_left_out(world: World, tmp_path: Path) -> None:
         return len(world.got) == 100 and len(world.systems()) == 1
 
     await world.until(one_is_left)
-    assert "left out by hand: field-a/1" in await run("fleet", "status")
+    assert "excluded: field-a/1" in await run("fleet", "status")
     assert json.loads((tmp_path / "fleet.json").read_text())["field-a/1"] == 0
     params = {"site": "field-a", "system_id": 1, "own_id": 9}
     path = world.fleet.control_socket

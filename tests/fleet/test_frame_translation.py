@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
+from gateway.fleet.signatures import EPOCH_2015_US, SiteSignatures
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import split_datagram, target_of
 
@@ -39,7 +40,8 @@ def translation(key: bytes | None = None) -> FrameTranslation:
     ids.id_of("a", 1)
     ids.id_of("b", 1)
     ids.id_of("b", 30)
-    return FrameTranslation("b", ids, key)
+    signatures = None if key is None else SiteSignatures(key, EPOCH_2015_US)
+    return FrameTranslation("b", ids, signatures)
 
 
 def attitude() -> Any:
@@ -182,7 +184,7 @@ def test_what_does_not_change_passes_byte_for_byte() -> None:
 
 
 class TestSigned:
-    def test_sealed_anew_with_the_stamp_that_it_had(self) -> None:
+    def test_signature_is_renewed_with_the_same_timestamp(self) -> None:
         frame = packed(attitude(), 1, key=KEY)
         got = translation(KEY).from_site(frame, 0)
         assert got is not None

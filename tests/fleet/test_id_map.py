@@ -76,6 +76,19 @@ def test_no_site_uses_up_the_ids_of_others(sites: int) -> None:
     assert ids.id_of("many-0", 249) is None
 
 
+def test_site_gets_no_more_ids_than_its_limit() -> None:
+    ids = IdMap(per_site=3)
+    assert [ids.id_of("field", system) for system in range(1, 6)] == [1, 2, 3, None, None]
+    assert ids.id_of("other", 1) == 4
+    heard_us = dict.fromkeys([vehicle for vehicle, _ in ids.items()], 0)
+    for site in range(LAST_ID):
+        ids.id_of(f"site-{site}", 1)
+    done = ids.make_room(heard_us, 1000)
+    assert done is None or done.holder[0] != "field" or done.former[0] == "field"
+    ids.set_by_hand("field", 4, 9)
+    assert ids.known_id("field", 4) == 9, "the operator may exceed the limit"
+
+
 def test_who_is_heard_keeps_its_id() -> None:
     ids = filled(8)
     assert ids.id_of("field", 7) is None

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.fleet import ids_file
-from gateway.fleet.ids_file import IdsFile
+from gateway.fleet import id_map
+from gateway.fleet.id_map import IdsFile
 
 pytestmark = pytest.mark.io
 
@@ -48,7 +48,7 @@ async def test_ids_are_kept_for_the_next_start(kept: IdsFile) -> None:
 async def test_they_are_kept_only_once_the_disk_has_them(
     kept: IdsFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    may_write, begun, write_new = threading.Event(), asyncio.Event(), ids_file.write_new
+    may_write, begun, write_new = threading.Event(), asyncio.Event(), id_map.write_new
     loop = asyncio.get_running_loop()
 
     def slow(path: Path, pieces: list[bytes], *, overwrite: bool) -> int:
@@ -56,7 +56,7 @@ async def test_they_are_kept_only_once_the_disk_has_them(
         may_write.wait()
         return write_new(path, pieces, overwrite=overwrite)
 
-    monkeypatch.setattr(ids_file, "write_new", slow)
+    monkeypatch.setattr(id_map, "write_new", slow)
     kept.ids.set_by_hand("field-a", 1, 77)
     keeping = asyncio.create_task(kept.keep())
     try:
@@ -73,7 +73,7 @@ async def test_a_disk_that_refuses_is_reported_and_tried_again(
 ) -> None:
     kept.ids.set_by_hand("field-a", 1, 77)
     with monkeypatch.context() as patch:
-        patch.setattr(ids_file, "write_new", refuse)
+        patch.setattr(id_map, "write_new", refuse)
         assert await kept.keep() == NO_SPACE
         assert await kept.keep() == NO_SPACE
     assert [record.getMessage().count(NO_SPACE) for record in caplog.records] == [1]

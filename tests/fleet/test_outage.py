@@ -3,9 +3,9 @@
 import msgspec
 import pytest
 
-from gateway.fleet.fleet_settings import FleetSettings
+from gateway.fleet.settings import FleetSettings
 from tests.fleet.conftest import World
-from tests.hub.test_fleet_link import Router, router
+from tests.hub.test_zenoh import Router, router
 
 __all__ = ["router"]
 

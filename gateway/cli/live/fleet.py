@@ -1,4 +1,4 @@
-"""`mavgate fleet`: many sites as one picture, and what is to be known of them."""
+"""`mavgate fleet`: the vehicles of many sites, their state, and their recordings."""
 
 import asyncio
 import logging
@@ -27,7 +27,7 @@ from gateway.units import US_PER_S, counted
 log = logging.getLogger(__name__)
 
 DISK_S: Final = 60.0
-"""Longest wait for a file that is written: a worn card takes seconds for each of its steps."""
+"""Longest wait for a file to be written: a worn card takes seconds for each step."""
 
 group = AskingTyper(
     help="Show the vehicles of many sites here, through a Zenoh router.",
@@ -51,10 +51,10 @@ def fleet(
     *,
     listen: Annotated[
         str | None,
-        typer.Option("--listen", help="Be the router, at a place such as tcp/0.0.0.0:7447."),
+        typer.Option("--listen", help="Be the router, as in tls/0.0.0.0:7447."),
     ] = None,
     connect: Annotated[
-        str | None, typer.Option("--connect", help="Router to connect to: tcp/HOST:7447.")
+        str | None, typer.Option("--connect", help="Router to connect to: tls/HOST:7447.")
     ] = None,
     site: Annotated[
         list[str] | None, typer.Option("--site", help="Sites to show, such as 'field-*'.")
@@ -85,7 +85,7 @@ def status(*, json: JsonOption = False) -> None:
         return
     console = console_of()
     role = "router at" if found["is_router"] else "connected to"
-    lost = "" if found["is_linked"] else ", which is not there"
+    lost = "" if found["is_linked"] else ", which does not answer"
     console.print(f"{role} {found['router']}{lost}")
     table = table_of("site", "", "ms", "system", "id here", "Hz", "age s", "lost", left=2)
     for each in found["sites"]:
@@ -95,24 +95,37 @@ def status(*, json: JsonOption = False) -> None:
         text = f"no id left for: {', '.join(found['unmapped'])}; give one by `mavgate fleet id`"
         console.print(text)
     if found["left_out"]:
-        console.print(f"left out by hand: {', '.join(found['left_out'])}")
+        console.print(f"excluded: {', '.join(found['left_out'])}")
     if found["overflowed"]:
-        console.print(f"{counted(found['overflowed'], 'message')} came too fast to be taken")
+        console.print(f"{counted(found['overflowed'], 'message')} dropped: they arrived too fast")
+    for text in _rejections(found["sites"]):
+        console.print(text)
     loops = [
         f"{site['looped']} through {site['name']}" for site in found["sites"] if site["looped"]
     ]
     if found["looped"]:
         loops.append(f"{found['looped']} through clients here")
     if loops:
-        console.print(f"looped frames ended: {', '.join(loops)}")
+        console.print(f"looped frames dropped: {', '.join(loops)}")
+
+
+def _rejections(sites: list[dict[str, Any]]) -> list[str]:
+    """Describe the frames of each site that its passphrase has rejected."""
+    found = []
+    for site in sites:
+        kinds = ("unsigned", "forged", "replayed")
+        counts = [f"{site[kind]} {kind}" for kind in kinds if site[kind]]
+        if counts:
+            found.append(f"frames of {site['name']} dropped: {', '.join(counts)}")
+    return found
 
 
 @group.command("id")
 def set_id(
     vehicle: Annotated[str, typer.Argument(help="SITE/SYSTEM, as in field-1/1.")],
-    own_id: Annotated[int, typer.Argument(help="Its system id here; 0 leaves it out.")],
+    own_id: Annotated[int, typer.Argument(help="Its system id here; 0 excludes it.")],
 ) -> None:
-    """Give a vehicle of a site a system id by hand, or none; it is kept."""
+    """Assign a system id to a vehicle of a site, or exclude it; the choice is saved."""
     name, _, system = vehicle.rpartition("/")
     if not name or not system.isdecimal():
         refuse(f"{vehicle!r} is not SITE/SYSTEM, as in field-1/1")
@@ -141,7 +154,7 @@ def _add_site(table: Any, site: Mapping[str, Any]) -> None:
 
 
 async def _serve(settings: Any, hub_settings: Any) -> None:
-    from gateway.fleet.fleet_server import FleetServer
+    from gateway.fleet.server import FleetServer
     from gateway.live.control_socket import ControlError
 
     stopped = asyncio.Event()
@@ -153,7 +166,8 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
         refuse(f"the fleet is an extra: {how_to_add('fleet')}")
     except (ValueError, ControlError) as error:
         refuse(str(error))
-    log.info("sites by %s, ground stations by %s", server.place, ", ".join(hub_settings.endpoints))
+    stations = ", ".join(hub_settings.endpoints)
+    log.info("sites at %s, ground stations at %s", server.locator, stations)
     with detached_output():
         try:
             await stopped.wait()
@@ -200,7 +214,7 @@ def get(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that differ.")] = False,
 ) -> None:
-    """Fetch a recording of a site; what has come already is not fetched again."""
+    """Fetch a recording of a site; an interrupted fetch is continued."""
     if not SITE_NAME.fullmatch(site):
         refuse(f"site {site!r}: letters, digits, . _ and - only")
     listed = ask("fleet.recordings", {"site": site}, of="fleet").get(site)
@@ -232,7 +246,7 @@ def _fetch_all(fetch: RecordingFetch, recording: dict[str, Any], folder: Path) -
             is_new = fetch.fetch(
                 file["name"], file["size"], lambda count: progress.advance(task, count)
             )
-            state = "fetched" if is_new else "was here already"
+            state = "fetched" if is_new else "already complete"
             lines.append(f"{folder / file['name']} {state}")
     for line in lines:
         console_of().print(line)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, Protocol
 
 from gateway.hub.client_table import ClientStats
-from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint
+from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind
 from gateway.hub.express import ClientCounters, Express
 from gateway.hub.hosts import is_loopback
 from gateway.hub.routing_table import Origin
@@ -246,9 +246,12 @@ class HubContext(Protocol):
 
 
 def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
-    """Return whether a peer may change state: as in the URL, else if configured or local."""
+    """Return whether a peer may change state: as in the URL, else if configured or local.
+
+    A fleet is not trusted by default: everyone who reaches its router can publish there.
+    """
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:
         return is_loopback(remote.rpartition(":")[0].strip("[]"))
-    return True
+    return endpoint.kind != EndpointKind.ZENOH

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, Final
 
-from gateway.edges.hub.fleet_link.zenoh_client import ZenohClient
 from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind
 from gateway.hub.transports.base import Client, HubContext
 from gateway.hub.transports.listener import Listener
@@ -12,6 +11,7 @@ from gateway.hub.transports.tcp import TcpClient, TcpListener
 from gateway.hub.transports.udp import UdpClient
 from gateway.hub.transports.udp_group import GroupClient
 from gateway.hub.transports.udp_listen import UdpListener
+from gateway.hub.transports.zenoh.client import ZenohClient
 
 ClientMaker = Callable[[HubContext, int, Endpoint], Client]
 

@@ -1,16 +1,18 @@
-"""A fleet as one client of the hub: all frames of this site go there, and its wishes come back.
+"""A fleet as one client of the hub: frames of this site are published, requests are received.
 
-The session finds its router again by itself. While it has none nothing is sent and nothing waits,
-so that nothing old ever arrives as new.
+The session finds its router again by itself. While it has none nothing is sent and nothing is
+queued, so that old data never arrives as new.
 """
 
 import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from gateway.edges.hub.fleet_link.query_answers import QueryAnswers
-from gateway.edges.hub.fleet_link.recording_answers import RecordingAnswers
-from gateway.edges.hub.fleet_link.site_keys import (
+from gateway.hub.endpoint import RAW_KEYS, Endpoint
+from gateway.hub.send_queue import Packer
+from gateway.hub.transports.base import READ_BYTES, Client
+from gateway.hub.transports.listener import RETRY_US
+from gateway.hub.transports.zenoh.keys import (
     ALL_SYSTEMS,
     OWN,
     in_key,
@@ -19,22 +21,22 @@ from gateway.edges.hub.fleet_link.site_keys import (
     presence_key,
     recordings_key,
 )
-from gateway.edges.hub.fleet_link.zenoh_session import (
+from gateway.hub.transports.zenoh.session import (
+    MAX_MESSAGE,
     NOT_INSTALLED,
-    PATIENT_IDS,
-    Inlet,
-    Outlets,
+    RELIABLE_IDS,
+    SECURED,
+    LoopQueue,
+    Payload,
+    Publishers,
     end_session,
-    frames_of,
+    off_loop,
     open_session,
     part_of_turn,
+    payload_of,
     session_config,
 )
-from gateway.edges.hub.fleet_link.zenoh_threads import off_loop
-from gateway.hub.endpoint import RAW_KEYS, Endpoint
-from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import READ_BYTES, Client
-from gateway.hub.transports.listener import RETRY_US
+from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
 
@@ -45,14 +47,16 @@ log = logging.getLogger(__name__)
 
 RAW_OUT: Final = "mavlink_raw/out"
 RAW_IN: Final = "mavlink_raw/in"
+LOCAL: Final = ("tcp/127.", "tcp/[::1]", "tcp/localhost:", "unixsock-stream/")
+MAX_NAMESAKES: Final = 16
+"""Other sessions under this site's name that are remembered; more are forged."""
 
 
-class _Way(NamedTuple):
-    """How frames are published."""
+class _Topic(NamedTuple):
+    """Key and attachment that frames are published with."""
 
     key: str
-    mark: bytes | None
-    """Attached; None for nothing."""
+    attachment: bytes | None
 
 
 class ZenohClient(Client):
@@ -60,7 +64,7 @@ class ZenohClient(Client):
 
     _session: "zenoh.Session | None" = None
     _task: asyncio.Task[None] | None = None
-    _outlets: Outlets | None = None
+    _publishers: Publishers | None = None
     _retry_us = 0
     _is_gathering = False
 
@@ -68,35 +72,35 @@ class ZenohClient(Client):
         """Begin without a session; the first tick opens it."""
         super().__post_init__()
         self._namesakes: set[str] = set()
-        self._packers: dict[_Way, Packer] = {}
-        self._inlets: list[Inlet[Any]] = []
+        self._packers: dict[_Topic, Packer] = {}
+        self._queues: list[LoopQueue[Any]] = []
         self._declared: list[object] = []
 
     @property
     def queued(self) -> int:
         """Frames that wait for a congested link and must not be lost."""
-        return self._outlets.queued if self._outlets is not None else 0
+        return self._publishers.queued if self._publishers is not None else 0
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Publish one frame, or gather it with others."""
-        if self.state != "open" or self._outlets is None:
+        if self.state != "open" or self._publishers is None:
             self.counters.dropped += 1
             return
         origin = origin_of(frame)
         if self._is_raw:
-            way = _Way(RAW_OUT, None)
+            topic = _Topic(RAW_OUT, None)
         else:
-            mark = OWN if self.context.is_own(origin) else None
-            way = _Way(out_key(self.endpoint.site, origin[0]), mark)
-        if message_id in PATIENT_IDS:
-            self._publish(way, [frame], patient=True)
+            attachment = OWN if self.context.is_own(origin) else None
+            topic = _Topic(out_key(self.endpoint.site, origin[0]), attachment)
+        if message_id in RELIABLE_IDS:
+            self._publish(topic, [frame], reliable=True)
         elif self.endpoint.pack_bytes:
-            self._pack(way, frame)
+            self._pack(topic, frame)
         else:
-            self._publish(way, [frame], patient=False)
+            self._publish(topic, [frame], reliable=False)
 
     def tick(self, now_us: int) -> None:
-        """Open the session, and see whether it has a router."""
+        """Open the session, and check whether it has a router."""
         if self._session is None:
             if self._task is None and now_us >= self._retry_us:
                 self._retry_us = now_us + RETRY_US
@@ -109,22 +113,22 @@ class ZenohClient(Client):
         elif not is_linked and self.state == "open":
             self.become("connecting")
             self._packers.clear()
-        self._tell_namesakes()
+        self._report_namesakes()
 
     def close(self) -> None:
-        """End the session; it says good-bye by itself, which may take a moment."""
+        """End the session; a thread closes it, which may take a moment."""
         if self._task is not None:
             self._task.cancel()
-        for inlet in self._inlets:
-            inlet.close()
-        if self._outlets is not None:
-            self._outlets.close()
+        for each in self._queues:
+            each.close()
+        if self._publishers is not None:
+            self._publishers.close()
         if self._session is not None:
-            off_loop(end_session, self._session, self._outlets, self._declared)
-        self._session, self._outlets, self._declared = None, None, []
+            off_loop(end_session, self._session, self._publishers, self._declared)
+        self._session, self._publishers, self._declared = None, None, []
 
     def reconfigure(self, endpoint: Endpoint) -> None:
-        """Take over changed options; another site or file needs the endpoint to be added anew."""
+        """Apply changed options; another site or file needs the endpoint to be added again."""
         self._flush()
         self._packers.clear()
         super().reconfigure(endpoint)
@@ -144,23 +148,35 @@ class ZenohClient(Client):
             self.become("unreachable", error)
         else:
             self._session = session
-            self._outlets = Outlets(session)
+            self._publishers = Publishers(session)
             self._declare(session)
+            self._warn_of_open_access()
             self.tick(self.context.now_us())
         finally:
             self._task = None
 
+    def _warn_of_open_access(self) -> None:
+        locator = self.endpoint.host
+        if self.trusted and not locator.startswith((*SECURED, *LOCAL)):
+            log.warning(
+                "%s: trusted=yes without TLS: whoever reaches the router or the network on the way "
+                "can command the vehicles; see docs/fleet.md, Mutual TLS",
+                self.name,
+            )
+
     def _declare(self, session: "zenoh.Session") -> None:
-        """Declare to the router what we take, and that we are here."""
+        """Subscribe to frames for this site, and announce its presence."""
         import zenoh
 
-        inlet: Inlet[bytes] = Inlet(self._take, _cost, lambda: self._pause_us() / US_PER_S)
-        presence: Inlet[tuple[bool, str]] = Inlet(self._note_session)
-        self._inlets = [inlet, presence]
+        frames: LoopQueue[Payload] = LoopQueue(
+            self._handle, _cost_of, lambda: self._pause_us() / US_PER_S
+        )
+        presence: LoopQueue[tuple[bool, str]] = LoopQueue(self._handle_presence)
+        self._queues = [frames, presence]
         self._namesakes.clear()
         wanted = RAW_IN if self._is_raw else in_key(self.endpoint.site, ALL_SYSTEMS)
         self._declared = [
-            session.declare_subscriber(wanted, lambda sample: inlet.put(frames_of(sample)))
+            session.declare_subscriber(wanted, lambda sample: frames.put(payload_of(sample)))
         ]
         if self._is_raw:
             return
@@ -179,24 +195,29 @@ class ZenohClient(Client):
             answers = RecordingAnswers(self.context.recordings)
             self._declared.append(QueryAnswers(session, recordings_key(site), answers))
 
-    def _take(self, data: bytes) -> None:
+    def _handle(self, payload: Payload) -> None:
+        data, size = payload
         if not self.trusted:
-            self.context.strangers.level -= len(data)
-        self.receive(split_datagram(data), len(data), self.context.now_us())
+            self.context.strangers.level -= min(size, MAX_MESSAGE)
+        if not data:
+            self.counters.bytes_received += size
+            self.counters.bytes_garbage += size
+            return
+        self.receive(split_datagram(data), size, self.context.now_us())
 
-    def _note_session(self, news: tuple[bool, str]) -> None:
+    def _handle_presence(self, news: tuple[bool, str]) -> None:
         is_here, key = news
         session = key.rpartition("/")[2]
         if self._session is None or session == str(self._session.zid()):
             return
-        if is_here:
+        if is_here and len(self._namesakes) < MAX_NAMESAKES:
             self._namesakes.add(session)
-        else:
+        elif not is_here:
             self._namesakes.discard(session)
-        self._tell_namesakes()
+        self._report_namesakes()
 
-    def _tell_namesakes(self) -> None:
-        """Say for as long as it lasts that somebody else bears our name."""
+    def _report_namesakes(self) -> None:
+        """Report, for as long as it lasts, that another session uses this site's name."""
         text = f"another site is called {self.endpoint.site!r} too" if self._namesakes else ""
         if self.state != "open" or text == self.reason:
             return
@@ -204,29 +225,32 @@ class ZenohClient(Client):
         if text:
             log.warning("%s: %s; rename one of them", self.name, text)
 
-    def _pack(self, way: _Way, frame: bytes) -> None:
-        packer = self._packers.setdefault(way, Packer(self.endpoint.pack_bytes))
-        self._publish(way, packer.add(frame), patient=False)
+    def _pack(self, topic: _Topic, frame: bytes) -> None:
+        packer = self._packers.setdefault(topic, Packer(self.endpoint.pack_bytes))
+        self._publish(topic, packer.add(frame), reliable=False)
         if not self._is_gathering:
             self._is_gathering = True
             self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
 
     def _flush(self) -> None:
         self._is_gathering = False
-        for way, packer in self._packers.items():
-            self._publish(way, packer.flush(), patient=False)
+        for topic, packer in self._packers.items():
+            self._publish(topic, packer.flush(), reliable=False)
 
-    def _publish(self, way: _Way, frames: list[bytes], *, patient: bool) -> None:
-        if not frames or self._outlets is None:
+    def _publish(self, topic: _Topic, frames: list[bytes], *, reliable: bool) -> None:
+        if not frames or self._publishers is None:
             return
         data = b"".join(frames)
-        if self._outlets.publish(way.key, data, patient=patient, mark=way.mark):
+        published = self._publishers.publish(
+            topic.key, data, reliable=reliable, attachment=topic.attachment
+        )
+        if published:
             self.counters.sent += len(frames)
             self.counters.bytes_sent += len(data)
         else:
             self.counters.dropped += len(frames)
 
 
-def _cost(data: bytes) -> float:
-    """Return which part of a turn a message takes: no more is read from any client at a time."""
-    return part_of_turn(len(data), READ_BYTES)
+def _cost_of(payload: Payload) -> float:
+    """Return the part of a turn of a message: no client is read for longer at a time."""
+    return part_of_turn(payload[1], READ_BYTES)

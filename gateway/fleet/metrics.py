@@ -1,4 +1,4 @@
-"""The metrics of a fleet for Prometheus, beside those of any hub."""
+"""The metrics of a fleet for Prometheus, in addition to those of any hub."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
@@ -8,18 +8,20 @@ from prometheus_client.core import Metric
 from gateway.live.hub_metrics import counter, gauge
 
 SITE_GAUGES: Final = (
-    ("is_here", "here", "1 while a session of the site is there."),
+    ("is_here", "here", "1 while a session of the site is present."),
     ("sessions", "sessions", "Sessions under the site's name; more than 1: rename all but one."),
     ("round_trip_s", "round_trip_seconds", "Time until the site's session answered a query."),
 )
 SITE_COUNTERS: Final = (
     ("sent", "sent", "Frames published for the site."),
-    ("dropped", "dropped", "Frames for the site that were given up: its link is too slow."),
-    ("bytes_garbage", "garbage_bytes", "Bytes under the site's keys that were no MAVLink."),
-    ("unknown", "unknown", "Frames that no dialect here knows, so that no id can be changed."),
-    ("signed", "signed", "Signed frames that could not pass for want of the passphrase."),
-    ("forged", "forged", "Frames whose signature is not of the site's passphrase."),
-    ("looped", "looped", "Frames of the fleet that came back through the site, and ended here."),
+    ("dropped", "dropped", "Frames for the site that were dropped: its link is too slow."),
+    ("bytes_garbage", "garbage_bytes", "Bytes under the site's keys that are not MAVLink."),
+    ("unknown", "unknown", "Frames of unknown messages, whose ids cannot be changed."),
+    ("signed", "signed", "Signed frames dropped because the passphrase is not set here."),
+    ("unsigned", "unsigned", "Unsigned frames dropped because the site has a passphrase."),
+    ("forged", "forged", "Frames not signed with the site's passphrase."),
+    ("replayed", "replayed", "Signed frames with a timestamp used before, or too old."),
+    ("looped", "looped", "Frames of the fleet that returned through the site, and were dropped."),
 )
 VEHICLE_GAUGES: Final = (
     ("rate_hz", "rate_hertz", "Frames a second of the last seconds."),
@@ -27,7 +29,7 @@ VEHICLE_GAUGES: Final = (
 )
 VEHICLE_COUNTERS: Final = (
     ("frames", "frames", "Frames of the vehicle."),
-    ("lost", "lost", "Frames of the vehicle that never came, by their sequence numbers."),
+    ("lost", "lost", "Frames of the vehicle that were lost, by their sequence numbers."),
 )
 SITE: Final = ("site",)
 VEHICLE: Final = ("site", "system", "id")
@@ -39,7 +41,7 @@ def fleet_families(status: Mapping[str, Any]) -> Iterator[Metric]:
     Parameters
     ----------
     status : mapping
-        As `FleetServer.status` has it.
+        From `FleetServer.status`.
 
     Yields
     ------
@@ -50,13 +52,13 @@ def fleet_families(status: Mapping[str, Any]) -> Iterator[Metric]:
     yield gauge("fleet_linked", "1 while there is a router.", (), [((), linked)])
     for key, text in (
         ("unmapped", "Vehicles for which no system id is left."),
-        ("left_out", "Vehicles that were left out by hand."),
+        ("left_out", "Vehicles excluded by the operator."),
     ):
         yield gauge(f"fleet_{key}", text, (), [((), float(len(status[key])))])
     for key, text in (
-        ("overflowed", "Messages that came faster than they could be taken."),
-        ("looped", "Frames for sites that a client here brought back, and that ended here."),
-        ("bad_names", "Messages under names that no site may have, or of too many sites."),
+        ("overflowed", "Messages dropped because they arrived faster than they were handled."),
+        ("looped", "Frames for sites that a client here returned, and that were dropped."),
+        ("bad_names", "Messages under invalid site names, or of too many sites."),
     ):
         yield counter(f"fleet_{key}", text, (), [((), float(status[key]))])
     sites = [((site["name"],), site) for site in status["sites"]]

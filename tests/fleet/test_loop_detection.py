@@ -4,7 +4,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
-from gateway.fleet.loop_watch import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopWatch
+from gateway.fleet.loop_detection import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopDetection
 from gateway.wire.mavlink_splitter import origin_of
 from tests.hub.conftest import Sender
 
@@ -16,7 +16,7 @@ class Ring:
 
     def __init__(self, ids: IdMap | None = None) -> None:
         self.ids = ids or IdMap()
-        self.loops = LoopWatch()
+        self.loops = LoopDetection()
         self.sites = {name: FrameTranslation(name, self.ids, None, self.loops) for name in "abc"}
         self.vehicles = {name: Sender(1, 1) for name in "ab"}
         self.now_us = 0
@@ -114,8 +114,8 @@ def test_a_command_ends_by_either_way_back() -> None:
     for frame in (said, found[1]):
         assert ring.give("c", frame) is None
     assert ring.ids.known_id("c", 255) is None
-    assert ring.loops.came_back(found[1], 0), "for another vehicle's id"
-    assert not ring.loops.came_back(said, 0), "a program may say the same again"
+    assert ring.loops.is_returned_by_client(found[1], 0), "for another vehicle's id"
+    assert not ring.loops.is_returned_by_client(said, 0), "a program may say the same again"
     assert ring.loops.looped == 1
 
 
@@ -125,8 +125,8 @@ def test_memory_ends_in_time_and_number() -> None:
     assert given is not None
     ring.now_us += 2 * SPAN_US + 1
     assert ring.give("c", given) is not None
-    loops = LoopWatch()
+    loops = LoopDetection()
     for number in range(3 * MAX_FRAMES):
         frame = b"\xfd\x04" + bytes(8) + number.to_bytes(4, "little")
-        loops.note_given(frame, ("a", 1), 0)
+        loops.record_given(frame, ("a", 1), 0)
     assert len(loops._given._recent) + len(loops._given._older) <= 2 * MAX_FRAMES

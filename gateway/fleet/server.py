@@ -1,8 +1,9 @@
-"""`mavgate fleet`: sites in, one picture out, through the hub that every gateway has."""
+"""`mavgate fleet`: the vehicles of many sites, shown to ground stations by one hub."""
 
 import asyncio
 import logging
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -11,17 +12,19 @@ import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
-from gateway.fleet.fleet_hub import FleetHub
-from gateway.fleet.fleet_session import FleetSession, SessionEvents
-from gateway.fleet.fleet_settings import FleetSettings
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.fleet.id_map import LEFT_OUT
-from gateway.fleet.ids_file import IdsFile
-from gateway.fleet.loop_watch import LoopWatch
+from gateway.fleet.id_map import LEFT_OUT, IdsFile
+from gateway.fleet.loop_detection import LoopDetection
 from gateway.fleet.remote_recordings import RemoteRecordings
-from gateway.fleet.site_client import SiteClient, site_endpoint
+from gateway.fleet.session import FleetSession, SessionEvents
+from gateway.fleet.settings import FleetSettings
+from gateway.fleet.signatures import SiteSignatures
+from gateway.fleet.site import SiteClient, site_endpoint
 from gateway.hub.endpoint import SITE_NAME
+from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
+from gateway.hub.transports.base import Client
+from gateway.hub.transports.zenoh.session import Payload
 from gateway.live.control_socket import (
     ControlError,
     ControlServer,
@@ -34,14 +37,14 @@ from gateway.vehicle.signing import key_from_passphrase
 
 log = logging.getLogger(__name__)
 
-KEEP_S: Final = 1.0
-"""How often changed ids are written, rates are taken, and the router is looked for."""
+POLL_S: Final = 1.0
+"""Interval of writing changed ids, updating rates, and looking for the router."""
 ONBOARD: Final = 191
-"""MAV_COMP_ID_ONBOARD_COMPUTER: its numbers are not the vehicle's, so that a text is no loss."""
+"""MAV_COMP_ID_ONBOARD_COMPUTER: its sequence numbers are independent of the autopilot's."""
 MAX_SITES: Final = 2000
-"""Names that strangers may fill the memory with."""
-FORGET_US: Final = 3600 * US_PER_S
-"""After so long without a frame a vehicle's id, or a site's place, may go to another."""
+"""Site names that are remembered; more are forged."""
+ABANDONED_US: Final = 3600 * US_PER_S
+"""After so long without a frame a vehicle may lose its id, and a site is removed."""
 
 
 class IdParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -50,7 +53,34 @@ class IdParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     site: str
     system_id: int
     own_id: int
-    """0 to leave it out."""
+    """0 to exclude it."""
+
+
+class FleetHub(Hub):
+    """A hub without vehicles of its own, which drops frames that clients return from sites.
+
+    Parameters
+    ----------
+    settings : HubSettings
+        Endpoints of the ground stations.
+    now_us : callable
+        The gateway clock.
+    loops : LoopDetection
+        Remembers frames sent to sites.
+    """
+
+    def __init__(
+        self, settings: HubSettings, now_us: Callable[[], int], loops: LoopDetection
+    ) -> None:
+        super().__init__(settings, lambda _: None, now_us)
+        self._loops = loops
+        self._deliver_new = self.deliver
+        self.deliver = self._deliver_once
+
+    def _deliver_once(self, client: Client, frame: bytes, now_us: int) -> None:
+        # A returned frame has an id of the site, which is another vehicle's here.
+        if not self._loops.is_returned_by_client(frame, now_us):
+            self._deliver_new(client, frame, now_us)
 
 
 class FleetServer:
@@ -59,32 +89,34 @@ class FleetServer:
     Parameters
     ----------
     settings : FleetSettings
-        Which sites, through which router.
+        Sites and router.
     hub_settings : HubSettings
-        Where ground stations are.
+        Endpoints of the ground stations.
 
     Raises
     ------
     ValueError
-        If a pattern, Zenoh's file or the file of ids is wrong.
+        If a pattern, Zenoh's file or the file of ids is malformed, or it would listen beyond
+        loopback without authentication.
     ModuleNotFoundError
         If Zenoh is not installed.
     """
 
     def __init__(self, settings: FleetSettings, hub_settings: HubSettings) -> None:
         self._now_us = GatewayClock()
-        events = SessionEvents(self._take, self._note_session, self._note_round_trip)
+        events = SessionEvents(self._handle, self._handle_presence, self._handle_round_trip)
         self._session = FleetSession(settings, events, self._now_us)
-        self._ids_file = IdsFile(Path(settings.ids_file).expanduser())
+        self._ids_file = IdsFile(Path(settings.ids_file).expanduser(), settings.vehicles_per_site)
         self._ids = self._ids_file.ids
-        self._keys = {
-            each.name: key_from_passphrase(each.passphrase)
+        at_zero_us = time.time_ns() // 1000 - self._now_us()
+        self._signatures = {
+            each.name: SiteSignatures(key_from_passphrase(each.passphrase), at_zero_us)
             for each in settings.site
             if each.passphrase
         }
         self._ping_interval_us = round(hub_settings.ping_interval_s * US_PER_S)
         self._ping_us = 0
-        self._loops = LoopWatch()
+        self._loops = LoopDetection()
         self._hub = FleetHub(hub_settings, self._now_us, self._loops)
         self._metrics = MetricsServer(self._metrics_text)
         self._metrics_port = hub_settings.metrics_port
@@ -98,29 +130,31 @@ class FleetServer:
 
     @property
     def control_socket(self) -> Path:
-        """Where it can be asked."""
+        """Path of the control socket."""
         return self._control.path
 
     @property
-    def place(self) -> str:
-        """Where the router is, or where this one listens as the router."""
-        return self._session.place
+    def locator(self) -> str:
+        """Locator of the router, or where this one listens as the router."""
+        return self._session.locator
 
     async def start(self) -> None:
-        """Open everything; a router that is not there yet is waited for.
+        """Open everything; a router that does not answer yet is retried.
 
         Raises
         ------
         ControlError
-            If the control socket cannot be made.
+            If the control socket cannot be created.
         """
+        if self._session.warning:
+            log.warning("%s", self._session.warning)
         await self._control.start()
         self._hub.start()
         self._metrics.listen(self._metrics_port)
-        self._task = asyncio.get_running_loop().create_task(self._keep())
+        self._task = asyncio.get_running_loop().create_task(self._poll())
 
     def close(self) -> None:
-        """End everything."""
+        """Close everything."""
         if self._task is not None:
             self._task.cancel()
         self._session.close()
@@ -130,10 +164,10 @@ class FleetServer:
         self._control.close()
 
     def status(self) -> dict[str, Any]:
-        """Return sites and vehicles as they are now, for people and programs."""
+        """Return the present state of sites and vehicles."""
         now_us = self._now_us()
         return {
-            "router": self._session.place,
+            "router": self._session.locator,
             "is_router": self._session.is_router,
             "is_linked": self._session.is_linked,
             "sites": [self._sites[name].describe(now_us) for name in sorted(self._sites)],
@@ -146,8 +180,8 @@ class FleetServer:
         }
 
     def _metrics_text(self) -> Iterator[str]:
-        # Not above: most fleets serve no metrics, and need not wait for the library.
-        from gateway.fleet.fleet_metrics import fleet_families
+        # Imported late: most fleets serve no metrics.
+        from gateway.fleet.metrics import fleet_families
         from gateway.live.hub_metrics import hub_families, text_of
 
         status, hub = self.status(), self._hub
@@ -157,7 +191,7 @@ class FleetServer:
 
     async def _set_id(self, params: IdParams) -> list[str]:
         if not SITE_NAME.fullmatch(params.site):
-            raise ControlError(f"site {params.site!r}: letters, digits, . _ and - only")
+            raise ControlError(f"site {params.site!r}: only letters, digits, . _ and - are allowed")
         try:
             if params.own_id == LEFT_OUT:
                 self._ids.leave_out(params.site, params.system_id)
@@ -167,15 +201,15 @@ class FleetServer:
             raise ControlError(str(error)) from error
         if reason := await self._ids_file.keep():
             raise ControlError(
-                f"the id counts from now on, but is not kept: {self._ids_file.file}: {reason}; "
-                "it is tried again until the fleet ends"
+                f"the id is used from now on, but not saved: {self._ids_file.file}: {reason}; "
+                "writing is retried until the fleet ends"
             )
         return [
-            f"{site}/{system} {f'= {own_id}' if own_id else 'is left out'}"
+            f"{site}/{system} {f'= {own_id}' if own_id else 'is excluded'}"
             for (site, system), own_id in self._ids.items()
         ]
 
-    async def _keep(self) -> None:
+    async def _poll(self) -> None:
         while True:
             await self._session.open()
             await self._ids_file.keep()
@@ -186,31 +220,31 @@ class FleetServer:
             if self._ping_interval_us and now_us - self._ping_us >= self._ping_interval_us:
                 self._ping_us = now_us
                 self._session.ask_round_trips()
-            await asyncio.sleep(KEEP_S)
+            await asyncio.sleep(POLL_S)
 
     def _make_room(self, now_us: int) -> None:
-        """Let those wait no longer whom others, of whom nothing is heard, keep out."""
+        """Pass on the id of one abandoned vehicle, and remove abandoned sites."""
         if self._ids.unmapped:
             heard_us = {
                 (name, system_id): traffic.heard_us
                 for name, site in self._sites.items()
                 for system_id, traffic in site.translation.traffic.items()
             }
-            # One at a time: it takes some milliseconds where many wait.
-            if done := self._ids.make_room(heard_us, now_us - FORGET_US):
-                text = "id %d of %s/%d, long not heard, is that of %s/%d now"
+            # One at a time: it takes some milliseconds when many wait.
+            if done := self._ids.make_room(heard_us, now_us - ABANDONED_US):
+                text = "id %d of %s/%d, not received for an hour, is now of %s/%d"
                 log.warning(text, done.own_id, *done.former, *done.holder)
         if len(self._sites) >= MAX_SITES:
             for name, site in list(self._sites.items()):
-                if not site.is_here and now_us - (site.heard_us or site.since_us) > FORGET_US:
+                if not site.is_here and now_us - (site.heard_us or site.since_us) > ABANDONED_US:
                     del self._sites[name]
                     self._hub.vanish(site)
 
-    def _take(self, name: str, data: bytes, is_own: bool) -> None:
+    def _handle(self, name: str, payload: Payload, is_own: bool) -> None:
         if (site := self._site(name)) is not None:
-            site.take(data, is_own=is_own)
+            site.handle(payload, is_own=is_own)
 
-    def _note_round_trip(self, name: str, round_trip_us: int) -> None:
+    def _handle_round_trip(self, name: str, round_trip_us: int) -> None:
         if (site := self._sites.get(name)) is not None:
             site.round_trip_us = round_trip_us
 
@@ -221,33 +255,30 @@ class FleetServer:
             self._bad_names += 1
             return None
         client = SiteClient(self._hub, self._hub.new_client_id(), site_endpoint(name))
-        translation = FrameTranslation(name, self._ids, self._keys.get(name), self._loops)
-        site = self._sites[name] = client.set_up(translation, lambda: self._session.outlets)
+        translation = FrameTranslation(name, self._ids, self._signatures.get(name), self._loops)
+        site = self._sites[name] = client.set_up(translation, lambda: self._session.publishers)
         self._hub.appear(site)
         return site
 
-    def _note_session(self, name: str, token: str, is_here: bool) -> None:
+    def _handle_presence(self, name: str, token: str, is_here: bool) -> None:
         site = self._site(name)
         if site is None:
             return
-        was_here = site.is_here
-        if is_here:
-            site.tokens.add(token)
-            if len(site.tokens) > 1:
-                log.warning("%d sites are called %r; rename one of them", len(site.tokens), name)
-        else:
-            site.tokens.discard(token)
-        if site.is_here == was_here:
+        before = len(site.tokens)
+        has_changed = site.handle_presence(token, is_here)
+        if 1 < len(site.tokens) > before:
+            log.warning("%d sites are called %r; rename one of them", len(site.tokens), name)
+        if not has_changed:
             return
-        log.info("site %s %s", name, "is here" if site.is_here else "is gone")
+        log.info("site %s %s", name, "connected" if site.is_here else "disconnected")
         if not site.is_here:
             site.become("gone")
             site.round_trip_us = None
             self._report_gone(site)
 
     def _report_gone(self, site: SiteClient) -> None:
-        """Report it to the ground stations once, in the name of each of the site's vehicles."""
-        text = f"Site {site.endpoint.site} is gone"[:50].encode()
+        """Send the ground stations one text from each of the site's vehicles."""
+        text = f"Site {site.endpoint.site} disconnected"[:50].encode()
         for system_id in site.translation.traffic:
             own_id = self._ids.known_id(site.endpoint.site, system_id)
             if own_id is None:

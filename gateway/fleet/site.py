@@ -1,32 +1,34 @@
-"""A site as one client of the hub here: its vehicles are heard behind it, under ids of ours."""
+"""A site as one client of the fleet's hub, with its vehicles behind it under ids of this side."""
 
 from collections.abc import Callable
 from typing import Any, Final
 
-from gateway.edges.hub.fleet_link.site_keys import in_key
-from gateway.edges.hub.fleet_link.zenoh_session import PATIENT_IDS, Outlets
 from gateway.fleet.frame_translation import FrameTranslation
-from gateway.hub.endpoint import Endpoint
+from gateway.hub.endpoint import SITE_NAME, Endpoint
 from gateway.hub.transports.base import Client
+from gateway.hub.transports.zenoh.keys import in_key
+from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import SplitFault, key_of, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
-"""No message has this number. One site's telemetry is none of another's: a site gets what addresses
-its vehicles and what ground stations say to all."""
+"""No message has this number. No site receives the telemetry of another: it gets frames addressed
+to its vehicles, and broadcasts of ground stations."""
+MAX_SESSIONS: Final = 16
+"""Sessions under the name of one site that are remembered; more are forged."""
 
 
 class SiteClient(Client):
-    """One site; what moves frames is shared by all."""
+    """One site of the fleet."""
 
-    outlets: Callable[[], Outlets | None]
+    publishers: Callable[[], Publishers | None]
     translation: FrameTranslation
     tokens: set[str]
-    """Its sessions that are there by Zenoh's liveliness; more than one are namesakes."""
+    """Its sessions by Zenoh's liveliness; more than one are sites of the same name."""
 
     @property
     def is_here(self) -> bool:
-        """Whether a session of it is there."""
+        """Whether a session of it is present."""
         return bool(self.tokens)
 
     @property
@@ -35,18 +37,32 @@ class SiteClient(Client):
         return True
 
     def set_up(
-        self, translation: FrameTranslation, outlets: Callable[[], Outlets | None]
+        self, translation: FrameTranslation, publishers: Callable[[], Publishers | None]
     ) -> "SiteClient":
-        """Give the site its ids and its way out."""
+        """Set the translation of its frames, and where frames for it are published."""
         self.tokens = set()
         self.translation = translation
-        self.outlets = outlets
+        self.publishers = publishers
         self.become("connecting")
         return self
 
-    def take(self, data: bytes, *, is_own: bool) -> None:
-        """Take what the site has published; of its gateway's own vehicles, or of its clients."""
+    def handle_presence(self, token: str, is_here: bool) -> bool:
+        """Update its sessions; return whether the site has appeared or disappeared."""
+        was_here = self.is_here
+        if not is_here:
+            self.tokens.discard(token)
+        elif len(self.tokens) < MAX_SESSIONS and SITE_NAME.fullmatch(token):
+            self.tokens.add(token)
+        return self.is_here != was_here
+
+    def handle(self, payload: Payload, *, is_own: bool) -> None:
+        """Handle a published message, of the gateway's own vehicles or of its clients."""
+        data, size = payload
         now_us = self.context.now_us()
+        if not data:
+            self.counters.bytes_received += size
+            self.counters.bytes_garbage += size
+            return
         if self.state != "open":
             self.become("open")
         for event in split_datagram(data):
@@ -64,14 +80,14 @@ class SiteClient(Client):
 
     def transmit(self, frame: bytes, message_id: int) -> None:
         """Publish a frame for a vehicle of the site."""
-        outlets = self.outlets()
+        publishers = self.publishers()
         found = self.translation.to_site(frame, self.context.now_us())
-        if outlets is None or found is None:
+        if publishers is None or found is None:
             self.counters.dropped += 1
             return
         system_id, changed = found
         key = in_key(self.endpoint.site, system_id)
-        if outlets.publish(key, changed, patient=message_id in PATIENT_IDS):
+        if publishers.publish(key, changed, reliable=message_id in RELIABLE_IDS):
             self.counters.sent += 1
             self.counters.bytes_sent += len(changed)
         else:
@@ -101,15 +117,17 @@ class SiteClient(Client):
             "bytes_garbage": self.counters.bytes_garbage,
             "unknown": counters.unknown,
             "signed": counters.signed,
+            "unsigned": counters.unsigned,
             "forged": counters.forged,
+            "replayed": counters.replayed,
             "looped": counters.looped,
         }
 
     @property
     def queued(self) -> int:
         """Frames of all sites that wait for a congested link."""
-        outlets = self.outlets()
-        return 0 if outlets is None else outlets.queued
+        publishers = self.publishers()
+        return 0 if publishers is None else publishers.queued
 
 
 def site_endpoint(site: str) -> Endpoint:

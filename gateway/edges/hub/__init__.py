@@ -1,1 +1,0 @@
-"""The hub: MAVLink to and from every client, one file per transport."""

@@ -1,1 +1,0 @@
-"""MAVLink through a Zenoh router: what a site and its fleet have in common."""

@@ -1,0 +1,112 @@
+"""Detect frames that a fleet sent to its stations and that return through a site that they feed.
+
+Frames pass a hub byte for byte, so a frame of a vehicle that equals one sent recently for another
+vehicle has most likely gone round. Two aircraft of one type send equal frames too: heartbeats
+differ only in the sequence number, and many aircraft have the same system id. So equal frames of
+vehicles with equal ids prove nothing, and a vehicle that has an id loses no frame before a whole
+run of its frames has been here. Frames marked as made by the site's own gateway are not checked.
+"""
+
+from typing import Final
+
+import msgspec
+
+from gateway.fleet.id_map import Vehicle
+from gateway.hub.routing_table import FrameMemory
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of
+
+SPAN_US: Final = 3 * US_PER_S
+"""Longest way through a site and back, over two slow links."""
+MAX_FRAMES: Final = 1 << 15
+"""Frames of a span: 200 aircraft at 50 messages/s; two spans take some 20 MB."""
+MAX_CHANCE: Final = 8
+"""A longer run of frames is not equal to those of another vehicle by chance."""
+MAX_KINDS: Final = 1 << 14
+"""Messages times vehicles that are remembered; more are forged."""
+NO_SITE: Final = ""
+"""Site of the ground stations here."""
+
+
+class _Sent(msgspec.Struct, frozen=True, gc=False):
+    """A frame that was sent to the stations here."""
+
+    time_us: int
+    vehicle: Vehicle
+    is_proof: bool
+    """Whether no other vehicle sends the same by itself."""
+
+
+class LoopDetection:
+    """Frames sent recently to either side, and vehicles that return nothing else."""
+
+    def __init__(self) -> None:
+        self._given: FrameMemory[_Sent] = FrameMemory(SPAN_US, MAX_FRAMES)
+        self._sent: FrameMemory[int] = FrameMemory(SPAN_US, MAX_FRAMES)
+        """Frames changed for a site, and until when they may return."""
+        self._newest: dict[tuple[Vehicle, int, int], bytes] = {}
+        """Newest payload of each message of each component of a vehicle."""
+        self._runs: dict[Vehicle, int] = {}
+        """Number of its last frames in a row that had been here."""
+        self._proven: set[Vehicle] = set()
+        """Vehicles proven to return frames, until they send one of their own."""
+        self.looped = 0
+        """Frames sent to a site that a client here returned."""
+
+    def record_given(self, frame: bytes, vehicle: Vehicle, now_us: int) -> None:
+        """Remember a frame of a vehicle sent to the ground stations here."""
+        kind = (vehicle, origin_of(frame)[1], message_id_of(frame))
+        head = 10 if frame[0] == START_V2 else 6
+        payload = frame[head : head + frame[1]]
+        before = self._newest.get(kind)
+        if before is None and len(self._newest) >= MAX_KINDS:
+            self._newest.clear()
+        self._newest[kind] = payload
+        self._given.turn(now_us)
+        self._given.put(frame, _Sent(now_us, vehicle, before not in (None, payload)))
+
+    def record_sent(self, frame: bytes, changed: bytes, now_us: int) -> None:
+        """Remember a frame of a client here, as received and as sent to a site."""
+        station = (NO_SITE, origin_of(frame)[0])
+        self.record_given(frame, station, now_us)
+        if changed != frame:
+            self.record_given(changed, station, now_us)
+            self._sent.turn(now_us)
+            self._sent.put(changed, now_us + 2 * SPAN_US)
+
+    def is_returned(self, frame: bytes, vehicle: Vehicle, *, has_id: bool, now_us: int) -> bool:
+        """Return whether a frame of a site has been here before.
+
+        Parameters
+        ----------
+        frame : bytes
+            As it was published.
+        vehicle : Vehicle
+            Its sender, by its key and its header.
+        has_id : bool
+            Whether that vehicle has an id here.
+        now_us : int
+            Gateway time.
+        """
+        known = self._given.get(frame)
+        if known is None or known.vehicle == vehicle or now_us - known.time_us > 2 * SPAN_US:
+            self._runs.pop(vehicle, None)
+            self._proven.discard(vehicle)
+            return False
+        run = self._runs[vehicle] = self._runs.get(vehicle, 0) + 1
+        if known.is_proof:
+            self._proven.add(vehicle)
+        is_proven = vehicle in self._proven
+        if has_id:
+            return is_proven and run > MAX_CHANCE
+        # Two vehicles with the same id may send the same; not if one id was changed.
+        was_changed = known.vehicle[1] != vehicle[1] or known.vehicle[0] == NO_SITE
+        return is_proven or was_changed or run <= MAX_CHANCE
+
+    def is_returned_by_client(self, frame: bytes, now_us: int) -> bool:
+        """Return whether a client here returns a frame sent to a site, and count it."""
+        until_us = self._sent.get(frame)
+        if until_us is None or now_us > until_us:
+            return False
+        self.looped += 1
+        return True

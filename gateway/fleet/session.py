@@ -1,0 +1,360 @@
+"""The Zenoh session of a fleet: subscriptions, presence, round trips and queries.
+
+As a router it listens beyond loopback only with authentication: TLS that verifies client
+certificates, or Zenoh's user and password. `insecure` in the settings lifts that, with a warning.
+"""
+
+import logging
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+import msgspec
+
+from gateway.fleet.settings import FleetSettings
+from gateway.hub.hosts import is_loopback
+from gateway.hub.transports.zenoh.keys import (
+    MAX_KEY,
+    OWN,
+    out_key,
+    ping_key,
+    presence_key,
+    site_of,
+)
+from gateway.hub.transports.zenoh.session import (
+    LoopQueue,
+    Payload,
+    Publishers,
+    Subscription,
+    end_session,
+    off_loop,
+    open_session,
+    payload_of,
+    session_config,
+)
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+PATTERN: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}")
+MAX_KEYS: Final = 4096
+"""Declared keys: more than there are vehicles that can have an id."""
+PING_TIMEOUT_S: Final = 5.0
+"""Longest round trip that is measured."""
+MAX_ANSWER: Final = 256 << 10
+"""Bytes of one answer of a site: a list of some 2500 recordings, or a piece of one."""
+MAX_ANSWERS: Final = 16 << 20
+"""Bytes of the answers of all sites to one query."""
+ANSWER_OVERHEAD: Final = 64
+"""Bytes counted for an answer besides its payload, so that empty ones are bounded too."""
+VERIFIED: Final = ("tls", "quic")
+"""Protocols whose clients can be verified by their certificates."""
+LOCAL: Final = "unixsock-stream"
+"""The protocol that no other machine can reach."""
+
+Decoded = TypeVar("Decoded")
+
+
+@dataclass(frozen=True, slots=True)
+class SessionEvents:
+    """Callbacks of a session, called on the loop."""
+
+    frames: Callable[[str, Payload, bool], None]
+    """Site, what it has published, and whether that is of its gateway's own vehicles."""
+    presence: Callable[[str, str, bool], None]
+    """Site, one of its sessions, and whether that is here or gone."""
+    round_trip: Callable[[str, int], None]
+    """Site, and the round trip in microseconds."""
+
+
+class NoAnswerError(Exception):
+    """No site answered a query: the site, or the router, is not there."""
+
+
+class QueryRefusedError(Exception):
+    """A site refused a query; the text says why."""
+
+
+class FleetSession:
+    """A session that subscribes to sites.
+
+    Parameters
+    ----------
+    settings : FleetSettings
+        Which sites, the router, and Zenoh's own file.
+    events : SessionEvents
+        Callbacks.
+    now_us : callable
+        The gateway clock.
+
+    Raises
+    ------
+    ValueError
+        If a pattern, Zenoh's file or the locator is malformed, or it would listen beyond loopback
+        without authentication.
+    ModuleNotFoundError
+        If Zenoh is not installed.
+    """
+
+    def __init__(
+        self,
+        settings: FleetSettings,
+        events: SessionEvents,
+        now_us: Callable[[], int],
+    ) -> None:
+        self.is_router = not settings.router
+        self.locator = settings.router or settings.listen
+        mode = "router" if self.is_router else "client"
+        self._config = session_config(self.locator, settings.zenoh_config, mode)
+        self.warning = ""
+        """What is unsafe about the way it listens; empty if nothing is."""
+        if self.is_router and (lack := missing_authentication(self.locator, self._config)):
+            if not settings.insecure:
+                raise ValueError(
+                    f"{lack}. See docs/fleet.md, Mutual TLS, or set insecure = true in [fleet]"
+                )
+            self.warning = f"insecure: {lack}; everyone who reaches it can command every vehicle"
+        self.patterns = [key_pattern(site) for site in settings.sites]
+        self._events = events
+        self._now_us = now_us
+        self._session: zenoh.Session | None = None
+        self.publishers: Publishers | None = None
+        self._queues: list[LoopQueue[Any]] = []
+        self._subscriptions: list[Subscription] = []
+        self._keys: dict[str, zenoh.KeyExpr | None] = {}
+        """Declared keys; a declaration ends with its object."""
+        self._declared: list[object] = []
+        self._trouble = ""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether there is a session, with a router or without."""
+        return self._session is not None
+
+    @property
+    def is_linked(self) -> bool:
+        """Whether sites can be reached."""
+        session = self._session
+        return session is not None and (self.is_router or bool(session.info.routers_zid()))
+
+    @property
+    def overflowed(self) -> int:
+        """Messages dropped because they arrived faster than they were handled."""
+        return sum(each.dropped for each in self._subscriptions)
+
+    async def open(self) -> None:
+        """Open the session if it is not open, and subscribe; log a failure once."""
+        if self._session is not None:
+            return
+        try:
+            session = await off_loop(open_session, self._config)
+        except OSError as error:
+            if str(error) != self._trouble:
+                self._trouble = str(error)
+                log.warning("%s: %s; retrying", self.locator, error)
+            return
+        self._trouble = ""
+        self._session, self.publishers = session, Publishers(session)
+        self._declare(session)
+
+    def close(self) -> None:
+        """End the session; a thread closes it, which may take a moment."""
+        for each in self._queues:
+            each.close()
+        for subscription in self._subscriptions:
+            subscription.close()
+        if self.publishers is not None:
+            self.publishers.close()
+        if self._session is not None:
+            off_loop(end_session, self._session, self.publishers, self._declared)
+        self._session, self.publishers, self._declared = None, None, []
+
+    def ask_round_trips(self) -> None:
+        """Query every site for its round trip; one query serves all sites of a pattern."""
+        import zenoh
+
+        if self._session is None or not self.is_linked:
+            return
+        asked_us, trips = self._now_us(), self._queues[-1]
+
+        def record(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                trips.put((site_of(str(reply.ok.key_expr)), self._now_us() - asked_us))
+
+        for pattern in self.patterns:
+            self._session.get(
+                ping_key(pattern),
+                record,
+                target=zenoh.QueryTarget.ALL,
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.DROP,
+                timeout=PING_TIMEOUT_S,
+            )
+
+    async def query(
+        self, key: str, payload: bytes, timeout_s: float, decode: Callable[[str, bytes], Decoded]
+    ) -> dict[str, Decoded]:
+        """Query the sites of a key at the lowest priority, off the loop.
+
+        Parameters
+        ----------
+        key : str
+            Key of one site or, with a pattern, of several.
+        payload : bytes
+            The query.
+        timeout_s : float
+            Longest wait.
+        decode : callable
+            Decodes the answer of a site, on a thread.
+
+        Returns
+        -------
+        dict of str
+            The first answer of each site, decoded; none above `MAX_ANSWER`.
+
+        Raises
+        ------
+        NoAnswerError
+            If there is none.
+        QueryRefusedError
+            If the only answers are refusals.
+        """
+        if self._session is None:
+            raise NoAnswerError(f"{self.locator}: no session")
+        work: Callable[[], dict[str, Decoded]] = partial(
+            _query, self._session, key, payload, timeout_s, decode
+        )
+        return await off_loop(work)
+
+    def _declare(self, session: "zenoh.Session") -> None:
+        import zenoh
+
+        events = self._events
+        presence: LoopQueue[tuple[str, bool]] = LoopQueue(self._handle_token)
+        trips: LoopQueue[tuple[str, int]] = LoopQueue(lambda item: events.round_trip(*item))
+        self._queues = [presence, trips]
+        here = zenoh.SampleKind.PUT
+        for pattern in self.patterns:
+            subscription = Subscription(session, out_key(pattern, "*"), self._handle)
+            self._subscriptions.append(subscription)
+            self._declared += [
+                subscription,
+                session.liveliness().declare_subscriber(
+                    presence_key(pattern, "*"),
+                    lambda sample: presence.put((str(sample.key_expr), sample.kind == here)),
+                    history=True,
+                ),
+            ]
+
+    def _handle(self, sample: "zenoh.Sample") -> None:
+        key, attachment = str(sample.key_expr), sample.attachment
+        if key not in self._keys and len(self._keys) < MAX_KEYS and len(key) <= MAX_KEY:
+            self._keys[key] = None
+            off_loop(_declare_key, self._session, key, self._keys)
+        is_own = (
+            attachment is not None and len(attachment) == len(OWN) and attachment.to_bytes() == OWN
+        )
+        self._events.frames(site_of(key), payload_of(sample), is_own)
+
+    def _handle_token(self, news: tuple[str, bool]) -> None:
+        key, is_here = news
+        self._events.presence(site_of(key), key.rpartition("/")[2], is_here)
+
+
+def _declare_key(
+    session: "zenoh.Session", key: str, declared: "dict[str, zenoh.KeyExpr | None]"
+) -> None:
+    """Resolve a key once: else Zenoh would search the tokens of all sites for every message."""
+    import zenoh
+
+    with suppress(zenoh.ZError):
+        declared[key] = session.declare_keyexpr(key)
+
+
+def key_pattern(site: str) -> str:
+    """Return a pattern of sites as Zenoh writes it in one part of a key.
+
+    Raises
+    ------
+    ValueError
+        If it is malformed.
+    """
+    if not PATTERN.fullmatch(site) or "**" in site:
+        raise ValueError(f"site {site!r}: letters, digits, . _ - and single * only")
+    return site if site == "*" else site.replace("*", "$*")
+
+
+def missing_authentication(locator: str, config: "zenoh.Config") -> str:
+    """Return why a router that listens here would admit everyone; empty if it does not.
+
+    Parameters
+    ----------
+    locator : str
+        Where it listens.
+    config : zenoh.Config
+        Its configuration.
+    """
+    protocol, _, rest = locator.partition("/")
+    host = rest.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    if protocol == LOCAL or is_loopback(host):
+        return ""
+    tls = msgspec.json.decode(config.get_json("transport/link/tls")) or {}
+    login = (msgspec.json.decode(config.get_json("transport/auth")) or {}).get("usrpwd") or {}
+    verifies = tls.get("enable_mtls") and tls.get("root_ca_certificate")
+    if (protocol in VERIFIED and verifies) or login.get("dictionary_file"):
+        return ""
+    return (
+        f"{locator} is reachable from other machines, and zenoh_config has neither TLS with client "
+        "certificates (enable_mtls, root_ca_certificate) nor users (usrpwd, dictionary_file)"
+    )
+
+
+def _query(
+    session: "zenoh.Session",
+    key: str,
+    payload: bytes,
+    timeout_s: float,
+    decode: Callable[[str, bytes], Decoded],
+) -> dict[str, Decoded]:
+    import zenoh
+
+    found: dict[str, Decoded] = {}
+    refusal = ""
+    room = MAX_ANSWERS
+    try:
+        for reply in session.get(
+            key,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            priority=zenoh.Priority.BACKGROUND,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            timeout=timeout_s,
+            payload=payload,
+        ):
+            answer = reply.ok.payload if reply.ok is not None else None
+            fault = reply.err.payload if reply.err is not None else None
+            size = sum(len(each) for each in (answer, fault) if each is not None)
+            room -= min(size, MAX_ANSWER) + ANSWER_OVERHEAD
+            if room < 0:
+                log.warning("query %s: answers above %d bytes are ignored", key, MAX_ANSWERS)
+                break
+            if size > MAX_ANSWER:
+                refusal = f"the answer is above {MAX_ANSWER} bytes"
+            elif answer is not None and reply.ok is not None:
+                site = site_of(str(reply.ok.key_expr))
+                if site and site not in found:
+                    found[site] = decode(site, answer.to_bytes())
+            elif fault is not None:
+                refusal = fault.to_bytes().decode(errors="replace")
+    except zenoh.ZError as error:
+        raise NoAnswerError(str(error)) from error
+    if found:
+        return found
+    if refusal and refusal != "Timeout":
+        raise QueryRefusedError(refusal)
+    raise NoAnswerError("no answer")

@@ -1,0 +1,120 @@
+"""Signatures of a site's frames: checked with its passphrase, replays rejected.
+
+Each stream (link, system, component) has a sliding window of signing timestamps, as IPsec has of
+sequence numbers [1]_: Zenoh sends commands, answers and texts with a higher priority than
+telemetry, so frames of one stream may overtake each other. A timestamp is accepted once, and only
+if it is newer than the end of the window. The first one of a stream must not be more than a minute
+behind the clock of the fleet, as MAVLink demands [2]_.
+
+References
+----------
+.. [1] RFC 4303, section 3.4.3.
+.. [2] https://mavlink.io/en/guide/message_signing.html
+"""
+
+import hashlib
+import hmac
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, is_signed, origin_of
+
+HASH_BYTES: Final = 6
+EPOCH_2015_US: Final = 1_420_070_400_000_000
+TICK_US: Final = 10
+TICKS_PER_S: Final = 1_000_000 // TICK_US
+WINDOW_TICKS: Final = 5 * TICKS_PER_S
+"""Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
+NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
+"""Largest age of the first timestamp of a stream."""
+MAX_STREAMS: Final = 1024
+"""Streams of one site; only a holder of the passphrase begins one."""
+
+
+class Rejection(StrEnum):
+    """Why a frame of a site with a passphrase is dropped; also the name of its counter."""
+
+    UNSIGNED = "unsigned"
+    FORGED = "forged"
+    REPLAYED = "replayed"
+
+
+@dataclass(slots=True)
+class _Window:
+    newest: int
+    seen: set[int] = field(default_factory=set)
+    """Accepted timestamps within the window."""
+    pruned: int = 0
+    """Newest timestamp when `seen` was last pruned."""
+
+    def accepts(self, timestamp: int) -> bool:
+        if timestamp <= self.newest - WINDOW_TICKS or timestamp in self.seen:
+            return False
+        self.newest = max(self.newest, timestamp)
+        self.seen.add(timestamp)
+        if self.newest - self.pruned > WINDOW_TICKS:
+            self.pruned = self.newest
+            self.seen = {each for each in self.seen if each > self.newest - WINDOW_TICKS}
+        return True
+
+
+class SiteSignatures:
+    """Check and renew the signatures of one site.
+
+    Parameters
+    ----------
+    key : bytes
+        32 bytes, derived from the site's passphrase.
+    unix_us_at_zero : int
+        Unix time, in microseconds, when the gateway clock was zero.
+    """
+
+    def __init__(self, key: bytes, unix_us_at_zero: int) -> None:
+        self._key = key
+        self._offset_us = unix_us_at_zero - EPOCH_2015_US
+        self._windows: dict[tuple[int, int, int], _Window] = {}
+
+    def check(self, frame: bytes, now_us: int) -> Rejection | None:
+        """Return why a frame of the site is rejected; None if it is accepted.
+
+        Parameters
+        ----------
+        frame : bytes
+            A complete frame as it was published.
+        now_us : int
+            Gateway time.
+        """
+        if not is_signed(frame):
+            return Rejection.UNSIGNED
+        if not self.is_genuine(frame):
+            return Rejection.FORGED
+        timestamp = int.from_bytes(frame[-HASH_BYTES * 2 : -HASH_BYTES], "little")
+        stream = (frame[-SIGNATURE_SIZE], *origin_of(frame))
+        window = self._windows.get(stream)
+        if window is None:
+            oldest = (self._offset_us + now_us) // TICK_US - NEW_STREAM_TICKS
+            if timestamp < oldest or len(self._windows) >= MAX_STREAMS:
+                return Rejection.REPLAYED
+            window = self._windows[stream] = _Window(timestamp)
+        return None if window.accepts(timestamp) else Rejection.REPLAYED
+
+    def is_genuine(self, frame: bytes) -> bool:
+        """Return whether a signed frame was signed with the passphrase."""
+        return hmac.compare_digest(self._hash(frame[:-HASH_BYTES]), frame[-HASH_BYTES:])
+
+    def renewed(self, body: bytes, former: bytes) -> bytes:
+        """Sign a changed frame with the link and the timestamp of the former one.
+
+        Parameters
+        ----------
+        body : bytes
+            The changed frame up to its checksum.
+        former : bytes
+            The whole frame before the change.
+        """
+        signed = body + former[-SIGNATURE_SIZE:-HASH_BYTES]
+        return signed + self._hash(signed)
+
+    def _hash(self, data: bytes) -> bytes:
+        return hashlib.sha256(self._key + data).digest()[:HASH_BYTES]

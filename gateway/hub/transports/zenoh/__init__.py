@@ -1,0 +1,1 @@
+"""The zenoh: endpoint: MAVLink of a site through a Zenoh router."""

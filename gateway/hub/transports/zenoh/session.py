@@ -1,0 +1,434 @@
+"""A Zenoh session next to an event loop that never waits for it.
+
+Theory of operation. Zenoh calls back on threads of its own; received messages are queued there and
+handled by the loop, a bounded number at a time. Messages that may be dropped are published by the
+loop itself, because Zenoh then never waits. The others are published by a thread, because Zenoh
+waits while a link is congested: 5 s before it gives a message up, 10 s before it gives a session
+up. Python cannot end in order meanwhile, so every call that may wait runs in `off_loop`'s threads,
+and the end of the process waits for those with a timeout (`end_calls`).
+
+Nothing is published as `express`: that gives every message a batch of its own, and a link has only
+a few batches, so an idle link would drop frames of a short burst. Messages that share batches leave
+as soon as the link is free, so nothing is held back for it.
+"""
+
+import asyncio
+import logging
+import queue
+import re
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+
+import msgspec
+
+from gateway.hub.send_queue import BULK_IDS
+from gateway.reasons import reason_of
+
+if TYPE_CHECKING:
+    import zenoh
+
+log = logging.getLogger(__name__)
+
+NOT_INSTALLED: Final = "the extra mavgate[fleet] is not installed: see mavgate doctor"
+MAX_WAITING: Final = 4096
+"""Received messages that wait for the loop: a third of a second of two hundred aircraft."""
+AT_ONCE: Final = 64
+"""Messages handled in one turn of the loop, so that a flood does not delay other clients."""
+MAX_MESSAGE: Final = 4096
+"""Bytes of one message with frames, as of a datagram; ours have at most 1100. Longer ones are
+dropped unread."""
+BYTES_AT_ONCE: Final = 4 * MAX_MESSAGE
+"""Bytes handled in one turn by a fleet, which has no sensor samples that would wait meanwhile."""
+MAX_RELIABLE: Final = 1024
+"""Messages that wait for a congested link and must not be dropped: a whole parameter list."""
+BATCHES: Final = 4
+"""Batches of 64 KiB that may wait on a link: two thousand frames, and little memory a site."""
+GIVE_UP_S: Final = 10.0
+"""Zenoh gives a message up after half of this, and closes the link."""
+RELIABLE_IDS: Final = BULK_IDS | {75, 76, 77, 253}
+"""Parameters, missions, files, commands, their answers, texts: none of them is sent again."""
+MAX_CALLS: Final = 64
+"""Calls at a time: sessions that open or end, and a query for each recording being fetched."""
+CLOSE_S: Final = 3.0
+"""Ten times the duration of closing over a link that works."""
+
+TLS_FILES: Final = (
+    "root_ca_certificate",
+    *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
+)
+NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
+SECURED: Final = ("tls/", "quic/", "wss/")
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+Payload = tuple[bytes, int]
+"""Frames of a message, and its size in bytes; no frames if it is longer than `MAX_MESSAGE`."""
+_Reliable = tuple["zenoh.Publisher", bytes, bytes | None]
+
+_calls: Final = ThreadPoolExecutor(MAX_CALLS, "zenoh")
+
+
+def off_loop(work: Callable[..., Result], *args: object) -> "asyncio.Future[Result]":
+    """Call a function that waits for Zenoh, on a thread whose end the process waits for."""
+    return asyncio.get_running_loop().run_in_executor(_calls, work, *args)
+
+
+def end_calls() -> bool:
+    """Let running calls end, refuse new ones, and return whether none is left after `CLOSE_S`."""
+    ending = threading.Thread(target=_calls.shutdown, daemon=True)
+    ending.start()
+    ending.join(CLOSE_S)
+    return not ending.is_alive()
+
+
+def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Config":
+    """Return the configuration of a session.
+
+    Parameters
+    ----------
+    locator : str
+        Where to connect, or where a router listens: `tcp/127.0.0.1:7447`.
+    file : str
+        Zenoh's own configuration file, for everything but mode, locator and scouting; empty for
+        none.
+    mode : str
+        `client`, or `router` for a session that others connect to.
+
+    Returns
+    -------
+    zenoh.Config
+
+    Raises
+    ------
+    ModuleNotFoundError
+        If Zenoh is not installed.
+    ValueError
+        If the file or the locator is malformed.
+    """
+    import zenoh
+
+    listens = "listen" if mode == "router" else "connect"
+    try:
+        if file:
+            config = zenoh.Config.from_file(Path(file).expanduser())
+        else:
+            config = zenoh.Config()
+            config.insert_json5("transport/link/tx/queue/size/data", str(BATCHES))
+        # Only the configured locator: no session joins an unknown network by itself.
+        config.insert_json5("scouting/multicast/enabled", "false")
+        config.insert_json5("scouting/gossip/enabled", "false")
+        config.insert_json5("mode", f'"{mode}"')
+        config.insert_json5(f"{listens}/endpoints", msgspec.json.encode([locator]).decode())
+        drop = "transport/link/tx/queue/congestion_control/drop/wait_before_drop"
+        config.insert_json5(drop, "0")
+    except zenoh.ZError as error:
+        raise ValueError(f"zenoh: {_message_of(error)}") from None
+    return config
+
+
+def open_session(config: "zenoh.Config") -> "zenoh.Session":
+    """Open a session; waits, so it is called off the loop.
+
+    Raises
+    ------
+    OSError
+        If nobody answers at the locator, or a certificate or key cannot be read.
+    """
+    import zenoh
+
+    _check_files(config)
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise OSError(_message_of(error)) from None
+
+
+def _check_files(config: "zenoh.Config") -> None:
+    """Name a certificate or key that cannot be read; Zenoh only reports that it cannot connect."""
+    tls: dict[str, Any] = msgspec.json.decode(config.get_json("transport/link/tls")) or {}
+    for name in TLS_FILES:
+        if file := tls.get(name):
+            try:
+                Path(file).open("rb").close()
+            except OSError as error:
+                raise OSError(f"{name} {file}: {reason_of(error)}") from None
+
+
+def end_session(
+    session: "zenoh.Session", publishers: "Publishers | None", declared: list[Any]
+) -> None:
+    """Undeclare everything declared, and close; waits, so it is called off the loop.
+
+    A declaration left at the end of Python would wait for ever for threads that have ended. A
+    publisher cannot be undeclared while its thread publishes.
+    """
+    import zenoh
+
+    if publishers is not None:
+        declared += publishers.ended()
+    while declared:
+        with suppress(zenoh.ZError, RuntimeError):
+            declared.pop().undeclare()
+    with suppress(zenoh.ZError):
+        session.close()  # type: ignore[no-untyped-call]
+
+
+def payload_of(sample: "zenoh.Sample") -> Payload:
+    """Return the frames of a message and its size; a longer one is not even copied."""
+    size = len(sample.payload)
+    return (b"" if size > MAX_MESSAGE else sample.payload.to_bytes()), size
+
+
+def part_of_turn(size: int, bytes_at_once: int) -> float:
+    """Return the part of a turn of the loop that a message of this size takes."""
+    return max(1 / AT_ONCE, min(size, MAX_MESSAGE) / bytes_at_once)
+
+
+def handle_turn(
+    waiting: deque[Item], handle: Callable[[Item], None], cost: Callable[[Item], float]
+) -> None:
+    """Handle items from the front until one turn of the loop is full."""
+    spent = 0.0
+    while waiting and spent < 1.0:
+        item = waiting.popleft()
+        spent += cost(item)
+        handle(item)
+
+
+class LoopQueue(Generic[Item]):
+    """Pass items from a thread to the loop, in order; when too many wait the oldest are dropped.
+
+    Parameters
+    ----------
+    handle : callable
+        Called on the loop with each item.
+    cost : callable, optional
+        Returns the part of a turn that an item takes.
+    pause_s : callable, optional
+        Returns for how many seconds nothing may be handled; 0 for no pause.
+    """
+
+    def __init__(
+        self,
+        handle: Callable[[Item], None],
+        cost: Callable[[Item], float] = lambda _: 1 / AT_ONCE,
+        pause_s: Callable[[], float] = lambda: 0.0,
+    ) -> None:
+        self._handle = handle
+        self._cost = cost
+        self._pause_s = pause_s
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[Item] = deque(maxlen=MAX_WAITING)
+        self._is_due = False
+        self._is_closed = False
+        self.dropped = 0
+
+    def put(self, item: Item) -> None:
+        """Queue an item; called from any thread."""
+        if self._is_closed:
+            return
+        self.dropped += len(self._waiting) == MAX_WAITING
+        self._waiting.append(item)
+        if not self._is_due:
+            self._is_due = True
+            try:
+                self._loop.call_soon_threadsafe(self._drain)
+            except RuntimeError:
+                # The loop has ended meanwhile.
+                self._is_closed = True
+
+    def close(self) -> None:
+        """Discard queued items and refuse new ones."""
+        self._is_closed = True
+        self._waiting.clear()
+
+    def _drain(self) -> None:
+        if pause_s := self._pause_s():
+            self._loop.call_later(pause_s, self._drain)
+            return
+        # Before the queue is read: an item that arrives from now on schedules another turn.
+        self._is_due = False
+        handle_turn(self._waiting, self._handle, self._cost)
+        if self._waiting and not self._is_due:
+            self._is_due = True
+            self._loop.call_soon(self._drain)
+
+
+class Subscription:
+    """Pass the messages of a subscription to the loop; the oldest are dropped on overflow.
+
+    Zenoh would call back once a message on a thread of its own, and each call would wait for
+    Python's lock: at thousands of messages a second that costs more than handling them. Here a
+    thread waits for the first message, wakes the loop, and sleeps until the loop has handled all
+    messages that arrived meanwhile.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        An open session.
+    key : str
+        Key expression.
+    handle : callable
+        Called on the loop with each message.
+    """
+
+    def __init__(
+        self, session: "zenoh.Session", key: str, handle: Callable[["zenoh.Sample"], None]
+    ) -> None:
+        import zenoh
+
+        self._handle = handle
+        self._usual = zenoh.Priority.DATA
+        self._loop = asyncio.get_running_loop()
+        self._waiting: deque[zenoh.Sample] = deque()
+        self._all_handled = threading.Event()
+        self._is_closed = False
+        # Twice, so that an overflow is dropped and counted here, not within Zenoh.
+        ring: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(2 * MAX_WAITING)
+        self._subscriber: Any = session.declare_subscriber(key, ring)
+        self.dropped = 0
+        threading.Thread(target=self._wait, name=key, daemon=True).start()
+
+    def close(self) -> None:
+        """Handle nothing more."""
+        self._is_closed = True
+        self._all_handled.set()
+
+    def undeclare(self) -> None:
+        """End the subscription."""
+        self._subscriber.undeclare()
+
+    def _wait(self) -> None:
+        for sample in self._subscriber:
+            self._all_handled.clear()
+            try:
+                self._loop.call_soon_threadsafe(self._drain, sample)
+            except RuntimeError:
+                # The loop has ended meanwhile.
+                return
+            if self._is_closed:
+                return
+            self._all_handled.wait()
+
+    def _drain(self, sample: "zenoh.Sample | None" = None) -> None:
+        waiting = self._waiting
+        while not self._is_closed and (sample := sample or self._subscriber.try_recv()) is not None:
+            if len(sample.payload) > MAX_MESSAGE:
+                # Handled at once, so that the queue is bounded in bytes.
+                self._handle(sample)
+            else:
+                waiting.append(sample)
+            sample = None
+        for _ in range(len(waiting) - MAX_WAITING):
+            oldest = waiting.popleft()
+            if oldest.priority == self._usual:
+                self.dropped += 1
+            else:
+                # Commands, parameters, missions, texts: none of them is sent again.
+                self._handle(oldest)
+        handle_turn(waiting, self._handle, _cost_of)
+        if waiting:
+            self._loop.call_soon(self._drain)
+        else:
+            self._all_handled.set()
+
+
+def _cost_of(sample: "zenoh.Sample") -> float:
+    return part_of_turn(len(sample.payload), BYTES_AT_ONCE)
+
+
+class Publishers:
+    """Publish under many keys, each declared at its first use.
+
+    Parameters
+    ----------
+    session : zenoh.Session
+        An open session.
+    """
+
+    def __init__(self, session: "zenoh.Session") -> None:
+        import zenoh
+
+        self._zenoh = zenoh
+        self._session = session
+        self._publishers: dict[tuple[str, bool], zenoh.Publisher] = {}
+        self._waiting: queue.Queue[_Reliable | None] = queue.Queue(MAX_RELIABLE)
+        self._is_closed = False
+        self._thread = threading.Thread(target=self._publish, name="zenoh-reliable", daemon=True)
+        self._thread.start()
+
+    def publish(
+        self, key: str, payload: bytes, *, reliable: bool, attachment: bytes | None = None
+    ) -> bool:
+        """Publish without waiting; return whether the message was accepted.
+
+        Parameters
+        ----------
+        key : str
+            Key to publish under.
+        payload : bytes
+            Some frames.
+        reliable : bool
+            Whether it waits for a congested link instead of being dropped.
+        attachment : bytes, optional
+            Sent with the message.
+        """
+        publisher = self._publishers.get((key, reliable)) or self._declare(key, reliable=reliable)
+        if not reliable:
+            publisher.put(payload, attachment=attachment)
+            return True
+        try:
+            self._waiting.put_nowait((publisher, payload, attachment))
+        except queue.Full:
+            return False
+        return True
+
+    @property
+    def queued(self) -> int:
+        """Messages that wait for a congested link."""
+        return self._waiting.qsize()
+
+    def close(self) -> None:
+        """Publish nothing more; waiting messages are lost."""
+        self._is_closed = True
+        # It wakes the thread; if there is no room for it the thread is awake.
+        with suppress(queue.Full):
+            self._waiting.put_nowait(None)
+
+    def ended(self) -> list["zenoh.Publisher"]:
+        """Wait for the message being published, and return the publishers to undeclare."""
+        self._thread.join(GIVE_UP_S)
+        return [*self._publishers.values()]
+
+    def _declare(self, key: str, *, reliable: bool) -> "zenoh.Publisher":
+        control, priority = self._zenoh.CongestionControl, self._zenoh.Priority
+        publisher = self._session.declare_publisher(
+            key,
+            congestion_control=control.BLOCK if reliable else control.DROP,
+            priority=priority.INTERACTIVE_HIGH if reliable else priority.DATA,
+        )
+        self._publishers[key, reliable] = publisher
+        return publisher
+
+    def _publish(self) -> None:
+        while (item := self._waiting.get()) is not None and not self._is_closed:
+            publisher, payload, attachment = item
+            try:
+                publisher.put(payload, attachment=attachment)
+            except self._zenoh.ZError as error:
+                log.debug("not published: %s", error)
+
+
+def _message_of(error: Exception) -> str:
+    """Return Zenoh's message without the position in its source code."""
+    text = str(error).partition(" at /")[0].strip()
+    if (found := NO_ANSWER.fullmatch(text)) is None:
+        return text
+    if found[1].startswith(SECURED):
+        return f"no router answers at {found[1]}, or a certificate does not fit"
+    return f"no router answers at {found[1]}, or it refuses the login"
