@@ -1,8 +1,11 @@
-"""The receiver's serial port: found by name or USB id, lost and found again.
+"""The receiver's serial port: found by name, USB id or its frames, lost and found again.
 
-| state     | what happens                   | next                                      |
+| state     | event                          | next                                      |
 | --------- | ------------------------------ | ----------------------------------------- |
-| waiting   | the timer fires                | tries to open: `open`, or waits longer    |
+| waiting   | the timer fires, one port fits | tries to open: `open`, or waits longer    |
+| waiting   | the timer fires, several fit   | opens all of them: `asking`               |
+| asking    | a port sends a valid frame     | the others are closed: `open`             |
+| asking    | `ASK_S` without any frame      | closes all: `waiting`                     |
 | open      | bytes are there                | passed on, with the time of reading       |
 | open      | the port fails or is pulled    | closed: `waiting`, shortest delay         |
 """
@@ -22,6 +25,7 @@ from serial.tools import list_ports
 from gateway.reasons import reason_of
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
+from gateway.wire.framing import Frame, FrameDecoder
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +36,13 @@ READ_SIZE: Final = 48
 of the loop, so that clients are not kept waiting until all of it is worked off."""
 BITS_PER_BYTE: Final = 10
 """On the line, start and stop bit included."""
+
+ASK_S: Final = 6.0
+"""How long adapters are asked: opening a port resets a board, whose bootloader waits up to 2 s;
+then the receiver reports at least once a second."""
+ASK_AGAIN_S: Final = 30.0
+"""Pause before adapters that sent no frame are opened again."""
+READ_ASKED: Final = 4096
 
 KNOWN_ADAPTERS: Final = {
     (0x0403, 0x6001): "FTDI FT232R",
@@ -53,8 +64,9 @@ class SerialSettings(Settings, frozen=True):
         str,
         setting(
             'Where the receiver is: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
-            'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), or "auto" for the only known USB '
-            "adapter. `mavgate ports` lists them.",
+            'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), or "auto" for a known USB '
+            "adapter. If several fit, each is opened and asked for the receiver's frames, which "
+            "resets the boards behind them. `mavgate ports` lists them.",
             pattern=r"^(auto|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
         ),
     ] = "auto"
@@ -94,8 +106,8 @@ def list_serial_ports() -> list[Port]:
     return sorted(ports, key=lambda port: (not port.known, port.device))
 
 
-def find_port(wanted: str, ports: list[Port]) -> str:
-    """Choose the device for the setting `port`.
+def fitting_ports(wanted: str, ports: list[Port]) -> list[str]:
+    """List the devices that the setting `port` may mean.
 
     Parameters
     ----------
@@ -106,13 +118,13 @@ def find_port(wanted: str, ports: list[Port]) -> str:
 
     Returns
     -------
-    str
-        The device to open.
+    list of str
+        One or more.
 
     Raises
     ------
     PortNotFoundError
-        If nothing fits, or `auto` would have to guess between several.
+        If nothing fits.
     """
     if wanted == "auto":
         fitting = [port for port in ports if port.known]
@@ -125,15 +137,30 @@ def find_port(wanted: str, ports: list[Port]) -> str:
             and (not serial_number or port.serial_number.lower() == serial_number[0])
         ]
     else:
-        return wanted
-    if len(fitting) == 1 or (fitting and wanted != "auto"):
-        return fitting[0].device
-    seen = ", ".join(f"{p.device} ({p.usb_id or 'no USB'})" for p in ports) or "no port at all"
-    if fitting:
+        return [wanted]
+    if not fitting:
+        raise PortNotFoundError(f"no port fits {wanted!r}; this machine has {_listed(ports)}")
+    return [port.device for port in fitting]
+
+
+def find_port(wanted: str, ports: list[Port]) -> str:
+    """Choose the only device that the setting `port` may mean; see `fitting_ports`.
+
+    Raises
+    ------
+    PortNotFoundError
+        If nothing fits, or several do.
+    """
+    fitting = fitting_ports(wanted, ports)
+    if len(fitting) > 1:
         raise PortNotFoundError(
-            f"several USB adapters fit: {seen}; name one in [serial] port or with --port"
+            f"several USB adapters fit: {', '.join(fitting)}; name one with --port"
         )
-    raise PortNotFoundError(f"no port fits {wanted!r}; this machine has {seen}")
+    return fitting[0]
+
+
+def _listed(ports: list[Port]) -> str:
+    return ", ".join(f"{p.device} ({p.usb_id or 'no USB'})" for p in ports) or "no port at all"
 
 
 def why_not_open(error: Exception, ports: list[Port]) -> str:
@@ -160,7 +187,7 @@ def why_not_open(error: Exception, ports: list[Port]) -> str:
     return "; ".join([reason_of(error), *others])
 
 
-def open_port(settings: SerialSettings) -> serial.Serial:
+def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
     """Open the receiver's port, for this program alone.
 
     Raises
@@ -168,12 +195,116 @@ def open_port(settings: SerialSettings) -> serial.Serial:
     PortNotFoundError
         If there is none, or it cannot be opened.
     """
-    ports = list_serial_ports()
-    device = find_port(settings.port, ports)
     try:
-        return serial.Serial(device, settings.baud, timeout=0, write_timeout=0, exclusive=True)
+        return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
     except (OSError, ValueError) as error:
         raise PortNotFoundError(f"receiver {device}: {why_not_open(error, ports)}") from error
+
+
+class ReceiverSearch:
+    """Open several ports and find the one that sends the receiver's frames.
+
+    Parameters
+    ----------
+    devices : list of str
+    baud : int
+        Speed of the receiver's line.
+    on_end : callable
+        Called once with the open port and the bytes that were read last, or, if no port sends a
+        frame within `ASK_S`, with None, no bytes, and a text of what each did instead.
+    """
+
+    def __init__(
+        self,
+        devices: list[str],
+        baud: int,
+        on_end: Callable[[serial.Serial | None, bytes, str], None],
+    ) -> None:
+        self._devices = devices
+        self._baud = baud
+        self._on_end = on_end
+        self._asked: dict[str, tuple[serial.Serial, FrameDecoder]] = {}
+        self._answers: dict[str, str] = {}
+        self._timer: asyncio.TimerHandle | None = None
+
+    def start(self) -> None:
+        """Open the ports. Needs a running event loop."""
+        loop, ports = asyncio.get_running_loop(), list_serial_ports()
+        self._timer = loop.call_later(ASK_S, self._give_up)
+        for device in self._devices:
+            try:
+                port = open_port(device, self._baud, ports)
+            except PortNotFoundError as error:
+                self._answers[device] = str(error).removeprefix("receiver ")
+                continue
+            self._answers[device] = f"{device}: silent"
+            self._asked[device] = (port, FrameDecoder())
+            loop.add_reader(port.fileno(), self._read, device)
+
+    def close(self) -> None:
+        """Close all ports."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for device in [*self._asked]:
+            self._release(device).close()
+
+    def _read(self, device: str) -> None:
+        port, decoder = self._asked[device]
+        try:
+            data = os.read(port.fileno(), READ_ASKED)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._answers[device] = f"{device}: gone"
+            self._release(device).close()
+            return
+        self._answers[device] = f"{device}: sends no frames at {self._baud} baud"
+        if any(isinstance(event, Frame) for event in decoder.feed(data)):
+            found = self._release(device)
+            self.close()
+            self._on_end(found, data, "")
+
+    def _give_up(self) -> None:
+        self.close()
+        answers = "; ".join(self._answers.values())
+        self._on_end(None, b"", f"several USB adapters fit, and none is the receiver: {answers}")
+
+    def _release(self, device: str) -> serial.Serial:
+        port, _ = self._asked.pop(device)
+        asyncio.get_running_loop().remove_reader(port.fileno())
+        return port
+
+
+async def find_receiver(settings: SerialSettings) -> str:
+    """Return the device of the receiver, asking every port if several fit the settings.
+
+    Raises
+    ------
+    PortNotFoundError
+        If nothing fits, none of several is the receiver, or the only one cannot be opened.
+    """
+    ports = list_serial_ports()
+    fitting = fitting_ports(settings.port, ports)
+    if len(fitting) == 1:
+        open_port(fitting[0], settings.baud, ports).close()
+        return fitting[0]
+    result = asyncio.get_running_loop().create_future()
+
+    def on_end(port: serial.Serial | None, _: bytes, text: str) -> None:
+        if port is None:
+            result.set_exception(PortNotFoundError(text))
+        else:
+            port.close()
+            result.set_result(str(port.port))
+
+    search = ReceiverSearch(fitting, settings.baud, on_end)
+    search.start()
+    try:
+        return str(await result)
+    finally:
+        search.close()
 
 
 class SerialPort:
@@ -207,6 +338,10 @@ class SerialPort:
         self._retry: asyncio.TimerHandle | None = None
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
+        self._search: ReceiverSearch | None = None
+        self._silent: set[str] = set()
+        """Ports that were asked and are not the receiver."""
+        self._asked_s = 0.0
         self._read_us = 0
         self._left_more = False
 
@@ -224,6 +359,9 @@ class SerialPort:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
+        if self._search is not None:
+            self._search.close()
+            self._search = None
         self._release()
 
     def apply(self, settings: SerialSettings) -> None:
@@ -232,25 +370,64 @@ class SerialPort:
             self.close()
             self._settings = settings
             self._delay_s = FIRST_RETRY_S
+            self._silent.clear()
             self._open()
 
     def _open(self) -> None:
         self._retry = None
+        ports = list_serial_ports()
         try:
-            self._port = open_port(self._settings)
+            fitting = self._candidates(ports)
+            if len(fitting) > 1:
+                self._ask(fitting)
+                return
+            port = open_port(fitting[0], self._settings.baud, ports)
         except PortNotFoundError as error:
             self._complain(str(error))
             self._try_later()
             return
-        device = self._port.port
+        self._use(port)
+
+    def _candidates(self, ports: list[Port]) -> list[str]:
+        """List the ports that may be the receiver, without those that were asked lately."""
+        fitting = fitting_ports(self._settings.port, ports)
+        if asyncio.get_running_loop().time() - self._asked_s > ASK_AGAIN_S:
+            self._silent.clear()
+        self._silent &= {*fitting}  # one that was unplugged may return as another
+        if left := [device for device in fitting if device not in self._silent]:
+            return left
+        raise PortNotFoundError(
+            f"no receiver among {', '.join(fitting)}, which are asked again every "
+            f"{ASK_AGAIN_S:.0f} s; plug it in, or name its port in [serial] port or with --port"
+        )
+
+    def _ask(self, devices: list[str]) -> None:
+        def on_end(port: serial.Serial | None, data: bytes, text: str) -> None:
+            self._search = None
+            self._asked_s = asyncio.get_running_loop().time()
+            found = None if port is None else port.port
+            self._silent = {device for device in devices if device != found}
+            if port is None:
+                self._complain(text)
+                self._try_later()
+                return
+            self._use(port)
+            self._on_bytes(data, self._now_us())
+
+        log.info("several USB adapters fit, asking each: %s", ", ".join(devices))
+        self._search = ReceiverSearch(devices, self._settings.baud, on_end)
+        self._search.start()
+
+    def _use(self, port: serial.Serial) -> None:
+        self._port, device = port, str(port.port)
         with contextlib.suppress(OSError, ValueError):
             # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
-            self._port.set_low_latency_mode(True)
+            port.set_low_latency_mode(True)
         log.info("receiver on %s at %d baud", device, self._settings.baud)
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
         self._on_open(device)
-        file = self._port.fileno()
+        file = port.fileno()
         asyncio.get_running_loop().add_reader(file, self._read, file)
 
     def _read(self, file: int) -> None:

@@ -16,8 +16,10 @@ from gateway.live.serial_port import (
     SerialPort,
     SerialSettings,
     find_port,
+    find_receiver,
     why_not_open,
 )
+from gateway.wire.framing import encode_frame
 
 CH340 = Port("/dev/ttyUSB0", "1a86:7523", "", "WCH CH340", known=True)
 FTDI = Port("/dev/ttyUSB1", "0403:6001", "A50285BI", "FTDI FT232R", known=True)
@@ -117,6 +119,7 @@ class Listener:
     def __init__(self) -> None:
         self.data = b""
         self.opened = 0
+        self.devices: list[str] = []
         self.lost: list[str] = []
         self.changed = asyncio.Event()
 
@@ -127,6 +130,7 @@ class Listener:
 
     def on_open(self, device: str) -> None:
         self.opened += 1
+        self.devices.append(device)
         self.changed.set()
 
     def on_lost(self, device: str) -> None:
@@ -254,3 +258,102 @@ def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
     os.close(end)
     # 40 ms of the line are 2000 bytes; the last two reads find what is left, and nothing.
     assert sizes == [48, 48, 2000, 48, 856]
+
+
+class Adapters:
+    """Pseudo-terminals in the place of several known USB adapters."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.masters: dict[str, int] = {}
+        monkeypatch.setattr("gateway.live.serial_port.list_serial_ports", self.ports)
+
+    def ports(self) -> list[Port]:
+        return [Port(device, "1a86:7523", "", "WCH CH340", known=True) for device in self.masters]
+
+    def plug(self) -> str:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        device = os.ttyname(slave)
+        os.close(slave)
+        self.masters[device] = master
+        return device
+
+    def pull(self, device: str) -> None:
+        os.close(self.masters.pop(device))
+
+
+@pytest.fixture
+def adapters(monkeypatch: pytest.MonkeyPatch) -> Iterator[Adapters]:
+    adapters = Adapters(monkeypatch)
+    yield adapters
+    for device in [*adapters.masters]:
+        adapters.pull(device)
+
+
+FRAME = encode_frame(bytes(range(1, 40)))
+NOISE = bytes([0x55, 0x00, 0xFF]) * 40
+"""Bytes of another device, delimiters included."""
+
+
+async def found_receiver(adapters: Adapters, listener: Listener, receiver: str) -> SerialPort:
+    """Open a port that searches, and send frames to one adapter until it is found."""
+    settings = SerialSettings(port="auto")
+    port = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    port.start()
+    while not listener.opened:
+        os.write(adapters.masters[receiver], FRAME)
+        await asyncio.sleep(0.001)
+    return port
+
+
+@pytest.mark.io
+async def test_receiver_is_found_among_adapters_by_its_frames(
+    adapters: Adapters, listener: Listener
+) -> None:
+    silent, noisy, receiver = (adapters.plug() for _ in range(3))
+    os.write(adapters.masters[noisy], NOISE)
+    port = await found_receiver(adapters, listener, receiver)
+    assert listener.devices == [receiver]
+    await listener.until(data=FRAME)
+    # The others are free for other programs.
+    for device in (silent, noisy):
+        serial.Serial(device, timeout=0, exclusive=True).close()
+    port.close()
+
+
+@pytest.mark.io
+@pytest.mark.usefixtures("fast_retry")
+async def test_silent_adapter_is_not_taken_when_the_receiver_is_pulled(
+    adapters: Adapters, listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    silent, receiver = adapters.plug(), adapters.plug()
+    port = await found_receiver(adapters, listener, receiver)
+    adapters.pull(receiver)
+    async with asyncio.timeout(60):
+        while f"no receiver among {silent}" not in caplog.text:
+            await asyncio.sleep(0.001)
+    assert listener.devices == [receiver]
+    again = adapters.plug()
+    await listener.until(opened=2)
+    assert listener.devices == [receiver, again]
+    port.close()
+
+
+@pytest.mark.io
+async def test_no_receiver_among_several_adapters_is_reported_with_each_answer(
+    adapters: Adapters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.live.serial_port.ASK_S", 0.2)
+    silent, noisy, held = (adapters.plug() for _ in range(3))
+    with serial.Serial(held, timeout=0, exclusive=True):
+        search = asyncio.create_task(find_receiver(SerialSettings(port="auto")))
+        await asyncio.sleep(0.05)
+        os.write(adapters.masters[noisy], NOISE)
+        with pytest.raises(PortNotFoundError) as raised:
+            await search
+    for text in (
+        f"{silent}: silent",
+        f"{noisy}: sends no frames at 500000 baud",
+        f"{held}: another program has it open",
+    ):
+        assert text in str(raised.value)

@@ -31,7 +31,7 @@ from gateway.live.serial_port import (
     PortNotFoundError,
     SerialPort,
     SerialSettings,
-    open_port,
+    find_receiver,
 )
 from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
@@ -250,9 +250,10 @@ def _speed_mps(fix: GpsFix) -> float:
 def _capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     try:
         # Nobody shall lay an aircraft on its sides for a port that is not there.
-        open_port(serial).close()
+        device = asyncio.run(find_receiver(serial))
     except PortNotFoundError as error:
         refuse(str(error))
+    serial = msgspec.structs.replace(serial, port=device)
     return lambda seconds: node_samples(asyncio.run(_Listening(serial, vehicle).listen(seconds)))
 
 

@@ -1,5 +1,6 @@
 """Commands that help to set the gateway up: ports and settings."""
 
+import asyncio
 from pathlib import Path
 from typing import Annotated
 
@@ -7,7 +8,13 @@ import typer
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of, table_of
-from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.live.serial_port import (
+    PortNotFoundError,
+    SerialSettings,
+    find_receiver,
+    fitting_ports,
+    list_serial_ports,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -17,7 +24,10 @@ def register(app: typer.Typer) -> None:
 
 
 def ports() -> None:
-    """List the serial ports, and the one that `auto` selects."""
+    """List the serial ports, and the one that `auto` selects.
+
+    If several USB adapters fit, each is opened and asked for the receiver's frames.
+    """
     found = list_serial_ports()
     table = table_of("device", "setting by USB id", "serial number", "description", left=4)
     for port in found:
@@ -27,7 +37,11 @@ def ports() -> None:
     if found:
         console.print(table)
     try:
-        console.print(f'port = "auto" takes {find_port("auto", found)}')
+        fitting = fitting_ports("auto", found)
+        if len(fitting) > 1:
+            console.print(f"asking {', '.join(fitting)} for the receiver's frames")
+            fitting = [asyncio.run(find_receiver(SerialSettings()))]
+        console.print(f'port = "auto" takes {fitting[0]}')
     except PortNotFoundError as error:
         console.print(f'port = "auto": {error}')
 

@@ -23,7 +23,7 @@ from gateway.edges.disk.part_files import free_bytes_near
 from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.tls import valid_until_s
 from gateway.live.control_finder import live_sockets
-from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.reasons import reason_of
 
 TTY: Final = Path("/sys/class/tty")
@@ -83,10 +83,18 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
     """Check for the receiver's port, and whether it may be opened."""
     try:
-        device = find_port(settings.serial.port, list_serial_ports())
+        fitting = fitting_ports(settings.serial.port, list_serial_ports())
     except PortNotFoundError as error:
         yield Diagnosis(Grade.WRONG, "receiver", f"{error}; plug it in, or set serial.port")
         return
+    if len(fitting) > 1:
+        text = f"several adapters fit, the gateway asks each: {', '.join(fitting)}"
+        yield Diagnosis(Grade.NOTE, "receiver", text)
+    for device in fitting:
+        yield from _check_port(device)
+
+
+def _check_port(device: str) -> Iterator[Diagnosis]:
     path = Path(device)
     if not path.exists():
         yield Diagnosis(
