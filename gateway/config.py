@@ -19,9 +19,9 @@ import tomlkit
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.fleet.settings import FleetSettings
-from gateway.flightlog.session import RecordingSettings
 from gateway.hub.settings import HubSettings
 from gateway.live.serial_port import SerialSettings
+from gateway.live.session import RecordingSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
 from gateway.sensing.chain import SensingSettings

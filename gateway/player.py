@@ -11,18 +11,17 @@ from typing import Final
 
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings
-from gateway.edges.disk.player_edge import PlayerEdge
-from gateway.flightlog.answers import VehicleAnswers
-from gateway.flightlog.moment import Moment, place_in
-from gateway.flightlog.playback import Player
-from gateway.flights.flight_terms import FlightError
-from gateway.flights.joined import NOTHING_WITHIN
-from gateway.flights.opening import PlayedFlight
 from gateway.hub.endpoint import parse_endpoint, stays_here
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import PlayerVerbs
+from gateway.live.player_edge import PlayerEdge
+from gateway.recordings.answers import VehicleAnswers
+from gateway.recordings.join import NOTHING_WITHIN, Moment, place_in
+from gateway.recordings.opening import PlayedFlight
+from gateway.recordings.play import Player
+from gateway.recordings.reading import FlightError
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle

@@ -15,20 +15,19 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway import Outgoing, Pipeline, PipelineSettings
 from gateway.aircraft import AircraftSettings
-from gateway.edges.disk.recording_streams import OTHER_FORMATS
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.extensions import ExtensionError, load_extensions
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import encode_head
-from gateway.flights.reading import READERS, ReadOptions
-from gateway.flights.writing import WRITERS, FlightToWrite
 from gateway.hub.endpoint import ADDED_KINDS
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.registry import CLIENTS
 from gateway.panel.added_views import ADDED_VIEWS, add_view
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.convert import WRITERS, FlightToWrite
+from gateway.recordings.files import OTHER_FORMATS
+from gateway.recordings.reading import READERS, ReadOptions, header_for
+from gateway.recordings.table import encode_head
 from gateway.records import ImuRaw, Incoming, NavState
-from gateway.replay import header_for
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES

@@ -13,14 +13,14 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
-from gateway.flightlog.tlog.tlog import TlogRecord
-from gateway.flights.opening import lay_out, open_flights
-from gateway.flights.reading import ReadOptions
 from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.pipeline import PipelineSettings
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
+from gateway.recordings.opening import lay_out, open_flights
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
-from tests.flightlog.frames import START_US, make_tlog
+from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 

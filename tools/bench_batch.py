@@ -36,12 +36,11 @@ from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
 from gateway.analysis.sources import ideal_calibration
 from gateway.analysis.tuning.axis import parse_axis
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import TableHeader, encode_head
-from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw
-from gateway.replay import header_for
 from gateway.season.batch.dask_executor import DaskCluster
 from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, SweepTask, warm_up
 from gateway.season.batch.result_folder import ResultFolder

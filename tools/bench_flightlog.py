@@ -28,16 +28,15 @@ from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.clock import GatewayClock, unix_time_us
-from gateway.edges.disk.player_edge import PlayerEdge
-from gateway.edges.disk.recorder import Recorder
-from gateway.edges.disk.tlog_file import TlogFile
-from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE, Player
-from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table.table import TableHeader
-from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flightlog.track import Track
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
+from gateway.live.player_edge import PlayerEdge
+from gateway.live.recorder import Recorder
+from gateway.live.session import RecordingSettings
+from gateway.recordings.opening import TlogFile
+from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player, Track
+from gateway.recordings.table import TableHeader
+from gateway.recordings.tlog import encode_record
 from gateway.records import (
     FusedSample,
     ImuFlags,
@@ -169,7 +168,7 @@ def timed(job: Callable[[], Any]) -> tuple[float, Any]:
 MEMORY = """
 import gc, json, sys
 from pathlib import Path
-from gateway.edges.disk.tlog_file import TlogFile
+from gateway.recordings.opening import TlogFile
 
 def memory_kb():
     lines = (line.split() for line in Path("/proc/self/status").read_text().splitlines())

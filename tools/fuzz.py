@@ -30,14 +30,14 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.config import ConfigError, GatewaySettings, load
-from gateway.flightlog.autopilots.px4_log import TOPICS
-from gateway.flightlog.moment import parse_moment
-from gateway.flightlog.table.row import COLUMNS, TableRow
-from gateway.flightlog.table.table import TableHeader, TableReader, encode_head, encode_line
-from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
 from gateway.live.control_socket import ControlError, ControlServer, NoParams
 from gateway.live.control_verbs import AircraftVerbs, Named, Text, To
 from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import COLUMNS, TableRow
+from gateway.recordings.formats.ulog import TOPICS
+from gateway.recordings.join import parse_moment
+from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.home import Place

@@ -28,11 +28,11 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.clock import GatewayClock, unix_time_us
-from gateway.edges.disk.recorder import Recorder
-from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableFault, TableHeader, TableReader
-from gateway.flightlog.tlog.tlog import Batch, TlogScanner
+from gateway.live.recorder import Recorder
+from gateway.live.session import RecordingSettings
+from gateway.recordings.columns import TableRow
+from gateway.recordings.table import TableFault, TableHeader, TableReader
+from gateway.recordings.tlog import Batch, TlogScanner
 from gateway.records import (
     FusedSample,
     ImuFlags,

@@ -23,11 +23,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.config import GatewaySettings
-from gateway.flights.flown import open_flown
-from gateway.flights.log_facts import with_reference
-from gateway.flights.reading import ReadOptions
 from gateway.geometry.angle import wrap_pi
 from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.flown import open_flown
+from gateway.recordings.fuse import with_reference
+from gateway.recordings.reading import ReadOptions
 from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
 from gateway.units import DEG_PER_DEGE7, US_PER_S

@@ -19,12 +19,11 @@ from gateway.analysis.flight_arrays import (
 )
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.table.cells import NODE_TIME, has_group
-from gateway.flightlog.table.row import BARO, GPS, NAV, RAW, SI, fix_of_cells
-from gateway.flightlog.table.table import TableBlock
 from gateway.geometry.atmosphere import pressure_altitude_m
+from gateway.recordings.columns import BARO, GPS, NAV, NODE_TIME, RAW, SI, fix_of_cells, has_group
+from gateway.recordings.fuse import calibrated_of
+from gateway.recordings.table import TableBlock
 from gateway.records import GpsFix, RawRecord
-from gateway.replay import calibrated_of
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.simulator.flight import SimulatedAircraft

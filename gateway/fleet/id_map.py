@@ -11,8 +11,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from gateway.edges.disk.worker import begin_worker, done_by
 from gateway.hub.endpoint import SITE_NAME
+from gateway.live.worker import begin_worker, done_by
 from gateway.output import write_new
 from gateway.reasons import reason_of
 

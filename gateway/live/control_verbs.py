@@ -6,21 +6,21 @@ from collections.abc import Awaitable, Callable
 
 import msgspec
 
-from gateway.edges.disk.player_edge import PlayerEdge, PlayerStatus
-from gateway.edges.disk.recorder import Recorder
-from gateway.edges.disk.recordings import (
+from gateway.hub.client_table import ClientStats
+from gateway.hub.hub import Hub
+from gateway.live.control_socket import ControlError, ControlServer, NoParams
+from gateway.live.player_edge import PlayerEdge, PlayerStatus
+from gateway.live.recorder import Recorder
+from gateway.live.session import SessionState
+from gateway.recordings.index import (
     Recording,
     RecordingError,
     delete_recording,
     find_recording,
     list_recordings,
 )
-from gateway.flightlog.moment import parse_moment
-from gateway.flightlog.playback import AS_FAST_AS_POSSIBLE
-from gateway.flightlog.session import SessionState
-from gateway.hub.client_table import ClientStats
-from gateway.hub.hub import Hub
-from gateway.live.control_socket import ControlError, ControlServer, NoParams
+from gateway.recordings.join import parse_moment
+from gateway.recordings.play import AS_FAST_AS_POSSIBLE
 from gateway.status import RecorderStatus, Snapshot
 from gateway.vehicle.home import Place
 

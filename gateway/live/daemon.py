@@ -20,23 +20,24 @@ from gateway.config import (
     load_aircraft,
     save_aircraft,
 )
-from gateway.edges.disk.place_files import PlaceFiles
-from gateway.edges.disk.recorder import Recorder
-from gateway.edges.disk.stamp_file import StampFile
-from gateway.edges.disk.worker import begin_worker
-from gateway.flightlog.recording_budget import RecordingBudget
-from gateway.flightlog.session import SessionState
-from gateway.flightlog.table.table import TableHeader
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
 from gateway.live.loop_lag import LoopLag
 from gateway.live.metrics_server import MetricsServer
+from gateway.live.part import RecordingBudget
+from gateway.live.place_files import PlaceFiles
 from gateway.live.pty_port import PtyPort
+from gateway.live.recorder import Recorder
 from gateway.live.serial_port import SerialPort
 from gateway.live.service import ServiceNotifier, set_realtime_priority
+from gateway.live.session import SessionState
+from gateway.live.stamp_file import StampFile
+from gateway.live.worker import begin_worker
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.reasons import reason_of
+from gateway.recordings.reading import header_for
+from gateway.recordings.table import TableHeader
 from gateway.records import (
     RECORDED_ONLY,
     BaroRaw,
@@ -47,7 +48,6 @@ from gateway.records import (
     NodeStatus,
     Outgoing,
 )
-from gateway.replay import header_for
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S

@@ -24,13 +24,13 @@ from gateway.analysis.fusion import fuse
 from gateway.analysis.metrics import euler_rad, rms
 from gateway.analysis.sources import flight_of_blocks
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
-from gateway.flightlog.table.autopilot import AutopilotReader
-from gateway.flightlog.table.table import TableBlock
-from gateway.flightlog.tlog.tlog import TlogScanner, encode_record
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.field_history import FloatArray
 from gateway.panel.state.sample_memory import TimedFrames
+from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.table import TableBlock
+from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.services.parameters.parameters import ParameterTable

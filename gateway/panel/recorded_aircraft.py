@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.disk.recording_streams import FileKind, kind_of, read_chunks
-from gateway.edges.disk.recordings import parts_together
-from gateway.edges.disk.tlog_file import TlogFile
-from gateway.flightlog.mapshape import TrackPoint, VehicleTrack
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableHeader, TableReader
-from gateway.flightlog.tlog.recorded_commands import FIRST_GROUND_STATION, is_station
-from gateway.flights.map_tracks import tracks_of_frames
-from gateway.flights.reading import recorded_frames
+from gateway.recordings.answers import FIRST_GROUND_STATION, is_station
+from gateway.recordings.columns import TableRow
+from gateway.recordings.files import FileKind, kind_of, read_chunks
+from gateway.recordings.formats.maps import TrackPoint, VehicleTrack, tracks_of_frames
+from gateway.recordings.index import parts_together
+from gateway.recordings.opening import TlogFile
+from gateway.recordings.reading import recorded_frames
+from gateway.recordings.table import TableHeader, TableReader
 from gateway.units import US_PER_S
 
 PROFILE_POINTS: Final = 400

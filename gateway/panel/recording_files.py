@@ -21,13 +21,13 @@ from fastapi import FastAPI
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
-from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.edges.disk.recordings import RecordingError, check_free, find_recording
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableReader
-from gateway.flightlog.tlog.tlog import TlogScanner
 from gateway.panel.access import ROLE, UPLOAD, Role
 from gateway.panel.view_context import PanelParts
+from gateway.recordings.columns import TableRow
+from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.index import RecordingError, check_free, find_recording
+from gateway.recordings.table import TableReader
+from gateway.recordings.tlog import TlogScanner
 
 LOOKED_AT: Final = 1 << 20
 CHUNK: Final = 1 << 18

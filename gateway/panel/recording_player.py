@@ -13,13 +13,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.edges.disk.recordings import RecordingError, find_recording
 from gateway.live.attachment import own_command
 from gateway.live.control_socket import ControlError
 from gateway.panel.control_client import ControlClient
 from gateway.panel.recorded_aircraft import FUSED_AGAIN, RecordedAircraft, free_ids, look_into
 from gateway.panel.state.fleet_picture import FleetPicture, Origin
 from gateway.panel.uplink import Uplink
+from gateway.recordings.index import RecordingError, find_recording
 
 log = logging.getLogger(__name__)
 

@@ -11,10 +11,10 @@ from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.axis import with_value
-from gateway.edges.disk.recording_streams import read_chunks
-from gateway.flightlog.table.column_map import ColumnMap, CsvReader
-from gateway.flightlog.table.table import block_of
-from gateway.flights.reading import TRACKER_LOG
+from gateway.recordings.files import read_chunks
+from gateway.recordings.formats.csv import ColumnMap, CsvReader
+from gateway.recordings.reading import TRACKER_LOG
+from gateway.recordings.table import block_of
 from gateway.sensing.calibration import NodeCalibration
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]

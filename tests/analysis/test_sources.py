@@ -10,8 +10,8 @@ from gateway.analysis.fusion import fuse
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.sources import at_times, flight_of_blocks, ideal_calibration, judged_by
 from gateway.estimation.select import make_estimator
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import block_of
+from gateway.recordings.columns import TableRow
+from gateway.recordings.table import block_of
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain

@@ -48,7 +48,7 @@ def test_the_gateway_imports_nothing_that_it_may_not_need() -> None:
 def test_a_summary_of_a_recording_needs_neither_settings_nor_stages() -> None:
     found = imported_by("gateway.cli.app", "gateway.cli.recorded.info")
     assert found & (NEVER | {"numba", "scipy"}) == set()
-    assert not {"gateway.config", "gateway.aircraft", "gateway.flights.reading"} & found
+    assert not {"gateway.config", "gateway.aircraft", "gateway.recordings.reading"} & found
 
 
 def test_a_listing_of_commands_loads_no_extension() -> None:

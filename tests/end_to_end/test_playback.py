@@ -14,13 +14,13 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
 from gateway.live.control_socket import request
+from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.test_demo import NEAR_DEG
-from tests.flightlog.frames import START_US, make_tlog
 from tests.ports import free_port
+from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -12,19 +12,17 @@ from gateway.aircraft import Action
 from gateway.cli.app import app
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
-from gateway.edges.disk.recorder import Recorder
-from gateway.edges.disk.tlog_file import TlogFile
-from gateway.flightlog.playback import Player
-from gateway.flightlog.session import RecordingSettings
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableReader
-from gateway.flightlog.tlog.tlog import TlogScanner
-from gateway.flightlog.track import Track
-from gateway.flights.reading import ReadOptions
-from gateway.flights.recorded_fusion import RecordedFusion
+from gateway.live.recorder import Recorder
+from gateway.live.session import RecordingSettings
 from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import TableRow
+from gateway.recordings.fuse import RecordedFusion
+from gateway.recordings.opening import TlogFile
+from gateway.recordings.play import Player, Track
+from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.table import TableReader
+from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
-from gateway.replay import header_for
 from gateway.simulator.receiver import simulate
 from tests.conftest import ManualClock
 

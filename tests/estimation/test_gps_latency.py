@@ -14,7 +14,7 @@ from gateway.estimation.alignment.latency_of_log import estimate_latency
 from gateway.estimation.columns import ACCEL, GPS_VEL
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.select import EstimationSettings, make_estimator
-from gateway.flights.log_facts import with_reference
+from gateway.recordings.fuse import with_reference
 from gateway.records import Outgoing
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -9,14 +9,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateway.edges.disk.recordings import Recording
 from gateway.live.control_socket import ControlServer
 from gateway.live.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
+from gateway.recordings.index import Recording
 from gateway.vehicle.home import Place
 from tests.conftest import ManualClock
-from tests.edges.disk.test_player_edge import Played
-from tests.edges.disk.test_recorder import Bench
-from tests.flightlog.frames import START_US, make_frames, make_records, make_tlog
+from tests.live.test_player_edge import Played
+from tests.live.test_recorder import Bench
+from tests.recordings.frames import START_US, make_frames, make_records, make_tlog
 
 pytestmark = pytest.mark.io
 

@@ -15,9 +15,9 @@ from pymavlink.dialects.v20 import common as mavlink
 import gateway.live.daemon
 from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
-from gateway.flightlog.recording_budget import BURST_S, STRANGERS_BPS
 from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
+from gateway.live.part import BURST_S, STRANGERS_BPS
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
 from gateway.vehicle.actions import Request, SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase

@@ -8,12 +8,12 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import encode_head
-from gateway.flightlog.tlog.tlog import encode_record
 from gateway.panel.recorded_aircraft import FUSED_AGAIN, RECORDED, free_ids, look_into
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.table import encode_head
+from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S
-from tests.test_replay import fly, make_flight, read
+from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 

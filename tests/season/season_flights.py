@@ -9,10 +9,10 @@ from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.sources import ideal_calibration
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import encode_head
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.reading import header_for
+from gateway.recordings.table import encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
-from gateway.replay import header_for
 from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 

@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.sections.ground_track import ground_track
 from gateway.cli.app import app
-from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.reading import ReadOptions
 from gateway.season.batch.flight_tasks import FlightResult, FuseTask, InfoTask, without_secrets
 from gateway.season.batch.result_folder import RESULTS, ResultFolder, read_results
 from gateway.season.batch.season_run import run_season

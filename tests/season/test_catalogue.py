@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
-from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner, encode_record
-from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.season.catalogue import indexing
 from gateway.season.catalogue.catalogue_file import (
     CATALOGUE_NAME,

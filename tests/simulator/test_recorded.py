@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from gateway.config import GatewaySettings
-from gateway.flights.flown import open_flown
-from gateway.flights.reading import ReadOptions
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.flown import open_flown
+from gateway.recordings.reading import ReadOptions
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
 from gateway.simulator.recorded import RecordedFlight, in_rounds, replay
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -26,13 +26,13 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
-from gateway.flights.reading import open_rows
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialPort,
     SerialSettings,
     find_receiver,
 )
+from gateway.recordings.reading import open_rows
 from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.procedure import (

@@ -38,9 +38,9 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.warm_up import make_ready
 from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
-from gateway.flights.flown import open_flown
-from gateway.flights.log_facts import with_reference
 from gateway.live.daemon import Daemon
+from gateway.recordings.flown import open_flown
+from gateway.recordings.fuse import with_reference
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate

@@ -16,12 +16,12 @@ from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
-from gateway.flightlog.moment import civil_time
-from gateway.flightlog.session import NEWEST
 from gateway.hub.endpoint import SITE_NAME
 from gateway.live.attachment import on_end_signals
 from gateway.live.control_socket import ControlError, request
 from gateway.live.detached_output import detached_output
+from gateway.recordings.index import NEWEST
+from gateway.recordings.join import civil_time
 from gateway.units import US_PER_S, counted
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,8 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
-from gateway.edges.disk.recordings import (
+from gateway.live.session import SessionState
+from gateway.recordings.index import (
     Recording,
     RecordingError,
     delete_recording,
@@ -24,14 +25,13 @@ from gateway.edges.disk.recordings import (
     list_recordings,
     rename_recording,
 )
-from gateway.flightlog.moment import civil_time
-from gateway.flightlog.session import SessionState
+from gateway.recordings.join import civil_time
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from gateway.flights.glance import Glance
+    from gateway.recordings.summary import Glance
     from gateway.season.catalogue.catalogue_file import FlightFigures
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
@@ -171,7 +171,7 @@ def _show(status: dict[str, Any]) -> None:
 
 def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":
     # Imported here: it imports the compiler, for which the other commands must not wait.
-    from gateway.flights.glance import glance
+    from gateway.recordings.summary import glance
 
     return ((recording, glance(recording.files)) for recording in recordings)
 

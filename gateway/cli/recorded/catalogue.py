@@ -14,7 +14,7 @@ from gateway.cli.support.named_recordings import folder_of
 from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
-from gateway.edges.disk.recordings import RecordingError, find_recording
+from gateway.recordings.index import RecordingError, find_recording
 from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
 from gateway.season.catalogue.indexing import index_folder
 from gateway.season.executors import LocalProcesses

@@ -31,8 +31,8 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.flights.writing import LACKS, WRITERS, FlightToWrite
 from gateway.output import write_new
+from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
 
 ONE_KIND: Final = ".parquet"
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")

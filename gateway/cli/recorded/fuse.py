@@ -30,20 +30,27 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.select import ESTIMATORS
-from gateway.flightlog.table.cells import has_group
-from gateway.flightlog.table.row import NAV
-from gateway.flightlog.table.table import TableBlock
-from gateway.flights.flight_terms import FlightError, SettingsChoice
-from gateway.flights.fused_rows import fused_lines
-from gateway.flights.joined import joined_tables
-from gateway.flights.log_facts import aircraft_for, note_smoothed_latency
-from gateway.flights.reading import RecordedTable, open_rows
-from gateway.flights.recorded_fusion import SETTLES
-from gateway.flights.row_fusion import RowFusion
-from gateway.flights.smoothed import smooth_blocks, with_smoothed_estimator
 from gateway.output import check_output, write_new
+from gateway.recordings.columns import NAV, has_group
+from gateway.recordings.fuse import (
+    SETTLES,
+    RowFusion,
+    aircraft_for,
+    fused_lines,
+    note_smoothed_latency,
+    smooth_blocks,
+    with_smoothed_estimator,
+)
+from gateway.recordings.join import joined_tables
+from gateway.recordings.reading import (
+    FlightError,
+    RecordedTable,
+    SettingsChoice,
+    header_for,
+    open_rows,
+)
+from gateway.recordings.table import TableBlock
 from gateway.records import FusionState
-from gateway.replay import header_for
 from gateway.units import US_PER_S, counted
 
 LEAST_RATE_HZ: Final = 10.0

@@ -23,30 +23,17 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import console_of, print_json, table_of
-from gateway.edges.disk.recording_streams import (
-    FileKind,
-    Progress,
-    kind_of,
-    read_blocks,
-)
-from gateway.edges.disk.tlog_source import open_tlog
-from gateway.flightlog.moment import civil_time
-from gateway.flightlog.summary import MENDED, FileInfo, VehicleInfo
-from gateway.flightlog.table.table import (
-    TableFault,
-    TableHeader,
-    TableReader,
-    encode_block,
-    encode_head,
-)
-from gateway.flightlog.tlog.tlog import encode_record
-from gateway.flights.describing import describe
-from gateway.flights.flight_terms import NO_RECORDING, FlightError
 from gateway.output import write_new
+from gateway.recordings.files import FileKind, Progress, kind_of, open_tlog, read_blocks
+from gateway.recordings.join import civil_time
+from gateway.recordings.reading import NO_RECORDING, FlightError
+from gateway.recordings.summary import MENDED, FileInfo, VehicleInfo, describe
+from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
+from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
-    from gateway.flights.reading import ReadOptions
+    from gateway.recordings.reading import ReadOptions
 
 SHOWN: Final = 8
 """Gaps and damaged places that are listed one by one."""

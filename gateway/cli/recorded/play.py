@@ -39,26 +39,26 @@ from gateway.cli.support.settings_options import (
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
-from gateway.edges.disk.player_edge import PlayerStatus
-from gateway.flightlog.playback import (
-    AS_FAST_AS_POSSIBLE,
-    GREATEST_SPEED,
-    LEAST_SPEED,
-    PlayState,
-    check_speed,
-)
-from gateway.flights.flight_terms import FlightError
-from gateway.flights.opening import lay_out, open_flights
 from gateway.live.attachment import on_end_signals, on_parent_gone
 from gateway.live.control_socket import ControlError
 from gateway.live.detached_output import detached_output
 from gateway.live.keyboard import Keyboard
+from gateway.live.player_edge import PlayerStatus
 from gateway.player import (
     PlayerDaemon,
     PlayPlan,
     endpoints_beyond,
     prepare,
 )
+from gateway.recordings.opening import lay_out, open_flights
+from gateway.recordings.play import (
+    AS_FAST_AS_POSSIBLE,
+    GREATEST_SPEED,
+    LEAST_SPEED,
+    PlayState,
+    check_speed,
+)
+from gateway.recordings.reading import FlightError
 from gateway.units import counted
 
 VIEW_INTERVAL_S: Final = 0.25

@@ -33,8 +33,8 @@ from gateway.cli.support.settings_options import (
     or_refuse,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.flights.smoothed import smoothed_latency_in_words
 from gateway.output import check_folder
+from gateway.recordings.fuse import smoothed_latency_in_words
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 

@@ -23,8 +23,8 @@ from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.sweeping import HEADINGS, SHOWN, SweepOptions, parse_axes
 from gateway.cli.support.terminal import console_of, table_of
 from gateway.config import GatewaySettings, render
-from gateway.flights.reading import ReadOptions
 from gateway.output import check_output, write_new
+from gateway.recordings.reading import ReadOptions
 from gateway.season.batch.flight_tasks import FlightResult, SweepTask
 from gateway.season.statistics.cross_validation import Choice, FloatArray, choose
 from gateway.season.statistics.season_errors import group_of

@@ -15,9 +15,8 @@ from gateway.cli.support.named_recordings import Wanted, files_of, recordings_fo
 from gateway.cli.support.recording_options import read_column_map, refusing
 from gateway.cli.support.settings_options import read_options, read_settings
 from gateway.cli.support.terminal import console_of
-from gateway.flights.flight_terms import SettingsChoice
-from gateway.flights.reading import ReadOptions
 from gateway.printable import printable
+from gateway.recordings.reading import ReadOptions, SettingsChoice
 from gateway.season.batch.dask_executor import ClusterError, DaskCluster, has_dask
 from gateway.season.batch.flight_tasks import FlightResult, FlightTask, warm_up, without_secrets
 from gateway.season.batch.result_folder import ResultFolder

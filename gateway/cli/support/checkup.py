@@ -19,10 +19,10 @@ from typing import Final
 from gateway.cli.support.errors import how_to_add
 from gateway.cli.support.warm_up import ENTRY_POINTS, is_kept
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
-from gateway.edges.disk.part_files import free_bytes_near
 from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.tls import valid_until_s
 from gateway.live.control_finder import live_sockets
+from gateway.live.part_files import free_bytes_near
 from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.reasons import reason_of
 

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
-from gateway.edges.disk.recordings import is_file_name
 from gateway.output import sync_folder
+from gateway.recordings.index import is_file_name
 
 SMALLEST: Final = 4 << 10
 LARGEST: Final = 128 << 10

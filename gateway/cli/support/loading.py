@@ -18,11 +18,10 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import read_options
 from gateway.config import GatewaySettings
-from gateway.edges.disk.recording_streams import FileKind, kind_of
-from gateway.flights.flight_terms import FlightError, SettingsChoice
-from gateway.flights.joined import joined_tables
-from gateway.flights.log_facts import aircraft_for, check_latency
-from gateway.flights.reading import ReadOptions, is_table, open_rows
+from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.fuse import aircraft_for, check_latency
+from gateway.recordings.join import joined_tables
+from gateway.recordings.reading import FlightError, ReadOptions, SettingsChoice, is_table, open_rows
 
 FlightArgument = Annotated[
     Path | None,

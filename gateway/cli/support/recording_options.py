@@ -11,11 +11,11 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
-from gateway.flightlog.autopilots.ardupilot_log import SENSORS
-from gateway.flightlog.moment import Moment, parse_moment
-from gateway.flightlog.table.column_map import ColumnMap
-from gateway.flights.flight_terms import FlightError, Position, SettingsChoice
 from gateway.reasons import reason_of
+from gateway.recordings.formats.csv import ColumnMap
+from gateway.recordings.formats.dataflash import SENSORS
+from gateway.recordings.join import Moment, parse_moment
+from gateway.recordings.reading import FlightError, Position, SettingsChoice
 
 PANEL: Final = "Recordings"
 

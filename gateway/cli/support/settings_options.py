@@ -17,8 +17,8 @@ from gateway.cli.support.errors import refuse
 if TYPE_CHECKING:
     from gateway.aircraft import AircraftSettings
     from gateway.config import GatewaySettings
-    from gateway.flights.reading import ReadOptions
     from gateway.pipeline import PipelineSettings
+    from gateway.recordings.reading import ReadOptions
 
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
 
@@ -68,7 +68,7 @@ def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
 
 def read_options(settings: GatewaySettings, **how: Any) -> ReadOptions:
     """Return how flights are read: the limits of the settings, and further fields by name."""
-    from gateway.flights.reading import ReadOptions
+    from gateway.recordings.reading import ReadOptions
 
     current = pipeline_settings(settings)
     return ReadOptions(current, unpacked_limit=settings.recording.unpacked_limit, **how)

@@ -20,8 +20,8 @@ from gateway.estimation.complementary.complementary_kernels import KERNELS as CO
 from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
 from gateway.estimation.paper.paper_entry import step_live
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.tlog.tlog_scan import scan_at
 from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.tlog_scan import scan_at
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 
 log = logging.getLogger(__name__)

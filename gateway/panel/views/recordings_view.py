@@ -11,7 +11,6 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from gateway.edges.disk.recordings import delete_recording, list_recordings
 from gateway.panel.recorded_aircraft import Profile
 from gateway.panel.recording_facts import RecordingFacts
 from gateway.panel.recording_player import SPEEDS, Playback
@@ -19,6 +18,7 @@ from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets.prompts import confirm, heading, notify_failure
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
+from gateway.recordings.index import delete_recording, list_recordings
 from gateway.season.catalogue.catalogue_file import Row
 
 REFRESH_S: Final = 1.0

@@ -7,12 +7,12 @@ from typing import Any, Final
 from nicegui import ui
 from nicegui.elements.mixins.text_element import TextElement
 
-from gateway.edges.disk.recordings import RecordingError
 from gateway.live.control_socket import ControlError
 from gateway.panel.recording_player import PlaybackError
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext
 from gateway.printable import printable
+from gateway.recordings.index import RecordingError
 
 FAILURES: Final = (
     ControlError, CommandFailedError, NotAllowedError, PlaybackError, RecordingError, OSError,

@@ -9,7 +9,7 @@ from typing import Final
 import msgspec
 
 from gateway import __version__
-from gateway.edges.disk.recordings import as_text
+from gateway.recordings.index import as_text
 from gateway.season.batch.flight_tasks import FlightResult, FlightTask, name_of, work_on
 from gateway.season.batch.result_folder import ResultFolder
 from gateway.season.batch.storage import BatchItem, stamp_of_item

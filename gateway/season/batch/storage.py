@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import msgspec
 
-from gateway.edges.disk.recording_streams import CHUNK, GZIP
-from gateway.edges.disk.recordings import parts_together, recording_name
+from gateway.recordings.files import CHUNK, GZIP
+from gateway.recordings.index import parts_together, recording_name
 from gateway.season.catalogue.indexing import ENDINGS, digest_of, recordings_below
 from gateway.season.executors import WorkError
 

@@ -9,7 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
-from gateway.edges.disk.recording_streams import (
+from gateway.recordings.files import (
     CHUNK,
     GZIP,
     OTHER_FORMATS,
@@ -18,12 +18,11 @@ from gateway.edges.disk.recording_streams import (
     kind_of,
     open_recording,
     other_format,
+    read_batches,
     read_chunks,
 )
-from gateway.edges.disk.recordings import as_text, recording_name
-from gateway.edges.disk.tlog_source import read_batches
-from gateway.flights.flight_terms import NO_RECORDING, FlightError
-from gateway.flights.reading import ReadOptions, open_rows
+from gateway.recordings.index import as_text, recording_name
+from gateway.recordings.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
 from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
 from gateway.season.executors import Executor, WorkFailed
 from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
-from gateway.flightlog.damaged_times import DAY_US
-from gateway.flightlog.moment import civil_time
-from gateway.flightlog.summary import GroundDistance
 from gateway.geometry.angle import wrap_180
+from gateway.recordings.join import civil_time
+from gateway.recordings.summary import GroundDistance
+from gateway.recordings.tlog import DAY_US
 from gateway.season.statistics.track_shape import Place, simplified
 from gateway.units import US_PER_S
 

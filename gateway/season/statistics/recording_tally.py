@@ -8,17 +8,16 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from gateway.flightlog.summary import (
+from gateway.recordings.answers import is_station
+from gateway.recordings.columns import TableRow
+from gateway.recordings.summary import (
     GLOBAL_POSITION_INT_ID,
     HEARTBEAT_ID,
     STEP_US,
     TimesSpan,
-    payload_of,
 )
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableEvent, TableFault, TableHeader, TableReader
-from gateway.flightlog.tlog.recorded_commands import is_station
-from gateway.flightlog.tlog.tlog import Batch, TlogIndex
+from gateway.recordings.table import TableEvent, TableFault, TableHeader, TableReader
+from gateway.recordings.tlog import Batch, TlogIndex, payload_of
 from gateway.records import NavFlags, NodeStatus
 from gateway.season.statistics.flight_facts import FlightFacts, FlightTally, began_text, lost_share
 from gateway.season.statistics.track_shape import Place

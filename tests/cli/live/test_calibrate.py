@@ -9,8 +9,8 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import calibrate
 from gateway.config import load, load_aircraft
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import TableHeader, encode_head
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.solvers import NodeSamples
 from gateway.simulator.flight import fly

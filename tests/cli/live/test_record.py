@@ -13,8 +13,8 @@ from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import RecorderVerbs
 from gateway.season.catalogue.catalogue_file import CATALOGUE_NAME
 from tests.conftest import ManualClock
-from tests.edges.disk.test_recorder import Bench
-from tests.flightlog.frames import make_frames
+from tests.live.test_recorder import Bench
+from tests.recordings.frames import make_frames
 
 pytestmark = pytest.mark.io
 

@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 from gateway.cli.app import app
 from gateway.config import GatewaySettings
-from gateway.flightlog.table.row import TableRow
-from gateway.flightlog.table.table import TableFault, TableHeader, TableReader
-from gateway.flightlog.tlog.tlog import TlogRecord, TlogScanner
+from gateway.recordings.columns import TableRow
+from gateway.recordings.table import TableFault, TableHeader, TableReader
+from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.wire.mavlink_splitter import origin_of
-from tests.flightlog.frames import START_US, make_records, make_tlog
-from tests.test_replay import fly, make_flight
+from tests.recordings.frames import START_US, make_records, make_tlog
+from tests.recordings.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 

@@ -11,11 +11,11 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import TableReader, encode_head, encode_state
-from gateway.replay import header_for
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.reading import header_for
+from gateway.recordings.table import TableReader, encode_head, encode_state
 from tests.estimation.test_golden import GOLDEN
-from tests.test_replay import fly_from_the_middle
+from tests.recordings.test_replay import fly_from_the_middle
 
 HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
 

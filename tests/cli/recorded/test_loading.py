@@ -9,14 +9,14 @@ import typer
 from gateway.aircraft import AircraftSettings
 from gateway.cli.support.loading import STORIES, Loading, load_flight
 from gateway.config import GatewaySettings
-from gateway.edges.disk.recording_streams import FileKind
 from gateway.estimation.alignment.latency_of_log import GpsLatency
 from gateway.estimation.select import EstimationSettings
-from gateway.flightlog.table.row import TableRow, row_to_line
-from gateway.flightlog.table.table import encode_head
-from gateway.flights import log_facts
+from gateway.recordings import fuse as log_facts
+from gateway.recordings.columns import TableRow, row_to_line
+from gateway.recordings.files import FileKind
+from gateway.recordings.reading import header_for
+from gateway.recordings.table import encode_head
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
-from gateway.replay import header_for
 
 pytestmark = pytest.mark.io
 

@@ -17,14 +17,14 @@ from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
 from gateway.cli.support.named_recordings import files_of
 from gateway.config import GatewaySettings, load
-from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import encode_head
-from gateway.flightlog.tlog.tlog import TlogRecord
-from gateway.flights.flight_terms import FlightError
-from gateway.flights.glance import END_BYTES, glance
 from gateway.player import PlayerDaemon
-from tests.flightlog.frames import START_US, STEP_US, make_records, make_tlog
-from tests.test_replay import fly, make_flight, read
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.reading import FlightError
+from gateway.recordings.summary import END_BYTES, glance
+from gateway.recordings.table import encode_head
+from gateway.recordings.tlog import TlogRecord
+from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
+from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 

@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
-from gateway.flightlog.table.row import COLUMNS
-from gateway.flightlog.table.table import FORMAT_LINE, encode_head
+from gateway.recordings.columns import COLUMNS
+from gateway.recordings.reading import header_for
+from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
-from gateway.replay import header_for
-from tests.flightlog.frames import make_frames
+from tests.recordings.frames import make_frames
 
 pytestmark = pytest.mark.io
 

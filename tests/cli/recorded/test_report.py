@@ -10,8 +10,8 @@ from gateway.analysis.reporting.page import Report
 from gateway.analysis.reporting.sections.raw_sensors import timing
 from gateway.cli.app import app
 from gateway.cli.recorded import report
-from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import TableHeader, encode_head
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.table import TableHeader, encode_head
 from tests.analysis.test_sources import rows
 
 pytestmark = pytest.mark.io

@@ -7,8 +7,8 @@ from typer.testing import CliRunner
 
 from gateway.cli.app import app
 from gateway.config import load
-from gateway.flightlog.table.row import row_to_line
-from gateway.flightlog.table.table import TableHeader, encode_head
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.table import TableHeader, encode_head
 from tests.analysis.test_sources import rows
 
 pytestmark = pytest.mark.io

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import msgspec
 
-from gateway.edges.disk.recordings import is_file_name, list_recordings
+from gateway.recordings.index import is_file_name, list_recordings
 
 if TYPE_CHECKING:
     import zenoh

@@ -1,1 +1,0 @@
-"""Clocks, ports, sockets and files: the only I/O."""

@@ -1,1 +1,0 @@
-"""Recordings, places and logs on disk."""

@@ -1,1 +1,0 @@
-"""Recording formats and playback state machines; pure."""

@@ -1,1 +1,0 @@
-"""Flights as tables: our CSV, and other formats read into the same rows."""

@@ -1,1 +1,0 @@
-"""Recordings as streams: opened from any format, and fused again."""

@@ -1,1 +1,0 @@
-"""File formats of other programs, read by packages that are extras."""

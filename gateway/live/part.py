@@ -1,0 +1,198 @@
+"""The data buffered for the part of a recording that is being written, and its limits."""
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import msgspec
+
+from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
+from gateway.recordings.table import (
+    TableHeader,
+    TableMark,
+    encode_head,
+    encode_header,
+    encode_mark,
+    encode_node,
+    encode_state,
+)
+from gateway.recordings.tlog import Stamper, encode_record
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
+from gateway.units import US_PER_S
+
+PENDING_LIMIT: Final = 16 << 20
+"""Bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
+TLOG: Final = ".tlog"
+
+
+@dataclass(slots=True)
+class _Table:
+    """One aircraft's table, which begins with its first row."""
+
+    header: TableHeader
+    state: FusionState | None
+    rows: RowBuilder = field(default_factory=RowBuilder)
+    begun: bool = False
+
+
+class Part:
+    """Bytes by the ending of their file's name, buffered until they are written to the disk.
+
+    Parameters
+    ----------
+    session : str
+        Name of the recording.
+    number : int
+        Which part of it, from 1.
+    offset_us : int
+        Civil time of gateway time zero, for as long as the part is written.
+    """
+
+    def __init__(self, session: str, number: int, offset_us: int) -> None:
+        self.session = session
+        """May be set until the table of an aircraft begins."""
+        self.number = number
+        self.stamper = Stamper(offset_us)
+        self.pending: dict[str, bytearray] = {}
+        self.size = 0
+        """Bytes added, those beyond the limit included."""
+        self._tables: dict[int, _Table] = {}
+
+    def add(self, ending: str, data: bytes) -> None:
+        """Buffer bytes for one file, unless too many wait already."""
+        if self.size < PENDING_LIMIT:
+            self.pending.setdefault(ending, bytearray()).extend(data)
+        self.size += len(data)
+
+    def take(self) -> dict[str, bytes]:
+        """Return the buffered bytes and clear the buffer."""
+        pending, self.pending, self.size = self.pending, {}, 0
+        return {ending: bytes(data) for ending, data in pending.items()}
+
+    def add_frame(self, frame: bytes, now_us: int) -> None:
+        """Buffer a MAVLink frame for the tlog."""
+        self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
+
+    def has_table(self, vehicle_id: int) -> bool:
+        """Return whether the table of an aircraft was prepared."""
+        return vehicle_id in self._tables
+
+    def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:
+        """Set the head of an aircraft's table.
+
+        Parameters
+        ----------
+        header : TableHeader
+            Of this part; the recording's name is put in when the table begins.
+        state : FusionState, optional
+            State of the fusion before the first row, if it has any.
+        """
+        self._tables[header.vehicle_id] = _Table(header, state)
+
+    def add_flight(
+        self, vehicle_id: int, record: BaroRaw | GpsFix | FusedSample | NodeStatus
+    ) -> None:
+        """Buffer a record of an aircraft, for a table that was prepared."""
+        if isinstance(record, NodeStatus):
+            # It begins no table: the first row must come first.
+            if self._tables[vehicle_id].begun:
+                self.add(table_ending(vehicle_id), encode_node(record).encode())
+            return
+        self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
+
+    def change_settings(self, header: TableHeader) -> None:
+        """Note in a prepared table that the following rows are fused with other settings."""
+        table = self._tables[header.vehicle_id]
+        self._begin(table)
+        self._write(table, table.rows.flush())
+        self.add(table_ending(header.vehicle_id), encode_header(header).encode())
+
+    def add_mark(self, mark: TableMark) -> None:
+        """Add a remark to every table that has begun."""
+        for vehicle_id, table in self._tables.items():
+            if table.begun:
+                self.add(table_ending(vehicle_id), encode_mark(mark).encode())
+
+    def flush_rows(self) -> None:
+        """Buffer also the records that still wait for an IMU sample to share its row."""
+        for table in self._tables.values():
+            self._write(table, table.rows.flush())
+
+    def _begin(self, table: _Table) -> None:
+        if not table.begun:
+            table.begun = True
+            # The name may have changed since the table was prepared.
+            header = msgspec.structs.replace(table.header, session=self.session)
+            begun = "" if table.state is None else encode_state(table.state)
+            self.add(table_ending(header.vehicle_id), (encode_head(header) + begun).encode())
+
+    def _write(self, table: _Table, rows: list[TableRow]) -> None:
+        for row in rows:
+            self._begin(table)
+            self.add(table_ending(table.header.vehicle_id), row_to_line(row).encode())
+
+
+def table_ending(vehicle_id: int) -> str:
+    """Return the file name ending of an aircraft's table."""
+    return f"_v{vehicle_id}.csv"
+
+
+TRUSTED_BPS: Final = 64_000
+"""Bytes a second for each client that may change things: more than any ground station sends."""
+STRANGERS_BPS: Final = 4_000
+"""Bytes a second for all others together."""
+BURST_S: Final = 16
+"""Length of a burst: a ground station asks much when it connects, then little."""
+
+
+class _Bucket:
+    """A token bucket."""
+
+    def __init__(self, rate_bps: int, now_us: int) -> None:
+        self._rate_bps = rate_bps
+        self._bytes = float(rate_bps * BURST_S)
+        self._filled_us = now_us
+
+    def draw(self, size: int, now_us: int) -> bool:
+        added = self._rate_bps * (now_us - self._filled_us) / US_PER_S
+        self._bytes = min(self._bytes + added, self._rate_bps * BURST_S)
+        self._filled_us = now_us
+        if self._bytes < size:
+            return False
+        self._bytes -= size
+        return True
+
+
+class RecordingBudget:
+    """What may still be recorded of each client; one that was never noted is untrusted."""
+
+    def __init__(self) -> None:
+        self._strangers = _Bucket(STRANGERS_BPS, 0)
+        self._trusted: dict[int, _Bucket] = {}
+
+    def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
+        """Note whether a client may change things."""
+        if not trusted:
+            self._trusted.pop(client_id, None)
+        elif client_id not in self._trusted:
+            self._trusted[client_id] = _Bucket(TRUSTED_BPS, now_us)
+
+    def forget_client(self, client_id: int) -> None:
+        """Forget a client that has gone."""
+        self._trusted.pop(client_id, None)
+
+    def takes(self, client_id: int, size: int, now_us: int) -> bool:
+        """Return whether a frame from a client, or to it alone, is recorded.
+
+        Parameters
+        ----------
+        client_id : int
+        size : int
+            Of the frame in bytes.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        bool
+        """
+        return self._trusted.get(client_id, self._strangers).draw(size, now_us)

@@ -1,0 +1,143 @@
+"""The stored places of each aircraft: one JSON file each, beside its settings.
+
+A file is replaced whole or not at all, by a separate thread, since writing to a disk may block. A
+failed write is retried until it succeeds. A file that cannot be read is reported and left as it
+is: it may hold a mission that a person can repair.
+"""
+
+import asyncio
+import contextlib
+import logging
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from gateway.live.worker import begin_worker
+from gateway.output import write_new
+from gateway.reasons import reason_of
+from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
+
+log = logging.getLogger(__name__)
+
+NAME: Final = re.compile(r"(\d{1,3})\.places\.json")
+RETRY_S: Final = 10.0
+"""Soon for a person who has repaired a file or made room, and no load for a failing disk."""
+
+
+class PlaceFiles:
+    """The files of all aircraft.
+
+    Parameters
+    ----------
+    folder : Path
+        Created when it is needed.
+    report : callable
+        Called with the vehicle id and why its places cannot be stored, or None when they can again.
+    """
+
+    def __init__(self, folder: Path, report: Callable[[int, str | None], None]) -> None:
+        self.failures = 0
+        """Changes that could not be written at once since the start."""
+        self.broken: dict[int, str] = {}
+        """Why the places of an aircraft could not be loaded, by vehicle id."""
+        self._folder = folder
+        self._report = report
+        self._pending: dict[int, StoredPlaces] = {}
+        self._failed: dict[int, StoredPlaces] = {}
+        """Places whose last write failed."""
+        self._worker = begin_worker("places")
+        self._task: asyncio.Task[None] | None = None
+        self._retry: asyncio.TimerHandle | None = None
+
+    def load(self) -> dict[int, StoredPlaces]:
+        """Read all files that can be read."""
+        found: dict[int, StoredPlaces] = {}
+        for file in sorted(self._folder.glob("*.places.json")):
+            named = NAME.fullmatch(file.name)
+            if named is None:
+                continue
+            vehicle_id = int(named[1])
+            try:
+                found[vehicle_id] = decode_places(file.read_text(encoding="utf-8"))
+            except (OSError, ValueError) as error:
+                self.broken[vehicle_id] = _broken(file)
+                log.warning(
+                    "%s cannot be read and is left alone: %s. Missions, mark and home of aircraft "
+                    "%d begin empty and are not kept until it is repaired or removed.",
+                    file,
+                    error,
+                    vehicle_id,
+                )
+        return found
+
+    def save(self, vehicle_id: int, places: StoredPlaces) -> None:
+        """Store the places of an aircraft; returns at once, only the newest are written."""
+        self._pending[vehicle_id] = places
+        self._start()
+
+    async def settle(self) -> None:
+        """Wait until all pending writes are done."""
+        if self._task is not None:
+            await self._task
+
+    def close(self) -> None:
+        """Write what is pending and end; waits for the disk."""
+        if self._retry is not None:
+            self._retry.cancel()
+        if self._task is not None:
+            self._task.cancel()
+        self._worker.shutdown(wait=True)
+        for vehicle_id, places in self._pending.items():
+            with contextlib.suppress(OSError):
+                self._write(vehicle_id, places)
+
+    def _start(self) -> None:
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._write_pending())
+
+    async def _write_pending(self) -> None:
+        """Write all that is pending; failed writes wait for the next attempt."""
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        loop = asyncio.get_running_loop()
+        tried: dict[int, StoredPlaces] = {}
+        while left := [item for item in self._pending.items() if tried.get(item[0]) is not item[1]]:
+            vehicle_id, places = left[0]
+            tried[vehicle_id] = places
+            try:
+                await loop.run_in_executor(self._worker, self._write, vehicle_id, places)
+            except OSError as error:
+                self._note_failure(vehicle_id, places, reason_of(error))
+            else:
+                self._note_success(vehicle_id, places)
+        if self._pending:
+            self._retry = loop.call_later(RETRY_S, self._start)
+
+    def _note_failure(self, vehicle_id: int, places: StoredPlaces, reason: str) -> None:
+        if self._failed.get(vehicle_id) is places:
+            return
+        self._failed[vehicle_id] = places
+        self.failures += 1
+        log.warning("places of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
+        self._report(vehicle_id, reason)
+
+    def _note_success(self, vehicle_id: int, places: StoredPlaces) -> None:
+        # It stays until it is written, so that a shutdown in between loses nothing.
+        if self._pending[vehicle_id] is places:
+            del self._pending[vehicle_id]
+        if self._failed.pop(vehicle_id, None):
+            log.info("places of aircraft %d are kept again", vehicle_id)
+            self._report(vehicle_id, None)
+
+    def _write(self, vehicle_id: int, places: StoredPlaces) -> None:
+        file = self._folder / f"{vehicle_id}.places.json"
+        if vehicle_id in self.broken and file.exists():
+            raise OSError(None, _broken(file))
+        self._folder.mkdir(parents=True, exist_ok=True)
+        write_new(file, [encode_places(places).encode()], overwrite=True)
+
+
+def _broken(file: Path) -> str:
+    return f"{file.name} is broken: repair or remove it"

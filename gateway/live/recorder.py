@@ -1,0 +1,399 @@
+"""The recorder: records what passes through the gateway, and never delays it.
+
+Linux has no way to write to a disk without waiting for it: a card that cleans up, or a network
+folder, blocks for seconds. So two other threads do all disk work. They get immutable values and
+return results; nothing is shared, so there is nothing to lock. Meanwhile the event loop buffers
+the next bytes, up to a limit.
+
+Every `flush_s` one thread gives the buffered bytes to the kernel, which survives a crash of the
+gateway; every `sync_s` the other has the kernel write them to the disk, which survives a power
+loss, and it closes, renames and copies what is finished. So no write waits for a slow sync, and
+the next sync begins once the last has ended. By default both times are half a second, so that
+either costs less than a second on a disk that syncs as fast; a card that is worn by this may be
+synced less often.
+"""
+
+import asyncio
+import contextlib
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+
+import msgspec
+
+from gateway.live.part import PENDING_LIMIT, Part
+from gateway.live.part_files import (
+    DiskState,
+    PartFiles,
+    Restamper,
+    clear_copies,
+    close_behind,
+    free_bytes_near,
+    reason_of,
+)
+from gateway.live.session import (
+    Announce,
+    ClosePart,
+    CorrectTimes,
+    OpenPart,
+    RecordingSettings,
+    Session,
+    SessionAction,
+    SessionState,
+)
+from gateway.live.worker import begin_worker, done_by
+from gateway.output import sync_folder
+from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
+from gateway.recordings.table import REMARK, TableHeader, TableMark
+from gateway.recordings.tlog import CivilClock
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
+from gateway.status import RecorderStatus
+from gateway.units import US_PER_S
+
+log = logging.getLogger(__name__)
+
+
+class Recorder:
+    """Record MAVLink and flights.
+
+    Parameters
+    ----------
+    settings : RecordingSettings
+        What, where, when.
+    now_us : callable
+        The gateway clock.
+    unix_us : callable
+        The machine's civil time.
+    header_of : callable
+        Returns the head of a vehicle's table: version, settings, calibration. Session, part and
+        start are filled in here.
+    announce : callable
+        Called with whether it is a problem, and a text for the user.
+    state_of : callable
+        Returns the state of a vehicle's fusion after all records passed to `flight`.
+    """
+
+    def __init__(
+        self,
+        settings: RecordingSettings,
+        now_us: Callable[[], int],
+        unix_us: Callable[[], int],
+        header_of: Callable[[int], TableHeader],
+        announce: Callable[[bool, str], None],
+        state_of: Callable[[int], FusionState | None] = lambda _: None,
+    ) -> None:
+        self._settings = settings
+        self._clock, self._machine_us = now_us, unix_us
+        self._header_of = header_of
+        self._announce = announce
+        self._state_of = state_of
+        self._session = Session(settings)
+        self._civil = CivilClock()
+        self._seen: set[int] = set()
+        self._part: Part | None = None
+        self._files: PartFiles | None = None
+        self._disk = DiskState(0, 0)
+        self._sync_due_us = 0
+        self._syncing: Future[None] | None = None
+        """The sync that runs, or ended since the last flush."""
+        self._writer, self._syncer = begin_worker("recorder"), begin_worker("syncer")
+        self._wake = asyncio.Event()
+        self._turned = asyncio.Event()
+        self._task: asyncio.Task[None] | None = None
+        self._offsets: dict[int, int] = {}
+        """Civil time of gateway time zero with which each part of the session was written."""
+        self._restamper = Restamper(round(settings.free_floor_mb * 1e6))
+        self._restamping: asyncio.Task[None] | None = None
+        self.folder = Path(settings.folder).expanduser()
+        """Folder of the recordings."""
+
+    def start(self) -> None:
+        """Start; needs a running event loop.
+
+        A recording that is wanted already is opened at once: nothing runs yet that could be
+        delayed, and a table should begin with the estimator's first sample.
+        """
+        clear_copies(self.folder)
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        if self._session.wanted:
+            self._open_at_once()
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def close(self) -> None:
+        """Write what is pending and end; waits for the disk."""
+        for task in (self._task, self._restamping):
+            if task is not None:
+                task.cancel()
+        self._writer.shutdown(wait=True)
+        self._syncer.shutdown(wait=True)
+        files, self._files = self._files, None
+        try:
+            if files is not None and self._part is not None:
+                self._part.flush_rows()
+                files.close(self._part.take())
+            self._check_sync()
+        except OSError as error:
+            log.warning("Recording: the last bytes are lost: %s", reason_of(error))
+        self._restamper.finish()
+
+    async def settle(self) -> None:
+        """Wait until all requests so far have been carried out."""
+        # The present turn may have begun before the request came.
+        for _ in range(2):
+            self._turned.clear()
+            self._wake.set()
+            await self._turned.wait()
+
+    def record(self) -> None:
+        """Record from now on."""
+        self._session.start()
+        self._wake.set()
+
+    def stop(self) -> None:
+        """Stop recording until the next request or flight."""
+        self._session.stop()
+        self._wake.set()
+
+    def set_in_flight(self, in_flight: bool) -> None:
+        """Note take-off or landing."""
+        self._session.set_in_flight(in_flight)
+
+    def mark(self, text: str) -> None:
+        """Add a remark to the recording at this moment."""
+        if self._part is not None:
+            self._part.add_mark(TableMark(self._clock(), text))
+        self._announce(False, REMARK + text)
+
+    async def save(self, name: str) -> None:
+        """Rename the present or last session.
+
+        Raises
+        ------
+        RecordingError
+            If there is none, or the name is taken or invalid.
+        """
+        if not self._session.name:
+            raise RecordingError("nothing was recorded since the gateway started")
+        await self._restamped()
+        old, files = self._session.name, self._files
+        if files is None:
+            await done_by(self._syncer, move_recording, self.folder, old, name)
+        else:
+            await done_by(self._writer, files.rename, name)
+        self._session.name = name
+        if self._part is not None:
+            self._part.session = name
+        # Not by the thread that writes.
+        await done_by(self._syncer, sync_folder, self.folder)
+
+    def status(self) -> RecorderStatus:
+        """Return the present state."""
+        session, disk = self._session, self._disk
+        return RecorderStatus(
+            state=session.state.value,
+            name=session.name,
+            part=session.part,
+            part_bytes=disk.part_bytes,
+            free_bytes=disk.free_bytes,
+            reason=session.reason,
+            folder=str(self.folder),
+        )
+
+    @property
+    def trouble(self) -> str:
+        """Why nothing can be recorded at the moment, or empty."""
+        return self._session.reason if self._session.state is SessionState.BLOCKED else ""
+
+    @property
+    def recording(self) -> bool:
+        """Whether a recording runs, and its first bytes are written."""
+        return self._session.state is SessionState.RECORDING and self._disk.part_bytes > 0
+
+    def frame(self, frame: bytes) -> None:
+        """Record a MAVLink frame that was sent or received."""
+        if self._part is not None and self._settings.tlog:
+            self._part.add_frame(frame, self._clock())
+
+    def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
+        """Record a sample of the estimator, or the resulting state."""
+        if isinstance(record, GpsFix) and record.utc_us is not None:
+            self._civil.hear_gps(record.node.vehicle_id, record.utc_us, record.time_us)
+        vehicle_id = (
+            record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
+        )
+        part = self._part
+        if part is not None and self._settings.table:
+            if not part.has_table(vehicle_id):
+                part.prepare_table(self._header(vehicle_id, part))
+            part.add_flight(vehicle_id, record)
+        self._seen.add(vehicle_id)
+
+    def settings_changed(self, vehicle_id: int) -> None:
+        """Note that the following samples are fused with other settings, in a new header line."""
+        if self._part is not None and self._part.has_table(vehicle_id):
+            self._part.change_settings(self._header(vehicle_id, self._part))
+
+    def _new_part(self, session: str, number: int) -> Part:
+        """Start buffering for a part; later, the fusion would be ahead of its first row."""
+        part = Part(session, number, self._civil.offset_us or 0)
+        if number == 1:
+            self._offsets.clear()
+        self._offsets[number] = part.stamper.offset_us
+        if self._settings.table:
+            for vehicle_id in self._seen:
+                part.prepare_table(self._header(vehicle_id, part), self._state_of(vehicle_id))
+        return part
+
+    def _header(self, vehicle_id: int, part: Part) -> TableHeader:
+        return msgspec.structs.replace(
+            self._header_of(vehicle_id),
+            vehicle_id=vehicle_id,
+            session=part.session,
+            part=part.number,
+            cold_start=vehicle_id not in self._seen,
+            unix_us_at_zero=part.stamper.offset_us,
+        )
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            # The time that a slow disk needs is subtracted from the pause.
+            due_s = loop.time() + self._settings.flush_s
+            self._wake.clear()
+            await self._turn()
+            self._turned.set()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), max(due_s - loop.time(), 0.0))
+
+    async def _turn(self) -> None:
+        """Write the buffered bytes, then let the session decide."""
+        self._civil.hear_machine(self._machine_us(), self._clock())
+        actions = await self._flush()
+        if not actions:
+            now_us, disk = self._clock(), self._disk
+            part = self._part
+            actions = self._session.poll(
+                now_us,
+                now_us + (self._civil.offset_us or 0),
+                disk.part_bytes,
+                disk.free_bytes,
+                jumped=part is not None and part.stamper.has_jumped(self._civil),
+            )
+        while actions:
+            actions = await self._perform(actions)
+
+    async def _flush(self) -> list[SessionAction]:
+        now_us, part, files = self._clock(), self._part, self._files
+        try:
+            if part is None or files is None:
+                free_bytes = await done_by(self._writer, free_bytes_near, self.folder)
+                self._disk = DiskState(0, free_bytes)
+                return []
+            if part.size > PENDING_LIMIT:
+                return self._session.failed("disk is too slow", now_us)
+            self._disk = await done_by(self._writer, files.write, part.take())
+            self._session.name = part.session = files.session
+            self._check_sync()
+        except OSError as error:
+            return self._session.failed(reason_of(error), self._clock())
+        if self._syncing is None and now_us >= self._sync_due_us:
+            self._sync_due_us = now_us + round(self._settings.sync_s * US_PER_S)
+            self._syncing = self._syncer.submit(files.sync_job())
+        return []
+
+    def _check_sync(self) -> None:
+        """Forget the last sync if it has ended; raises the OSError with which it failed."""
+        if self._syncing is not None and self._syncing.done():
+            ended, self._syncing = self._syncing, None
+            ended.result()
+
+    async def _perform(self, actions: list[SessionAction]) -> list[SessionAction]:
+        """Carry out the session's actions; return its actions upon their outcome."""
+        closing = self._part
+        opening = next((action for action in actions if isinstance(action, OpenPart)), None)
+        # The next part buffers from here on, so that nothing is lost while the last one closes.
+        if closing is not None and any(isinstance(a, ClosePart) for a in actions):
+            closing.flush_rows()
+            self._part = None
+        if opening is not None:
+            self._part = self._new_part(opening.session, opening.part)
+        following: list[SessionAction] = []
+        for action in actions:
+            match action:
+                case ClosePart():
+                    await self._close_part(closing, is_last=opening is None)
+                case CorrectTimes():
+                    await self._correct_times()
+                case OpenPart():
+                    following += await self._open_part(action)
+                case Announce():
+                    self._say(action)
+        return following
+
+    def _say(self, action: Announce) -> None:
+        (log.warning if action.is_trouble else log.info)("%s", action.text)
+        self._announce(action.is_trouble, action.text)
+
+    def _open_at_once(self) -> None:
+        now_us, offset_us = self._clock(), self._civil.offset_us or 0
+        try:
+            self._disk = DiskState(0, free_bytes_near(self.folder))
+            actions = self._session.poll(now_us, now_us + offset_us, 0, self._disk.free_bytes)
+            for action in actions:
+                if isinstance(action, OpenPart):
+                    files = PartFiles(self.folder, action.session, action.part)
+                    self._part = self._new_part(action.session, action.part)
+                    actions = self._adopt(files)
+        except OSError as error:
+            actions = self._session.failed(reason_of(error), now_us)
+        for action in actions:
+            if isinstance(action, Announce):
+                self._say(action)
+
+    async def _open_part(self, action: OpenPart) -> list[SessionAction]:
+        try:
+            files = await done_by(self._writer, PartFiles, self.folder, action.session, action.part)
+        except OSError as error:
+            self._part = None
+            return self._session.failed(reason_of(error), self._clock())
+        return self._adopt(files)
+
+    def _adopt(self, files: PartFiles) -> list[SessionAction]:
+        self._files = files
+        self._session.name = files.session
+        if self._part is not None:
+            self._part.session = files.session
+        return self._session.opened(self._clock())
+
+    async def _close_part(self, part: Part | None, *, is_last: bool) -> None:
+        """Write the end of a part and close it behind its syncs; only for the last one wait."""
+        files, self._files = self._files, None
+        syncing, self._syncing = self._syncing, None
+        if part is None or files is None:
+            return
+        written = self._writer.submit(files.write, part.take())
+        closing = self._syncer.submit(close_behind, files, written, syncing)
+        if is_last:
+            await asyncio.shield(asyncio.wrap_future(closing))
+
+    async def _correct_times(self) -> None:
+        """Queue the finished parts of the session to be shifted to the true time."""
+        await self._restamped()
+        try:
+            # Not by the thread that syncs the part before.
+            found = await done_by(self._writer, find_recording, self.folder, self._session.name)
+        except (OSError, RecordingError) as error:
+            log.warning("Recording %s keeps its times: %s", self._session.name, error)
+            return
+        true_us = self._civil.offset_us or 0
+        for path in found.files:
+            self._restamper.add(path, true_us - self._offsets.get(part_of(path), true_us))
+        self._offsets = dict.fromkeys(self._offsets, true_us)
+        run = self._restamper.run(lambda step: done_by(self._syncer, step))
+        self._restamping = asyncio.get_running_loop().create_task(run)
+
+    async def _restamped(self) -> None:
+        """Wait until no file is being copied, so that its name may change."""
+        if self._restamping is not None:
+            await self._restamping

@@ -1,0 +1,287 @@
+"""When to record, into which part, and what to do when the disk fails.
+
+Theory of operation. The session never touches a file: it returns actions to its owner, which
+reports their outcome.
+
+| state     | event                              | becomes   | actions                           |
+| --------- | ---------------------------------- | --------- | --------------------------------- |
+| idle      | wanted (start, in flight, always)  | opening   | open part 1 of a new session      |
+| opening   | opened                             | recording | announce (first part only)        |
+| opening   | failed                             | blocked   | announce why                      |
+| recording | not wanted any more                | idle      | close, announce                   |
+| recording | part too large or too old          | opening   | close, open the next part         |
+| recording | the clock turns out to be wrong *  | opening   | close, correct, open the next     |
+| recording | too little free space, or failed   | blocked   | close, announce why               |
+| blocked   | retry is due and there is space    | opening   | open the next part                |
+| blocked   | not wanted any more                | idle      | announce                          |
+
+* Only once per part: the part that this opens is not corrected again. Otherwise clocks that
+disagree permanently would rewrite the session again and again.
+
+Whether a recording is wanted: a user's start or stop counts until the next one; without one the
+mode in the settings decides.
+"""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from typing import Annotated, Final, Literal
+
+from gateway.settings import Settings, setting
+from gateway.units import US_PER_S
+
+RETRY_US: Final = 5 * US_PER_S
+RESUME_FACTOR: Final = 1.25
+"""Free space must exceed the floor by this before recording resumes, or it would flap."""
+RESUME_LEAST_MB: Final = 1.0
+"""And this in any case: some ten seconds of recording."""
+PART_DIGITS: Final = 2
+
+
+Mode = Literal["manual", "in_flight", "always"]
+
+
+class RecordingSettings(Settings, frozen=True):
+    """What is recorded, where, and when."""
+
+    mode: Annotated[
+        Mode,
+        setting(
+            "manual: on command only; in_flight: from arming or take-off to landing; always: as "
+            "long as the gateway runs."
+        ),
+    ] = "in_flight"
+    folder: Annotated[
+        str, setting("Folder of the recordings; created if it does not exist.", path=True)
+    ] = "~/mavgate/recordings"
+    tlog: Annotated[bool, setting("Record all MAVLink that is sent and received.")] = True
+    table: Annotated[
+        bool, setting("Record raw samples and fused states, one CSV per aircraft.")
+    ] = True
+    rotate_mb: Annotated[
+        float, setting("A larger file is closed and the next one started.", "MB", ge=1, le=1e6)
+    ] = 512.0
+    rotate_min: Annotated[
+        float, setting("An older file is closed and the next one started.", "min", ge=1, le=1e4)
+    ] = 120.0
+    free_floor_mb: Annotated[
+        float, setting("Recording stops when the disk has less space left.", "MB", ge=0, le=1e6)
+    ] = 200.0
+    flush_s: Annotated[
+        float, setting("Most that is lost when the gateway is killed.", "s", ge=0.05, le=1)
+    ] = 0.5
+    sync_s: Annotated[
+        float,
+        setting(
+            "How often data is synced to the disk; longer spares a card, but a loss of power "
+            "costs more.",
+            "s",
+            ge=0.05,
+            le=60,
+        ),
+    ] = 0.5
+    unpacked_limit_mb: Annotated[
+        float,
+        setting(
+            "Maximum unpacked size of a gzipped log that is read as a whole (ULog, DataFlash, "
+            "Parquet, and a tlog to be played).",
+            "MB",
+            ge=1,
+            le=1e6,
+        ),
+    ] = 1000.0
+
+    @property
+    def unpacked_limit(self) -> int:
+        """The same in bytes."""
+        return round(self.unpacked_limit_mb * 1e6)
+
+
+class SessionState(StrEnum):
+    """State of the recording."""
+
+    IDLE = "idle"
+    OPENING = "opening"
+    RECORDING = "recording"
+    BLOCKED = "blocked"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenPart:
+    """Open the files of a part; answer by `opened` or `failed`."""
+
+    session: str
+    part: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClosePart:
+    """Close the files of the part that is open."""
+
+
+@dataclass(frozen=True, slots=True)
+class Announce:
+    """Announce to the user."""
+
+    is_trouble: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class CorrectTimes:
+    """Correct the times of the files of the session, all closed; it keeps its announced name."""
+
+
+SessionAction = OpenPart | ClosePart | Announce | CorrectTimes
+
+
+def session_name(unix_us: int) -> str:
+    """Name a session by the civil time of its start, in UTC: `20260611-142530`."""
+    return datetime.fromtimestamp(unix_us // US_PER_S, UTC).strftime("%Y%m%d-%H%M%S")
+
+
+def part_stem(session: str, part: int) -> str:
+    """Name the files of a part, without their endings: `20260611-142530_01`."""
+    return f"{session}_{part:0{PART_DIGITS}d}"
+
+
+class Session:
+    """Decide when files are opened and closed.
+
+    Parameters
+    ----------
+    settings : RecordingSettings
+        Mode and limits.
+    """
+
+    def __init__(self, settings: RecordingSettings) -> None:
+        self._settings = settings
+        self._in_flight = False
+        self._asked: bool | None = None
+        self._opened_us = 0
+        self._retry_us = 0
+        self._corrected = False
+        self.state = SessionState.IDLE
+        self.name = ""
+        """Name of the session that runs, or ran last."""
+        self.part = 0
+        self.reason = ""
+        """Why it is blocked."""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there should be a recording now."""
+        if self._asked is not None:
+            return self._asked
+        mode = self._settings.mode
+        return mode == "always" or (mode == "in_flight" and self._in_flight)
+
+    def start(self) -> None:
+        """Start on a user's request; a blocked recording is retried at once."""
+        self._asked = True
+        if self.state is SessionState.BLOCKED:
+            self.state = SessionState.IDLE
+
+    def stop(self) -> None:
+        """Stop on a user's request, until the next request or the next flight."""
+        self._asked = False
+
+    def set_in_flight(self, in_flight: bool) -> None:
+        """Note take-off or landing; a take-off cancels an earlier request to stop."""
+        if in_flight and not self._in_flight and self._asked is False:
+            self._asked = None
+        self._in_flight = in_flight
+
+    def opened(self, now_us: int) -> list[SessionAction]:
+        """Note that the files of the part are open."""
+        self.state, self._opened_us = SessionState.RECORDING, now_us
+        resumed, self.reason = bool(self.reason), ""
+        if self.part == 1 or resumed:
+            return [Announce(is_trouble=False, text=f"Recording {self.name}")]
+        return []
+
+    def failed(self, reason: str, now_us: int) -> list[SessionAction]:
+        """Note that files could not be opened or written; this is retried later."""
+        closing: list[SessionAction] = [ClosePart()] if self.state is SessionState.RECORDING else []
+        if self.state is SessionState.OPENING:
+            self.part -= 1
+        self.state, self._retry_us = SessionState.BLOCKED, now_us + RETRY_US
+        known, self.reason = reason == self.reason, reason
+        if known:
+            return closing
+        return [*closing, Announce(is_trouble=True, text=f"Recording stopped: {reason}")]
+
+    def poll(
+        self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False
+    ) -> list[SessionAction]:
+        """Return the actions that are due.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        unix_us : int
+            Civil time, for the name of a new session.
+        part_bytes : int
+            Size of the largest file that is open.
+        free_bytes : int
+            Space left on the disk; 0 if unknown.
+        jumped : bool
+            Whether civil time has turned out to differ from that of the open files.
+
+        Returns
+        -------
+        list of SessionAction
+            To be carried out in this order.
+        """
+        match self.state:
+            case SessionState.IDLE if self.wanted:
+                self.name, self.part = session_name(unix_us), 0
+                self._corrected = False
+                if self._is_short(free_bytes):
+                    return self._stop_short(now_us)
+                return self._open_next()
+            case SessionState.RECORDING:
+                return self._poll_recording(now_us, part_bytes, free_bytes, jumped=jumped)
+            case SessionState.BLOCKED:
+                return self._poll_blocked(now_us, free_bytes)
+            case _:
+                return []
+
+    def _poll_recording(
+        self, now_us: int, part_bytes: int, free_bytes: int, *, jumped: bool
+    ) -> list[SessionAction]:
+        if not self.wanted:
+            self.state = SessionState.IDLE
+            return [ClosePart(), Announce(is_trouble=False, text=f"Recording {self.name} ended")]
+        if self._is_short(free_bytes):
+            return self._stop_short(now_us)
+        s, age_us = self._settings, now_us - self._opened_us
+        too_old = age_us > s.rotate_min * 60 * US_PER_S
+        if jumped and not self._corrected:
+            self._corrected = True
+            return [ClosePart(), CorrectTimes(), *self._open_next()]
+        if too_old or part_bytes > s.rotate_mb * 1e6:
+            self._corrected = False
+            return [ClosePart(), *self._open_next()]
+        return []
+
+    def _poll_blocked(self, now_us: int, free_bytes: int) -> list[SessionAction]:
+        if not self.wanted:
+            self.state, self.reason = SessionState.IDLE, ""
+            return [Announce(is_trouble=False, text=f"Recording {self.name} ended")]
+        enough_mb = max(self._settings.free_floor_mb * RESUME_FACTOR, RESUME_LEAST_MB)
+        if now_us < self._retry_us or free_bytes < enough_mb * 1e6:
+            return []
+        return self._open_next()
+
+    def _is_short(self, free_bytes: int) -> bool:
+        return free_bytes < self._settings.free_floor_mb * 1e6
+
+    def _stop_short(self, now_us: int) -> list[SessionAction]:
+        return self.failed(f"less than {self._settings.free_floor_mb:g} MB free", now_us)
+
+    def _open_next(self) -> list[SessionAction]:
+        self.state = SessionState.OPENING
+        self.part += 1
+        return [OpenPart(self.name, self.part)]

@@ -1,0 +1,360 @@
+"""What a recording answers to ground stations, and which of its frames must not be played.
+
+A tlog holds the answers that the vehicle gave in flight. They are collected while the file is
+indexed, each with the time from which it was valid, so that a player can give them again: as of
+the moment that is played, or the first one for what the vehicle sent only later.
+
+| what                         | where from                                               |
+| ---------------------------- | -------------------------------------------------------- |
+| parameters                   | PARAM_VALUE of the autopilot, the newest of each name    |
+| mission, fence, rally points | a whole download, or an upload that the vehicle accepted |
+| home, origin, version, modes | the messages of that name                                |
+
+A recording holds both directions of a link. Messages of a vehicle are played; those of ground
+stations, and any others that command a vehicle or feed its navigation, could arm, steer or mislead
+a real vehicle with the same id on the link that it is played to.
+"""
+
+import struct
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Set
+from dataclasses import dataclass, field
+from typing import Final, Generic, TypeVar
+
+import numpy as np
+from fastcrc.crc16 import mcrf4xx
+
+from gateway.recordings.tlog import Batch, payload_of, readdress
+from gateway.recordings.tlog_scan import IntArray
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, TARGET_OFFSETS
+from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of, target_of
+
+FIRST_GROUND_STATION: Final = 250
+"""System ids from here on are by custom ground stations, which keep their id."""
+AUTOPILOT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1."""
+
+_REPORTS: Final = {
+    MESSAGE_IDS[name]
+    for name in (
+        "COMMAND_ACK", "MISSION_ACK", "PARAM_ERROR", "MOUNT_STATUS", "CAMERA_STATUS",
+        "CAMERA_FEEDBACK", "GIMBAL_REPORT", "GIMBAL_TORQUE_CMD_REPORT",
+        "GIMBAL_DEVICE_ATTITUDE_STATUS", "OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION",
+        "OPEN_DRONE_ID_AUTHENTICATION", "OPEN_DRONE_ID_SELF_ID", "OPEN_DRONE_ID_SYSTEM",
+        "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
+    )
+}  # fmt: skip
+"""Messages with a target that request nothing of it."""
+_ASKING: Final = frozenset(TARGET_OFFSETS.keys() - _REPORTS)
+_FEEDING: Final = frozenset(
+    MESSAGE_IDS[name]
+    for name in (
+        "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
+        "HIL_GPS", "HIL_OPTICAL_FLOW", "HIL_ACTUATOR_CONTROLS", "HIL_STATE_QUATERNION",
+        "GLOBAL_VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE",
+        "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LANDING_TARGET",
+        "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D", "DISTANCE_SENSOR", "OPTICAL_FLOW",
+        "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
+    )
+)  # fmt: skip
+"""Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
+_LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
+
+
+def is_station(origin: int, stations: Set[int]) -> bool:
+    """Return whether a sender (system << 8 | component) is a ground station.
+
+    Parameters
+    ----------
+    origin : int
+        The sender.
+    stations : set of int
+        Senders whose heartbeats say so.
+    """
+    return origin >> 8 >= FIRST_GROUND_STATION or origin in stations
+
+
+def is_command(frame: bytes, stations: Set[int]) -> bool:
+    """Return whether a frame is a request to a vehicle, or feeds its navigation."""
+    message_id = message_id_of(frame)
+    if message_id in _FEEDING:
+        return origin_of(frame)[1] != AUTOPILOT
+    if message_id not in _ASKING:
+        return False
+    target = target_of(frame)[0]
+    return target < FIRST_GROUND_STATION and target not in {s >> 8 for s in stations}
+
+
+def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
+    """Find the records that are neither from a station nor requests to a vehicle.
+
+    Parameters
+    ----------
+    batch : Batch
+        Records of a tlog.
+    begin : int
+        First of them to look at.
+    stations : set of int
+        Senders whose heartbeats said that they are ground stations.
+
+    Returns
+    -------
+    ndarray of int
+        Their numbers in the batch.
+    """
+    origins = batch.origins[begin:]
+    kept = (origins >> 8 < FIRST_GROUND_STATION) & ~np.isin(origins, list(stations))
+    for i in np.flatnonzero(kept & np.isin(batch.message_ids[begin:], _LOOKED_AT)).tolist():
+        kept[i] = not is_command(batch.frame(begin + i), stations)
+    found: IntArray = np.flatnonzero(kept) + begin
+    return found
+
+
+PARAM_VALUE_ID: Final = 22
+GPS_GLOBAL_ORIGIN_ID: Final = 49
+AUTOPILOT_VERSION_ID: Final = 148
+HOME_POSITION_ID: Final = 242
+PROTOCOL_VERSION_ID: Final = 300
+AVAILABLE_MODES_ID: Final = 435
+MISSION_ITEM_ID: Final = 39
+MISSION_COUNT_ID: Final = 44
+MISSION_CLEAR_ALL_ID: Final = 45
+MISSION_ACK_ID: Final = 47
+MISSION_ITEM_INT_ID: Final = 73
+
+_VALUE: Final = struct.Struct("<4sHH16sB")
+"""PARAM_VALUE: value, count, index, name, type."""
+_COUNT: Final = struct.Struct("<HBBB")
+"""MISSION_COUNT: count, target system and component, mission type."""
+_ITEM: Final = struct.Struct("<28sHHBBBBBB")
+"""MISSION_ITEM and MISSION_ITEM_INT; the sequence number is the second, the type the last."""
+_ACK: Final = struct.Struct("<BBBB")
+"""MISSION_ACK: target system and component, result, mission type."""
+_CLEAR: Final = struct.Struct("<BBB")
+
+_SAME: Final = {HOME_POSITION_ID: 52}
+"""How much of the payload must be equal to be no change; the rest is the time of sending."""
+_KEPT: Final = frozenset(
+    {
+        PARAM_VALUE_ID, GPS_GLOBAL_ORIGIN_ID, AUTOPILOT_VERSION_ID, HOME_POSITION_ID,
+        PROTOCOL_VERSION_ID, AVAILABLE_MODES_ID,
+    }
+)  # fmt: skip
+_MISSION: Final = frozenset(
+    {MISSION_ITEM_ID, MISSION_COUNT_ID, MISSION_CLEAR_ALL_ID, MISSION_ACK_ID, MISSION_ITEM_INT_ID}
+)
+_READ: Final = np.array(sorted(_KEPT | _MISSION))
+
+KINDS: Final = (0, 1, 2)
+"""Mission, fence, rally points."""
+ALL_KINDS: Final = 255
+MAX_KEPT: Final = 200_000
+"""Frames; some 10 MB. A vehicle has a thousand parameters that change now and then."""
+
+Items = tuple[bytes, ...]
+Value = TypeVar("Value")
+
+
+@dataclass(slots=True)
+class _Course(Generic[Value]):
+    """A value that changes: since when each of its values is valid."""
+
+    times: list[int] = field(default_factory=list)
+    values: list[Value] = field(default_factory=list)
+
+    def add(self, time_us: int, value: Value) -> None:
+        # Clocks of other recorders may go back; a value recorded later is valid later.
+        self.times.append(max(time_us, self.times[-1]) if self.times else time_us)
+        self.values.append(value)
+
+    def at(self, time_us: int) -> Value:
+        return self.values[max(bisect_right(self.times, time_us) - 1, 0)]
+
+
+@dataclass(slots=True)
+class _Transfer:
+    """A mission in transfer: an upload waits for the vehicle's ACK, a download for its items."""
+
+    count: int
+    items: dict[int, bytes] = field(default_factory=dict)
+
+
+class LogAnswers:
+    """The answers in one recording, of any number of parts."""
+
+    def __init__(self) -> None:
+        self._frames: dict[tuple[int, int, bytes], _Course[bytes]] = {}
+        self._missions: dict[tuple[int, int], _Course[Items]] = {}
+        self._transfers: dict[tuple[int, int, bool], _Transfer] = {}
+        self._seen: set[tuple[int, int]] = set()
+        self._kept = 0
+
+    def note(self, batch: Batch, stations: Set[int]) -> None:
+        """Take in the next records.
+
+        Parameters
+        ----------
+        batch : Batch
+            Records of a tlog, in their order.
+        stations : set of int
+            Senders (system << 8 | component) that are ground stations, as far as it is known.
+        """
+        systems = batch.origins >> 8
+        pairs = np.unique(systems << 32 | batch.message_ids)
+        self._seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
+        for i in np.flatnonzero(np.isin(batch.message_ids, _READ)).tolist():
+            if self._kept < MAX_KEPT:
+                self.note_frame(batch.frame(i), int(batch.time_us[i]), stations)
+
+    def note_frame(self, frame: bytes, time_us: int, stations: Set[int] = frozenset()) -> None:
+        """Take in one frame: an answer or a part of a mission; others are ignored."""
+        message_id, (system, component) = message_id_of(frame), origin_of(frame)
+        self._seen.add((system, message_id))
+        if message_id in _MISSION:
+            self._note_mission(frame, time_us, is_station(system << 8 | component, stations))
+        elif message_id in _KEPT and component == AUTOPILOT:
+            course = self._frames.setdefault((system, message_id, _key_of(frame)), _Course())
+            if not course.values or _content_of(course.values[-1]) != _content_of(frame):
+                course.add(time_us, frame)
+                self._kept += 1
+
+    def has_message(self, system: int, message_id: int) -> bool:
+        """Return whether a vehicle sent a message at all."""
+        return (system, message_id) in self._seen
+
+    def frames_at(self, system: int, message_id: int, time_us: int) -> Iterator[bytes]:
+        """Yield the frames that a vehicle sent last before a time, or else first after it."""
+        for (sender, kind, _), course in self._frames.items():
+            if (sender, kind) == (system, message_id):
+                yield course.at(time_us)
+
+    def mission_at(self, system: int, kind: int, time_us: int) -> Items | None:
+        """Return the items of a mission, a fence or rally points; None if none are recorded."""
+        course = self._missions.get((system, kind))
+        return None if course is None else course.at(time_us)
+
+    def _note_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
+        vehicle = target_of(frame)[0] if is_upload else origin_of(frame)[0]
+        message_id = message_id_of(frame)
+        if message_id == MISSION_COUNT_ID:
+            count, _, _, kind = _COUNT.unpack(payload_of(frame, _COUNT.size))
+            self._begin(vehicle, kind, is_upload, count, time_us)
+        elif message_id == MISSION_CLEAR_ALL_ID and is_upload:
+            kind = _CLEAR.unpack(payload_of(frame, _CLEAR.size))[-1]
+            for each in KINDS if kind == ALL_KINDS else (kind,):
+                self._begin(vehicle, each, is_upload, 0, time_us)
+        elif message_id == MISSION_ACK_ID and not is_upload:
+            result, kind = _ACK.unpack(payload_of(frame, _ACK.size))[2:]
+            for each in KINDS if kind == ALL_KINDS else (kind,):
+                transfer = self._transfers.pop((vehicle, each, True), None)
+                if transfer is not None and not result:
+                    self._store(vehicle, each, transfer, time_us)
+        elif message_id in (MISSION_ITEM_ID, MISSION_ITEM_INT_ID):
+            _, sequence, *_, kind = _ITEM.unpack(payload_of(frame, _ITEM.size))
+            transfer = self._transfers.get((vehicle, kind, is_upload))
+            if transfer is not None and sequence < transfer.count:
+                self._kept += sequence not in transfer.items
+                transfer.items[sequence] = frame
+                if not is_upload:
+                    self._store(vehicle, kind, transfer, time_us)
+
+    def _begin(self, vehicle: int, kind: int, is_upload: bool, count: int, time_us: int) -> None:
+        transfer = self._transfers[vehicle, kind, is_upload] = _Transfer(count)
+        if not is_upload:
+            self._store(vehicle, kind, transfer, time_us)
+
+    def _store(self, vehicle: int, kind: int, transfer: _Transfer, time_us: int) -> None:
+        """Keep a mission that is complete."""
+        if kind not in KINDS or len(transfer.items) < transfer.count:
+            return
+        items = tuple(transfer.items[i] for i in range(transfer.count))
+        course = self._missions.setdefault((vehicle, kind), _Course())
+        contents = [payload_of(frame, 255) for frame in items]
+        if not course.values or [payload_of(f, 255) for f in course.values[-1]] != contents:
+            course.add(time_us, items)
+
+
+class VehicleAnswers:
+    """The answers of one vehicle of a recording at the played moment, under its played id.
+
+    Parameters
+    ----------
+    log : LogAnswers
+        Of its recording.
+    system_id : int
+        Its system id in the recording.
+    played_as : int
+        Its system id in playback.
+    position_us : callable
+        Returns the recording's time that is being played.
+    """
+
+    def __init__(
+        self, log: LogAnswers, system_id: int, played_as: int, position_us: Callable[[], int]
+    ) -> None:
+        self._log = log
+        self._system_id = system_id
+        self.played_as = played_as
+        self._position_us = position_us
+
+    def has_message(self, message_id: int) -> bool:
+        """Return whether the vehicle sent a message at all."""
+        return self._log.has_message(self._system_id, message_id)
+
+    def frames(self, message_id: int) -> list[bytes]:
+        """Return the frames that answer a request for a message; none if there is no answer."""
+        found = self._log.frames_at(self._system_id, message_id, self._position_us())
+        return [readdress(frame, self.played_as) for frame in found]
+
+    def mission(self, kind: int) -> Items | None:
+        """Return the frames of the items of a mission; None if the recording has none."""
+        return self._log.mission_at(self._system_id, kind, self._position_us())
+
+    def parameters(self) -> dict[str, bytes]:
+        """Return the parameters by name, in their order, numbered so that the list is complete.
+
+        Returns
+        -------
+        dict of str to bytes
+            PARAM_VALUE frames; each value has its recorded bits, whatever its type.
+        """
+        values = [
+            _VALUE.unpack(payload_of(frame, _VALUE.size)) for frame in self.frames(PARAM_VALUE_ID)
+        ]
+        # Answers to a setting carry no index (65535); they come last.
+        values.sort(key=lambda value: (value[2], value[3]))
+        found: dict[str, bytes] = {}
+        for number, (value, _, _, name, kind) in enumerate(values):
+            payload = _VALUE.pack(value, len(values), number, name, kind)
+            found[_text_of(name)] = _encode(PARAM_VALUE_ID, self.played_as, payload)
+        return found
+
+
+def _encode(message_id: int, system_id: int, payload: bytes) -> bytes:
+    """Build a frame of an autopilot; its sender sets the sequence number."""
+    head = bytes((len(payload), 0, 0, 0, system_id, AUTOPILOT)) + message_id.to_bytes(3, "little")
+    crc: int = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(head + payload))
+    return bytes((START_V2,)) + head + payload + crc.to_bytes(2, "little")
+
+
+def _key_of(frame: bytes) -> bytes:
+    """Tell frames of one message apart that hold different items."""
+    message_id = message_id_of(frame)
+    if message_id == PARAM_VALUE_ID:
+        return bytes(_VALUE.unpack(payload_of(frame, _VALUE.size))[3])
+    if message_id == AVAILABLE_MODES_ID:
+        # AVAILABLE_MODES: custom_mode and properties, 4 bytes each, then number and index.
+        return payload_of(frame, 10)[9:]
+    return b""
+
+
+def _content_of(frame: bytes) -> bytes:
+    message_id = message_id_of(frame)
+    if message_id == PARAM_VALUE_ID:
+        value, _, _, _, kind = _VALUE.unpack(payload_of(frame, _VALUE.size))
+        return bytes((*value, kind))
+    return payload_of(frame, _SAME.get(message_id, 255))
+
+
+def _text_of(name: bytes) -> str:
+    return name.split(b"\0", 1)[0].decode("ascii", "replace")

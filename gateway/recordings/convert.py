@@ -1,0 +1,256 @@
+"""Flights written as files: one writer per format, by the ending of the file's name."""
+
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.formats.maps import (
+    VehicleTrack,
+    to_geojson,
+    to_gpx,
+    to_kml,
+    tracks_of_frames,
+    tracks_of_table,
+)
+from gateway.recordings.fuse import RecordedFusion
+from gateway.recordings.join import NOTHING_WITHIN, Limits, joined_tables, place_in, trimmed
+from gateway.recordings.reading import (
+    NO_RECORDING,
+    FlightError,
+    ReadOptions,
+    RecordedTable,
+    aircraft_of,
+    import_format,
+    is_table,
+    open_rows,
+    recorded_frames,
+)
+from gateway.recordings.table import encode_block, encode_head
+from gateway.recordings.tlog import Stamper, TlogRecord, encode_record
+
+
+class FlightToWrite:
+    """Recordings that become one file: as MAVLink or as rows, whichever its format needs.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Tlogs, or tables of one aircraft.
+    options : ReadOptions
+        How to read and fuse.
+    limits : tuple of Moment or None
+        First and last moment.
+    title : str
+        Name of the flight in the file.
+    fuse : bool
+        Fuse tables again instead of using their recorded states.
+    smooth : bool
+        Smooth them from both ends.
+    message : str, optional
+        Name of the MAVLink message to write, if the format holds only one type.
+
+    Raises
+    ------
+    OSError
+        If a file cannot be read.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        options: ReadOptions,
+        *,
+        limits: Limits = (None, None),
+        title: str = "flight",
+        fuse: bool = False,
+        smooth: bool = False,
+        message: str | None = None,
+    ) -> None:
+        self.files, self.options, self.title, self.message = files, options, title, message
+        self._limits, self._smooth = limits, smooth
+        kinds = {kind_of(file) for file in files}
+        self.is_mavlink = kinds == {FileKind.TLOG}
+        """Whether the frames are the recorded ones, and the rows are derived from them."""
+        self._as_recorded = not fuse and all(is_table(file) for file in files)
+        self._sources: list[RecordedFusion | RecordedTable] = []
+        self._remarks: list[str] = []
+
+    def frames(self) -> Iterator[TlogRecord]:
+        """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
+        if not self.is_mavlink:
+            return _within(self._sent(), self._limits)
+        recorded = recorded_frames(self.files, self.options.progress, self._remarks)
+        first = next(recorded, None)
+        if first is None:
+            raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
+        return _within(chain([first], recorded), self._limits)
+
+    def table(self) -> RecordedTable:
+        """Return the rows: as recorded, or fused again from the start and then cut."""
+        if self._as_recorded:
+            table = joined_tables([open_rows(file, self.options) for file in self.files])
+            self._sources.append(table)
+        else:
+            table = self.fused().table()
+        return trimmed(table, self._limits)
+
+    def by_aircraft(self) -> "list[FlightToWrite]":
+        """Split tables by aircraft."""
+        if len(self.files) == 1:
+            return [self]
+        files: dict[int, list[Path]] = {}
+        quiet = replace(self.options, progress=None)
+        for file in self.files:
+            files.setdefault(open_rows(file, quiet).header.vehicle_id, []).append(file)
+        parts = []
+        for vehicle_id in sorted(files):
+            part = copy(self)
+            part.files = files[vehicle_id]
+            parts.append(part)
+        return parts
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks for the user, complete once all is written."""
+        return [*self._remarks, *(remark for source in self._sources for remark in source.remarks)]
+
+    def remark(self, text: str) -> None:
+        """Add a remark for the user."""
+        self._remarks.append(text)
+
+    def fused(self) -> RecordedFusion:
+        """Return these files fused again."""
+        fusion = RecordedFusion(self.files, self.options, smooth=self._smooth)
+        self._sources.append(fusion)
+        return fusion
+
+    def _sent(self) -> Iterator[TlogRecord]:
+        """Yield the frames that the gateway would send for all aircraft, stamped as in one file."""
+        streams = [part.fused().frames() for part in self.by_aircraft()]
+        stamper = Stamper(0)
+        for record in heapq.merge(*streams, key=lambda record: record.time_us):
+            yield TlogRecord(stamper.stamp(record.time_us), record.frame)
+
+
+Write = Callable[[FlightToWrite], Iterable[bytes]]
+
+WRITERS: Final[dict[str, Write]] = {}
+"""By the ending of the file's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lacks:
+    """What a format cannot hold, as text."""
+
+    of_tables: str = ""
+    of_tlogs: str = ""
+
+
+LACKS: Final[dict[str, Lacks]] = {}
+"""By the ending of the file's name."""
+
+
+def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
+    """Add a format that `mavgate convert` can write.
+
+    Parameters
+    ----------
+    ending : str
+        Of the file's name, with its dot.
+    write : callable
+        Yields the file's bytes piece by piece.
+    lacks : Lacks
+        What the format cannot hold of a recording; the command tells the user.
+
+    Raises
+    ------
+    ValueError
+        If the ending is taken.
+    """
+    if ending in WRITERS:
+        raise ValueError(f"files that end in {ending} are written already")
+    WRITERS[ending], LACKS[ending] = write, lacks
+
+
+def _write_tlog(flight: FlightToWrite) -> Iterator[bytes]:
+    return (encode_record(record.time_us, record.frame) for record in flight.frames())
+
+
+def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
+    table = flight.table()
+    yield encode_head(table.header).encode()
+    yield from map(encode_block, table.blocks)
+
+
+def _write_kml(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_kml(flight.title, _vehicles(flight)))
+
+
+def _write_gpx(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_gpx(flight.title, _vehicles(flight)))
+
+
+def _write_geojson(flight: FlightToWrite) -> Iterator[bytes]:
+    return (piece.encode() for piece in to_geojson(flight.title, _vehicles(flight)))
+
+
+def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
+    if flight.is_mavlink:
+        found = tracks_of_frames(flight.frames(), flight.options.system_id)
+    else:
+        tables = (one.table() for one in flight.by_aircraft())
+        found = [
+            track
+            for table in tables
+            for track in tracks_of_table(table, aircraft_of(table, flight.options))
+        ]
+    if not found:
+        files = ", ".join(map(str, flight.files))
+        raise FlightError(f"{files}: nothing to draw, since the flight has no position")
+    return found
+
+
+def _packaged(module: str, name: str) -> Write:
+    """Return a writer whose packages are imported at its first use."""
+
+    def write(flight: FlightToWrite) -> Iterable[bytes]:
+        pieces: Iterable[bytes] = import_format(module, name).write(flight)
+        return pieces
+
+    return write
+
+
+NOT_FUSED: Final = "raw samples, settings and the states' digits"
+NOT_IN_TABLE: Final = "what is no sample, fix or state of one vehicle"
+NOT_DRAWN: Final = (
+    "samples, velocities and settings",
+    "MAVLink messages, only positions, attitude and texts",
+)
+
+add_writer(".tlog", _write_tlog, Lacks(of_tables=NOT_FUSED))
+add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))
+add_writer(".kml", _write_kml, Lacks(*NOT_DRAWN))
+add_writer(".gpx", _write_gpx, Lacks(*NOT_DRAWN))
+add_writer(".geojson", _write_geojson, Lacks(*NOT_DRAWN))
+add_writer(".mcap", _packaged("mcap", "MCAP"), Lacks(of_tables=NOT_FUSED))
+add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TABLE))
+
+
+def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecord]:
+    begin, end = limits
+    first_us: int | None = None
+    is_empty = limits != (None, None)
+    for record in records:
+        first_us = record.time_us if first_us is None else first_us
+        if end is not None and record.time_us > place_in(end, first_us):
+            break
+        if begin is None or record.time_us >= place_in(begin, first_us):
+            yield record
+            is_empty = False
+    if is_empty:
+        raise FlightError(NOTHING_WITHIN)

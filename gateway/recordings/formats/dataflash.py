@@ -1,0 +1,468 @@
+"""DataFlash, the log of ArduPilot, in binary (.bin) and as text (.log), read by pymavlink.
+
+IMU, MAG (milligauss, offsets taken off), BARO, GPS with the accuracies of GPA, and what the
+autopilot estimated: ATT, POS and the velocities of its Kalman filter (XKF1, of old NKF1). All in
+body FRD and NED, in us since the start. Of several sensors of a kind one is taken; firmware before
+3.3 counts milliseconds (TimeMS, and T in GPS), and names the second sensor IMU2, GPS2 and so on.
+"""
+
+import contextlib
+import io
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain, islice
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from msgspec.structs import replace
+from pymavlink.DFReader import DFReader_binary, DFReader_text
+
+from gateway.geometry.quaternion import from_euler
+from gateway.recordings.columns import Imported, RowBuilder, TableRow
+from gateway.recordings.files import ERASED, read_chunks, temporary_copy
+from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US
+from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NavFlags,
+    NavState,
+    NodeId,
+    Vec3,
+)
+from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
+
+GPS_EPOCH_UNIX_US: Final = 315_964_800 * US_PER_S
+LEAP_US: Final = 18 * US_PER_S
+"""GPS time is ahead of UTC by so much since 2017."""
+WEEK_US: Final = 604_800 * US_PER_S
+LATE_US: Final = US_PER_S
+"""Messages of one loop are not quite in order; one later than this has a damaged time."""
+AHEAD_US: Final = 3_600 * US_PER_S
+"""And so has one that jumps ahead by more."""
+BELIEVED: Final = 50
+"""So many messages in a row that agree about another time are right: the clock has leaped."""
+LEAST_BELIEVED: Final = 3
+"""And so many that nothing follows."""
+FIX_2D: Final = 2
+SENSOR_NUMBERS: Final = ("I", "C")
+"""Columns with the number of the sensor, or Kalman filter, of a message."""
+KINDS: Final = {
+    "IMU": "IMU", "IMU2": "IMU", "IMU3": "IMU", "MAG": "MAG", "MAG2": "MAG", "MAG3": "MAG",
+    "BARO": "BARO", "BAR2": "BARO", "BAR3": "BARO", "GPS": "GPS", "GPS2": "GPS",
+    "GPA": "GPA", "GPA2": "GPA",
+}  # fmt: skip
+"""Kind of sensor by the name of its messages."""
+SENSORS: Final = ("IMU", "MAG", "BARO", "GPS")
+"""Kinds of which a log may hold several."""
+ROLLOVER_US: Final = 1024 * WEEK_US
+FIRST_LOG_US: Final = 1_262_304_000 * US_PER_S
+"""The year 2010: nobody wrote this format before, so a receiver with an earlier date has lost count
+of the weeks, which begin again every 1024."""
+
+Message = Any
+"""With the columns of its format as attributes, in the units of the format."""
+
+
+def sensor_of(name: str, message: Message) -> int:
+    """Return which sensor, or Kalman filter, sent a message; counted from 0."""
+    number = next((n for column in SENSOR_NUMBERS if (n := getattr(message, column, None))), 0)
+    return int(number) or (int(name[-1]) - 1 if name in KINDS and name[-1].isdigit() else 0)
+
+
+def in_era(unix_us: int) -> int:
+    """Add the weeks that a GPS receiver has lost count of."""
+    lost = -(-(FIRST_LOG_US - unix_us) // ROLLOVER_US) if unix_us < FIRST_LOG_US else 0
+    return unix_us + lost * ROLLOVER_US
+
+
+def _own_us(name: str, message: Message) -> int:
+    """Return a message's time on the autopilot's clock."""
+    time_us = getattr(message, "TimeUS", None)
+    if time_us is not None:
+        return int(time_us)
+    return 1000 * int(message.T if KINDS.get(name) == "GPS" else message.TimeMS)
+
+
+class ArdupilotReader:
+    """Turn the messages of one log into records.
+
+    Parameters
+    ----------
+    vehicle_id : int
+        Vehicle id of the records.
+    sensors : mapping of str to int
+        Which sensor to take of each of `SENSORS`, counted from 0; by default the first.
+    """
+
+    def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
+        self.dropped = 0
+        """Messages with an impossible time."""
+        self.leaps = 0
+        """How often the autopilot's clock jumped forward by more than that."""
+        self.restarts = 0
+        """How often it began again."""
+        self.is_rolled_over = False
+        """Whether a receiver has lost count of the weeks."""
+        self.zero_us: int | None = None
+        """The autopilot's time at the records' zero."""
+        self._vehicle_id = vehicle_id
+        self._newest_us = 0
+        self._sensors = {**sensors, "GPA": sensors.get("GPS", 0)}
+        self._held: list[tuple[int, str, Message]] = []
+        """Messages whose times agree with each other, but not with those before."""
+        self._mag: Vec3 | None = None
+        self._fix: GpsFix | None = None
+        """The newest fix, which waits for its accuracies."""
+        self._place: tuple[int, float, float, float] | None = None
+        self._motion: tuple[int, Vec3] | None = None
+        self._handlers: dict[str, Callable[[Message, int], list[Imported]]] = {
+            "IMU": self._imu, "MAG": self._magnetometer, "BARO": self._baro,
+            "GPS": self._gps, "GPA": self._accuracies,
+            "ATT": self._attitude, "POS": self._position, "XKF1": self._kalman,
+            "NKF1": self._kalman,
+        }  # fmt: skip
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the messages that are used."""
+        return {*self._handlers, *KINDS}
+
+    def feed(self, name: str, message: Message) -> list[Imported]:
+        """Take the next message.
+
+        Parameters
+        ----------
+        name : str
+            Of its format.
+        message : Message
+
+        Returns
+        -------
+        list of Imported
+            What it holds, in the order of time; nothing for most messages.
+        """
+        kind = KINDS.get(name, name)
+        if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
+            return []
+        own_us = _own_us(name, message)
+        if self.zero_us is None:
+            self.zero_us = own_us
+        if -LATE_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
+            self._drop_held()
+            return self._take(own_us, kind, message)
+        if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
+            self._drop_held()
+        self._held.append((own_us, kind, message))
+        return self._follow() if len(self._held) == BELIEVED else []
+
+    def flush(self) -> list[Imported]:
+        """Return what still waits at the end of the log."""
+        held = self._follow() if len(self._held) >= LEAST_BELIEVED else []
+        self._drop_held()
+        return [*held, *self._flush_fix()]
+
+    def _take(self, own_us: int, kind: str, message: Message) -> list[Imported]:
+        """Handle a message at its time on the records' clock, which never goes back."""
+        self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
+        waited = [] if kind == "GPA" else self._flush_fix()
+        return [*waited, *self._handlers[kind](message, self._newest_us)]
+
+    def _flush_fix(self) -> list[Imported]:
+        """Return the fix that waits for its accuracies, if one does."""
+        fix, self._fix = self._fix, None
+        return [] if fix is None else [fix]
+
+    def _drop_held(self) -> None:
+        self.dropped += len(self._held)
+        self._held.clear()
+
+    def _follow(self) -> list[Imported]:
+        """Follow the clock to the times of the held messages, and handle these."""
+        held, self._held = self._held, []
+        step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
+        self.leaps += step_us > 0
+        self.restarts += step_us < 0
+        # A log that begins again goes on from where it was.
+        self.zero_us = (self.zero_us or 0) + min(step_us, 0)
+        return [record for one in held for record in self._take(*one)]
+
+    def _imu(self, m: Message, time_us: int) -> list[Imported]:
+        mag, self._mag = self._mag, None
+        return [
+            ImuCalibrated(
+                time_us=time_us,
+                node=NodeId(self._vehicle_id, 0),
+                accel_b_mps2=(m.AccX, m.AccY, m.AccZ),
+                gyro_b_radps=(m.GyrX, m.GyrY, m.GyrZ),
+                mag_b_ut=mag,
+                temperature_degc=getattr(m, "T", getattr(m, "Temp", NAN)),
+                flags=ImuFlags.MAG_NEW if mag else ImuFlags(0),
+            )
+        ]
+
+    def _magnetometer(self, m: Message, _time_us: int) -> list[Imported]:
+        ut = MILLI * UT_PER_GAUSS
+        self._mag = (m.MagX * ut, m.MagY * ut, m.MagZ * ut)
+        return []
+
+    def _baro(self, m: Message, time_us: int) -> list[Imported]:
+        node = NodeId(self._vehicle_id, 0)
+        return [BaroRaw(time_us, node, time_us, m.Press, getattr(m, "Temp", NAN))]
+
+    def _gps(self, m: Message, time_us: int) -> list[Imported]:
+        fix_type = GpsFixType(min(m.Status, 3)) if m.Status >= FIX_2D else GpsFixType.NONE
+        has_fix = fix_type is not GpsFixType.NONE
+        course_rad = math.radians(m.GCrs)
+        level = (m.Spd * math.cos(course_rad), m.Spd * math.sin(course_rad))
+        utc_us = None
+        # Before 3.3 TimeMS is the time of the week.
+        week, week_ms = getattr(m, "GWk", 0) or getattr(m, "Week", 0), getattr(m, "GMS", None)
+        week_ms = m.TimeMS if week_ms is None else week_ms
+        if week and has_fix:
+            counted_us = GPS_EPOCH_UNIX_US + week * WEEK_US + week_ms * 1000 - LEAP_US
+            utc_us = in_era(counted_us)
+            self.is_rolled_over |= utc_us != counted_us
+        self._fix = GpsFix(
+            time_us=time_us,
+            node=NodeId(self._vehicle_id, 1),
+            node_time_us=time_us,
+            itow_ms=week_ms,
+            fix_type=fix_type,
+            fix_ok=has_fix,
+            satellites=m.NSats,
+            lat_dege7=round(m.Lat / DEG_PER_DEGE7),
+            lon_dege7=round(m.Lng / DEG_PER_DEGE7),
+            alt_amsl_m=m.Alt,
+            vel_n_mps=(*level, getattr(m, "VZ", NAN)) if has_fix else UNKNOWN_VEC3,
+            alt_ellipsoid_m=NAN,
+            h_acc_m=NAN,
+            v_acc_m=NAN,
+            speed_acc_mps=NAN,
+            course_acc_deg=NAN,
+            pdop=NAN,
+            utc_us=utc_us,
+        )
+        return []
+
+    def _accuracies(self, m: Message, time_us: int) -> list[Imported]:
+        """Join a fix with the receiver's accuracies, which follow it."""
+        fix = self._fix
+        if fix is None or fix.time_us != time_us:
+            return self._flush_fix()
+        north, east, down = fix.vel_n_mps
+        self._fix = replace(
+            fix,
+            vel_n_mps=(north, east, down if getattr(m, "VV", 1) else NAN),
+            h_acc_m=m.HAcc or NAN,
+            v_acc_m=m.VAcc or NAN,
+            speed_acc_mps=m.SAcc or NAN,
+        )
+        return self._flush_fix()
+
+    def _position(self, m: Message, time_us: int) -> list[Imported]:
+        self._place = (time_us, m.Lat, m.Lng, m.Alt)
+        return []
+
+    def _kalman(self, m: Message, time_us: int) -> list[Imported]:
+        self._motion = (time_us, (m.VN, m.VE, m.VD))
+        return []
+
+    def _attitude(self, m: Message, time_us: int) -> list[Imported]:
+        """Take the autopilot's own solution, for comparison."""
+        flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+        lat, lon, alt, vel = NAN, NAN, NAN, UNKNOWN_VEC3
+        if self._place is not None and time_us - self._place[0] <= VELOCITY_AGE_US:
+            _, lat, lon, alt = self._place
+            flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
+        if self._motion is not None and time_us - self._motion[0] <= VELOCITY_AGE_US:
+            _, vel = self._motion
+            flags |= NavFlags.VELOCITY_VALID
+        angles_rad = (math.radians(degrees) for degrees in (m.Roll, m.Pitch, m.Yaw))
+        return [
+            NavState(
+                time_us=time_us,
+                q_nb=from_euler(*angles_rad),
+                rate_b_radps=UNKNOWN_VEC3,
+                lat_deg=lat,
+                lon_deg=lon,
+                alt_amsl_m=alt,
+                vel_n_mps=vel,
+                attitude_std_rad=UNKNOWN_VEC3,
+                vel_std_mps=UNKNOWN_VEC3,
+                pos_std_m=UNKNOWN_VEC3,
+                flags=flags,
+            )
+        ]
+
+
+MAGIC: Final = b"\xa3\x95"
+MAX_LOOKED_AT: Final = 20_000
+"""Messages of a kind that are read to find the first sensor with data: an hour of GPS."""
+SYSTEM_IDS: Final = ("SYSID_THISMAV", "MAV_SYSID")
+_AS_TEXT: Final = bytes(range(128)) + b"?" * 128
+_SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
+
+
+class _Complaints(io.TextIOBase):
+    """Count the damage that pymavlink prints to the terminal."""
+
+    def __init__(self) -> None:
+        self.bytes = self.messages = 0
+        self.spoken = False
+
+    def write(self, text: str) -> int:
+        self.spoken = True
+        self.bytes += sum(map(int, _SKIPPED.findall(text)))
+        return len(text)
+
+    def quietly(self, call: Callable[[], Any]) -> Any:
+        """Call while counting what is printed."""
+        with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
+            return call()
+
+
+def read(path: Path, options: ReadOptions) -> RecordedTable:
+    """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
+    heard = _Complaints()
+    log = _open(path, options, heard)
+    named = (log.params.get(name) for name in SYSTEM_IDS)
+    known = next((int(value) for value in named if value is not None), 1)
+    vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
+    sensors = _sensors_of(log, heard) | dict(options.sensors)
+    reader = ArdupilotReader(vehicle_id, sensors)
+    remarks = [f"{path}: uses {kind} {number + 1}" for kind, number in sensors.items() if number]
+
+    def rows() -> Iterator[TableRow]:
+        builder = RowBuilder()
+        with contextlib.closing(log):
+            for record in _records(log, heard, reader):
+                yield from builder.add(record)
+            yield from builder.flush()
+            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, heard, reader))
+
+    stream = rows()
+    first = next((row for row in stream if row.imu is not None), None)
+    if first is None:
+        raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
+    # By the first week and time of GPS; 0 without one.
+    unix_us = in_era(round(log.clock.timebase * US_PER_S)) if log.clock.timebase else None
+    zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
+    table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
+    table.remarks = remarks
+    return table
+
+
+def _sensors_of(log: Any, heard: _Complaints) -> dict[str, int]:
+    """Find the first sensor of each kind that has data; a GPS that has a fix."""
+    found: dict[str, int] = {}
+    for kind in SENSORS:
+        names = {name for name, of in KINDS.items() if of == kind}
+        seen: set[int] = set()
+        for message in islice(_each(log, heard, names), MAX_LOOKED_AT):
+            if kind != "GPS" or getattr(message, "Status", 0) >= FIX_2D:
+                seen.add(sensor_of(message.get_type(), message))
+            if 0 in seen:
+                break
+        found[kind] = min(seen, default=0)
+    return found
+
+
+def _each(log: Any, heard: _Complaints, names: set[str]) -> Iterator[Any]:
+    """Yield the messages of these names up to the first damage, and go back to the begin."""
+    log.type_list = None
+    try:
+        while message := heard.quietly(lambda: log.recv_match(type=names, strict=True)):
+            yield message
+    except Exception:  # noqa: BLE001 - as for `_open`
+        return
+    finally:
+        log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
+
+
+def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
+    """Open a temporary copy of a log, unpacked.
+
+    pymavlink maps a log into the memory, where one that shrinks would end the process.
+    """
+    content = read_chunks(path, options.progress, options.unpacked_limit)
+    first = next(content, b"")
+    while first and not first.strip(ERASED):
+        first = next(content, b"")
+    first = first.lstrip(ERASED) if first[:2] == ERASED * 2 else first
+    is_binary = first.startswith(MAGIC)
+    kind = DFReader_binary if is_binary else DFReader_text
+    # A byte that is not text must not stop the reading.
+    all_of_it = chain([first], content)
+    sound = all_of_it if is_binary else (data.translate(_AS_TEXT) for data in all_of_it)
+    with temporary_copy(path, sound) as plain:
+        log = kind.__new__(kind)
+        # The fast indexer prints to the terminal directly, not through Python.
+        log.init_arrays_fast = log.init_arrays
+        try:
+            heard.quietly(lambda: kind.__init__(log, plain.name))
+        except Exception as error:
+            # Damage makes pymavlink raise anything, bare exceptions included.
+            log.close()
+            raise FlightError(f"{path}: its list of formats is damaged: {error}") from error
+        return log
+
+
+def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[Imported]:
+    """Read the whole log; a message that cannot be decoded is counted.
+
+    Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
+    damage, so it is read message by message.
+    """
+
+    def wanted() -> Any:
+        return log.recv_match(type=reader.names, strict=True)
+
+    take = log.recv_msg if heard.spoken else wanted
+    lines, end = 0, -1
+    while True:
+        begin = log.offset
+        try:
+            message = heard.quietly(take)
+            # For a line that is no message it gives the next one, and that again in its turn.
+            is_again, end = log.offset == end, log.offset
+            found = [] if message is None or is_again else reader.feed(message.get_type(), message)
+        except Exception:  # noqa: BLE001 - as above
+            heard.messages += 1
+            log.offset = max(log.offset, begin + 1)
+            continue
+        if message is None:
+            yield from reader.flush()
+            break
+        lines += not is_again
+        yield from found
+    if isinstance(log, DFReader_text):
+        heard.messages = _lines_of(log, reader.names) - lines
+
+
+def _lines_of(log: Any, names: set[str]) -> int:
+    """Count the lines of a text log that should be such messages, or are of no known format."""
+    odd = {name for name in log.counts if name.strip() and name not in log.formats}
+    return sum(log.counts.get(name, 0) for name in names | odd)
+
+
+def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:
+    if heard.bytes:
+        yield f"is damaged: left out {counted(heard.bytes, 'byte')} without a message"
+    if log.offset < log.data_len:
+        yield f"ends within a message: left out {counted(log.data_len - log.offset, 'byte')}"
+    if broken := reader.dropped + heard.messages:
+        yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
+    if reader.leaps:
+        yield f"its clock jumped forward {counted(reader.leaps, 'time')}"
+    if reader.restarts:
+        yield f"the autopilot restarted {counted(reader.restarts, 'time')}; its times run on"
+    if reader.is_rolled_over:
+        yield "its GPS receiver counts 1024 weeks too few; its dates are corrected"

@@ -1,0 +1,506 @@
+"""A flight out of any autopilot's MAVLink, so that it can be fused here.
+
+The IMU comes from the best of HIGHRES_IMU (floats), RAW_IMU as ArduPilot sends it (the units of
+SCALED_IMU) and SCALED_IMU; once one was seen, poorer ones are left out. The axes are body FRD by
+definition. Time is the vehicle's own (`time_usec`, `time_boot_ms`), less the first one seen; it
+never falls within a kind of message. The IMU keeps its own time whatever the others contain: theirs
+may be of another clock, as a GPS receiver's.
+
+GPS_RAW_INT has no velocity down: it is that of GLOBAL_POSITION_INT, or unknown. Heights do not give
+it, for that of a receiver that finds or loses its fix jumps by any amount. Of the autopilot's own
+estimates (ATTITUDE, with the position known then) the last before each sample is kept.
+"""
+
+import math
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.compiled.entry_point import dispatched
+from gateway.geometry.quaternion import from_euler
+from gateway.recordings.columns import (
+    BARO,
+    COLUMNS,
+    GPS,
+    LARGEST_WHOLE,
+    NAV,
+    SI,
+    BoolArray,
+    FloatArray,
+)
+from gateway.recordings.tlog import Batch
+from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
+from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
+from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.wire.mavlink_splitter import START_V2
+
+HEAD_V1: Final = 6
+HEAD_V2: Final = 10
+LENGTH_AT: Final = 1
+
+
+@cache
+def layout_of(kind: Any) -> np.dtype[np.void]:
+    """Return a message's fields as they lie in its payload.
+
+    Parameters
+    ----------
+    kind : type
+        pymavlink's class of the message.
+
+    Returns
+    -------
+    dtype
+        A field of it by each name; texts are bytes up to their first NUL at the latest.
+    """
+    fields = []
+    for name, code, length in zip(
+        kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
+    ):
+        if chr(code) == "c":
+            fields.append((name, f"S{max(1, length)}"))
+        else:
+            fields.append((name, f"({length},)<{chr(code)}" if length else f"<{chr(code)}"))
+    return np.dtype(fields)
+
+
+def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
+    """Read the fields of some frames of one message.
+
+    Parameters
+    ----------
+    batch : Batch
+        Records of a tlog.
+    wanted : ndarray of int, shape (n,)
+        Numbers of those that are this message.
+    kind : type
+        pymavlink's class of the message.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        See `layout_of`; what a sender cut off or did not know is zero.
+    """
+    layout = layout_of(kind)
+    data = np.frombuffer(batch.data, np.uint8)
+    starts = batch.starts[wanted] + TIME_SIZE
+    begins = starts + np.where(data[starts] == START_V2, HEAD_V2, HEAD_V1)
+    places = np.arange(layout.itemsize)
+    is_there = places < data[starts + LENGTH_AT][:, None]
+    payloads = np.zeros((len(wanted), layout.itemsize), np.uint8)
+    payloads[is_there] = data[(begins[:, None] + places)[is_there]]
+    found: NDArray[np.void] = payloads.view(layout)[:, 0]
+    return found
+
+
+UT_PER_GAUSS: Final = 100.0
+MILLI: Final = 1e-3
+CENTI: Final = 1e-2
+DEG_PER_HDG_ACC: Final = 1e-5
+UNKNOWN_U16: Final = 65535
+UNKNOWN_U8: Final = 255
+MAG_FIELDS: Final = 0b111 << 6
+"""HIGHRES_IMU's bits of what is new."""
+UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
+"""Later times are civil time, earlier ones count from the start of the autopilot."""
+FIX_2D, FIX_3D = 2, 3
+GPS_NODE: Final = 1
+
+Fields = NDArray[np.void]
+
+_ATTITUDE_FLAGS: Final = int(NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID)
+_PLACE_FLAGS: Final = int(
+    NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
+)
+
+
+def imu_cells(message_id: int, values: Fields, time_us: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Return the cells of `HEAD_COLUMNS` and of `SI_COLUMNS` of any of the three IMU messages."""
+    if message_id == mavlink.MAVLINK_MSG_ID_HIGHRES_IMU:
+        accel, gyro, mag = _vectors(values, 1.0, 1.0, UT_PER_GAUSS)
+        temperature_degc = values["temperature"].astype(np.float64)
+        may_be_new = (values["fields_updated"] & MAG_FIELDS) != 0
+    else:
+        g, mgauss = STANDARD_GRAVITY_MPS2 * MILLI, UT_PER_GAUSS * MILLI
+        accel, gyro, mag = _vectors(values, g, MILLI, mgauss)
+        temperature_degc = _unless_zero(values["temperature"], CENTI)
+        may_be_new = np.ones(len(values), bool)
+    is_new = may_be_new & (mag != 0.0).any(axis=1)
+    mag[~is_new] = np.nan
+    flags = np.where(is_new, float(ImuFlags.MAG_NEW), 0.0)
+    nothing = np.full(len(values), np.nan)
+    head = np.column_stack([time_us, np.zeros(len(values)), nothing, flags])
+    return head, np.column_stack([accel, gyro, mag, temperature_degc])
+
+
+def baro_cells(values: Fields, time_us: IntArray) -> FloatArray:
+    """Return the cells of `BARO_COLUMNS` of SCALED_PRESSURE."""
+    pressure_pa = values["press_abs"].astype(np.float64) * PA_PER_HPA
+    temperature_degc = values["temperature"] * CENTI
+    node = np.zeros(len(values))
+    return np.column_stack([time_us, node, time_us, pressure_pa, temperature_degc])
+
+
+def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntArray) -> FloatArray:
+    """Return the cells of `GPS_COLUMNS` of GPS_RAW_INT.
+
+    Parameters
+    ----------
+    values, time_us :
+        As for the others.
+    places : ndarray
+        Fields of GLOBAL_POSITION_INT.
+    place_at : ndarray of int, shape (n,)
+        Which of them was known at each fix; -1 for none.
+    """
+    told = np.minimum(values["fix_type"], FIX_3D)
+    fix_type = np.select(
+        [told == FIX_2D, told == FIX_3D],
+        [int(GpsFixType.FIX_2D), int(GpsFixType.FIX_3D)],
+        int(GpsFixType.NONE),
+    )
+    has_fix = fix_type != int(GpsFixType.NONE)
+    satellites = values["satellites_visible"]
+    utc_us = values["time_usec"]
+    is_civil = (utc_us > UNIX_YEAR_2000_US) & (utc_us <= LARGEST_WHOLE)
+    down_mps = _of_place(places, np.where(told == FIX_3D, place_at, -1), "vz", CENTI)
+    north_mps, east_mps = _velocity(values, has_fix)
+    return np.column_stack(
+        [
+            time_us,
+            np.full(len(values), GPS_NODE),
+            time_us,
+            np.zeros(len(values)),
+            fix_type,
+            has_fix,
+            np.where(satellites == UNKNOWN_U8, 0, satellites),
+            values["lat"],
+            values["lon"],
+            values["alt"] * MILLI,
+            *(north_mps, east_mps, down_mps),
+            _unless_zero(values["alt_ellipsoid"], MILLI),
+            _unless_zero(values["h_acc"], MILLI),
+            _unless_zero(values["v_acc"], MILLI),
+            _unless_zero(values["vel_acc"], MILLI),
+            _unless_zero(values["hdg_acc"], DEG_PER_HDG_ACC),
+            _known(values["eph"], CENTI),
+            np.where(is_civil, utc_us.astype(np.float64), np.nan),
+        ]
+    )
+
+
+def nav_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntArray) -> FloatArray:
+    """Return the cells of `NAV_COLUMNS` of ATTITUDE; the places are as for `gps_cells`."""
+    angles = [values[name].astype(np.float64) for name in ("roll", "pitch", "yaw")]
+    rates = [values[name] for name in ("rollspeed", "pitchspeed", "yawspeed")]
+    flags = np.where(place_at >= 0, _ATTITUDE_FLAGS | _PLACE_FLAGS, _ATTITUDE_FLAGS)
+    return np.column_stack(
+        [
+            time_us,
+            _quaternions(np.column_stack(angles)),
+            *rates,
+            _of_place(places, place_at, "lat", DEG_PER_DEGE7),
+            _of_place(places, place_at, "lon", DEG_PER_DEGE7),
+            _of_place(places, place_at, "alt", MILLI),
+            *(_of_place(places, place_at, name, CENTI) for name in ("vx", "vy", "vz")),
+            np.full((len(values), 9), np.nan),
+            flags,
+        ]
+    )
+
+
+def _vectors(values: Fields, *scales: float) -> list[FloatArray]:
+    """Return acceleration, rate and field, each by its scale."""
+    return [
+        np.column_stack([values[axis + name].astype(np.float64) for axis in "xyz"]) * scale
+        for name, scale in zip(("acc", "gyro", "mag"), scales, strict=True)
+    ]
+
+
+def _velocity(values: Fields, has_fix: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Make the level part of the velocity of speed and course; NaN without a fix."""
+    speed_mps = np.where(has_fix, _known(values["vel"], CENTI), np.nan)
+    # Not numpy's sine: its last digit is another one on some processors.
+    course_rad = [*map(math.radians, _known(values["cog"], CENTI).tolist())]
+    north = np.array([*map(math.cos, course_rad)])
+    east = np.array([*map(math.sin, course_rad)])
+    return speed_mps * north, speed_mps * east
+
+
+def _known(values: NDArray[np.uint16], scale: float) -> FloatArray:
+    return np.where(values == UNKNOWN_U16, NAN, values * scale)
+
+
+def _unless_zero(values: NDArray[np.int32], scale: float) -> FloatArray:
+    return np.where(values == 0, NAN, values * scale)
+
+
+def _of_place(places: Fields, place_at: IntArray, name: str, scale: float) -> FloatArray:
+    """Return a field of the place that was known at each time; NaN where none was."""
+    found = np.full(len(place_at), np.nan)
+    known = place_at >= 0
+    found[known] = places[name][place_at[known]] * scale
+    return found
+
+
+@dispatched
+def _quaternions(angles: FloatArray) -> FloatArray:
+    """Apply `from_euler` to roll, pitch and yaw of shape (n, 3)."""
+    found = np.empty((len(angles), 4))
+    for i in range(len(angles)):
+        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = from_euler(
+            angles[i, 0], angles[i, 1], angles[i, 2]
+        )
+    return found
+
+
+VELOCITY_AGE_US: Final = US_PER_S // 2
+"""An older velocity down is not used."""
+
+ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
+POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+PRESSURE: Final = mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE
+FIX: Final = mavlink.MAVLINK_MSG_ID_GPS_RAW_INT
+IMU_RANK: Final = {
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: 3,
+    mavlink.MAVLINK_MSG_ID_RAW_IMU: 2,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
+}
+_WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
+_PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
+
+_STREAMS: Final = {FIX: 1, PRESSURE: 2, ATTITUDE: 3}
+"""What has a clock of its own besides the IMU, which is 0."""
+
+_BARO, _GPS, _IMU = 1, 2, 3
+"""The order of a row: what is not behind its predecessor in it begins a row."""
+_HEAD: Final = slice(0, 4)
+
+
+class AutopilotReader:
+    """Turn one vehicle's messages into rows of a table.
+
+    Parameters
+    ----------
+    system_id : int or None
+        Whose; the first system that sends an IMU message by default.
+    """
+
+    def __init__(self, system_id: int | None = None) -> None:
+        self.system_id = system_id
+        self.unix_us_at_zero: int | None = None
+        """Civil time of the rows' time zero, by the times of the recording."""
+        self._rank = 0
+        self._zero_us = np.zeros(2, np.int64)
+        """What the vehicle's own time, and that of the recording, were at the rows' zero."""
+        self._newest_us = np.zeros(1 + len(_STREAMS), np.int64)
+        """Of each stream, on the rows' clock."""
+        self._sampled_us = np.zeros(1, np.int64)
+        """When the newest IMU sample was recorded, or what was first."""
+        self._places = np.empty(0, _PLACE)
+        self._places_us = np.empty(0, np.int64)
+        """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
+        self._state = np.full((1, NAV.stop - NAV.start), np.nan)
+        """What the autopilot believed last; NaN once a sample has it."""
+        self._open = np.empty((0, len(COLUMNS)))
+        """The row that waits for its sample, if any."""
+
+    def feed(self, batch: Batch) -> FloatArray:
+        """Take the next records of the recording, of which every checksum was checked.
+
+        Parameters
+        ----------
+        batch : Batch
+            The one after the last.
+
+        Returns
+        -------
+        ndarray, shape (n, len(COLUMNS))
+            The rows that are complete now; see `gateway.recordings.columns`.
+        """
+        taken = self._taken(batch)
+        message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
+        fields = {
+            int(one): columns_of(batch, taken[message_ids == one], mavlink.mavlink_map[int(one)])
+            for one in np.unique(message_ids)
+        }
+        time_us = self._times(message_ids, recorded_us, fields)
+        places = self._places_at(message_ids, recorded_us, fields)
+        states = self._states_at(message_ids, time_us, places, fields)
+        return self._rows(message_ids, time_us, places, states, fields)
+
+    def flush(self) -> FloatArray:
+        """Return the row that still waits for a sample, if any, without one."""
+        rows, self._open = self._open, self._open[:0]
+        return rows
+
+    def _taken(self, batch: Batch) -> IntArray:
+        """Choose what is of the vehicle, and no poorer than others of its kind."""
+        wanted = np.flatnonzero(np.isin(batch.message_ids, _WANTED))
+        ranks = np.zeros(len(wanted), np.int64)
+        for message_id, rank in IMU_RANK.items():
+            ranks[batch.message_ids[wanted] == message_id] = rank
+        if self.system_id is None:
+            first = np.flatnonzero(ranks)[:1]
+            if not len(first):
+                return wanted[:0]
+            self.system_id = int(batch.origins[wanted[first[0]]]) >> 8
+            wanted, ranks = wanted[first[0] :], ranks[first[0] :]
+        own = batch.origins[wanted] == self.system_id << 8 | 1
+        wanted, ranks = wanted[own], ranks[own]
+        best = np.maximum.accumulate(np.concatenate([[self._rank], ranks]))
+        self._rank = int(best[-1])
+        taken: IntArray = wanted[(ranks == 0) | (ranks >= best[:-1])]
+        return taken
+
+    def _times(
+        self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
+    ) -> IntArray:
+        """Put messages on the rows' clock."""
+        own_us = np.zeros(len(message_ids), np.int64)
+        for message_id, values in fields.items():
+            if "time_usec" in (values.dtype.names or ()):
+                told = values["time_usec"]
+                own = np.where(told > UNIX_YEAR_2000_US, 0, told).astype(np.int64)
+            else:
+                own = values["time_boot_ms"].astype(np.int64) * 1000
+            own_us[message_ids == message_id] = own
+        clocked = message_ids != POSITION
+        if self.unix_us_at_zero is None and clocked.any():
+            first = int(np.argmax(clocked))
+            self.unix_us_at_zero = int(recorded_us[first])
+            self._zero_us[:] = own_us[first] or recorded_us[first], recorded_us[first]
+            self._sampled_us[0] = recorded_us[first]
+        own_us[~clocked] = -1
+        streams = np.zeros(len(message_ids), np.int64)
+        for message_id, stream in _STREAMS.items():
+            streams[message_ids == message_id] = stream
+        return _on_clock(
+            streams, own_us, recorded_us, self._zero_us, self._newest_us, self._sampled_us
+        )
+
+    def _places_at(
+        self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
+    ) -> tuple[NDArray[np.void], IntArray]:
+        """Return all GLOBAL_POSITION_INT, and which was known at each message; -1 for none."""
+        is_place = message_ids == POSITION
+        known = len(self._places)
+        places = np.concatenate([self._places, fields.get(POSITION, np.empty(0, _PLACE))])
+        places_us = np.concatenate([self._places_us, recorded_us[is_place]])
+        at = np.cumsum(is_place) - 1 + known
+        if len(places):
+            is_old = np.abs(recorded_us - places_us[at]) > VELOCITY_AGE_US
+            at = np.where(is_old, -1, at)
+        self._places, self._places_us = places[-1:], places_us[-1:]
+        return places, at
+
+    def _states_at(
+        self,
+        message_ids: IntArray,
+        time_us: IntArray,
+        places: tuple[NDArray[np.void], IntArray],
+        fields: dict[int, NDArray[np.void]],
+    ) -> FloatArray:
+        """Return what the autopilot believed at each sample; NaN where it told nothing new."""
+        is_state, is_imu = message_ids == ATTITUDE, np.isin(message_ids, [*IMU_RANK])
+        newest = np.cumsum(is_state)
+        # Of states that come one behind another the last counts; the end of all is a sample too.
+        at = np.append(newest[is_imu], newest[-1:] if len(newest) else 0)
+        before = np.concatenate([[0], at[:-1]])
+        chosen = np.flatnonzero(is_state)[at[at > before] - 1]
+        values = fields.get(ATTITUDE)
+        states = np.full((len(at), NAV.stop - NAV.start), np.nan)
+        if values is not None:
+            values = values[at[at > before] - 1]
+            states[at > before] = nav_cells(values, time_us[chosen], places[0], places[1][chosen])
+        if not at[0]:
+            states[0] = self._state[0]
+        self._state = states[-1:]
+        return states[:-1]
+
+    def _rows(
+        self,
+        message_ids: IntArray,
+        time_us: IntArray,
+        places: tuple[NDArray[np.void], IntArray],
+        states: FloatArray,
+        fields: dict[int, NDArray[np.void]],
+    ) -> FloatArray:
+        kinds = np.select(
+            [message_ids == PRESSURE, message_ids == FIX, np.isin(message_ids, [*IMU_RANK])],
+            [_BARO, _GPS, _IMU],
+        )
+        waiting = [k for k, group in ((_BARO, BARO), (_GPS, GPS)) if self._holds(group)]
+        order = np.concatenate([np.array(waiting, np.int64), kinds[kinds > 0]])
+        numbers = np.cumsum(np.diff(order, prepend=_IMU) <= 0)
+        row_of = np.full(len(message_ids), -1)
+        row_of[kinds > 0] = numbers[len(waiting) :] - 1
+        rows = np.full((numbers[-1] if len(numbers) else 0, len(COLUMNS)), np.nan)
+        rows[: len(self._open)] = self._open
+        for message_id, values in fields.items():
+            here = message_ids == message_id
+            row, now_us = row_of[here], time_us[here]
+            if message_id == PRESSURE:
+                rows[row, BARO] = baro_cells(values, now_us)
+            elif message_id == FIX:
+                rows[row, GPS] = gps_cells(values, now_us, places[0], places[1][here])
+            elif message_id in IMU_RANK:
+                rows[row, _HEAD], rows[row, SI] = imu_cells(message_id, values, now_us)
+        rows[row_of[kinds == _IMU], NAV] = states
+        has_sample = np.isin(np.arange(len(rows)), row_of[kinds == _IMU])
+        told_us = np.where(np.isnan(rows[:, GPS.start]), rows[:, BARO.start], rows[:, GPS.start])
+        rows[~has_sample, 0] = told_us[~has_sample]
+        whole = len(rows) - (len(rows) > 0 and not has_sample[-1])
+        self._open = rows[whole:]
+        return rows[:whole]
+
+    def _holds(self, group: slice) -> bool:
+        return len(self._open) > 0 and not np.isnan(self._open[0, group.start])
+
+
+@dispatched
+def _on_clock(
+    streams: IntArray,
+    own_us: IntArray,
+    recorded_us: IntArray,
+    zero_us: IntArray,
+    newest_us: IntArray,
+    sampled_us: IntArray,
+) -> IntArray:
+    """Give each message its time since zero.
+
+    Parameters
+    ----------
+    streams : ndarray, shape (n,)
+        0 for the IMU, or of `_STREAMS`.
+    own_us : ndarray, shape (n,)
+        By the vehicle; 0 where it tells none, less for a message that has no time.
+    recorded_us : ndarray, shape (n,)
+    zero_us : ndarray, shape (2,)
+        The vehicle's time at zero, and that of the recording.
+    newest_us : ndarray, shape (4,)
+        The newest time of each stream, which is changed.
+    sampled_us : ndarray, shape (1,)
+        When the newest IMU sample was recorded, which is changed.
+    """
+    found = np.empty_like(own_us)
+    for i in range(len(own_us)):
+        stream = streams[i]
+        if own_us[i] >= 0:
+            told_us = recorded_us[i] if own_us[i] == 0 else own_us[i]
+            elapsed_us = told_us - zero_us[0]
+            if not 0 <= elapsed_us - newest_us[0] <= US_PER_S:
+                # Another clock than the IMU's, or a restart: use the time of recording.
+                if stream == 0:
+                    elapsed_us = recorded_us[i] - zero_us[1]
+                else:
+                    # The two clocks drift apart, so only since the newest sample.
+                    elapsed_us = newest_us[0] + max(recorded_us[i] - sampled_us[0], 0)
+            newest_us[stream] = max(newest_us[stream], elapsed_us)
+            if stream == 0:
+                sampled_us[0] = recorded_us[i]
+        found[i] = newest_us[stream]
+    return found

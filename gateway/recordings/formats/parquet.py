@@ -1,0 +1,275 @@
+"""Parquet: a table as typed columns with units, or one type of MAVLink message.
+
+The comment lines between the rows of a table (changed settings, states, marks, the nodes' reports)
+are in the column `comments` of the next row, written as in a CSV; settings and calibration are in
+the file's metadata. So a CSV can be restored exactly.
+"""
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.columns import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
+from gateway.recordings.convert import FlightToWrite
+from gateway.recordings.files import is_packed, read_chunks, temporary_copy
+from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_blocks
+from gateway.recordings.table import (
+    FORMAT_LINE,
+    HEADER_PREFIX,
+    TableBlock,
+    TableReader,
+    encode_header,
+    encode_line,
+)
+from gateway.recordings.tlog import TlogRecord
+from gateway.units import counted
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import origin_of
+
+
+class Pieces:
+    """Buffer written bytes until they are taken."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self._written: list[bytes] = []
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """Take more of the file."""
+        self._written.append(bytes(data))
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how much was written in all."""
+        return self._size
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered elsewhere."""
+
+    def close(self) -> None:
+        """Close the stream."""
+        self.closed = True
+
+    def taken(self) -> bytes:
+        """Return what was written since the last time."""
+        data = b"".join(self._written)
+        self._written.clear()
+        return data
+
+
+def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
+    """Yield a flight's frames with their messages; unknown ones are mentioned in a remark."""
+    decoder, unknown = mavlink.MAVLink(None), 0
+    for record in flight.frames():
+        try:
+            yield record, decoder.decode(bytearray(record.frame))
+        except mavlink.MAVError:
+            unknown += 1
+    if unknown:
+        flight.remark(f"left out {counted(unknown, 'message')} that no MAVLink dialect here knows")
+
+
+ROWS: Final = 16_384
+"""Of a row group, all that is in the memory at a time: some 40 MB."""
+COMMENTS: Final = "comments"
+TIME: Final = "time"
+"""Civil time, where it is known."""
+HEADER: Final = b"mavgate.header"
+END: Final = "mavgate.end"
+"""Comments after the last row."""
+
+UNITS: Final = {
+    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
+    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
+    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
+}  # fmt: skip
+"""By the ending of a column's name."""
+TRUTHS: Final = {"gps_fix_ok"}
+
+_TYPES: Final = {
+    **{f"{sign}int{bits}_t": getattr(pa, f"{sign}int{bits}")() for sign in ("", "u")
+       for bits in (8, 16, 32, 64)},
+    "float": pa.float32(), "double": pa.float64(), "char": pa.string(),
+    "uint8_t_mavlink_version": pa.uint8(),
+}  # fmt: skip
+
+
+def write(flight: FlightToWrite) -> Iterator[bytes]:
+    """Write a flight's table, or its messages of the requested type."""
+    if flight.message is None:
+        return _write_table(flight.table())
+    return _write_messages(flight, flight.message)
+
+
+def read(path: Path, options: ReadOptions) -> RecordedTable:
+    """Open a table that was written here; raises FlightError if it is not one."""
+    reader = TableReader()
+
+    def blocks() -> Iterator[TableBlock]:
+        try:
+            for text in _lines(path, options):
+                yield reader.feed_block(text)
+        except (pa.ArrowException, OSError) as error:
+            # An error of the operating system has a number, one of the library has none.
+            if getattr(error, "errno", None) is not None:
+                raise
+            raise FlightError(f"{path}: cannot be read as Parquet: {error}") from error
+
+    return table_of_blocks(path, reader, blocks())
+
+
+def _write_table(table: RecordedTable) -> Iterator[bytes]:
+    zero_us = table.header.unix_us_at_zero
+    fields = [_column(name) for name in COLUMNS]
+    if zero_us is not None:
+        fields = [pa.field(TIME, pa.timestamp("us", "UTC")), *fields]
+    fields.append(pa.field(COMMENTS, pa.string()))
+    header = encode_header(table.header).removeprefix(HEADER_PREFIX).strip().encode()
+    schema = pa.schema(fields, metadata={HEADER: header})
+    pieces = Pieces()
+    with _writer(pieces, schema) as writer:
+        rows: list[tuple[Any, ...]] = []
+        comments = ""
+        for line in table.rows:
+            if not isinstance(line, TableRow):
+                comments += encode_line(line)
+                continue
+            civil = () if zero_us is None else (zero_us + line.time_us,)
+            rows.append((*civil, *cells_of(line), comments or None))
+            comments = ""
+            if len(rows) == ROWS:
+                writer.write_table(_batch(rows, schema))
+                yield pieces.taken()
+                rows.clear()
+        writer.write_table(_batch(rows, schema))
+        if comments:
+            writer.add_key_value_metadata({END: comments})
+    yield pieces.taken()
+
+
+def _writer(pieces: Pieces, schema: pa.Schema) -> pq.ParquetWriter:
+    file = pa.PythonFile(pieces, "w")
+    return pq.ParquetWriter(file, schema, compression="zstd", write_page_checksum=True)
+
+
+def _column(name: str) -> pa.Field:
+    if name in TRUTHS:
+        kind = pa.bool_()
+    elif name in WHOLE_COLUMNS:
+        kind = pa.int64()
+    else:
+        kind = pa.float64()
+    unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), None)
+    return pa.field(name, kind, metadata={"unit": unit} if unit else None)
+
+
+def _batch(rows: list[tuple[Any, ...]], schema: pa.Schema) -> pa.Table:
+    columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
+    arrays = [
+        # NaN is "not known", as an empty cell is.
+        pa.array(column, field.type, from_pandas=pa.types.is_floating(field.type))
+        if not pa.types.is_boolean(field.type)
+        else pa.array([None if value is None else bool(value) for value in column])
+        for column, field in zip(columns, schema, strict=True)
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
+    """Yield the lines of the CSV that the file was made of, many at once."""
+    with (
+        _plain(path, options) as plain,
+        pq.ParquetFile(plain, page_checksum_verification=True) as file,
+    ):
+        known = file.schema_arrow.metadata or {}
+        names = [name for name in COLUMNS if name in file.schema_arrow.names]
+        if "time_us" not in names:
+            raise FlightError(f"{path}: has no column time_us, so it is no table of mavgate's")
+        if HEADER in known:
+            yield f"{FORMAT_LINE}\n{HEADER_PREFIX}{known[HEADER].decode()}\n".encode()
+        yield (",".join(names) + "\n").encode()
+        wanted = [*names, *({COMMENTS} & set(file.schema_arrow.names))]
+        total, size = max(file.metadata.num_rows, 1), path.stat().st_size
+        for batch in file.iter_batches(ROWS // 4, columns=wanted):
+            columns = [column.to_pylist() for column in batch.columns]
+            comments: Iterable[str | None] = [None] * batch.num_rows
+            if len(columns) > len(names):
+                comments = columns.pop()
+            rows = zip(comments, zip(*columns, strict=True), strict=True)
+            lines = (
+                (comment or "") + ",".join(map(_text, cells)) + "\n" for comment, cells in rows
+            )
+            yield "".join(lines).encode()
+            if options.progress is not None:
+                options.progress(size * batch.num_rows // total)
+        yield (file.metadata.metadata or {}).get(END.encode(), b"")
+
+
+@contextmanager
+def _plain(path: Path, options: ReadOptions) -> Iterator[Path | IO[bytes]]:
+    """Yield a file that can be read at any position: a packed one is copied."""
+    if not is_packed(path):
+        yield path
+        return
+    with temporary_copy(path, read_chunks(path, None, options.unpacked_limit)) as copy:
+        yield copy
+
+
+def _text(cell: Any) -> str:
+    if cell is None:
+        return ""
+    return repr(int(cell)) if isinstance(cell, bool) else repr(cell)
+
+
+def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
+    """Write every message of one type, of any sender; raises FlightError if there is none."""
+    kind = mavlink.mavlink_map.get(MESSAGE_IDS.get(name))
+    if kind is None:
+        raise FlightError(f"no MAVLink message is called {name}")
+    schema = pa.schema(
+        [
+            pa.field(TIME, pa.timestamp("us", "UTC")),
+            pa.field("system_id", pa.uint8()),
+            pa.field("component_id", pa.uint8()),
+            *(_message_field(kind, field) for field in kind.fieldnames),
+        ],
+        metadata={"mavlink.message": name},
+    )
+    met: set[str] = set()
+    pieces, rows = Pieces(), []
+    with _writer(pieces, schema) as writer:
+        for record, message in decoded(flight):
+            met.add(message.msgname)
+            if message.msgname == name:
+                fields = (_value(getattr(message, field)) for field in kind.fieldnames)
+                rows.append((record.time_us, *origin_of(record.frame), *fields))
+            if len(rows) == ROWS:
+                writer.write_table(_batch(rows, schema))
+                yield pieces.taken()
+                rows.clear()
+        if name not in met:
+            raise FlightError(f"the flight holds no {name}, but {', '.join(sorted(met))}")
+        writer.write_table(_batch(rows, schema))
+    yield pieces.taken()
+
+
+def _message_field(kind: Any, name: str) -> pa.Field:
+    written = kind.fieldtypes[kind.fieldnames.index(name)]
+    length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
+    one = _TYPES[written]
+    facts = {"unit": kind.fieldunits_by_name.get(name), "enum": kind.fieldenums_by_name.get(name)}
+    metadata = {key: value for key, value in facts.items() if value}
+    return pa.field(name, pa.list_(one) if length and written != "char" else one, metadata=metadata)
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode("ascii", "replace")
+    return value

@@ -1,0 +1,439 @@
+"""ULog, the log of PX4, read by pyulog, by the definitions of its uORB messages.
+
+IMU: `sensor_combined`. Magnetic field: `vehicle_magnetometer`, in old logs among the former's
+fields. Barometer: `vehicle_air_data`, `sensor_baro`, or the former's heights. GPS:
+`vehicle_gps_position` or `sensor_gps`, with positions in 1e-7 degrees or, in newer logs, in
+degrees. What the autopilot estimated: `vehicle_attitude`, `vehicle_global_position`,
+`vehicle_local_position`. All are in body FRD and NED already, in us since the start.
+"""
+
+import contextlib
+import heapq
+import io
+import math
+import os
+import struct
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from statistics import median_low
+from typing import Any, Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+from pyulog import ULog
+from pyulog.exceptions import ULogException
+
+from gateway.geometry.atmosphere import pressure_at_height
+from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, TableRow
+from gateway.recordings.files import read_chunks, temporary_copy
+from gateway.recordings.formats.mavlink import UNIX_YEAR_2000_US, UT_PER_GAUSS, VELOCITY_AGE_US
+from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NavFlags,
+    NavState,
+    NodeId,
+    Vec3,
+)
+from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA, US_PER_S, counted
+
+TOPICS: Final = (
+    *("sensor_combined", "vehicle_magnetometer", "vehicle_air_data", "sensor_baro"),
+    *("vehicle_gps_position", "sensor_gps"),
+    *("vehicle_attitude", "vehicle_global_position", "vehicle_local_position"),
+)
+"""All that is read."""
+LEAST_PA: Final = 2000.0
+"""A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
+AROUND: Final = 5
+"""Rows whose median time is believed."""
+FAR_US: Final = 60 * US_PER_S
+"""A row so far from that has a damaged time."""
+NOT_THERE: Final = 0x7FFFFFFF
+"""A time relative to the sample's that means "no new one"."""
+EXTRAPOLATED: Final = 8
+ORDER: Final[dict[type, int]] = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
+"""Of records of one time: that of a row."""
+
+_FIX_TYPES: Final = {
+    0: GpsFixType.NONE, 1: GpsFixType.NONE, 2: GpsFixType.FIX_2D,
+    EXTRAPOLATED: GpsFixType.DEAD_RECKONING,
+}  # fmt: skip
+
+Topic = Mapping[str, NDArray[Any]]
+Row = Mapping[str, Any]
+
+
+class Px4Log:
+    """The topics of one log.
+
+    Parameters
+    ----------
+    topics : mapping of str to mapping of str to ndarray
+        Arrays of one length by field, by topic; `timestamp` among them.
+    vehicle_id : int
+        Vehicle id of the records.
+
+    Raises
+    ------
+    ValueError
+        If there is no IMU in it.
+    """
+
+    def __init__(self, topics: Mapping[str, Topic], vehicle_id: int) -> None:
+        self.dropped = 0
+        """Samples with an impossible time."""
+        sound = {name: _sound_columns(topic) for name, topic in topics.items()}
+        self.left_out = sorted(name for name, topic in sound.items() if _lacks(name, topic))
+        """Topics without the fields that are needed of them."""
+        self._topics = {
+            name: self._in_order(topic)
+            for name, topic in sound.items()
+            if name not in self.left_out
+        }
+        if not len(self._topics.get("sensor_combined", {}).get("timestamp", ())):
+            raise ValueError("holds no sensor_combined, the samples of the IMU")
+        self._vehicle_id = vehicle_id
+        begins = (t["timestamp"][0] for t in self._topics.values() if len(t["timestamp"]))
+        self._zero_us = int(min(begins))
+
+    @property
+    def unix_us_at_zero(self) -> int | None:
+        """Civil time of the records' time zero, by GPS; None if GPS never had it."""
+        found = [
+            row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
+            for row in self._rows(*_GPS_TOPICS)
+            if UNIX_YEAR_2000_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
+        ]
+        return self._zero_us + median_low(found) if found else None
+
+    def records(self) -> Iterator[Imported]:
+        """Yield all records in the order of time, which begins at 0."""
+        streams = (self._imu(), self._baros(), self._fixes(), self._states())
+        return heapq.merge(*streams, key=lambda record: (record.time_us, ORDER[type(record)]))
+
+    def _in_order(self, topic: Topic) -> Topic:
+        """Sort by time, and leave out rows without one, or with one far from those around it."""
+        time_us = topic["timestamp"].astype(np.int64)
+        sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
+        if len(time_us) >= AROUND:
+            around = np.median(sliding_window_view(time_us, AROUND), axis=1)
+            usual = np.pad(around, AROUND // 2, mode="edge")
+            sound &= np.abs(time_us - usual) < FAR_US
+        self.dropped += int(np.count_nonzero(~sound))
+        order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
+        return {name: column[order] for name, column in topic.items()}
+
+    def _rows(self, *names: str) -> Iterator[Row]:
+        """Yield the rows of the first topic that the log has."""
+        for name in names:
+            topic = self._topics.get(name)
+            if topic is not None:
+                columns = [column.tolist() for column in topic.values()]
+                return (dict(zip(topic, row, strict=True)) for row in zip(*columns, strict=True))
+        return iter(())
+
+    def _time(self, row: Row) -> int:
+        return int(row["timestamp"]) - self._zero_us
+
+    def _imu(self) -> Iterator[ImuCalibrated]:
+        fields, node = self._fields_at_samples(), NodeId(self._vehicle_id, 0)
+        for number, row in enumerate(self._rows("sensor_combined")):
+            mag = fields.get(number)
+            flags = ImuFlags.MAG_NEW if mag else ImuFlags(0)
+            if row.get("accelerometer_clipping", 0):
+                flags |= ImuFlags.ACCEL_CLIPPED
+            if row.get("gyro_clipping", 0):
+                flags |= ImuFlags.GYRO_CLIPPED
+            accel, gyro = _vector(row, "accelerometer_m_s2"), _vector(row, "gyro_rad")
+            yield ImuCalibrated(self._time(row), node, accel, gyro, mag, NAN, flags)
+
+    def _fields_at_samples(self) -> dict[int, Vec3]:
+        """Return the newest magnetic field of each IMU sample that has a new one, by its number."""
+        imu = self._topics["sensor_combined"]
+        if "vehicle_magnetometer" not in self._topics and all(
+            axis in imu for axis in _axes("magnetometer_ga")
+        ):
+            relative = imu.get("magnetometer_timestamp_relative", np.zeros(len(imu["timestamp"])))
+            at = np.flatnonzero(relative != NOT_THERE).tolist()
+            rows = list(self._rows("sensor_combined"))
+            return {number: _field(rows[number]) for number in at}
+        magnetometer = self._topics.get("vehicle_magnetometer")
+        if magnetometer is None:
+            return {}
+        after = np.searchsorted(imu["timestamp"], magnetometer["timestamp"]).tolist()
+        return dict(zip(after, map(_field, self._rows("vehicle_magnetometer")), strict=True))
+
+    def _baros(self) -> Iterator[BaroRaw]:
+        node = NodeId(self._vehicle_id, 0)
+        names = ("vehicle_air_data", "sensor_baro", "sensor_combined")
+        for row in self._rows(*names):
+            pressure_pa = row.get("baro_pressure_pa", row.get("pressure", NAN))
+            if pressure_pa < LEAST_PA:
+                pressure_pa *= PA_PER_HPA
+            if math.isnan(pressure_pa):
+                if row.get("baro_timestamp_relative", 0) == NOT_THERE:
+                    continue
+                pressure_pa = pressure_at_height(row.get("baro_alt_meter", NAN))
+            if math.isfinite(pressure_pa):
+                degc = next((row[name] for name in _BARO_DEGC if name in row), NAN)
+                time_us = self._time(row)
+                yield BaroRaw(time_us, node, time_us, pressure_pa, degc)
+
+    def _fixes(self) -> Iterator[GpsFix]:
+        return (self._fix(row) for row in self._rows(*_GPS_TOPICS))
+
+    def _fix(self, row: Row) -> GpsFix:
+        time_us = self._time(row)
+        fix_type = _FIX_TYPES.get(row.get("fix_type", 0), GpsFixType.FIX_3D)
+        utc_us = int(row.get("time_utc_usec", 0))
+        has_velocity = fix_type is not GpsFixType.NONE and row.get("vel_ned_valid", 0)
+        vel = (row["vel_n_m_s"], row["vel_e_m_s"], row["vel_d_m_s"]) if has_velocity else None
+        return GpsFix(
+            time_us=time_us,
+            node=NodeId(self._vehicle_id, 1),
+            node_time_us=time_us,
+            itow_ms=0,
+            fix_type=fix_type,
+            fix_ok=fix_type not in (GpsFixType.NONE, GpsFixType.DEAD_RECKONING),
+            satellites=row.get("satellites_used", 0),
+            lat_dege7=_dege7(row, "latitude_deg", "lat"),
+            lon_dege7=_dege7(row, "longitude_deg", "lon"),
+            alt_amsl_m=_metres(row, "altitude_msl_m", "alt"),
+            vel_n_mps=vel or UNKNOWN_VEC3,
+            alt_ellipsoid_m=_metres(row, "altitude_ellipsoid_m", "alt_ellipsoid"),
+            h_acc_m=row.get("eph", NAN) or NAN,
+            v_acc_m=row.get("epv", NAN) or NAN,
+            speed_acc_mps=row.get("s_variance_m_s", NAN) or NAN,
+            course_acc_deg=math.degrees(row.get("c_variance_rad", NAN)) or NAN,
+            pdop=math.hypot(row.get("hdop", NAN), row.get("vdop", NAN)) or NAN,
+            utc_us=utc_us if UNIX_YEAR_2000_US < utc_us < LARGEST_WHOLE else None,
+        )
+
+    def _states(self) -> Iterator[NavState]:
+        """Yield the autopilot's own solution, for comparison."""
+        places = _Newest(self._rows("vehicle_global_position"))
+        motions = _Newest(self._rows("vehicle_local_position", "vehicle_global_position"))
+        for row in self._rows("vehicle_attitude"):
+            place, motion = places.at(row["timestamp"]), motions.at(row["timestamp"])
+            flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+            if "lat" in place:
+                flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
+            north, east, down = (motion.get(k, motion.get(old, NAN)) for k, old in _VELOCITY)
+            if math.isfinite(north + east + down):
+                flags |= NavFlags.VELOCITY_VALID
+            yield NavState(
+                time_us=self._time(row),
+                q_nb=(row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"]),
+                rate_b_radps=UNKNOWN_VEC3,
+                lat_deg=place.get("lat", NAN),
+                lon_deg=place.get("lon", NAN),
+                alt_amsl_m=place.get("alt", NAN),
+                vel_n_mps=(north, east, down),
+                attitude_std_rad=UNKNOWN_VEC3,
+                vel_std_mps=UNKNOWN_VEC3,
+                pos_std_m=UNKNOWN_VEC3,
+                flags=flags,
+            )
+
+
+class _Newest:
+    """The newest row of a topic at a time that never goes back, unless it is too old."""
+
+    def __init__(self, rows: Iterator[Row]) -> None:
+        self._rows = rows
+        self._row: Row = {}
+        self._next: Row | None = next(rows, None)
+
+    def at(self, time_us: int) -> Row:
+        while self._next is not None and self._next["timestamp"] <= time_us:
+            self._row, self._next = self._next, next(self._rows, None)
+        is_new = self._row and time_us - self._row["timestamp"] <= VELOCITY_AGE_US
+        return self._row if is_new else {}
+
+
+_WHOLE: Final = frozenset((
+    "time_utc_usec", "fix_type", "satellites_used", "timestamp", "timestamp_time_relative",
+    "magnetometer_timestamp_relative", "baro_timestamp_relative",
+))  # fmt: skip
+"""Fields that are whole numbers."""
+
+
+def _axes(name: str, count: int = 3) -> tuple[str, ...]:
+    return tuple(f"{name}[{axis}]" for axis in range(count))
+
+
+_GPS_FIELDS: Final = (
+    ("lat", "latitude_deg"), ("lon", "longitude_deg"), ("vel_n_m_s",), ("vel_e_m_s",),
+    ("vel_d_m_s",),
+)  # fmt: skip
+_NEEDED: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
+    "sensor_combined": tuple(
+        (axis,) for axis in (*_axes("accelerometer_m_s2"), *_axes("gyro_rad"))
+    ),
+    "vehicle_magnetometer": tuple((axis,) for axis in _axes("magnetometer_ga")),
+    "vehicle_attitude": tuple((axis,) for axis in _axes("q", 4)),
+    "vehicle_gps_position": _GPS_FIELDS,
+    "sensor_gps": _GPS_FIELDS,
+}
+"""One of each is needed of a topic, beside its time."""
+
+
+def _sound_columns(topic: Topic) -> Topic:
+    """Leave out columns that are no numbers, or no whole ones where there are only such."""
+    return {
+        name: column
+        for name, column in topic.items()
+        if column.dtype.kind in ("iub" if name in _WHOLE else "iubf")
+    }
+
+
+def _lacks(name: str, topic: Topic) -> bool:
+    needed = (("timestamp",), *_NEEDED.get(name, ()))
+    return not all(any(field in topic for field in fields) for fields in needed)
+
+
+_GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
+_BARO_DEGC: Final = ("ambient_temperature", "baro_temp_celcius", "temperature")
+_VELOCITY: Final = (("vx", "vel_n"), ("vy", "vel_e"), ("vz", "vel_d"))
+
+
+def _vector(row: Row, name: str) -> Vec3:
+    return (row[f"{name}[0]"], row[f"{name}[1]"], row[f"{name}[2]"])
+
+
+def _field(row: Row) -> Vec3:
+    x, y, z = _vector(row, "magnetometer_ga")
+    return (x * UT_PER_GAUSS, y * UT_PER_GAUSS, z * UT_PER_GAUSS)
+
+
+def _dege7(row: Row, degrees: str, dege7: str) -> int:
+    value = row[degrees] / DEG_PER_DEGE7 if degrees in row else row[dege7]
+    return round(value) if math.isfinite(value) else 0
+
+
+def _metres(row: Row, metres: str, millimetres: str) -> float:
+    value: float = row[metres] if metres in row else row.get(millimetres, NAN) * M_PER_MM
+    return value
+
+
+MS_PER_S: Final = 1000.0
+SYSTEM_ID: Final = "MAV_SYS_ID"
+HEADER: Final = 3
+"""Bytes before the content of a message."""
+MOST_VALUES: Final = 1 << 16
+"""In a row: a message has no more bytes."""
+BROKEN: Final = (
+    *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
+    *(struct.error, RecursionError),
+)
+"""What damage makes pyulog raise, beside its own error."""
+
+
+class _Content(io.BufferedReader):
+    """The bytes of a log, read from a file as they are needed.
+
+    pyulog steps back by as much as it has asked for. Where the log is cut that is more than it has
+    got, and it would read the same bytes for ever.
+    """
+
+    unread = 0
+    """Bytes behind the last message that pyulog has read whole."""
+    _missing = _header_at = 0
+
+    def __init__(self, name: str) -> None:
+        super().__init__(io.FileIO(name))
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size == HEADER:
+            self._header_at = self.tell()
+        data = super().read(size)
+        self._missing = max((size or 0) - len(data), 0)
+        return data
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        return super().seek(offset + self._missing * (whence == io.SEEK_CUR), whence)
+
+    def close(self) -> None:
+        if not self.closed:
+            end = self._header_at if self._missing else self.tell()
+            self.unread = os.fstat(self.fileno()).st_size - end
+        super().close()
+
+
+def read(path: Path, options: ReadOptions) -> RecordedTable:
+    """Open a ULog as a flight; raises FlightError if there is none in it."""
+    with temporary_copy(
+        path, read_chunks(path, options.progress, options.unpacked_limit)
+    ) as content:
+        log, unread = _load(path, content.name)
+    topics = {data.name: data.data for data in reversed(log.data_list)}
+    known = log.initial_parameters.get(SYSTEM_ID, 1)
+    is_id = isinstance(known, int) and 1 <= known <= 255
+    vehicle_id = options.system_id or (known if is_id else 1)
+    try:
+        flight = Px4Log(topics, vehicle_id)
+    except ValueError as error:
+        raise FlightError("; it ".join([f"{path}: {error}", *_damage(log, unread)])) from error
+
+    def rows() -> Iterator[TableRow]:
+        builder = RowBuilder()
+        for record in flight.records():
+            yield from builder.add(record)
+        yield from builder.flush()
+
+    table = table_of_rows(rows(), options, vehicle_id, flight.unix_us_at_zero)
+    remarks = [*_damage(log, unread), *_remarks(log, flight)]
+    table.remarks += [f"{path}: {remark}" for remark in remarks]
+    return table
+
+
+def _load(path: Path, copy: str) -> tuple[Any, int]:
+    """Return the log, and how many bytes at its end could not be read."""
+    # Damage that it prints to the terminal is reported as remarks.
+    with contextlib.redirect_stdout(io.StringIO()):
+        try:
+            _check_formats(ULog(_Content(copy), parse_header_only=True).message_formats)
+            file = _Content(copy)
+            return ULog(file, list(TOPICS)), file.unread
+        except (ULogException, *BROKEN) as error:
+            raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error
+
+
+def _check_formats(formats: dict[str, Any]) -> None:
+    """Raise an error of `BROKEN` for formats that would fill the memory."""
+
+    @cache
+    def values_of(kind: str) -> int:
+        fields = formats[kind].fields if kind in formats else ()
+        return sum(max(count, 1) * values_of(part) for part, count, _ in fields) if fields else 1
+
+    for name in formats:
+        if values_of(name) > MOST_VALUES:
+            raise ValueError(f"{name} has more values than a message can hold")
+
+
+def _damage(log: Any, unread: int) -> Iterator[str]:
+    if log.file_corruption:
+        yield "is damaged; what is sound of it was read"
+    if unread:
+        yield f"left out {counted(unread, 'byte')} at its end that cannot be read"
+
+
+def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
+    if log.dropouts:
+        lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
+        slow = counted(len(log.dropouts), "time")
+        yield f"its logger was too slow {slow}, {lost_s:.1f} s are not in it"
+    if flight.left_out:
+        yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
+    if flight.dropped:
+        yield f"left out {counted(flight.dropped, 'sample')} without a time that can be"

@@ -1,0 +1,214 @@
+"""The folder of recordings: listing, and safe renaming and deleting.
+
+A recording `NAME` is all files `NAME_01.tlog`, `NAME_01_v1.csv`, `NAME_02.tlog` and so on.
+"""
+
+import contextlib
+import itertools
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gateway.output import sync_folder
+
+_FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
+MAX_NAME: Final = 100
+NEWEST: Final = "last"
+"""Name that always means the newest recording."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """All files of one recording."""
+
+    name: str
+    files: tuple[Path, ...]
+    size: int
+    modified_s: float
+    """When it was last written, in s since 1970."""
+
+
+class RecordingError(Exception):
+    """The request cannot be carried out; the text says why."""
+
+
+def check_name(name: str) -> str:
+    """Check the name under which a user saves a session.
+
+    Parameters
+    ----------
+    name : str
+        Letters, digits, space, dot, hyphen and underscore; begins with a letter or digit.
+
+    Returns
+    -------
+    str
+        The same.
+
+    Raises
+    ------
+    ValueError
+        If the name is not allowed for a file, or has another meaning.
+    """
+    if name == NEWEST:
+        raise ValueError(f"{name!r} is no name for a recording: it always means the newest")
+    sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
+    if not sound or not name[:1].isalnum() or name.endswith((" ", ".")):
+        raise ValueError(
+            f"{name!r} is no name for a recording: at most {MAX_NAME} letters, digits, spaces, "
+            "dots, hyphens and underscores, beginning with a letter or digit"
+        )
+    return name
+
+
+def part_of(path: Path) -> int:
+    """Return which part of its recording a file is; raises ValueError if it is not one."""
+    match = _FILE_NAME.fullmatch(path.name)
+    if match is None:
+        raise ValueError(f"{path} is no part of a recording")
+    return int(match["part"])
+
+
+def is_file_name(name: str) -> bool:
+    """Return whether a name is that of a recording's file, without a path."""
+    return _FILE_NAME.fullmatch(name) is not None and not {"/", "\0"} & set(name)
+
+
+def recording_name(path: Path) -> str:
+    """Return the name of a file's recording; for another file its own name."""
+    match = _FILE_NAME.fullmatch(path.name)
+    return path.name if match is None else match["name"]
+
+
+def as_text(name: str) -> str:
+    r"""Return a file's name as it can be printed and stored: what is not UTF-8 as `\xNN`."""
+    return os.fsencode(name).decode(errors="backslashreplace")
+
+
+def parts_together(paths: Iterable[Path]) -> list[list[Path]]:
+    """Group consecutive parts of a recording; other files stay alone."""
+    found: list[list[Path]] = []
+    newest: dict[tuple[Path, str, str], list[Path]] = {}
+    for path in paths:
+        match = _FILE_NAME.fullmatch(path.name)
+        if match is None:
+            found.append([path])
+            continue
+        series = (path.parent, match["name"], path.name[match.end("part") :])
+        before = newest.get(series)
+        if before is not None and part_of(before[-1]) < part_of(path):
+            before.append(path)
+        else:
+            newest[series] = [path]
+            found.append(newest[series])
+    return found
+
+
+def list_recordings(folder: Path) -> list[Recording]:
+    """List the recordings of a folder, the newest last; none if there is no such folder.
+
+    Two that ended in the same tick of the file system's clock stand by name.
+    """
+    files: dict[str, list[Path]] = {}
+    with contextlib.suppress(FileNotFoundError):
+        for path in sorted(folder.iterdir()):
+            if (match := _FILE_NAME.fullmatch(path.name)) and path.is_file():
+                files.setdefault(match["name"], []).append(path)
+    found = [_describe(name, paths) for name, paths in files.items()]
+    return sorted(found, key=lambda recording: (recording.modified_s, recording.name))
+
+
+def find_recording(folder: Path, name: str) -> Recording:
+    """Find one recording by name; `last` is the newest, unless one has that name.
+
+    Raises
+    ------
+    RecordingError
+        If there is none.
+    """
+    recordings = list_recordings(folder)
+    for recording in recordings:
+        if recording.name == name:
+            return recording
+    if name == NEWEST and recordings:
+        return recordings[-1]
+    raise RecordingError(f"no recording {name!r} in {folder}")
+
+
+def free_name(folder: Path, wanted: str) -> str:
+    """Return the wanted name, with a number added if there is such a recording."""
+    taken = {recording.name for recording in list_recordings(folder)}
+    names = (wanted if n == 1 else f"{wanted}-{n}" for n in itertools.count(1))
+    return next(name for name in names if name not in taken)
+
+
+def check_free(folder: Path, name: str) -> None:
+    """Check that a recording can have a name; raises RecordingError if not."""
+    try:
+        check_name(name)
+    except ValueError as error:
+        raise RecordingError(str(error)) from error
+    if free_name(folder, name) != name:
+        raise RecordingError(f"there is a recording {name!r} already in {folder}")
+
+
+def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
+    """Rename a recording as `move_recording`, and sync its folder."""
+    moved = move_recording(folder, name, to_name)
+    sync_folder(folder)
+    return moved
+
+
+def move_recording(folder: Path, name: str, to_name: str) -> Recording:
+    """Rename a recording, also while it is being written; never overwrites.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such recording, or the new name is taken or invalid.
+    """
+    recording = find_recording(folder, name)
+    check_free(folder, to_name)
+    for path in recording.files:
+        _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
+    return find_recording(folder, to_name)
+
+
+def delete_recording(folder: Path, name: str) -> Recording:
+    """Delete the files of a recording and return what they were.
+
+    Raises
+    ------
+    RecordingError
+        If there is no such recording.
+    """
+    recording = find_recording(folder, name)
+    for path in recording.files:
+        path.unlink()
+    sync_folder(folder)
+    return recording
+
+
+def _describe(name: str, paths: list[Path]) -> Recording:
+    stats = []
+    for path in paths:
+        with contextlib.suppress(FileNotFoundError):
+            stats.append(path.stat())
+    return Recording(
+        name,
+        tuple(paths),
+        sum(stat.st_size for stat in stats),
+        max((stat.st_mtime for stat in stats), default=0.0),
+    )
+
+
+def _move(path: Path, target: Path) -> None:
+    """Rename without overwriting, also on file systems without hard links."""
+    try:
+        target.touch(exist_ok=False)
+    except FileExistsError as error:
+        raise RecordingError(f"{target} is there already") from error
+    path.replace(target)

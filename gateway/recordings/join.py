@@ -1,0 +1,241 @@
+"""Tables of one aircraft one after another, cut and moved in time; moments as text."""
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from gateway.recordings.columns import TIMES, BoolArray
+from gateway.recordings.reading import FlightError, RecordedTable
+from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader, TableMark
+from gateway.recordings.tlog import JUMP_US
+from gateway.records import FusionState, NodeStatus
+from gateway.units import US_PER_S, counted
+
+MAX_TEXT: Final = 40
+_CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A moment of a recording; exactly one of the two is set."""
+
+    offset_s: float | None = None
+    """From the start, or from here if `relative`."""
+    relative: bool = False
+    time_us: int | None = None
+    """Civil time in µs since 1970."""
+
+
+def parse_moment(text: str) -> Moment:
+    """Read a moment.
+
+    Parameters
+    ----------
+    text : str
+        Seconds, `minutes:seconds` or `hours:minutes:seconds` from the start; with a sign, from
+        here; or a date and time in ISO 8601, in UTC unless it names a zone.
+
+    Returns
+    -------
+    Moment
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    if len(text) > MAX_TEXT:
+        raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")
+    if match := _CLOCK.fullmatch(text.strip()):
+        sign, first, second, seconds = match.groups()
+        hours, minutes = (first, second) if second is not None else ("0", first or "0")
+        offset_s = int(hours or 0) * 3600 + int(minutes) * 60 + float(seconds)
+        return Moment(-offset_s if sign == "-" else offset_s, relative=bool(sign))
+    try:
+        moment = datetime.fromisoformat(text.strip())
+    except ValueError as error:
+        raise ValueError(
+            f"{text!r} is no moment: write 80, 1:20, 1:02:03, +10, -0:30 or 2026-06-11T14:25:30Z"
+        ) from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return Moment(time_us=round(moment.timestamp() * US_PER_S))
+
+
+def civil_time(unix_us: float) -> datetime | None:
+    """Return a time in µs since 1970 as a moment in UTC; None beyond the calendar's years."""
+    try:
+        return datetime.fromtimestamp(unix_us / US_PER_S, UTC)
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def place_in(moment: Moment, first_us: int) -> int:
+    """Convert a moment to a recording's own time, given that of its start."""
+    if moment.time_us is not None:
+        return moment.time_us
+    return first_us + round((moment.offset_s or 0.0) * US_PER_S)
+
+
+Limits = tuple[Moment | None, Moment | None]
+
+NOTHING_WITHIN: Final = (
+    "there is nothing between that begin and end; `mavgate info` shows the length"
+)
+OLDER: Final = "a recording is older than the one before it; give the oldest first"
+OVERLAP: Final = "left out {} that overlap with the recording before"
+LATE_US: Final = 1_000_000
+"""Rows of one clock that are older by less than this came late, and are in their place."""
+
+
+def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
+    """Put tables of one aircraft behind one another on the clock of the first.
+
+    Parts of one recording share a clock; other recordings are put in their place by civil time.
+    Where two overlap, the later one is taken from the end of the earlier one on.
+
+    Raises
+    ------
+    FlightError
+        If they are of several aircraft; while the rows are read, if one begins before the one
+        that it is given behind.
+    """
+    vehicles = sorted({table.header.vehicle_id for table in tables})
+    if len(vehicles) > 1:
+        listed = " and ".join(map(str, vehicles))
+        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
+    first = tables[0].header
+    remarks: list[str] = []
+
+    def blocks() -> Iterator[TableBlock]:
+        known, begun_us, newest_us = first, -math.inf, -math.inf
+        for table in tables:
+            header, left_out = table.header, 0
+            if (header.settings, header.calibration) != (known.settings, known.calibration):
+                yield TableBlock(NO_ROWS, ((0, header),))
+            shift_us = _shift_us(header, first)
+            is_behind = None
+            for block in table.blocks:
+                for _, comment in block.comments:
+                    known = comment if isinstance(comment, TableHeader) else known
+                placed = shifted(block, shift_us or 0)
+                times_us = placed.cells[:, 0]
+                if len(block) and is_behind is None:
+                    is_behind = _is_behind(times_us[0], shift_us, begun_us, newest_us)
+                    begun_us = times_us[0]
+                if len(block) and not is_behind:
+                    overlap = _first(times_us >= newest_us)
+                    placed, is_behind = _without(placed, overlap), overlap < len(block)
+                    left_out += overlap
+                newest_us = times_us.max(initial=newest_us)
+                yield placed
+            remarks.extend(table.remarks)
+            if left_out:
+                remarks.append(OVERLAP.format(counted(left_out, "row")))
+
+    return RecordedTable(first, blocks(), remarks)
+
+
+def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us: float) -> bool:
+    """Return whether a recording begins at the end of the one before, as far as that is known.
+
+    Raises
+    ------
+    FlightError
+        If it begins before that one has begun.
+    """
+    if shift_us is None:
+        return True
+    if begin_us < begun_us:
+        raise FlightError(OLDER)
+    return shift_us == 0 and begin_us > newest_us - LATE_US
+
+
+def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
+    """Return how far two clocks are apart by civil time; None where that does not tell."""
+    zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
+    if header.session != "" and header.session == first.session:
+        return 0  # parts of a recording, whose time GPS may have corrected in between
+    if zero_us is None or first_zero_us is None:
+        return None
+    shift_us = zero_us - first_zero_us
+    return 0 if abs(shift_us) <= JUMP_US else shift_us
+
+
+def _without(block: TableBlock, count: int) -> TableBlock:
+    """Leave out the first rows, and what was remarked there; what was changed still holds."""
+    comments = tuple(
+        (max(row - count, 0), comment)
+        for row, comment in block.comments
+        if row >= count or isinstance(comment, TableHeader)
+    )
+    return TableBlock(block.cells[count:], comments)
+
+
+def shifted(block: TableBlock, shift_us: int) -> TableBlock:
+    """Move rows and all that they hold in time; a state holds times of its own and is left out."""
+    if not shift_us:
+        return block
+    cells = block.cells.copy()
+    cells[:, TIMES] += shift_us
+    kept = ((k, c) for k, c in block.comments if not isinstance(c, FusionState))
+    return TableBlock(cells, tuple((k, _moved(c, shift_us)) for k, c in kept))
+
+
+def _moved(comment: TableComment, shift_us: int) -> TableComment:
+    if isinstance(comment, TableMark | NodeStatus):
+        return msgspec.structs.replace(comment, time_us=comment.time_us + shift_us)
+    return comment
+
+
+def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
+    """Cut a table at its begin and end, each a moment or None.
+
+    Raises
+    ------
+    FlightError
+        While the rows are read, if none is between them.
+    """
+    begin, end = limits
+    zero_us = table.header.unix_us_at_zero or 0
+
+    def blocks() -> Iterator[TableBlock]:
+        first_us: int | None = None
+        begun, count = begin is None, 0
+        for block in table.blocks:
+            times_us = zero_us + block.cells[:, 0]
+            if first_us is None and len(block):
+                first_us = int(times_us[0])
+            start, stop, was_begun = 0, len(block), begun
+            if end is not None and first_us is not None:
+                stop = _first(times_us > place_in(end, first_us))
+            if not begun and begin is not None and first_us is not None:
+                start = _first(times_us[:stop] >= place_in(begin, first_us))
+                begun = start < stop
+            # What was changed before the begin still holds, but a state from there does not.
+            comments = tuple(
+                (max(k - start, 0), c)
+                for k, c in block.comments
+                if k <= stop and (was_begun or (begun and k > start) or isinstance(c, TableHeader))
+            )
+            yield TableBlock(block.cells[start:stop], comments)
+            count += stop - start
+            if stop < len(block):
+                break
+        if not count and limits != (None, None):
+            raise FlightError(NOTHING_WITHIN)
+
+    cold_start = table.header.cold_start and begin is None
+    return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), blocks())
+
+
+def _first(where: BoolArray) -> int:
+    """Return the number of the first that is true, or how many there are."""
+    found = np.flatnonzero(where)
+    return int(found[0]) if len(found) else len(where)

@@ -1,0 +1,318 @@
+"""Recordings opened for the player, with the times and ids of their vehicles."""
+
+import logging
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+from typing import Final
+
+from gateway.recordings.answers import FIRST_GROUND_STATION, LogAnswers, is_station
+from gateway.recordings.files import (
+    MAX_UNPACKED,
+    FileKind,
+    Layout,
+    Progress,
+    TlogSource,
+    is_packed,
+    kind_of,
+    open_descriptor,
+    open_tlog,
+    temporary_copy,
+)
+from gateway.recordings.fuse import RecordedFusion, end_of
+from gateway.recordings.index import parts_together
+from gateway.recordings.play import Source, Track
+from gateway.recordings.reading import NO_RECORDING, FlightError, ReadOptions
+from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
+
+READ_SIZE: Final = 1 << 20
+
+
+class TlogFile:
+    """A tlog on disk: its index, and reading at any position.
+
+    It is read, not memory-mapped: a file that shrinks, or a USB stick that is pulled out, would
+    kill a process that had mapped it.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    progress : callable, optional
+        Called with how many more bytes were indexed.
+    answers : LogAnswers, optional
+        Collects answers from the file.
+    unpacked_limit : int
+        Maximum unpacked size of a packed file, in bytes.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, or is too large when unpacked.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        progress: Progress | None = None,
+        answers: LogAnswers | None = None,
+        unpacked_limit: int = MAX_UNPACKED,
+    ) -> None:
+        self.path = path
+        source = open_tlog(path)
+        self.remarks = source.remarks
+        """What the user should know of its times."""
+        is_plain = source.layout is Layout.TLOG and not is_packed(path)
+        self._file = open_descriptor(path) if is_plain else _plain_copy(source, unpacked_limit)
+        self.index = TlogIndex(source.timeline)
+        scanner = TlogScanner()
+        offset = 0
+        data = b" "
+        while data:
+            data = self.read(offset, READ_SIZE)
+            batch = source.timeline.apply(scanner.feed(data, final=not data))
+            self.index.add(batch)
+            if answers is not None:
+                answers.note(batch, self.index.stations)
+            offset += len(data)
+            if progress is not None:
+                progress(len(data))
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to `size` bytes; nothing at the end, or if the medium fails."""
+        try:
+            return os.pread(self._file, size, offset)
+        except OSError:
+            return b""
+
+    @property
+    def last_us(self) -> int:
+        """Greatest time; 0 in an empty file."""
+        return self.index.last_us or 0
+
+    def prepare(self, until_us: int) -> bool:  # noqa: ARG002
+        """Return True: everything is there."""
+        return True
+
+    def close(self) -> None:
+        """Close the file; its tracks end."""
+        os.close(self._file)
+
+
+def _plain_copy(source: TlogSource, limit: int) -> int:
+    """Open a copy, since only a plain tlog can be read at any position."""
+    with temporary_copy(source.path, source.chunks(None, limit)) as plain:
+        return os.dup(plain.fileno())
+
+
+log = logging.getLogger(__name__)
+
+PIECE: Final = 8
+"""Frames generated at once: one or two milliseconds."""
+
+
+class FusedTlog:
+    """Generate frames on demand, and keep them on disk for seeking back.
+
+    Parameters
+    ----------
+    frames : iterator of TlogRecord
+        The frames to play, in the order of their times.
+    last_us : int, optional
+        Time of its end, if known beforehand.
+    answers : LogAnswers, optional
+        Collects answers from the frames.
+
+    Raises
+    ------
+    OSError
+        If there is no room for temporary files.
+    """
+
+    def __init__(
+        self,
+        frames: Iterator[TlogRecord],
+        last_us: int | None = None,
+        answers: LogAnswers | None = None,
+    ) -> None:
+        self._frames = frames
+        self._last_us = last_us
+        self._answers = answers
+        self._file = tempfile.TemporaryFile(prefix="mavgate-play-")  # noqa: SIM115
+        self._scanner = TlogScanner()
+        self._size = 0
+        self._ended = False
+        self.index = TlogIndex()
+        """Index of the frames generated so far."""
+        while not self.index.count and self._make():
+            pass
+
+    @property
+    def last_us(self) -> int:
+        """Time of the end, or of the last frame generated."""
+        return max(self._last_us or 0, self.index.last_us or 0)
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to `size` bytes; generate the next frames if there are none yet."""
+        while offset >= self._size and self._make():
+            pass
+        return os.pread(self._file.fileno(), size, offset)
+
+    def prepare(self, until_us: int) -> bool:
+        """Generate a few of the frames up to a time; return whether all are there."""
+        return (self.index.last_us or 0) >= until_us or not self._make()
+
+    def close(self) -> None:
+        """Delete the generated frames."""
+        with suppress(OSError):
+            # What found no room is written again.
+            self._file.close()
+
+    def _make(self) -> bool:
+        """Generate some frames; return whether there were any."""
+        if self._ended:
+            return False
+        made = b"".join(encode_record(r.time_us, r.frame) for r in islice(self._frames, PIECE))
+        self._ended = not made
+        try:
+            self._file.write(made)
+            self._file.flush()
+        except OSError as error:
+            log.warning("The rest cannot be played: %s: %s", tempfile.gettempdir(), error.strerror)
+            self._ended = True
+        batch = self._scanner.feed(made, final=self._ended)
+        self.index.add(batch)
+        if self._answers is not None:
+            self._answers.note(batch, self.index.stations)
+        self._size += len(made)
+        return not self._ended
+
+
+@dataclass(slots=True)
+class OpenFlight:
+    """One open recording, of any number of parts."""
+
+    sources: list[Source] = field(default_factory=list)
+    answers: LogAnswers = field(default_factory=LogAnswers)
+    remarks: list[str] = field(default_factory=list)
+    """What the user should know."""
+
+    @property
+    def first_us(self) -> int:
+        """Civil time of its begin."""
+        return min(source.index.first_us or 0 for source in self.sources)
+
+    @property
+    def last_us(self) -> int:
+        """Civil time of its end, as far as that is known."""
+        return max(source.last_us for source in self.sources)
+
+    @property
+    def vehicles(self) -> list[int]:
+        """System ids of all senders that are not ground stations."""
+        return sorted(
+            {
+                origin >> 8
+                for source in self.sources
+                for origin in source.index.origins
+                if not is_station(origin, source.index.stations)
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedFlight:
+    """A recording as it is played: when, and under which system ids."""
+
+    tracks: tuple[Track, ...]
+    answers: LogAnswers
+    shift_us: int
+    """From the recording's time to the player's."""
+    system_ids: dict[int, int]
+    """Of its vehicles: recorded and played."""
+
+
+def open_flights(
+    files: Sequence[Path], options: ReadOptions, opened: ExitStack
+) -> list[OpenFlight]:
+    """Index the tlogs, and begin to fuse other files; the parts of a recording together.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Anything that `mavgate play` takes.
+    options : ReadOptions
+        How to fuse.
+    opened : ExitStack
+        Closes the files.
+
+    Raises
+    ------
+    FlightError
+        If there is nothing to play in one of them.
+    OSError
+        If one cannot be read.
+    """
+    flights = []
+    for parts in parts_together(files):
+        flight = OpenFlight()
+        if kind_of(parts[0]) is FileKind.TLOG:
+            for file in parts:
+                tlog = TlogFile(file, options.progress, flight.answers, options.unpacked_limit)
+                opened.callback(tlog.close)
+                flight.sources.append(tlog)
+                flight.remarks += [f"{file}: {remark}" for remark in tlog.remarks]
+        else:
+            fusion = RecordedFusion(parts, options)
+            for frame in fusion.introduction():
+                flight.answers.note_frame(frame, 0)
+            fused = FusedTlog(fusion.frames(), end_of(parts[-1], options), flight.answers)
+            opened.callback(fused.close)
+            flight.sources.append(fused)
+            flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
+        for source, file in zip(flight.sources, parts, strict=False):
+            if not source.index.count:
+                raise FlightError(f"{file}: {NO_RECORDING}")
+        flights.append(flight)
+    return flights
+
+
+def lay_out(
+    flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool
+) -> list[PlayedFlight]:
+    """Give each vehicle its own system id, and recordings of different days the same start.
+
+    Parameters
+    ----------
+    flights : sequence of OpenFlight
+        At least one.
+    wished : sequence of int
+        System ids for the first vehicles of the recordings, as many as are given; the other
+        vehicles of a recording get the following ids.
+    with_commands : bool
+        Play messages of stations and other requests to a vehicle too.
+    """
+    begin_us, end_us = flights[0].first_us, flights[0].last_us
+    used: set[int] = set()
+    played = []
+    for number, flight in enumerate(flights):
+        together = flight.first_us <= end_us and begin_us <= flight.last_us
+        shift_us = 0 if together else begin_us - flight.first_us
+        system_ids: dict[int, int] = {}
+        for place, system_id in enumerate(flight.vehicles):
+            wanted = wished[number] + place if number < len(wished) else system_id
+            while wanted in used or wanted >= FIRST_GROUND_STATION:
+                wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
+            used.add(wanted)
+            system_ids[system_id] = wanted
+        changed = {old: new for old, new in system_ids.items() if old != new}
+        tracks = tuple(
+            Track(source, shift_us=shift_us, system_ids=changed, with_commands=with_commands)
+            for source in flight.sources
+        )
+        played.append(PlayedFlight(tracks, flight.answers, shift_us, system_ids))
+    return played

@@ -1,0 +1,442 @@
+"""Play recordings: when each recorded frame is due.
+
+Theory of operation. While it plays, one line ties the gateway clock to the recording:
+
+    due = anchor_now + (time - anchor_time) / speed
+
+Pause, speed, seek, a skipped gap and a clock that jumps within the recording only set a new
+anchor. Frames come in the order of their times over all tracks. At infinite speed everything is
+due at once and the owner's batch size sets the pace.
+
+| state   | resume, seek, step, speed               | end of the range reached            |
+| ------- | --------------------------------------- | ----------------------------------- |
+| playing | takes effect from here                  | loop: seek to its begin; else ended |
+| paused  | resume: playing; step: so many frames   | stays paused                        |
+| ended   | seek: playing; resume: from the start   |                                     |
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from enum import StrEnum
+from itertools import chain
+from types import MappingProxyType
+from typing import Final, Protocol
+
+import numpy as np
+
+from gateway.recordings.answers import telemetry_of
+from gateway.recordings.tlog import (
+    SEEK_BYTES,
+    STRIDE,
+    Batch,
+    TlogIndex,
+    TlogRecord,
+    TlogScanner,
+    readdress,
+)
+from gateway.recordings.tlog_scan import IntArray
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+
+BLOCK_BYTES: Final = 1 << 18
+"""Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
+
+CONTEXT_RECORDS: Final = 20 * STRIDE
+"""How far back a seek looks for frames that a ground station needs: a minute and more."""
+CONTEXT_IDS: Final = (0, 1, 22, 24, 30, 31, 33, 49, 74, 148, 242, 245)
+"""HEARTBEAT, SYS_STATUS, PARAM_VALUE, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
+HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
+PARAM_VALUE_ID: Final = 22
+PARAM_NAME: Final = slice(18, 34)
+"""Where the parameter's name stands in a MAVLink 2 frame; close enough in the older ones."""
+
+
+class Source(Protocol):
+    """A tlog that exists, or is generated as it is read."""
+
+    @property
+    def index(self) -> TlogIndex:
+        """Index of the part that exists so far."""
+        ...
+
+    @property
+    def last_us(self) -> int:
+        """Time of its end, as far as known; 0 if it is empty."""
+        ...
+
+    def read(self, offset: int, size: int) -> bytes:
+        """Read up to `size` bytes; nothing at the end."""
+        ...
+
+    def prepare(self, until_us: int) -> bool:
+        """Do a part of the work for reading up to a time; return whether it is done."""
+        ...
+
+
+class Track:
+    """A tlog being played.
+
+    Parameters
+    ----------
+    source : Source
+        The tlog.
+    shift_us : int
+        Added to every time, to play several recordings together.
+    system_ids : mapping of int to int
+        New system ids by recorded ones; other senders keep theirs.
+    with_commands : bool
+        Play messages of stations and other requests to a vehicle too.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        *,
+        shift_us: int = 0,
+        system_ids: Mapping[int, int] = MappingProxyType({}),
+        with_commands: bool = False,
+    ) -> None:
+        self._source = source
+        self._shift_us = shift_us
+        self._system_ids = system_ids
+        self._with_commands = with_commands
+        self._records = self._records_of(self._read_from(0))
+        self._next = next(self._records, None)
+
+    @property
+    def first_us(self) -> int:
+        """Time of the first record; 0 in an empty recording."""
+        return (self._source.index.first_us or 0) + self._shift_us
+
+    @property
+    def last_us(self) -> int:
+        """Time of the last record."""
+        return self._source.last_us + self._shift_us
+
+    def prepare(self, time_us: int) -> bool:
+        """Do a part of the work for a seek; return whether it can be made at once now."""
+        return self._source.prepare(time_us - self._shift_us)
+
+    def peek_us(self) -> int | None:
+        """Return the time of the next record, None at the end."""
+        return None if self._next is None else self._next.time_us + self._shift_us
+
+    def take(self) -> bytes:
+        """Return the next frame and move on.
+
+        Raises
+        ------
+        ValueError
+            At the end.
+        """
+        record = self._next
+        if record is None:
+            raise ValueError("the recording has ended")
+        self._next = next(self._records, None)
+        return self._addressed(record.frame)
+
+    def seek(self, time_us: int) -> list[bytes]:
+        """Move to the first record that is not before a time.
+
+        Parameters
+        ----------
+        time_us : int
+            In this player's time, the shift included.
+
+        Returns
+        -------
+        list of bytes
+            Frames from before that time that a ground station must know to understand the rest:
+            heartbeats, home and the like, the newest of each.
+        """
+        wanted_us = time_us - self._shift_us
+        newest: dict[tuple[int, int, int, bytes], bytes] = {}
+        batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
+        self._records = iter(())
+        for batch in batches:
+            reached = np.flatnonzero(batch.time_us >= wanted_us)
+            begin = int(reached[0]) if len(reached) else len(batch)
+            known = self._wanted(batch, 0)
+            known = known[(known < begin) & np.isin(batch.message_ids[known], CONTEXT_IDS)]
+            for i in known.tolist():
+                frame = batch.frame(i)
+                key = _key_of(frame)
+                # Taken out first, so that the newest come last.
+                newest.pop(key, None)
+                newest[key] = frame
+            if len(reached):
+                here = batch.records(self._wanted(batch, begin))
+                self._records = chain(here, self._records_of(batches))
+                break
+        self._next = next(self._records, None)
+        return [self._addressed(frame) for frame in newest.values()]
+
+    def _wanted(self, batch: Batch, begin: int) -> IntArray:
+        if self._with_commands:
+            return np.arange(begin, len(batch))
+        return telemetry_of(batch, begin, self._source.index.stations)
+
+    def _records_of(self, batches: Iterator[Batch]) -> Iterator[TlogRecord]:
+        return chain.from_iterable(batch.records(self._wanted(batch, 0)) for batch in batches)
+
+    def _addressed(self, frame: bytes) -> bytes:
+        system_id = self._system_ids.get(origin_of(frame)[0])
+        return frame if system_id is None else readdress(frame, system_id)
+
+    def _read_from(self, offset: int) -> Iterator[Batch]:
+        scanner, timeline = TlogScanner(offset), self._source.index.timeline
+        size = SEEK_BYTES
+        while data := self._source.read(offset, size):
+            yield timeline.apply(scanner.feed(data))
+            offset += len(data)
+            size = BLOCK_BYTES
+        yield timeline.apply(scanner.feed(b"", final=True))
+
+
+def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:
+    """Return a key, equal for frames that replace one another; each parameter has its own."""
+    message_id = message_id_of(frame)
+    name = frame[PARAM_NAME] if message_id == PARAM_VALUE_ID else b""
+    return (*origin_of(frame), message_id, name)
+
+
+LEAST_SPEED: Final = 0.1
+GREATEST_SPEED: Final = 100.0
+AS_FAST_AS_POSSIBLE: Final = math.inf
+END_OF_TIME_US: Final = 1 << 64
+CLOCK_JUMP_US: Final = 86_400 * US_PER_S
+"""A longer gap means that a clock was set; it is skipped."""
+
+
+class PlayState(StrEnum):
+    """State of a player."""
+
+    PLAYING = "playing"
+    PAUSED = "paused"
+    ENDED = "ended"
+
+
+def check_speed(speed: float) -> float:
+    """Check a speed: 0.1 to 100, or infinite.
+
+    Raises
+    ------
+    ValueError
+        If it is outside.
+    """
+    if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
+        raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")
+    return speed
+
+
+class Player:
+    """Play several recordings together.
+
+    Parameters
+    ----------
+    tracks : sequence of Track
+        At least one.
+    now_us : int
+        Gateway clock at the start.
+    speed : float
+        See `check_speed`.
+    begin_us, end_us : int, optional
+        Range of the recordings' time to play; the whole by default, the end included.
+    max_gap_us : int, optional
+        Longest silence to keep; None keeps all.
+    loop : bool
+        Restart at the end.
+    """
+
+    def __init__(
+        self,
+        tracks: Sequence[Track],
+        now_us: int,
+        *,
+        speed: float = 1.0,
+        begin_us: int | None = None,
+        end_us: int | None = None,
+        max_gap_us: int | None = None,
+        loop: bool = False,
+    ) -> None:
+        self._tracks = tracks
+        first_us = min(t.first_us for t in tracks)
+        self.begin_us = first_us if begin_us is None else max(begin_us, first_us)
+        self._end_us = end_us
+        self.max_gap_us = max_gap_us
+        self.loop = loop
+        self.state = PlayState.PLAYING
+        self.sent = 0
+        """Frames so far."""
+        self._speed = check_speed(speed)
+        self._anchor = (now_us, self.begin_us)
+        self._last_us = self.begin_us
+        self._context = self._seek_tracks(self.begin_us)
+
+    @property
+    def end_us(self) -> int:
+        """End of the range; may move while a table is being fused during playback."""
+        last_us = max(t.last_us for t in self._tracks)
+        return last_us if self._end_us is None else min(self._end_us, last_us)
+
+    @property
+    def speed(self) -> float:
+        """Factor to recorded time."""
+        return self._speed
+
+    @property
+    def position_us(self) -> int:
+        """Recorded time of the newest frame that was played."""
+        return self._last_us
+
+    def set_speed(self, speed: float, now_us: int) -> None:
+        """Change the speed from here on; raises ValueError like `check_speed`."""
+        here_us = self._time_at(now_us)
+        self._speed = check_speed(speed)
+        self._anchor = (now_us, here_us)
+
+    def pause(self, now_us: int) -> None:
+        """Pause."""
+        if self.state is PlayState.PLAYING:
+            self._anchor = (now_us, self._time_at(now_us))
+            self.state = PlayState.PAUSED
+
+    def resume(self, now_us: int) -> None:
+        """Resume; after the end, from the start."""
+        if self.state is PlayState.ENDED:
+            self.seek(self.begin_us, now_us)
+        elif self.state is PlayState.PAUSED:
+            self._anchor = (now_us, self._anchor[1])
+        self.state = PlayState.PLAYING
+
+    def step(self, now_us: int, count: int = 1) -> list[bytes]:
+        """Pause, and play the next frames at once.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        count : int
+            How many frames.
+
+        Returns
+        -------
+        list of bytes
+            At most `count` frames, after the frames that a seek has left to send.
+        """
+        self.pause(now_us)
+        frames, self._context = self._context, []
+        for _ in range(count):
+            track = self._next_track()
+            if track is None:
+                break
+            frames.append(self._take(track))
+        self._anchor = (now_us, self._last_us)
+        return frames
+
+    def prepare(self, time_us: int) -> bool:
+        """Do a part of the work for a seek; return whether it can be made at once now."""
+        return all(track.prepare(time_us) for track in self._tracks)
+
+    def seek(self, time_us: int, now_us: int) -> None:
+        """Move to a time of the recordings, limited to the range; a paused player stays paused."""
+        time_us = min(max(time_us, self.begin_us), self.end_us)
+        self._context = self._seek_tracks(time_us)
+        self._anchor = (now_us, time_us)
+        self._last_us = time_us
+        if self.state is PlayState.ENDED:
+            self.state = PlayState.PLAYING
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` is to be called next; None while nothing will be due."""
+        if self._context:
+            return self._anchor[0]
+        if self.state is not PlayState.PLAYING:
+            return None
+        track = self._next_track()
+        return self._anchor[0] if track is None else self._due_us(track)
+
+    def poll(self, now_us: int, limit: int) -> list[bytes]:
+        """Return the frames that are due.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+        limit : int
+            Most frames of the recordings, so that others get their turn.
+
+        Returns
+        -------
+        list of bytes
+            In order; after a seek, first the frames that a ground station needs.
+        """
+        frames, self._context = self._context, []
+        if self.state is not PlayState.PLAYING:
+            return frames
+        for _ in range(limit):
+            track = self._next_track()
+            if track is None:
+                self._end(now_us)
+                break
+            self._skip_silence(track, now_us)
+            if self._due_us(track) > now_us:
+                break
+            frames.append(self._take(track))
+        return frames
+
+    def _seek_tracks(self, time_us: int) -> list[bytes]:
+        return [frame for track in self._tracks for frame in track.seek(time_us)]
+
+    def _next_track(self) -> Track | None:
+        """Find the track whose next frame is the earliest; None at the end of the range."""
+        found: Track | None = None
+        earliest_us = END_OF_TIME_US if self._end_us is None else self._end_us
+        for track in self._tracks:
+            time_us = track.peek_us()
+            if time_us is not None and (
+                time_us < earliest_us or (found is None and time_us == earliest_us)
+            ):
+                found, earliest_us = track, time_us
+        return found
+
+    def _take(self, track: Track) -> bytes:
+        self._last_us = track.peek_us() or self._last_us
+        self.sent += 1
+        return track.take()
+
+    def _end(self, now_us: int) -> None:
+        if self.loop and self.sent:
+            self.seek(self.begin_us, now_us)
+        else:
+            self.state = PlayState.ENDED
+
+    def _time_at(self, now_us: int) -> int:
+        """Return the recorded time of a moment while playing, never beyond the next frame."""
+        anchor_now_us, anchor_time_us = self._anchor
+        if self.state is not PlayState.PLAYING:
+            return anchor_time_us
+        if self._speed == AS_FAST_AS_POSSIBLE:
+            return self._last_us
+        return anchor_time_us + round((now_us - anchor_now_us) * self._speed)
+
+    def _due_us(self, track: Track) -> int:
+        anchor_now_us, anchor_time_us = self._anchor
+        time_us = track.peek_us()
+        if time_us is None or self._speed == AS_FAST_AS_POSSIBLE:
+            return anchor_now_us
+        # Rounded up: a frame must not be due before its time.
+        return anchor_now_us + math.ceil((time_us - anchor_time_us) / self._speed)
+
+    def _skip_silence(self, track: Track, now_us: int) -> None:
+        """Set a new anchor if the next frame is too far away, or the recorded clock went back."""
+        time_us = track.peek_us() or 0
+        silence_us = time_us - self._last_us
+        longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
+        fell = silence_us < -US_PER_S
+        if silence_us <= longest_us and not fell:
+            return
+        kept_us = 0 if fell or self.max_gap_us is None else self.max_gap_us
+        due_last_us = self._anchor[0] + math.ceil((self._last_us - self._anchor[1]) / self._speed)
+        self._anchor = (max(due_last_us, now_us) if fell else due_last_us, time_us - kept_us)
+        self._last_us = time_us - kept_us

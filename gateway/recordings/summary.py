@@ -1,0 +1,502 @@
+"""Summary of any recording: time, vehicles, rates, gaps, distance, damage."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import numpy as np
+
+from gateway.geometry.geodesy import displacement_m
+from gateway.recordings.answers import is_station
+from gateway.recordings.columns import (
+    BARO,
+    FIX_LAT,
+    FIX_LON,
+    FIX_OK,
+    GPS,
+    MAG,
+    NAV,
+    NAV_LAT,
+    NAV_LON,
+    RAW,
+    SI,
+    FloatArray,
+    TableRow,
+    has_group,
+    has_position,
+)
+from gateway.recordings.files import (
+    HEAD_BYTES,
+    FileKind,
+    Layout,
+    Progress,
+    file_layout,
+    kind_of,
+    open_tlog,
+    other_format,
+    read_batches,
+    read_blocks,
+    read_ends,
+)
+from gateway.recordings.reading import NO_RECORDING, FlightError
+from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
+from gateway.recordings.tlog import DAY_US, Batch, TlogIndex, TlogScanner, payload_of
+from gateway.recordings.tlog_scan import IntArray
+from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
+
+if TYPE_CHECKING:
+    from gateway.recordings.reading import ReadOptions
+
+
+GAP_US: Final = 2 * US_PER_S
+"""Every vehicle sends a heartbeat a second: a longer silence is a gap."""
+MAX_GAPS: Final = 1000
+STEP_US: Final = US_PER_S // 2
+"""Interval of the positions between which the distance is summed."""
+LEAST_STEP_M: Final = 1.0
+"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
+
+MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
+HEARTBEAT_ID: Final = 0
+GLOBAL_POSITION_INT_ID: Final = 33
+_POSITION: Final = struct.Struct("<Iii")
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """A gap in the data."""
+
+    time_us: int
+    """When it began, in the recording's own time."""
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Rate:
+    """Count and rate of one kind of record."""
+
+    name: str
+    count: int
+    rate_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleInfo:
+    """What one system of a recording sent."""
+
+    system_id: int
+    mav_type: int | None
+    autopilot: int | None
+    distance_m: float
+    """Along the ground."""
+    rates: tuple[Rate, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FileInfo:
+    """What a recording holds."""
+
+    kind: str
+    size: int
+    records: int
+    first_us: int | None
+    """In µs since 1970 for a tlog, on the gateway clock for a table."""
+    last_us: int | None
+    duration_s: float
+    """From the first record to the last; where its clock leaped by days, without that."""
+    vehicles: tuple[VehicleInfo, ...]
+    gaps: tuple[Gap, ...]
+    damaged_bytes: int
+    damaged_runs: int
+    unfinished_bytes: int = 0
+    """Of a last record or line that is not whole: it is being written, or was cut."""
+    header: TableHeader | None = None
+    marks: tuple[TableMark, ...] = ()
+    remarks: tuple[str, ...] = ()
+    """Remarks of its reader for the user."""
+
+
+@dataclass(slots=True)
+class GroundDistance:
+    """The distance over ground: the one definition, for every command and page.
+
+    Steps of `LEAST_STEP_M` or more between positions `STEP_US` apart are summed. The positions are
+    the fused ones (GLOBAL_POSITION_INT, or the states of a table); the GPS fixes of a table that
+    has no states.
+    """
+
+    distance_m: float = 0.0
+    _sampled_us: int | None = None
+    _last: tuple[float, float] | None = None
+
+    def is_due(self, time_us: int) -> bool:
+        """Return whether a position of this time counts."""
+        return self._sampled_us is None or not 0 <= time_us - self._sampled_us < STEP_US
+
+    def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
+        """Add a position, if it is due."""
+        if not self.is_due(time_us):
+            return
+        self._sampled_us = time_us
+        if self._last is not None:
+            step_m = math.hypot(*displacement_m(*self._last, lat_deg, lon_deg, 0.0))
+            if step_m < LEAST_STEP_M:
+                return
+            self.distance_m += step_m
+        self._last = (lat_deg, lon_deg)
+
+
+@dataclass(slots=True)
+class TimesSpan:
+    """Sum up how long records last; a clock that leaps by days adds nothing."""
+
+    first_us: int | None = None
+    _begin_us: int = 0
+    """Of what is between two leaps."""
+    _newest_us: int = 0
+    _last_us: int = 0
+    _before_us: int = 0
+    """Length of what was before that."""
+
+    @property
+    def length_us(self) -> int:
+        """From the first record to the last, without leaps."""
+        return self._before_us + self._newest_us - self._begin_us
+
+    def add(self, time_us: int) -> None:
+        """Take in the time of the next record."""
+        if self.first_us is None:
+            self.first_us = self._begin_us = self._newest_us = time_us
+        elif abs(time_us - self._last_us) > DAY_US:
+            self._before_us = self.length_us
+            self._begin_us = self._newest_us = time_us
+        elif time_us > self._newest_us:
+            self._newest_us = time_us
+        self._last_us = time_us
+
+    def add_all(self, times_us: IntArray) -> None:
+        """Take in the times of the next records, at least one."""
+        leaps = np.flatnonzero(np.abs(np.diff(times_us)) > DAY_US) + 1
+        for between in np.split(times_us, leaps):
+            self.add(int(between[0]))
+            self._newest_us = max(self._newest_us, int(between.max()))
+            self._last_us = int(between[-1])
+
+
+@dataclass(slots=True)
+class _Gaps:
+    """Find gaps."""
+
+    last_us: int | None = None
+    found: list[Gap] = field(default_factory=list)
+
+    def add_all(self, times_us: IntArray) -> None:
+        if self.last_us is not None:
+            times_us = np.insert(times_us, 0, self.last_us)
+        steps = np.diff(times_us)
+        for i in np.flatnonzero(steps > GAP_US).tolist():
+            self._note(int(times_us[i]), int(steps[i]))
+        self.last_us = int(times_us[-1])
+
+    def _note(self, time_us: int, duration_us: int) -> None:
+        if len(self.found) < MAX_GAPS:
+            self.found.append(Gap(time_us, duration_us / US_PER_S))
+
+
+class TlogSummary:
+    """Summarise a tlog, batch by batch."""
+
+    def __init__(self) -> None:
+        self._index = TlogIndex()
+        self._counts: Counter[tuple[int, int]] = Counter()
+        self._kinds: dict[int, tuple[int, int]] = {}
+        self._ways: dict[int, GroundDistance] = {}
+        self._span, self._gaps = TimesSpan(), _Gaps()
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        self._index.add(batch)
+        if not len(batch):
+            return
+        self._span.add_all(batch.time_us)
+        self._gaps.add_all(batch.time_us)
+        keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
+        for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
+            self._counts[key >> 24, key & 0xFFFFFF] += count
+        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
+            system_id, component_id = divmod(int(batch.origins[i]), 256)
+            if component_id == 1 and system_id not in self._kinds:
+                payload = payload_of(batch.frame(i), 6)
+                self._kinds[system_id] = (payload[4], payload[5])
+        for i in np.flatnonzero(batch.message_ids == GLOBAL_POSITION_INT_ID).tolist():
+            self._add_position(batch, i)
+
+    def result(self, size: int) -> FileInfo:
+        """Return the summary of a file of that size."""
+        index = self._index
+        duration_s = self._span.length_us / US_PER_S
+        return FileInfo(
+            kind="tlog",
+            size=size,
+            records=index.count,
+            first_us=index.first_us,
+            last_us=index.last_us,
+            duration_s=duration_s,
+            vehicles=tuple(
+                self._vehicle(system_id, duration_s)
+                for system_id in sorted({system_id for system_id, _ in self._counts})
+            ),
+            gaps=tuple(self._gaps.found),
+            damaged_bytes=index.damaged_bytes,
+            damaged_runs=len(index.damage),
+            unfinished_bytes=index.unfinished,
+            remarks=(MENDED.format(counted(index.mended, "record")),) if index.mended else (),
+        )
+
+    def _add_position(self, batch: Batch, i: int) -> None:
+        way = self._ways.setdefault(int(batch.origins[i]) >> 8, GroundDistance())
+        time_us = int(batch.time_us[i])
+        if not way.is_due(time_us):
+            return
+        _, lat, lon = _POSITION.unpack(payload_of(batch.frame(i), _POSITION.size))
+        if lat or lon:
+            way.add(time_us, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+
+    def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
+        mav_type, autopilot = self._kinds.get(system_id, (None, None))
+        counts = {key: n for (system, key), n in self._counts.items() if system == system_id}
+        return VehicleInfo(
+            system_id=system_id,
+            mav_type=mav_type,
+            autopilot=autopilot,
+            distance_m=self._ways.get(system_id, GroundDistance()).distance_m,
+            rates=tuple(
+                _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
+                for key in sorted(counts)
+            ),
+        )
+
+
+class TableSummary:
+    """Summarise a table, event by event."""
+
+    def __init__(self) -> None:
+        self._header: TableHeader | None = None
+        self._marks: list[TableMark] = []
+        self._counts: Counter[str] = Counter()
+        self._damaged_bytes = self._unfinished_bytes = 0
+        self._last_us: int | None = None
+        self._of_states, self._of_fixes = GroundDistance(), GroundDistance()
+        self._span, self._gaps = TimesSpan(), _Gaps()
+
+    def add(self, block: TableBlock, header: TableHeader | None) -> None:
+        """Take in the next block of the file."""
+        self._header = header
+        for _, comment in block.comments:
+            if isinstance(comment, TableMark):
+                self._marks.append(comment)
+            elif isinstance(comment, TableFault) and comment.is_cut:
+                self._unfinished_bytes += comment.size
+            elif isinstance(comment, TableFault):
+                self._counts["damage"] += 1
+                self._damaged_bytes += comment.size
+        if len(block):
+            self._add_rows(block.cells)
+
+    def result(self, size: int) -> FileInfo:
+        """Return the summary of a file of that size."""
+        duration_s = self._span.length_us / US_PER_S
+        vehicle = VehicleInfo(
+            system_id=self._header.vehicle_id if self._header else 1,
+            mav_type=None,
+            autopilot=None,
+            distance_m=(self._of_states if self._counts["state"] else self._of_fixes).distance_m,
+            rates=tuple(
+                _rate(name, self._counts[name], duration_s)
+                for name in ("imu", "mag", "baro", "gps", "state")
+                if self._counts[name]
+            ),
+        )
+        return FileInfo(
+            kind="table",
+            size=size,
+            records=self._counts["row"],
+            first_us=self._span.first_us,
+            last_us=self._last_us,
+            duration_s=duration_s,
+            vehicles=(vehicle,),
+            gaps=tuple(self._gaps.found),
+            damaged_bytes=self._damaged_bytes,
+            damaged_runs=self._counts["damage"],
+            unfinished_bytes=self._unfinished_bytes,
+            header=self._header,
+            marks=tuple(self._marks),
+        )
+
+    def _add_rows(self, cells: FloatArray) -> None:
+        counts = self._counts
+        has_imu, has_mag = has_group(cells, SI), has_group(cells, MAG)
+        counts["row"] += len(cells)
+        counts["imu"] += int((has_imu | has_group(cells, RAW)).sum())
+        counts["mag"] += int((has_imu & has_mag).sum())
+        for name, group in (("baro", BARO), ("gps", GPS), ("state", NAV)):
+            counts[name] += int(has_group(cells, group).sum())
+        times_us = cells[:, 0].astype(np.int64)
+        self._last_us = max(int(times_us.max()), self._last_us or 0)
+        self._span.add_all(times_us)
+        self._gaps.add_all(times_us)
+        fixed = cells[:, FIX_OK] == 1.0
+        for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
+            self._of_fixes.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+        placed = cells[has_position(cells)]
+        for time_us, lat_deg, lon_deg in placed[:, [0, NAV_LAT, NAV_LON]].tolist():
+            self._of_states.add(int(time_us), lat_deg, lon_deg)
+
+
+def _rate(name: str, count: int, duration_s: float) -> Rate:
+    return Rate(name, count, round(count / duration_s, 3) if duration_s > 0 else 0.0)
+
+
+END_BYTES: Final = 1 << 16
+"""Of a tlog: some thousand frames, and so more than a second's heartbeats."""
+
+
+class Glance(msgspec.Struct, frozen=True):
+    """Length and vehicles of a recording."""
+
+    duration_s: float | None
+    """None if no file gives it."""
+    vehicles: tuple[int, ...]
+    """System ids; of a very long recording those seen at its ends."""
+
+
+def glance(files: Sequence[Path]) -> Glance:
+    """Look at a recording.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        All files of it; one that cannot be read, or is empty, is ignored.
+    """
+    times_us: list[int] = []
+    vehicles: set[int] = set()
+    for file in files:
+        try:
+            span = _tlog_span if kind_of(file) is FileKind.TLOG else _table_span
+            first_us, last_us, systems = span(file)
+        except (OSError, ValueError):
+            continue
+        times_us += [first_us, last_us]
+        vehicles |= systems
+    duration_s = (max(times_us) - min(times_us)) / US_PER_S if times_us else None
+    return Glance(duration_s, tuple(sorted(vehicles)))
+
+
+def _tlog_span(file: Path) -> tuple[int, int, set[int]]:
+    """Return begin, end and vehicles; raises ValueError if there are none."""
+    index = TlogIndex()
+    with file.open("rb") as stream:
+        size = file.stat().st_size
+        for begin in sorted({0, max(size - END_BYTES, 0)}):
+            stream.seek(begin)
+            # The end begins within a record; the scanner finds the next one.
+            index.add(TlogScanner(begin).feed(stream.read(END_BYTES), final=True))
+        stream.seek(0)
+        is_odd = file_layout(stream.read(HEAD_BYTES)) is not Layout.TLOG
+    if is_odd or (index.last_us or 0) - (index.first_us or 0) > DAY_US:
+        # Its clock was set meanwhile, or it is no plain tlog: only all of it shows its length.
+        index = TlogIndex()
+        for batch in read_batches(file):
+            index.add(batch)
+    if index.first_us is None or index.last_us is None:
+        raise ValueError("holds no record")
+    vehicles = {o >> 8 for o in index.origins if not is_station(o, index.stations)}
+    return index.first_us, index.last_us, vehicles
+
+
+def _table_span(file: Path) -> tuple[int, int, set[int]]:
+    head, tail = read_ends(file)
+    reader = TableReader()
+    rows = [e for e in reader.feed(head + tail, final=True) if isinstance(e, TableRow)]
+    header = reader.header
+    if not rows or header is None:
+        raise ValueError("holds no row")
+    zero_us = header.unix_us_at_zero or 0
+    return zero_us + _first_us(file, rows[0]), zero_us + rows[-1].time_us, {header.vehicle_id}
+
+
+def _first_us(file: Path, row: TableRow) -> int:
+    """Return the time of a table's first row."""
+    with file.open("rb") as stream:
+        for line in stream:
+            time_us = line.partition(b",")[0]
+            if time_us.isdigit():
+                return int(time_us)
+    return row.time_us
+
+
+def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOptions]) -> FileInfo:
+    """Summarise a recording.
+
+    Parameters
+    ----------
+    file : Path
+        A tlog, a table, or what can be read as one.
+    progress : callable or None
+        Called with the number of further bytes read.
+    options : callable
+        Returns how other programs' files are read; called for these alone.
+
+    Returns
+    -------
+    FileInfo
+
+    Raises
+    ------
+    FlightError
+        If it is none of these.
+    OSError
+        If it cannot be read.
+    """
+    kind, size = kind_of(file), file.stat().st_size
+    if kind is FileKind.TLOG:
+        tlog, source = TlogSummary(), open_tlog(file)
+        for batch in source.batches(progress):
+            tlog.add(batch)
+        found = tlog.result(size)
+        found = replace(found, remarks=(*source.remarks, *found.remarks))
+        if not found.records:
+            raise FlightError(f"{file}: {NO_RECORDING}")
+        return found
+    if kind in (FileKind.CSV, FileKind.OTHER):
+        return _describe_by_rows(file, kind, options())
+    table, reader = TableSummary(), TableReader()
+    for block in read_blocks(file, reader, progress):
+        table.add(block, reader.header)
+    return table.result(size)
+
+
+def _describe_by_rows(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
+    # They import every stage, which a summary of a recording of our own does not need.
+    from gateway.recordings.join import shifted
+    from gateway.recordings.reading import is_table, open_rows
+
+    recorded, table = open_rows(file, options), TableSummary()
+    own = is_table(file)
+    zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
+    for block in recorded.blocks:
+        table.add(shifted(block, zero_us), recorded.header)
+    return replace(
+        table.result(file.stat().st_size),
+        kind=other_format(file) if kind is FileKind.OTHER else kind.value,
+        header=recorded.header if own else None,
+        remarks=tuple(recorded.remarks),
+    )

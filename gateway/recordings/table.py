@@ -1,0 +1,353 @@
+"""The table format: a CSV with all that is needed to fuse a flight again.
+
+    # mavgate table 1
+    # header: {"mavgate_version": …, "vehicle_id": …, "settings": {…}, "calibration": {…}, …}
+    time_us,node_id,…
+    # state: {"vehicle_id": …, "fits": …, "sensing": …, "estimation": …}
+    12000,0,…
+    # mark: {"time_us": 12345, "text": "…"}
+    # node: {"time_us": 12345, "supply_mv": 3290, "bus_errors": 0, …}
+    # header: {…}
+
+A node reports the state of its board once a second. A second header means that the rows after it
+were fused with other settings. A state line is the internal state of filters and estimator at that
+row, so that a file that begins in flight can be fused again from its first row. Lines that begin
+with `#` hold JSON; spreadsheets and pandas (`comment="#"`) skip them. An empty cell means not
+known, or nothing new.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.recordings.columns import (
+    COLUMNS,
+    Cell,
+    FloatArray,
+    TableRow,
+    cells_of,
+    read_cells,
+    read_lines,
+    row_of_cells,
+    row_to_line,
+    settle,
+    write_lines,
+)
+from gateway.records import FusionState, NodeStatus
+
+FORMAT_PREFIX: Final = "# mavgate table "
+FORMAT_LINE: Final = f"{FORMAT_PREFIX}1"
+HEADER_PREFIX: Final = "# header: "
+STATE_PREFIX: Final = "# state: "
+MARK_PREFIX: Final = "# mark: "
+NODE_PREFIX: Final = "# node: "
+
+HEAD_LINES: Final = 3
+"""Version, header, names."""
+MAX_LINE: Final = 1 << 20
+"""Longer than any settings; a disk's zeros without a line's end must not fill the memory."""
+
+
+class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
+    """The head of a table."""
+
+    mavgate_version: str = ""
+    vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)] = 1
+    session: str = ""
+    """Recording that the file is a part of."""
+    part: int = 1
+    """Part of the recording; the states of a later part carry on those of the one before."""
+    cold_start: bool = True
+    """Whether the first row is the first sample that the estimator ever saw."""
+    unix_us_at_zero: int | None = None
+    """Civil time of `time_us` zero in µs since 1970, as far as it was known at the start."""
+    settings: dict[str, Any] = {}
+    """The settings, as in the settings file."""
+    calibration: dict[str, Any] = {}
+    """The calibration of the aircraft's IMU node."""
+
+
+IntArray = NDArray[np.int64]
+
+REMARK: Final = "Mark: "
+"""Begin of the STATUSTEXT with an operator's remark."""
+
+
+class TableMark(msgspec.Struct, frozen=True):
+    """A remark at a moment of the flight."""
+
+    time_us: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class TableFault:
+    """A line, or the end of one, that could not be read."""
+
+    line: int
+    """Counted from 1."""
+    size: int
+    reason: str
+    is_cut: bool = False
+    """Whether the file ends within the line: it is being written, or was cut."""
+
+
+_COMMENTS: Final[dict[str, Any]] = {
+    MARK_PREFIX: TableMark,
+    NODE_PREFIX: NodeStatus,
+    STATE_PREFIX: FusionState,
+}
+
+TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
+"""A header here is one after rows: the settings were changed."""
+
+
+def encode_head(header: TableHeader) -> str:
+    """Write everything before the first row."""
+    return f"{FORMAT_LINE}\n{encode_header(header)}{','.join(COLUMNS)}\n"
+
+
+def encode_header(header: TableHeader) -> str:
+    """Write a header as a comment line."""
+    return f"{HEADER_PREFIX}{msgspec.json.encode(header).decode()}\n"
+
+
+def encode_state(state: FusionState) -> str:
+    """Write a state as a comment line."""
+    return f"{STATE_PREFIX}{msgspec.json.encode(state).decode()}\n"
+
+
+def encode_mark(mark: TableMark) -> str:
+    """Write a mark as a comment line."""
+    return f"{MARK_PREFIX}{msgspec.json.encode(mark).decode()}\n"
+
+
+def encode_node(status: NodeStatus) -> str:
+    """Write a node's report as a comment line."""
+    return f"{NODE_PREFIX}{msgspec.json.encode(status).decode()}\n"
+
+
+def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeStatus) -> str:
+    """Write any line that may follow the head."""
+    match event:
+        case TableRow():
+            return row_to_line(event)
+        case TableHeader():
+            return encode_header(event)
+        case FusionState():
+            return encode_state(event)
+        case TableMark():
+            return encode_mark(event)
+        case NodeStatus():
+            return encode_node(event)
+
+
+TableComment = TableHeader | TableMark | TableFault | FusionState | NodeStatus
+"""What stands between rows."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableBlock:
+    """Rows of a stretch of a table as columns, and what stands between them."""
+
+    cells: FloatArray
+    """Shape (n, len(COLUMNS)); NaN is an empty cell."""
+    comments: tuple[tuple[int, TableComment], ...] = ()
+    """In the order of the file, each with the number of the row before which it stands: up to n."""
+
+    def __len__(self) -> int:
+        return len(self.cells)
+
+    def events(self, vehicle_id: int) -> Iterator[TableEvent]:
+        """Yield rows and what stands between them, one by one, as of this aircraft."""
+        begin = 0
+        for row, comment in (*self.comments, (len(self), None)):
+            for cells in self.cells[begin:row].tolist():
+                yield row_of_cells(cells, vehicle_id)
+            begin = row
+            if comment is not None:
+                yield comment
+
+
+def block_of(events: Iterable[TableEvent]) -> TableBlock:
+    """Lay rows, and what stands between them, out as columns."""
+    rows: list[tuple[Cell, ...]] = []
+    comments: list[tuple[int, TableComment]] = []
+    for event in events:
+        if isinstance(event, TableRow):
+            rows.append(cells_of(event))
+        else:
+            comments.append((len(rows), event))
+    cells = np.array(rows, np.float64).reshape(-1, len(COLUMNS))
+    return TableBlock(cells, tuple(comments))
+
+
+def encode_block(block: TableBlock) -> bytes:
+    """Write rows and what stands between them, but for faults."""
+    text, begin = b"", 0
+    for row, comment in (*block.comments, (len(block), None)):
+        text += write_lines(block.cells[begin:row])
+        begin = row
+        if comment is not None and not isinstance(comment, TableFault):
+            text += encode_line(comment).encode()
+    return text
+
+
+NO_ROWS: Final = np.empty((0, len(COLUMNS)))
+
+
+class TableReader:
+    """Decode any chunks of a table into rows, marks and faults; never raises on data.
+
+    Columns are found by name, so a file with more or fewer columns, or in another order, can be
+    read too.
+    """
+
+    def __init__(self) -> None:
+        self.header: TableHeader | None = None
+        """None until it is read, or if the file has none."""
+        self.lines = 0
+        self._rest = b""
+        self._skipped = 0
+        self._width = 0
+        self._places: list[int] | None = None
+
+    @property
+    def vehicle_id(self) -> int:
+        """The aircraft of the table; 1 where it does not tell."""
+        return 1 if self.header is None else self.header.vehicle_id
+
+    def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
+        """Take the next bytes of the file, and return what is in them one by one.
+
+        See `feed_block`.
+        """
+        return [*self.feed_block(data, final=final).events(self.vehicle_id)]
+
+    def feed_block(self, data: bytes, *, final: bool = False) -> TableBlock:
+        """Take the next bytes of the file.
+
+        Parameters
+        ----------
+        data : bytes
+            Any chunk.
+        final : bool
+            Whether the file ends with it. A last line without its end may have been cut within a
+            number and is dropped.
+
+        Returns
+        -------
+        TableBlock
+            All that came in whole lines.
+        """
+        text, newline, rest = (self._rest + data).rpartition(b"\n")
+        block = self._take(text + newline) if newline else TableBlock(NO_ROWS)
+        if len(rest) > MAX_LINE or (self._skipped and not newline):
+            self._skipped += len(rest)
+            rest = b""
+        self._rest = rest
+        if final and (rest or self._skipped):
+            self.lines += 1
+            size = self._skipped + len(rest)
+            is_cut = not self._skipped and b"\0" not in rest
+            cut = TableFault(self.lines, size, "the line has no end", is_cut)
+            block = TableBlock(block.cells, (*block.comments, (len(block), cut)))
+        return block
+
+    def _take(self, text: bytes) -> TableBlock:
+        """Take whole lines: all at once where they are rows alone."""
+        if self._width and not self._skipped and b"#" not in text:
+            cells = self._read(text)
+            if cells is not None and not settle(cells):
+                self.lines += len(cells)
+                return TableBlock(cells)
+        rows: list[bytes] = []
+        places: list[int] = []
+        comments: list[tuple[int, TableComment]] = []
+        for line in text.split(b"\n")[:-1]:
+            self.lines += 1
+            size, self._skipped = self._skipped + len(line) + 1, 0
+            if size > len(line) + 1:
+                comments.append((self.lines, TableFault(self.lines, size, "the line is too long")))
+            elif self._width and line.rstrip(b"\r") and not line.startswith(b"#"):
+                rows.append(line)
+                places.append(self.lines)
+            elif (comment := self._take_other(line)) is not None:
+                comments.append((self.lines, comment))
+        return self._joined(rows, np.array(places, np.int64), comments)
+
+    def _joined(
+        self, rows: list[bytes], lines: IntArray, comments: list[tuple[int, TableComment]]
+    ) -> TableBlock:
+        """Read rows, and put what is none of them to where it stands by the numbers of lines."""
+        if not rows:
+            return TableBlock(NO_ROWS, tuple((0, comment) for _, comment in comments))
+        text = b"\n".join([*rows, b""])
+        cells = self._read(text.replace(b"\r\n", b"\n") if b"\r" in text else text)
+        faults: dict[int, str] = {}
+        if cells is None:
+            cells, faults = self._read_singly(rows)
+        faults = {**settle(cells), **faults}
+        for row, reason in faults.items():
+            number = int(lines[row])
+            comments.append((number, TableFault(number, len(rows[row]) + 1, reason)))
+        sound = np.delete(lines, [*faults])
+        comments.sort(key=lambda placed: placed[0])
+        at = np.searchsorted(sound, [number for number, _ in comments]).tolist()
+        placed = zip(at, (comment for _, comment in comments), strict=True)
+        return TableBlock(np.delete(cells, [*faults], axis=0), tuple(placed))
+
+    def _read(self, text: bytes) -> FloatArray | None:
+        cells = read_lines(text, self._width)
+        if cells is None or self._places is None:
+            return cells
+        # The last column is none of the file's.
+        return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._places]
+
+    def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
+        """Read rows of which some are none: those are told, and stay empty."""
+        cells = np.full((len(rows), len(COLUMNS)), np.nan)
+        faults: dict[int, str] = {}
+        for row, line in enumerate(rows):
+            try:
+                cells[row] = read_cells(line.rstrip(b"\r"), self._width, self._places)
+            except ValueError as error:
+                faults[row] = str(error)
+        return cells, faults
+
+    def _take_other(self, line: bytes) -> TableComment | None:
+        """Take a line that is no row: of the head, empty, or between rows."""
+        try:
+            return self._read_other(line)
+        except ValueError as error:
+            return TableFault(self.lines, len(line) + 1, str(error))
+
+    def _read_other(self, line: bytes) -> TableComment | None:
+        text = line.decode("utf-8-sig" if self.lines == 1 else "utf-8").rstrip("\r")
+        if text and not text.startswith("#"):
+            self._take_names(text.split(","))
+        elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
+            version = text.removeprefix(FORMAT_PREFIX)
+            raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
+        elif text.startswith(HEADER_PREFIX):
+            header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
+            if self.header is not None:
+                return header
+            self.header = header
+        else:
+            for prefix, kind in _COMMENTS.items():
+                if text.startswith(prefix):
+                    found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)
+                    return found
+        return None
+
+    def _take_names(self, names: list[str]) -> None:
+        if "time_us" not in names:
+            raise ValueError("no line of column names with time_us before the first row")
+        self._width = len(names)
+        if tuple(names) != COLUMNS:
+            self._places = [names.index(name) if name in names else -1 for name in COLUMNS]

@@ -1,0 +1,533 @@
+"""The tlog format: bytes to records, records to bytes, an index for seeking, and its times.
+
+A ground station considers a tlog corrupt if its times lie in the future or do not grow. So the
+offset from the gateway clock to civil time stays fixed as long as a file is open, and a jump needs
+a new file.
+"""
+
+from array import array
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Final, TypeVar
+
+import numpy as np
+from fastcrc.crc16 import mcrf4xx
+from numpy.typing import NDArray
+
+from gateway.recordings.tlog_scan import (
+    COLUMNS,
+    LARGEST_RECORD,
+    SMALLEST_RECORD,
+    TIME_SIZE,
+    IntArray,
+    crc_extra_table,
+    lacks_end,
+    scan,
+)
+from gateway.units import US_PER_S
+from gateway.wire.gps_time import GpsTime
+from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.wire.mavlink_splitter import (
+    SIGNATURE_SIZE,
+    START_V2,
+    is_signed,
+    is_station_heartbeat,
+    message_id_of,
+)
+
+DAY_US: Final = 86_400 * US_PER_S
+"""Records that lie further apart are of different days: nothing is said of what is between."""
+ORDER_US: Final = 2 * US_PER_S
+"""A time that is further before the record before, or behind the next one, is damaged."""
+
+Times = TypeVar("Times", int, NDArray[np.int64])
+
+
+def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
+    """Return whether a time is not between those beside it, which are in order.
+
+    Parameters
+    ----------
+    before_us, time_us, after_us : int, or ndarray of shape (n,)
+        Of the record before, of the record itself, and of the next one.
+
+    Returns
+    -------
+    bool, or ndarray of shape (n,)
+    """
+    gap_us = after_us - before_us
+    is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
+    is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
+    return is_in_order & is_outside
+
+
+STRIDE: Final = 256
+"""Records between two entries of the index: a seek scans at most this many, some 15 kB."""
+SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
+MAX_DAMAGE_RUNS: Final = 1000
+"""Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+
+BACK_US: Final = 60 * US_PER_S
+"""Frames of two links may be out of order by seconds; a clock that was set back shows more."""
+FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
+"""The year 2000: an earlier time counts from the start of a clock."""
+MAX_JUMPS: Final = 1000
+
+HEARTBEAT_ID: Final = 0
+
+_EXTRA: Final = crc_extra_table()
+
+
+def payload_of(frame: bytes, size: int) -> bytes:
+    """Return the first bytes of a frame's payload, with the zeros that version 2 cuts off."""
+    begin = 10 if frame[0] == START_V2 else 6
+    return frame[begin : begin + min(frame[1], size)].ljust(size, b"\0")
+
+
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """A run of bytes of a file that belongs to no record."""
+
+    offset: int
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class TlogRecord:
+    """One frame and the civil time at which it passed, in µs since 1970."""
+
+    time_us: int
+    frame: bytes
+
+
+def encode_record(time_us: int, frame: bytes) -> bytes:
+    """Build the bytes of one record.
+
+    Parameters
+    ----------
+    time_us : int
+        µs since 1970.
+    frame : bytes
+        A complete MAVLink frame.
+
+    Returns
+    -------
+    bytes
+        Big-endian time, then the frame.
+    """
+    return time_us.to_bytes(TIME_SIZE, "big") + frame
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """The records of one stretch of a file, as columns."""
+
+    data: bytes
+    offset: int
+    """Where `data` begins in the file."""
+    starts: IntArray
+    """Offset of each record in `data`."""
+    sizes: IntArray
+    """Size of each frame in bytes."""
+    time_us: IntArray
+    origins: IntArray
+    """Sender of each frame: system id << 8 | component id."""
+    message_ids: IntArray
+    damage: tuple[Damage, ...]
+    mended: int = 0
+    """How many of the times were damaged, and are those of the record before."""
+    unfinished: int = 0
+    """Bytes at the end of the file that begin a record: it is being written, or was cut."""
+
+    def __len__(self) -> int:
+        return len(self.starts)
+
+    def frame(self, index: int) -> bytes:
+        """Return one frame's own bytes."""
+        begin = int(self.starts[index]) + TIME_SIZE
+        return self.data[begin : begin + int(self.sizes[index])]
+
+    def shifted(self, shift_us: int) -> bytes:
+        """Return the bytes from the first record to the last, with all times moved."""
+        if not len(self):
+            return b""
+        begin = int(self.starts[0])
+        end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
+        shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
+        times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
+        places = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
+        shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
+        return shifted.tobytes()
+
+    def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
+        """Yield the records, or some of them by their numbers."""
+        data = self.data
+        times, starts, sizes = self.time_us, self.starts, self.sizes
+        if wanted is not None:
+            times, starts, sizes = times[wanted], starts[wanted], sizes[wanted]
+        for time_us, start, size in zip(
+            times.tolist(), starts.tolist(), sizes.tolist(), strict=True
+        ):
+            yield TlogRecord(time_us, data[start + TIME_SIZE : start + TIME_SIZE + size])
+
+
+class TlogScanner:
+    """Decode any chunks of a tlog into batches of records; never raises on data.
+
+    Parameters
+    ----------
+    offset : int
+        Where in the file the first chunk begins; a record must begin there.
+    strict : bool
+        Check every checksum, so that a frame with a wrong one counts as damage.
+    """
+
+    def __init__(self, offset: int = 0, *, strict: bool = False) -> None:
+        self._offset = offset
+        self._strict = strict
+        self._rest = b""
+        self._in_step = True
+        self._last_us: int | None = None
+        """Time of the newest record."""
+
+    def feed(self, data: bytes, *, final: bool = False) -> Batch:
+        """Take the next bytes of the file.
+
+        Parameters
+        ----------
+        data : bytes
+            Any chunk.
+        final : bool
+            Whether the file ends with it. Before that the last record is held back, since only
+            its successor confirms it.
+
+        Returns
+        -------
+        Batch
+            Every record that is certain now.
+        """
+        data = self._rest + data if self._rest else data
+        room = len(data) // SMALLEST_RECORD + 1
+        columns = np.empty((COLUMNS, room), np.int64)
+        runs = np.empty((2, room + 1), np.int64)
+        was_in_step = self._in_step
+        end, count, damaged, self._in_step = scan(
+            np.frombuffer(data, np.uint8),
+            final,
+            self._strict,
+            self._in_step,
+            _EXTRA,
+            columns,
+            runs,
+        )
+        offset = self._offset
+        self._rest = data[end:]
+        self._offset += end
+        found = columns[:, :count]
+        mended = self._mend(found[2], data[end : end + TIME_SIZE]) if count else 0
+        begins, ends = runs[:, :damaged].tolist()
+        damage = [Damage(offset + b, e - b) for b, e in zip(begins, ends, strict=True)]
+        unfinished = 0
+        if final and damage and ends[-1] == len(data) and (begins[-1] or was_in_step):
+            rest = np.frombuffer(data, np.uint8)[begins[-1] :]
+            unfinished = damage.pop().size if lacks_end(rest) else 0
+        starts, sizes, times, origins, message_ids = found
+        return Batch(
+            data, offset, starts, sizes, times, origins, message_ids, tuple(damage), mended,
+            unfinished,
+        )  # fmt: skip
+
+    def _mend(self, times: IntArray, following: bytes) -> int:
+        """Give records whose time is damaged, which no checksum shows, that of the one before.
+
+        Parameters
+        ----------
+        times : ndarray, shape (n,)
+            In µs; changed in place.
+        following : bytes
+            The time of the record behind, if there is one and it is in step.
+
+        Returns
+        -------
+        int
+            How many were changed.
+        """
+        # A time begins with a zero, or it is none.
+        is_known = self._in_step and len(following) == TIME_SIZE and following[0] == 0
+        next_us = int.from_bytes(following, "big") if is_known else int(times[-1])
+        last_us = int(times[0]) if self._last_us is None else self._last_us
+        after = np.append(times[1:], next_us)
+        before = np.insert(times[:-1], 0, last_us)
+        if self._last_us is None and abs(int(after[0]) - last_us) > DAY_US:
+            before[0] = after[0]
+        if not is_known and abs(int(before[-1]) - next_us) > DAY_US:
+            after[-1] = before[-1]
+        mended = -2
+        count = 0
+        for i in np.flatnonzero(is_damaged(before, times, after)).tolist():
+            # Behind a record that was damaged the order is as it should be.
+            if i != mended + 1:
+                times[i] = before[i]
+                mended, count = i, count + 1
+        self._last_us = int(times[-1])
+        return count
+
+
+@dataclass(frozen=True, slots=True)
+class ClockJump:
+    """A step of a recording's clock, which the timeline leaves out."""
+
+    offset_us: int
+    """Time since the first record at which it happened."""
+    step_us: int
+
+
+class Timeline:
+    """One growing time for a tlog whose clock was set while it was written.
+
+    A step of the clock between two records that is longer than a day, or goes back by more than a
+    minute, is a jump: the time runs on without it. The date is that of the first stretch between
+    jumps whose clock showed a possible civil date; without one it is that of the first stretch.
+    """
+
+    def __init__(self) -> None:
+        self.jumps: list[ClockJump] = []
+        self._begins: list[int] = []
+        self._shifts_us: list[int] = []
+        self._first_us = 0
+        self._last_us: int | None = None
+        self._date_shift_us: int | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Take in the recorded times of the next batch of the file."""
+        if not len(batch):
+            return
+        times_us = batch.time_us
+        if self._last_us is None:
+            self._first_us = int(times_us[0])
+            self._begin(batch, 0, 0)
+            self._last_us = self._first_us
+        steps_us = np.diff(times_us, prepend=self._last_us)
+        for record in np.flatnonzero((steps_us > DAY_US) | (steps_us < -BACK_US)).tolist():
+            if len(self.jumps) == MAX_JUMPS:
+                break
+            step_us, shift_us = int(steps_us[record]), self._shifts_us[-1]
+            now_us = int(times_us[record]) - step_us + shift_us
+            self.jumps.append(ClockJump(now_us - self._first_us, step_us))
+            self._begin(batch, record, shift_us - step_us)
+        self._last_us = int(times_us[-1])
+
+    def _begin(self, batch: Batch, record: int, shift_us: int) -> None:
+        self._begins.append(batch.offset + int(batch.starts[record]))
+        self._shifts_us.append(shift_us)
+        if self._date_shift_us is None and int(batch.time_us[record]) >= FIRST_CIVIL_US:
+            self._date_shift_us = shift_us
+
+    def apply(self, batch: Batch) -> Batch:
+        """Return a batch of the same file with corrected times."""
+        if not self.jumps or not len(batch):
+            return batch
+        shifts_us = np.array(self._shifts_us) - (self._date_shift_us or 0)
+        at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
+        corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
+        return replace(batch, time_us=corrected)
+
+
+class TlogIndex:
+    """Index of a file: where to begin reading for a time, and a summary.
+
+    One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
+    it. The time stamps of other programs' files may jump back; the index searches by the greatest
+    time so far, which never does.
+    """
+
+    def __init__(self, timeline: Timeline | None = None) -> None:
+        self.timeline = timeline or Timeline()
+        """Corrects the times of batches that are read again."""
+        self.count = 0
+        """Records."""
+        self.size = 0
+        """Bytes that were seen, damage included."""
+        self.first_us: int | None = None
+        self.last_us: int | None = None
+        """Greatest time."""
+        self.origins: set[int] = set()
+        """All that sent: system << 8 | component."""
+        self.stations: set[int] = set()
+        """Those among them whose heartbeats say that they are ground stations."""
+        self.damage: list[Damage] = []
+        """The first `MAX_DAMAGE_RUNS` runs."""
+        self.damaged_bytes = 0
+        self.mended = 0
+        """Records whose time was damaged."""
+        self.unfinished = 0
+        """Bytes of a last record that is not whole."""
+        self._offsets = array("q")
+        self._times = array("q")
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        for run in batch.damage:
+            self._add_damage(run)
+        self.mended += batch.mended
+        self.unfinished += batch.unfinished
+        if not len(batch):
+            return
+        self.origins |= set(np.unique(batch.origins).tolist())
+        self._add_stations(batch)
+        if self.first_us is None or self.last_us is None:
+            self.first_us = self.last_us = int(batch.time_us[0])
+        greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))
+        first = -self.count % STRIDE
+        self._offsets.frombytes((batch.starts[first::STRIDE] + batch.offset).tobytes())
+        self._times.frombytes(greatest[first::STRIDE].tobytes())
+        self.count += len(batch)
+        self.last_us = int(greatest[-1])
+        end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
+        self.size = max(self.size, batch.offset + end)
+
+    def _add_stations(self, batch: Batch) -> None:
+        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
+            origin = int(batch.origins[i])
+            if origin not in self.stations and is_station_heartbeat(batch.frame(i)):
+                self.stations.add(origin)
+
+    def offset_before(self, time_us: int, records: int = 0) -> int:
+        """Return where to begin reading to find the first record that is not before a time.
+
+        Parameters
+        ----------
+        time_us : int
+            µs since 1970.
+        records : int
+            Begin at least this many records earlier, or at the start of the file.
+
+        Returns
+        -------
+        int
+            Offset of a record at most `records` and two strides before it; 0 for an empty file.
+        """
+        if not self._offsets:
+            return 0
+        entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
+        return self._offsets[max(entry, 0)]
+
+    def _add_damage(self, run: Damage) -> None:
+        self.damaged_bytes += run.size
+        self.size = max(self.size, run.offset + run.size)
+        last = self.damage[-1] if self.damage else None
+        if last is not None and last.offset + last.size == run.offset:
+            # A run across two chunks arrives in two pieces.
+            self.damage[-1] = Damage(last.offset, last.size + run.size)
+        elif len(self.damage) < MAX_DAMAGE_RUNS:
+            self.damage.append(run)
+
+
+JUMP_US: Final = 2 * US_PER_S
+"""Larger differences between the known time and the true one are worth a new file. GPS arrival
+lags by up to a second, and NTP slews smaller errors away."""
+STEP_US: Final = 4
+"""Least distance of two stamps: readers take the low two bits for a link's number."""
+_LINK_BITS: Final = 3
+
+
+class CivilClock:
+    """The best estimate of civil time: GPS if available, else the machine's clock."""
+
+    def __init__(self) -> None:
+        self._offset_us: int | None = None
+        self._from_gps = False
+        self._gps = GpsTime()
+
+    @property
+    def offset_us(self) -> int | None:
+        """Civil time of gateway time zero in µs since 1970; None before the first time is known."""
+        return self._offset_us
+
+    def hear_machine(self, unix_us: int, now_us: int) -> None:
+        """Note the machine's civil time; it counts until GPS time is known."""
+        if not self._from_gps:
+            self._offset_us = unix_us - now_us
+
+    def hear_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
+        """Note the time of an aircraft's fix and when it arrived.
+
+        A machine that agrees within `JUMP_US` keeps its own, finer time.
+        """
+        offset_us = self._gps.hear(vehicle_id, utc_us, time_us)
+        if offset_us is None:
+            return
+        if self._offset_us is None or abs(offset_us - self._offset_us) > JUMP_US:
+            self._offset_us = offset_us
+            self._from_gps = True
+
+
+class Stamper:
+    """The time stamps of one file: they grow, and follow one fixed offset.
+
+    Parameters
+    ----------
+    offset_us : int
+        Civil time of gateway time zero.
+    """
+
+    def __init__(self, offset_us: int) -> None:
+        self.offset_us = offset_us
+        self._last_us = 0
+
+    def stamp(self, now_us: int) -> int:
+        """Return the civil time of a moment, later than every stamp before.
+
+        Parameters
+        ----------
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        int
+            µs since 1970, a multiple of `STEP_US`.
+        """
+        wanted_us = max(now_us + self.offset_us, 0) & ~_LINK_BITS
+        self._last_us = max(wanted_us, self._last_us + STEP_US)
+        return self._last_us
+
+    def has_jumped(self, clock: CivilClock) -> bool:
+        """Return whether the clock now knows a time that differs too much for this file."""
+        offset_us = clock.offset_us
+        return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US
+
+
+_FLAGS_AT: Final = 2
+_SYSTEM_AT_V2: Final = 5
+_SYSTEM_AT_V1: Final = 3
+
+
+def readdress(frame: bytes, system_id: int) -> bytes:
+    """Return a frame as if another system had sent it.
+
+    Parameters
+    ----------
+    frame : bytes
+        A complete frame. Its signature is removed, since it would be invalid; a frame of an
+        unknown message is returned unchanged, since its checksum cannot be computed.
+    system_id : int
+        1 to 255.
+
+    Returns
+    -------
+    bytes
+        The frame with the checksum that fits.
+    """
+    extra = CRC_EXTRA.get(message_id_of(frame))
+    if extra is None:
+        return frame
+    body = bytearray(frame[: -SIGNATURE_SIZE - 2] if is_signed(frame) else frame[:-2])
+    if frame[0] == START_V2:
+        body[_FLAGS_AT] = 0
+        body[_SYSTEM_AT_V2] = system_id
+    else:
+        body[_SYSTEM_AT_V1] = system_id
+    crc: int = mcrf4xx(extra, mcrf4xx(bytes(body[1:])))
+    return bytes(body) + crc.to_bytes(2, "little")

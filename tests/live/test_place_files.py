@@ -1,0 +1,163 @@
+"""Files of places: whole or not at all, told when not, and left alone when broken."""
+
+import asyncio
+import errno
+import os
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.live import place_files
+from gateway.live.place_files import PlaceFiles
+from gateway.vehicle.home import Place
+from gateway.vehicle.stored import StoredPlaces
+
+pytestmark = pytest.mark.io
+
+FIRST = StoredPlaces(mark=Place(1.0, 2.0, 3.0))
+SECOND = StoredPlaces(mark=Place(4.0, 5.0, 6.0))
+
+
+class Bench:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.told: list[tuple[int, str | None]] = []
+        self.files = PlaceFiles(folder, lambda *told: self.told.append(told))
+
+    async def save(self, vehicle_id: int, places: StoredPlaces) -> None:
+        self.files.save(vehicle_id, places)
+        await self.files.settle()
+
+    def read(self) -> dict[int, StoredPlaces]:
+        return PlaceFiles(self.folder, lambda *_: None).load()
+
+
+@pytest.fixture
+async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path / "aircraft")
+    yield made
+    made.files.close()
+
+
+async def test_what_is_saved_is_loaded(bench: Bench) -> None:
+    assert bench.files.load() == {}
+    await bench.save(1, FIRST)
+    await bench.save(31, SECOND)
+    assert bench.read() == {1: FIRST, 31: SECOND}
+    await bench.save(1, SECOND)
+    assert bench.read() == {1: SECOND, 31: SECOND}
+    assert sorted(f.name for f in bench.folder.iterdir()) == ["1.places.json", "31.places.json"]
+
+
+async def test_only_the_newest_of_many_is_written(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written = counted(monkeypatch)
+    for _ in range(100):
+        bench.files.save(1, FIRST)
+    bench.files.save(1, SECOND)
+    await bench.files.settle()
+    assert bench.read() == {1: SECOND}
+    assert len(written) <= 2
+
+
+async def test_an_end_loses_nothing(bench: Bench) -> None:
+    bench.files.save(1, FIRST)
+    bench.files.save(2, SECOND)
+    bench.files.close()
+    assert bench.read() == {1: FIRST, 2: SECOND}
+
+
+async def test_a_disk_that_refuses_is_counted_and_reported(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await bench.save(1, FIRST)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        await bench.save(1, SECOND)
+    assert bench.told == [(1, "No space left on device")]
+    assert bench.files.failures == 1
+    assert bench.read() == {1: FIRST}, "the old file is whole"
+    await bench.save(1, SECOND)
+    assert bench.read() == {1: SECOND}
+    assert bench.told[1:] == [(1, None)]
+
+
+async def test_what_could_not_be_written_is_tried_again_and_reported_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    attempts = []
+    fsync: Callable[[int], None] = os.fsync
+
+    def ill(fd: int) -> None:
+        attempts.append(fd)
+        if len(attempts) < 5:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", ill)
+    monkeypatch.setattr(place_files, "RETRY_S", 0)
+    await bench.save(1, FIRST)
+    assert len(attempts) == 1, "the next attempt is not made at once"
+    async with asyncio.timeout(60):
+        while bench.told[-1:] != [(1, None)]:
+            await asyncio.sleep(0)
+    assert bench.told == [(1, "Input/output error"), (1, None)]
+    assert bench.files.failures == 1
+    assert bench.read() == {1: FIRST}
+    assert bench.files._retry is None
+
+
+async def test_one_that_cannot_be_written_holds_up_no_other(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await bench.save(2, FIRST)
+    file = bench.folder / "1.places.json"
+    file.write_text("{")
+    bench.files.load()
+    bench.files.save(1, FIRST)
+    await bench.save(2, SECOND)
+    assert bench.files.broken == {1: "1.places.json is broken: repair or remove it"}
+    file.unlink()
+    assert bench.read() == {2: SECOND}
+    await bench.save(2, FIRST)
+    assert bench.read() == {1: FIRST, 2: FIRST}, "what waited went with it"
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"version": 7}'])
+async def test_a_broken_file_is_reported_and_left_alone(
+    bench: Bench, content: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    await bench.save(2, SECOND)
+    file = bench.folder / "1.places.json"
+    file.write_bytes(content)
+    assert bench.files.load() == {2: SECOND}
+    assert f"{file} cannot be read and is left alone: " in caplog.text
+    await bench.save(1, FIRST)
+    assert file.read_bytes() == content
+    assert bench.told == [(1, "1.places.json is broken: repair or remove it")]
+    file.unlink()
+    await bench.save(1, FIRST)
+    assert bench.read() == {1: FIRST, 2: SECOND}
+
+
+async def test_strange_names_are_none_of_ours(bench: Bench) -> None:
+    await bench.save(1, FIRST)
+    for name in ("x.places.json", "1.places.json.bak", "12345.places.json", "1.places.new"):
+        (bench.folder / name).write_text("nonsense")
+    assert bench.files.load() == {1: FIRST}
+    assert bench.told == []
+
+
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Count the writes."""
+    calls: list[int] = []
+    fsync: Callable[[int], None] = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (calls.append(fd), fsync(fd))[1])
+    return calls

@@ -1,0 +1,119 @@
+"""The player on the event loop, with files on the disk."""
+
+import asyncio
+import gzip
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from gateway.clock import GatewayClock
+from gateway.live.player_edge import BATCH, PlayerEdge
+from gateway.recordings.opening import TlogFile
+from gateway.recordings.play import Player, Track
+from gateway.recordings.tlog import TlogRecord
+from tests.conftest import ManualClock
+from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
+
+pytestmark = pytest.mark.io
+
+COUNT = 24 * BATCH + 7
+RECORDS = make_records(COUNT)
+FRAMES = [record.frame for record in RECORDS]
+
+
+@pytest.fixture
+def tlog(tmp_path: Path) -> Path:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(make_tlog(RECORDS))
+    return path
+
+
+class Played:
+    """A player edge, and what came out of it."""
+
+    def __init__(self, path: Path, clock: GatewayClock | ManualClock, **options: object) -> None:
+        self.file = TlogFile(path)
+        self.frames: list[bytes] = []
+        self.ended = asyncio.Event()
+        player = Player([Track(self.file)], clock(), **options)  # type: ignore[arg-type]
+        self.edge = PlayerEdge(player, self._emit, clock, files=[path.name], on_end=self.ended.set)
+
+    def _emit(self, frames: Iterable[bytes]) -> None:
+        self.frames += frames
+
+    def close(self) -> None:
+        self.edge.close()
+        self.file.close()
+
+
+async def test_it_plays_to_the_end_by_itself(tlog: Path) -> None:
+    played = Played(tlog, GatewayClock(), speed=math.inf)
+    played.edge.start()
+    await asyncio.wait_for(played.ended.wait(), 60)
+    assert played.frames == FRAMES
+    status = played.edge.status()
+    assert (status.state, status.sent, status.speed) == ("ended", COUNT, None)
+    assert status.duration_s == pytest.approx((COUNT - 1) * STEP_US / 1e6)
+    assert status.files == ("flight.tlog",)
+    played.close()
+
+
+async def test_orders(tlog: Path, clock: ManualClock) -> None:
+    played = Played(tlog, clock)
+    played.edge.start()
+    assert played.frames == FRAMES[:1]
+    played.edge.pause()
+    played.edge.step(2)
+    assert played.frames == FRAMES[:3]
+    played.edge.seek(10 * STEP_US / 1e6)
+    assert played.edge.status().position_s == pytest.approx(10 * STEP_US / 1e6)
+    played.edge.seek(-0.1, relative=True)
+    assert played.edge.status().position_s == pytest.approx(5 * STEP_US / 1e6)
+    played.edge.seek_time(START_US + 7 * STEP_US)
+    assert played.edge.status().time_us == START_US + 7 * STEP_US
+    played.frames.clear()
+    played.edge.resume()
+    assert played.frames == FRAMES[7:8]
+    played.edge.set_speed(2.0)
+    played.edge.set_loop(True)
+    assert played.edge.status().loop
+    with pytest.raises(ValueError, match="speed"):
+        played.edge.set_speed(1000.0)
+    played.close()
+
+
+def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
+    seen: list[int] = []
+    file = TlogFile(tlog, seen.append)
+    assert sum(seen) == tlog.stat().st_size
+    assert file.index.count == COUNT
+    track = Track(file, system_ids={1: 5})
+    track.seek(RECORDS[500].time_us)
+    assert track.peek_us() == RECORDS[500].time_us
+    file.close()
+
+
+def test_a_file_that_shrinks_while_it_plays_just_ends(tlog: Path) -> None:
+    file = TlogFile(tlog)
+    track = Track(file)
+    tlog.write_bytes(make_tlog(RECORDS[:10]))
+    track.seek(START_US)
+    found = []
+    while (time_us := track.peek_us()) is not None:
+        found.append(TlogRecord(time_us, track.take()))
+    assert found == RECORDS[:10]
+    file.close()
+    assert file.read(0, 10) == b""
+
+
+def test_a_packed_tlog_is_played_from_an_unpacked_copy(tlog: Path) -> None:
+    plain = TlogFile(tlog)
+    packed = tlog.with_name("packed.tlog")
+    packed.write_bytes(gzip.compress(tlog.read_bytes()))
+    file = TlogFile(packed)
+    assert file.index.count == plain.index.count > 0
+    assert file.read(100, 500) == plain.read(100, 500)
+    for each in (file, plain):
+        each.close()

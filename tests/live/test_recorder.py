@@ -1,0 +1,452 @@
+"""The recorder on a real folder, turned by hand on a manual clock."""
+
+import errno
+import os
+import shutil
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.live.part import PENDING_LIMIT
+from gateway.live.part_files import PartFiles
+from gateway.live.recorder import Recorder
+from gateway.live.session import RETRY_US, RecordingSettings
+from gateway.recordings.columns import TableRow
+from gateway.recordings.index import RecordingError, list_recordings
+from gateway.recordings.table import TableHeader, TableMark, TableReader
+from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.records import FusedSample, FusionState
+from gateway.wire.gps_time import ENOUGH
+from tests.conftest import ManualClock
+from tests.recordings.frames import make_frames
+from tests.recordings.samples import make_baro, make_flight, make_fused
+
+pytestmark = pytest.mark.io
+
+UNIX_US = 1_781_187_930_000_000
+NAME = "20260611-142530"
+FRAMES = make_frames(40)
+HEADER = TableHeader(mavgate_version="1.2", settings={"a": {"b": 1}}, calibration={"c": [0.5]})
+
+
+class Bench:
+    """A recorder in a folder of its own, and what it announced."""
+
+    def __init__(self, folder: Path, clock: ManualClock, **settings: object) -> None:
+        self.clock = clock
+        self.unix_at_zero_us = UNIX_US
+        self.announced: list[tuple[bool, str]] = []
+        options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
+        self.recorder = Recorder(
+            RecordingSettings(**options),  # type: ignore[arg-type]
+            clock,
+            lambda: self.unix_at_zero_us + clock(),
+            lambda vehicle_id: HEADER,
+            lambda is_trouble, text: self.announced.append((is_trouble, text)),
+        )
+
+    async def turn(self, seconds: float = 0.5) -> None:
+        self.clock.advance(seconds)
+        await self.recorder._turn()
+
+    def send(self, frames: list[bytes]) -> None:
+        for frame in frames:
+            self.clock.advance(0.001)
+            self.recorder.frame(frame)
+
+    @property
+    def troubles(self) -> list[str]:
+        return [text for is_trouble, text in self.announced if is_trouble]
+
+
+@pytest.fixture
+async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
+    made = Bench(tmp_path / "recordings", clock)
+    yield made
+    made.recorder.close()
+
+
+def read_tlog(path: Path) -> list[TlogRecord]:
+    batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
+    assert batch.damage == ()
+    return list(batch.records())
+
+
+def frames_of(folder: Path) -> list[bytes]:
+    return [r.frame for path in sorted(folder.glob("*.tlog")) for r in read_tlog(path)]
+
+
+async def test_every_frame_is_in_the_tlog_at_its_time(bench: Bench) -> None:
+    await bench.turn()
+    begin_us = bench.clock()
+    bench.send(FRAMES)
+    await bench.turn()
+    records = read_tlog(bench.recorder.folder / f"{NAME}_01.tlog")
+    assert [record.frame for record in records] == FRAMES
+    for i, record in enumerate(records):
+        assert 0 <= UNIX_US + begin_us + 1000 * (i + 1) - record.time_us < 4
+    assert bench.announced == [(False, f"Recording {NAME}")]
+
+
+async def test_a_flight_is_in_the_table_with_its_head(
+    bench: Bench, rng: np.random.Generator
+) -> None:
+    await bench.turn()
+    flight = make_flight(rng, 50)
+    for record in flight[:25]:
+        bench.recorder.flight(record)
+    bench.recorder.mark("over the wood")
+    for record in flight[25:]:
+        bench.recorder.flight(record)
+    bench.recorder.close()
+    reader = TableReader()
+    data = (bench.recorder.folder / f"{NAME}_01_v3.csv").read_bytes()
+    events = reader.feed(data, final=True)
+    assert reader.header == TableHeader(
+        mavgate_version="1.2",
+        vehicle_id=3,
+        session=NAME,
+        part=1,
+        cold_start=True,
+        unix_us_at_zero=UNIX_US,
+        settings=HEADER.settings,
+        calibration=HEADER.calibration,
+    )
+    rows = [event for event in events if isinstance(event, TableRow)]
+    flat = [r for row in rows for r in (row.baro, row.gps, row.raw) if r is not None]
+    wanted = [r.imu if isinstance(r, FusedSample) else r for r in flight]
+    assert repr(flat) == repr(wanted)
+    assert [e.text for e in events if isinstance(e, TableMark)] == ["over the wood"]
+
+
+async def test_changed_settings_make_a_new_head_behind_what_came_before(
+    bench: Bench, rng: np.random.Generator
+) -> None:
+    await bench.turn()
+    bench.recorder.settings_changed(3)
+    for record in (make_fused(rng, 1000), make_baro(rng, 1500)):
+        bench.recorder.flight(record)
+    bench.recorder.settings_changed(3)
+    bench.recorder.flight(make_fused(rng, 2000))
+    bench.recorder.close()
+    data = (bench.recorder.folder / f"{NAME}_01_v3.csv").read_bytes()
+    events = TableReader().feed(data, final=True)
+    assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
+
+
+async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.Generator) -> None:
+    flight = make_flight(rng, 10)
+    bench.recorder.flight(flight[0])
+    await bench.turn()
+    bench.recorder.flight(flight[1])
+    bench.recorder.close()
+    reader = TableReader()
+    reader.feed((bench.recorder.folder / f"{NAME}_01_v3.csv").read_bytes())
+    assert reader.header is not None
+    assert not reader.header.cold_start
+
+
+async def test_a_part_begins_with_what_the_fusion_remembers(
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
+) -> None:
+    bench = Bench(tmp_path, clock, rotate_min=1)
+    seen = 0
+    bench.recorder._state_of = lambda vehicle_id: FusionState(vehicle_id, str(seen), b"", b"")
+    await bench.turn()
+    flight = [make_fused(rng, 1000), make_baro(rng, 1500), make_fused(rng, 2000)]
+    for record in flight[:2]:
+        bench.recorder.flight(record)
+    seen = 2
+    await bench.turn(100)
+    seen = 3
+    bench.recorder.settings_changed(3)
+    bench.recorder.flight(flight[2])
+    bench.recorder.close()
+    first, second = (
+        TableReader().feed(path.read_bytes(), final=True) for path in sorted(tmp_path.glob("*.csv"))
+    )
+    # What waited for the next sample was fused before the second part began.
+    assert [type(event) for event in first] == [TableRow, TableRow]
+    assert second[0] == FusionState(3, "2", b"", b"")
+    assert [type(event) for event in second[1:]] == [TableHeader, TableRow]
+    assert isinstance(second[2], TableRow)
+    assert second[2].baro is None
+
+
+async def test_rotation_loses_nothing(tmp_path: Path, clock: ManualClock) -> None:
+    bench = Bench(tmp_path, clock, rotate_min=1)
+    await bench.turn()
+    for frame in FRAMES:
+        bench.send([frame])
+        await bench.turn(10)
+    bench.recorder.close()
+    assert len(list(tmp_path.glob(f"{NAME}_*.tlog"))) > 3
+    assert frames_of(tmp_path) == FRAMES
+
+
+async def test_stop_and_start_make_two_recordings(bench: Bench) -> None:
+    await bench.turn()
+    bench.send(FRAMES[:5])
+    bench.recorder.stop()
+    await bench.turn()
+    bench.send(FRAMES[5:10])
+    bench.recorder.record()
+    await bench.turn()
+    bench.send(FRAMES[10:])
+    await bench.turn()
+    assert len(list_recordings(bench.recorder.folder)) == 2
+    assert sorted(frames_of(bench.recorder.folder)) == sorted(FRAMES[:5] + FRAMES[10:])
+
+
+async def test_two_recorders_never_overwrite_each_other(tmp_path: Path, clock: ManualClock) -> None:
+    first, second = Bench(tmp_path, clock), Bench(tmp_path, clock)
+    await first.turn(0)
+    first.send(FRAMES[:5])
+    await first.turn(0)
+    await second.turn(0)
+    second.send(FRAMES[5:9])
+    first.recorder.close()
+    second.recorder.close()
+    assert [recording.name for recording in list_recordings(tmp_path)] == [NAME, f"{NAME}-2"]
+    assert frames_of(tmp_path) == FRAMES[5:9] + FRAMES[:5] or frames_of(tmp_path) == FRAMES[:9]
+
+
+@pytest.mark.parametrize(
+    ("number", "text"), [(errno.ENOSPC, "disk is full"), (errno.EROFS, "disk is read-only")]
+)
+async def test_a_failing_disk_stops_recording_until_it_recovers(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
+) -> None:
+    await bench.turn()
+    bench.send(FRAMES[:5])
+    await bench.turn()
+
+    def refuse(*args: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", refuse)
+        bench.send(FRAMES[5:6])
+        await bench.turn()
+        assert bench.troubles == [f"Recording stopped: {text}"]
+        bench.send(FRAMES[6:7])
+        await bench.turn()
+    await bench.turn(RETRY_US / 1e6)
+    bench.send(FRAMES[7:])
+    await bench.turn()
+    assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[7:]
+    assert bench.announced[-1] == (False, f"Recording {NAME}")
+
+
+async def test_a_folder_that_vanishes_is_made_anew(bench: Bench) -> None:
+    await bench.turn()
+    bench.send(FRAMES[:5])
+    await bench.turn()
+    shutil.rmtree(bench.recorder.folder)
+    bench.send(FRAMES[5:6])
+    await bench.turn()
+    assert bench.troubles == ["Recording stopped: folder has vanished"]
+    await bench.turn(RETRY_US / 1e6)
+    bench.send(FRAMES[6:])
+    await bench.turn()
+    assert frames_of(bench.recorder.folder) == FRAMES[6:]
+
+
+async def test_a_disk_that_hangs_costs_recording_not_memory(bench: Bench) -> None:
+    await bench.turn()
+    part = bench.recorder._part
+    assert part is not None
+    piece = bytes(1 << 20)
+    for _ in range(2 * (PENDING_LIMIT >> 20)):
+        part.add(".tlog", piece)
+    assert sum(map(len, part.pending.values())) <= PENDING_LIMIT
+    await bench.turn()
+    assert bench.troubles == ["Recording stopped: disk is too slow"]
+
+
+async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
+    tmp_path: Path, clock: ManualClock, rng: np.random.Generator
+) -> None:
+    bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
+    bench.unix_at_zero_us = 1_000_000
+    await bench.turn()
+    bench.send(FRAMES[:3])
+    await bench.turn(100)
+    bench.send(FRAMES[3:5])
+    bench.recorder.flight(make_fused(rng, 1000))
+    await bench.turn()
+    for _ in range(ENOUGH):
+        bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock(), bench.clock())
+    await bench.turn()
+    bench.send(FRAMES[5:])
+    bench.recorder.close()
+    files = sorted(bench.recorder.folder.iterdir())
+    table = files.pop(2)
+    name = "19700101-000001"
+    assert [path.name for path in files] == [f"{name}_0{n}.tlog" for n in (1, 2, 3)]
+    assert table.name == f"{name}_02_v3.csv"
+    reader = TableReader()
+    reader.feed(table.read_bytes())
+    assert reader.header is not None
+    assert reader.header.unix_us_at_zero == UNIX_US
+    records = [record for path in files for record in read_tlog(path)]
+    assert [record.frame for record in records] == FRAMES
+    times = [record.time_us for record in records]
+    assert times == sorted(times)
+    assert UNIX_US < times[0] < times[-1] <= UNIX_US + bench.clock()
+
+
+async def test_two_aircraft_whose_times_differ_split_no_session_for_ever(
+    tmp_path: Path, clock: ManualClock
+) -> None:
+    bench = Bench(tmp_path / "recordings", clock)
+    await bench.turn()
+    for n in range(60):
+        bench.send(FRAMES[:2])
+        wrong_us = 5_000_000 * (1 + n % 2)
+        for _ in range(20):
+            bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock() + wrong_us, bench.clock())
+        await bench.turn()
+    bench.recorder.close()
+    assert len(list(bench.recorder.folder.glob("*.tlog"))) <= 2
+
+
+async def test_save_renames_while_it_runs(tmp_path: Path, clock: ManualClock) -> None:
+    bench = Bench(tmp_path, clock, rotate_min=1)
+    await bench.turn()
+    bench.send(FRAMES[:5])
+    await bench.turn()
+    await bench.recorder.save("first flight")
+    bench.send(FRAMES[5:9])
+    await bench.turn(100)
+    bench.send(FRAMES[9:])
+    await bench.turn()
+    assert bench.recorder.status().name == "first flight"
+    bench.recorder.close()
+    (recording,) = list_recordings(tmp_path)
+    assert [path.name for path in recording.files] == [
+        "first flight_01.tlog",
+        "first flight_02.tlog",
+    ]
+    assert frames_of(tmp_path) == FRAMES
+
+
+async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
+    with pytest.raises(RecordingError, match="nothing was recorded"):
+        await bench.recorder.save("x")
+    await bench.turn()
+    bench.send(FRAMES)
+    await bench.turn()
+    with pytest.raises(RecordingError, match="no name"):
+        await bench.recorder.save("../x")
+
+
+async def test_what_was_flushed_is_on_the_disk_without_closing(bench: Bench) -> None:
+    await bench.turn()
+    bench.send(FRAMES[:7])
+    await bench.turn()
+    assert frames_of(bench.recorder.folder) == FRAMES[:7]
+
+
+async def test_what_is_wanted_from_the_start_misses_nothing(bench: Bench) -> None:
+    bench.recorder.start()
+    assert bench.recorder.status().state == "recording"
+    bench.send(FRAMES)
+    bench.recorder.close()
+    assert frames_of(bench.recorder.folder) == FRAMES
+
+
+async def test_a_start_on_a_bad_disk_is_reported_and_mended(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.recorder.folder.write_text("a file where the folder should be")
+    bench.recorder.start()
+    assert bench.troubles == ["Recording stopped: File exists"]
+    bench.recorder.folder.unlink()
+    await bench.turn(RETRY_US / 1e6)
+    assert bench.recorder.status().state == "recording"
+
+
+async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
+    bench = Bench(tmp_path, clock, mode="manual")
+    bench.recorder.start()
+    await bench.recorder.settle()
+    assert not bench.recorder.recording
+    bench.recorder.record()
+    await bench.recorder.settle()
+    assert bench.recorder.status().state == "recording"
+    bench.send(FRAMES)
+    bench.recorder.close()
+    assert frames_of(bench.recorder.folder) == FRAMES
+
+
+def test_a_file_that_got_nothing_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = PartFiles(tmp_path, "a", 1)
+
+    def refuse(*args: object) -> int:
+        raise OSError(errno.ENOSPC, "full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", refuse)
+        with pytest.raises(OSError, match="full"):
+            files.write({".tlog": b"x"})
+    files.close({})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
+    first = PartFiles(tmp_path, "a", 2)
+    first.write({".tlog": b"x"})
+    second = PartFiles(tmp_path, "a", 2)
+    with pytest.raises(FileExistsError):
+        second.write({".tlog": b"y"})
+    first.close({})
+
+
+async def test_two_gateways_that_record_in_one_folder_lose_nothing(
+    tmp_path: Path, clock: ManualClock
+) -> None:
+    benches = [Bench(tmp_path, clock), Bench(tmp_path, clock)]
+    for bench in benches:
+        await bench.turn(0.0)
+    for bench in benches:
+        bench.send(FRAMES)
+    for bench in benches:
+        await bench.turn(0.0)
+    assert {bench.recorder.status().name for bench in benches} == {NAME, f"{NAME}-2"}
+    for bench in benches:
+        bench.send(FRAMES)
+        bench.recorder.close()
+        assert bench.troubles == []
+    for name in (NAME, f"{NAME}-2"):
+        records = read_tlog(tmp_path / f"{name}_01.tlog")
+        assert [record.frame for record in records] == 2 * FRAMES
+
+
+async def test_it_records_only_once_the_disk_has_taken_something(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def outcome() -> tuple[bool, str]:
+        status = bench.recorder.status()
+        return bench.recorder.recording, status.reason if status.state == "blocked" else ""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PartFiles, "_open", refuse)
+        await bench.turn()
+        assert outcome() == (False, "")
+        bench.send(FRAMES[:5])
+        await bench.turn()
+        assert outcome() == (False, "disk is read-only")
+    bench.recorder.record()
+    await bench.turn()
+    assert outcome() == (False, "")
+    bench.send(FRAMES[5:])
+    await bench.turn()
+    assert outcome() == (True, "")

@@ -1,0 +1,101 @@
+"""The recorder on a disk that is really full, read-only or gone: a small one, mounted here."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.live.session import RETRY_US
+from gateway.recordings.index import list_recordings
+from tests.conftest import ManualClock
+from tests.live.test_recorder import FRAMES, NAME, Bench, frames_of
+
+pytestmark = pytest.mark.io
+
+SIZE = 2 << 20
+RETRY_S = RETRY_US / 1e6
+
+
+def mount(*arguments: str) -> None:
+    done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"mounting is not allowed here: {done.stderr.strip()}")
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Path]:
+    if os.geteuid() != 0 or shutil.which("mount") is None:
+        pytest.skip("mounting a disk needs root")
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount("-t", "tmpfs", "-o", f"size={SIZE}", "tmpfs", str(folder))
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture
+async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[Bench]:
+    made = Bench(disk / "recordings", clock)
+    await made.turn()
+    made.send(FRAMES[:5])
+    await made.turn()
+    assert made.troubles == []
+    yield made
+    made.recorder.close()
+
+
+async def test_a_full_disk(bench: Bench, disk: Path) -> None:
+    ballast = disk / "ballast"
+    with pytest.raises(OSError, match="No space left"):
+        ballast.write_bytes(bytes(2 * SIZE))
+    # The page that the file has begun has room for some of these, which are taken back.
+    bench.send(FRAMES[5:] * 20)
+    await bench.turn()
+    assert bench.troubles == ["Recording stopped: disk is full"]
+    assert bench.recorder.status().reason == "disk is full"
+    bench.send(FRAMES[5:8])
+    await bench.turn(RETRY_S)
+    assert not bench.recorder.recording
+    ballast.unlink()
+    await bench.turn(RETRY_S)
+    bench.send(FRAMES[8:])
+    await bench.turn()
+    assert bench.recorder.recording
+    assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[8:]
+    assert bench.announced[-1] == (False, f"Recording {NAME}")
+    assert len(bench.troubles) == 1
+
+
+async def test_a_disk_that_turns_read_only(bench: Bench, disk: Path) -> None:
+    # With a file open for writing the kernel would refuse.
+    bench.recorder.stop()
+    await bench.turn()
+    mount("-o", "remount,ro", str(disk))
+    bench.recorder.record()
+    await bench.turn()
+    bench.send(FRAMES[5:8])
+    await bench.turn()
+    assert bench.troubles == ["Recording stopped: disk is read-only"]
+    await bench.turn(RETRY_S)
+    assert len(bench.troubles) == 1
+    mount("-o", "remount,rw", str(disk))
+    await bench.turn(RETRY_S)
+    bench.send(FRAMES[8:])
+    await bench.turn()
+    assert bench.recorder.recording
+    assert [len(r.files) for r in list_recordings(bench.recorder.folder)] == [1, 1]
+    assert frames_of(bench.recorder.folder)[5:] == FRAMES[8:]
+
+
+async def test_a_folder_that_is_removed(bench: Bench) -> None:
+    shutil.rmtree(bench.recorder.folder)
+    bench.send(FRAMES[5:8])
+    await bench.turn()
+    assert bench.troubles == ["Recording stopped: folder has vanished"]
+    await bench.turn(RETRY_S)
+    bench.send(FRAMES[8:])
+    await bench.turn()
+    assert frames_of(bench.recorder.folder) == FRAMES[8:]

@@ -1,0 +1,327 @@
+"""PX4's and ArduPilot's own logs: written by the published formats, read back, fused."""
+
+import gzip
+import itertools
+import json
+import math
+import os
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.analysis.metrics import rms, rotation_error, total_error_rad
+from gateway.cli.app import app
+from gateway.cli.support.loading import Loading, load_flight
+from gateway.config import GatewaySettings
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.columns import TableRow
+from gateway.recordings.flown import open_flown
+from gateway.recordings.opening import open_flights
+from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, open_rows
+from gateway.recordings.table import TableReader
+from gateway.records import BaroRaw, GpsFix, ImuCalibrated
+from tests.recordings.formats import flown
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+MAKERS: dict[str, tuple[Callable[[], bytes], int]] = {
+    "new.ulg": (flown.make_ulog, 7),
+    "old.ulg": (lambda: flown.make_ulog(old=True), 7),
+    "flight.bin": (flown.make_dataflash, 9),
+    "flight.log": (flown.make_dataflash_text, 9),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("logs")
+    for name, (make, _) in MAKERS.items():
+        flown.write(folder / name, make())
+    return folder
+
+
+@cache
+def whole(path: Path) -> tuple[RecordedTable, list[TableRow]]:
+    return rows_of(path)
+
+
+def rows_of(path: Path) -> tuple[RecordedTable, list[TableRow]]:
+    table = open_rows(path, OPTIONS)
+    return table, list(table.plain_rows)
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_what_was_logged_is_read(folder: Path, name: str) -> None:
+    table, rows = whole(folder / name)
+    assert table.header.vehicle_id == MAKERS[name][1]
+    assert table.remarks == []
+    zero_us = flown.records()[0].time_us
+    logged = [r for r in flown.records() if isinstance(r, ImuCalibrated)]
+    imus = [row.imu for row in rows if row.imu is not None]
+    assert [imu.time_us for imu in imus] == [r.time_us - zero_us for r in logged]
+    for axis in ("accel_b_mps2", "gyro_b_radps"):
+        np.testing.assert_allclose(
+            [getattr(imu, axis) for imu in imus], [getattr(r, axis) for r in logged], rtol=1e-6
+        )
+    mags = [imu.mag_b_ut for imu in imus if imu.mag_b_ut]
+    np.testing.assert_allclose(mags, [r.mag_b_ut for r in logged if r.mag_b_ut], atol=0.051)
+    baros = [row.baro.pressure_pa for row in rows if row.baro]
+    sent = [r.pressure_pa for r in flown.records() if isinstance(r, BaroRaw)]
+    np.testing.assert_allclose(baros, sent, rtol=1e-6)
+
+
+def test_a_field_that_was_not_new_is_not_read_again(tmp_path: Path) -> None:
+    """PX4 of 2017 repeated the last one in every row, and marked it."""
+    form = flown.FORMATS["sensor_combined"]
+    form += "int32_t magnetometer_timestamp_relative;float[3] magnetometer_ga;"
+    log = flown.Ulog({"sensor_combined": form}, {"MAV_SYS_ID": 7})
+    inertial = (0.0, 0.0, 0.0, 4000, 0, 0.0, 0.0, -9.8, 4000)
+    for number in range(12):
+        mark = -500 if number % 3 == 0 else 0x7FFF_FFFF
+        log.add("sensor_combined", 4000 * number, *inertial, mark, 0.2, 0.0, 0.4)
+    path = tmp_path / "older.ulg"
+    path.write_bytes(b"".join(log.parts))
+    fields = [row.imu.mag_b_ut for row in rows_of(path)[1] if row.imu is not None]
+    assert [bool(field) for field in fields] == [True, False, False] * 4
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
+    table, rows = whole(folder / name)
+    fixes = [row.gps for row in rows if row.gps]
+    sent = [r for r in flown.records() if isinstance(r, GpsFix)]
+    assert [f.fix_ok for f in fixes] == [r.fix_ok for r in sent]
+    pairs = [(f, r) for f, r in zip(fixes, sent, strict=True) if r.fix_ok]
+    assert len(pairs) > 100
+    for f, r in pairs:
+        assert (f.lat_dege7, f.lon_dege7, f.satellites) == (
+            r.lat_dege7,
+            r.lon_dege7,
+            r.satellites,
+        )
+        assert f.alt_amsl_m == pytest.approx(r.alt_amsl_m, abs=0.006)
+        assert f.vel_n_mps == pytest.approx(r.vel_n_mps, abs=1e-4)
+        assert f.h_acc_m == pytest.approx(r.h_acc_m, abs=0.006)
+        assert f.v_acc_m == pytest.approx(r.v_acc_m, abs=0.006)
+        assert f.speed_acc_mps == pytest.approx(r.speed_acc_mps, abs=0.006)
+        assert f.utc_us is not None
+        assert r.utc_us is not None
+        assert abs(f.utc_us - r.utc_us) <= 1000
+    first = pairs[0][1]
+    assert table.header.unix_us_at_zero is not None
+    zero_us = flown.records()[0].time_us
+    at_us = (first.utc_us or 0) - (first.time_us - zero_us)
+    assert table.header.unix_us_at_zero == pytest.approx(at_us, abs=200_000)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_what_the_autopilot_believed_is_there_to_compare_with(folder: Path, name: str) -> None:
+    _, rows = whole(folder / name)
+    states = [row.state for row in rows if row.state]
+    assert len(states) > 0.9 * len(flown.believed())
+    zero_us = flown.records()[0].time_us
+    believed = {b.time_us - zero_us: b for b in flown.believed()}
+    near = [(s, believed[s.time_us]) for s in states if s.time_us in believed]
+    assert len(near) > 0.9 * len(states)
+    error = total_error_rad(
+        rotation_error(np.array([s.q_nb for s, _ in near]), np.array([b.q_nb for _, b in near]))
+    )
+    assert math.degrees(float(error.max())) < 0.02
+    for s, b in near[20::50]:
+        assert (s.lat_deg, s.lon_deg) == pytest.approx((b.lat_deg, b.lon_deg), abs=1e-7)
+        assert s.vel_n_mps == pytest.approx(b.vel_n_mps, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
+def test_it_is_fused_to_what_was_true(folder: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "states.csv"
+    run("fuse", folder / name, "-o", out, "--gps-latency", "0.15", "--estimator", "eskf")
+    rows = [
+        row
+        for row in TableReader().feed(out.read_bytes(), final=True)
+        if isinstance(row, TableRow) and row.state and row.time_us > 30_000_000
+    ]
+    assert len(rows) > 2000
+    time_s = np.array([row.time_us + flown.records()[0].time_us for row in rows]) / 1e6
+    truth = flown.simulated().trajectory.truth_at(time_s)
+    q_nb = np.array([row.state.q_nb for row in rows if row.state])
+    assert math.degrees(rms(total_error_rad(rotation_error(q_nb, truth.q_nb)))) < 2.0
+    alt = np.array([row.state.alt_amsl_m for row in rows if row.state])
+    assert rms(alt - truth.alt_amsl_m) < 3.0
+    lat = np.array([row.state.lat_deg for row in rows if row.state])
+    assert rms((lat - truth.lat_deg) * 111_000) < 3.0
+
+
+def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
+    found = json.loads(run("info", folder / "new.ulg", "--json"))
+    assert found["kind"] == "ULog"
+    assert found["duration_s"] == pytest.approx(flown.DURATION_S, abs=1.0)
+    assert "2026-06-14" in run("info", folder / "flight.bin")
+    packed = flown.write(tmp_path / "a.bin.gz", gzip.compress((folder / "flight.bin").read_bytes()))
+    run("convert", packed, "-o", tmp_path / "a.kml")
+    assert (tmp_path / "a.kml").read_text().count("<gx:coord>") > 100
+    # What `report` and `sweep` make of it: the autopilot's own attitude is one more row.
+    loaded = load_flight(folder / "flight.bin", Loading(GatewaySettings()))
+    assert loaded.recorded is not None
+    assert np.isfinite(loaded.recorded.q_nb).all(axis=1).mean() > 0.9
+    with ExitStack() as opened:
+        (played,) = open_flights([folder / "new.ulg"], OPTIONS, opened)
+        assert played.vehicles == [7]
+    flight = open_flown([folder / "new.ulg"], OPTIONS)
+    assert flight.duration_s == pytest.approx(flown.DURATION_S, abs=1.0)
+
+
+def test_what_is_not_installed_is_named(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delitem(sys.modules, "gateway.recordings.formats.ulog", raising=False)
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    text = run("convert", folder / "new.ulg", "-o", tmp_path / "x.csv", code=2)
+    assert "needs pyulog, the extra mavgate[formats]" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
+def test_damage_is_counted_and_reported(folder: Path, tmp_path: Path, name: str) -> None:
+    data = (folder / name).read_bytes()
+    _, all_rows = whole(folder / name)
+    middle = len(data) // 2
+    spoilt = flown.write(
+        tmp_path / name, data[:middle] + b"\x00\xff" * 300 + data[middle + 77 : -11]
+    )
+    table, rows = rows_of(spoilt)
+    assert len(all_rows) > len(rows) > 0.9 * len(all_rows)
+    assert any("is damaged" in remark for remark in table.remarks)
+    text = run("convert", spoilt, "-o", tmp_path / "x.csv")
+    assert "is damaged" in " ".join(text.split())
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("share", [0.0, 0.002, 0.01])
+def test_what_is_cut_off_early_is_refused(
+    folder: Path, tmp_path: Path, name: str, share: float
+) -> None:
+    data = (folder / name).read_bytes()
+    stub = flown.write(tmp_path / name, data[: 100 + int(share * 8000)])
+    with pytest.raises(FlightError, match=name):
+        list(open_rows(stub, OPTIONS).rows)
+    assert name in run("info", stub, code=2)
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("name", MAKERS)
+def test_no_damage_is_fatal(folder: Path, tmp_path: Path, name: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    data = bytearray((folder / name).read_bytes()[:60_000])
+    for place in rng.integers(0 if seed % 2 else 2000, len(data), 40).tolist():
+        data[place] = int(rng.integers(256))
+    spoilt = flown.write(tmp_path / name, bytes(data[: int(rng.integers(3000, len(data)))]))
+    try:
+        table, rows = rows_of(spoilt)
+    except (FlightError, OSError):
+        return
+    assert all(a.time_us <= b.time_us for a, b in itertools.pairwise(rows))
+    assert all(isinstance(remark, str) for remark in table.remarks)
+
+
+@pytest.mark.parametrize("end", [b"\0" * 40, b"\x10\x27\xee", b"\xff" * 40, b"\x01\x00"])
+def test_a_ulog_that_is_cut_in_its_formats_ends(tmp_path: Path, end: bytes) -> None:
+    head = b"".join(flown.Ulog(flown.FORMATS, {"MAV_SYS_ID": 7}).parts[:6])
+    stub = flown.write(tmp_path / "cut.ulg", head + end)
+    with pytest.raises(FlightError, match=r"cut.ulg: holds no sensor_combined"):
+        rows_of(stub)
+
+
+@pytest.mark.parametrize(
+    "formats",
+    [
+        ["vehicle_attitude:vehicle_attitude again;"],
+        ["vehicle_attitude:a[3999] b;", "a:" + "b[3999] x;" * 50, "b:uint8_t x;"],
+    ],
+)
+def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: list[str]) -> None:
+    log = flown.Ulog({}, {})
+    log.parts += [flown.ulog_message(b"F", text.encode()) for text in formats]
+    log.parts.append(flown.ulog_message(b"A", bytes(3) + b"vehicle_attitude"))
+    path = flown.write(tmp_path / "odd.ulg", b"".join(log.parts))
+    with pytest.raises(FlightError, match=r"odd.ulg: cannot be read as a ULog"):
+        rows_of(path)
+
+
+@pytest.mark.parametrize(
+    ("odd", "is_read"),
+    [
+        # A dropout tells its length in two bytes.
+        (flown.ulog_message(b"O", b"\0"), True),
+        # A message that seems to last beyond the end.
+        (b"\xff\xffD", False),
+    ],
+)
+def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(
+    folder: Path, tmp_path: Path, odd: bytes, is_read: bool
+) -> None:
+    data = (folder / "new.ulg").read_bytes()
+    middle = data.index(flown.SYNC, len(data) - 40_000) - 3
+    spoilt = flown.write(tmp_path / "odd.ulg", data[:middle] + odd + data[middle:])
+    table, rows = rows_of(spoilt)
+    assert len(rows) > 0.4 * len(whole(folder / "new.ulg")[1])
+    lost = len(data) - middle + (0 if is_read else len(odd))
+    assert f"left out {lost} bytes at its end" in " ".join(table.remarks)
+
+
+@pytest.mark.parametrize("letters", [b"Q?", b"Q\xff"])
+def test_a_dataflash_log_with_an_unknown_kind_of_value_is_refused(
+    tmp_path: Path, letters: bytes
+) -> None:
+    layout = flown.packed("FMT", (200, 12, b"NEW", letters, b"TimeUS,X"))
+    data = flown.make_dataflash()
+    path = flown.write(tmp_path / "odd.bin", data[:89] + layout + data[89:])
+    with pytest.raises(FlightError, match=r"odd.bin: its list of formats is damaged"):
+        rows_of(path)
+
+
+def test_odd_lines_of_a_text_log_are_counted_and_nothing_is_read_twice(
+    folder: Path, tmp_path: Path
+) -> None:
+    lines = (folder / "flight.log").read_bytes().splitlines(keepends=True)
+    _, all_rows = whole(folder / "flight.log")
+    places = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
+    short, wrong, nameless = places[50], places[70], places[90]
+    lines[short] = lines[short][:20] + b"\n"
+    lines[wrong] = lines[wrong].replace(b".", b"x")
+    lines[nameless] = lines[nameless].replace(b"IMU", b"I%U")
+    table, rows = rows_of(flown.write(tmp_path / "odd.log", b"".join(lines)))
+    times_us = [row.time_us for row in rows if row.imu is not None]
+    assert len(times_us) == len(set(times_us)) == sum(r.imu is not None for r in all_rows) - 3
+    assert [r for r in table.remarks if "left out 3 messages that cannot be understood" in r]
+    assert not any("cannot be understood" in r for r in whole(folder / "flight.log")[0].remarks)
+
+
+@pytest.mark.parametrize("name", ["flight.bin", "flight.log"])
+def test_a_log_that_shrinks_while_it_is_read_ends_nothing(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
+    log = flown.write(tmp_path / name, (folder / name).read_bytes())
+    table = open_rows(log, OPTIONS)
+    rows = table.plain_rows
+    first = next(rows)
+    os.truncate(log, 0)
+    assert repr([first, *rows]) == repr(whole(folder / name)[1])
+
+
+@pytest.mark.parametrize("name", ["flight.bin", "new.ulg"])
+def test_a_packed_log_needs_no_ending(folder: Path, tmp_path: Path, name: str) -> None:
+    packed = flown.write(tmp_path / "log", gzip.compress((folder / name).read_bytes()))
+    assert repr(rows_of(packed)[1]) == repr(whole(folder / name)[1])

@@ -1,0 +1,128 @@
+"""Other people's columns become our rows."""
+
+import math
+from typing import Any
+
+import msgspec
+import pytest
+
+from gateway.geometry.atmosphere import pressure_altitude_m
+from gateway.recordings.formats.csv import Column, ColumnMap, CsvReader
+from gateway.recordings.reading import TRACKER_LOG
+from gateway.records import GpsFixType, ImuFlags
+
+TRACKER = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
+NAMES = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"
+NAMES += "gps_vn,gps_ve,gps_vd,note,gps_speed_ms,gps_course_deg"
+
+
+def read(*lines: str) -> tuple[CsvReader, list[Any]]:
+    reader = CsvReader(TRACKER)
+    return reader, list(reader.rows(["# made by somebody", NAMES, *lines]))
+
+
+def test_a_full_line() -> None:
+    _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,20,5,-40,512.5,1.45,47.1,8.5,430,1,2,3,hi")
+    (row,) = rows
+    assert row.time_us == 1_500_000
+    assert row.imu.accel_b_mps2 == (0.1, 0.2, -9.8)
+    assert row.imu.gyro_b_radps == (0.01, 0.02, 0.03)
+    assert row.imu.mag_b_ut == (20.0, 5.0, -40.0)
+    assert row.imu.flags is ImuFlags.MAG_NEW
+    assert pressure_altitude_m(row.baro.pressure_pa) == pytest.approx(512.5, abs=1e-6)
+    assert (row.gps.time_us, row.gps.lat_dege7, row.gps.lon_dege7) == (
+        1_450_000,
+        471_000_000,
+        85_000_000,
+    )
+    assert row.gps.vel_n_mps == (1.0, 2.0, 3.0)
+    assert row.gps.fix_type is GpsFixType.FIX_3D
+    assert math.isnan(row.gps.h_acc_m)
+    assert row.raw is row.state is None
+
+
+def test_speed_and_course_stand_in_for_a_velocity_that_is_not_reported() -> None:
+    _, rows = read("1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120")
+    north, east, down = rows[0].gps.vel_n_mps
+    assert (north, east) == pytest.approx((-2.5, 4.330127), abs=1e-6)
+    assert math.isnan(down)
+
+
+def test_blank_cells_are_nothing_new() -> None:
+    _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,,,,,,,,,,,,")
+    (row,) = rows
+    assert row.imu.mag_b_ut is None
+    assert row.imu.flags is ImuFlags(0)
+    assert row.baro is row.gps is None
+
+
+def test_lines_that_cannot_be_read_are_counted() -> None:
+    reader, rows = read("x,1", ",,,", "2,0,0,0,0,0,0,,,,,,,,,,,,")
+    assert len(rows) == 1
+    assert reader.faults == 2
+
+
+def test_scale_and_offset() -> None:
+    columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
+    (row,) = CsvReader(ColumnMap(columns=columns)).rows(["t,p", "2,95000"])
+    assert row.time_us == 2005
+    assert row.baro is not None
+    assert row.baro.pressure_pa == 95_000.0
+
+
+def test_a_file_without_the_columns_is_refused() -> None:
+    with pytest.raises(ValueError, match="no column ax, ay"):
+        list(CsvReader(TRACKER).rows(["time_s,az", "1,2"]))
+
+
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        ("time_s,az", "ax, ay, gx, gy, gz"),
+        ("time_s,ax,ay,az,gx,gz", "gy"),
+        ("time_s,ax,ay,az,gx,gy,gz,mx,my", "mz"),
+    ],
+)
+def test_a_file_without_a_map_lacks_only_what_is_needed(names: str, missing: str) -> None:
+    with pytest.raises(
+        ValueError, match=f"no column {missing}; found, separated by commas: time_s"
+    ):
+        list(CsvReader(TRACKER, lenient=True).rows([names, "1,2"]))
+
+
+@pytest.mark.parametrize(
+    ("columns", "text"),
+    [
+        ({"wings": "w", "time_us": "t"}, "wings"),
+        ({}, "time_us"),
+        ({"time_us": "t", "mag_y_b_ut": "m"}, "mapped too: mag_x_b_ut, mag_z_b_ut"),
+    ],
+)
+def test_a_wrong_map_is_refused(columns: dict[str, str], text: str) -> None:
+    with pytest.raises(msgspec.ValidationError, match=text):
+        msgspec.convert({"columns": columns}, ColumnMap)
+
+
+def times_of(*times_s: float) -> tuple[int, list[float]]:
+    reader, rows = read(*(f"{t},0,0,-9.8,0,0,0,,,,,,,,,,,,,," for t in times_s))
+    return reader.faults, [row.time_us / 1e6 for row in rows]
+
+
+SECONDS = tuple(range(10, 20))
+
+
+@pytest.mark.parametrize("odd", [86_410.0, -86_400.0, 1e9, 10.0, 30.0])
+def test_a_line_with_a_damaged_time_is_left_out(odd: float) -> None:
+    assert times_of(*SECONDS[:5], odd, *SECONDS[5:]) == (1, [*SECONDS])
+
+
+@pytest.mark.parametrize("leap", [-86_400, -60, 60, 86_400 * 400])
+def test_a_clock_that_leaps_is_left_alone(leap: int) -> None:
+    times = [*SECONDS, *(t + leap for t in SECONDS)]
+    assert times_of(*times) == (0, times)
+
+
+@pytest.mark.parametrize("own", ["86401", "-86400", "1e12", "1780000000"])
+def test_a_fix_of_another_time_is_as_old_as_its_line(own: str) -> None:
+    _, (row,) = read(f"1.5,0,0,-9.8,0,0,0,,,,,{own},47.1,8.5,430,1,2,3,,,")
+    assert row.gps.time_us == row.time_us

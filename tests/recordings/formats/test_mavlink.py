@@ -1,0 +1,272 @@
+"""An autopilot's messages become records in SI, on one clock."""
+
+import math
+import random
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.geometry.quaternion import to_euler
+from gateway.recordings.columns import Imported, RowBuilder, TableRow, row_of_cells
+from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.tlog import TlogScanner, encode_record
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuCalibrated,
+    ImuFlags,
+    NavFlags,
+    NavState,
+)
+from tests.recordings.frames import START_US
+from tests.recordings.single_reader import SingleReader
+
+G = 9.80665
+Message = Any
+
+
+def highres(time_us: int, updated: int = 0b111111111) -> Message:
+    return mavlink.MAVLink_highres_imu_message(
+        time_us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.05, -0.4, 950, 0, 400, 21.5, updated
+    )
+
+
+def raw(time_us: int) -> Message:
+    return mavlink.MAVLink_raw_imu_message(time_us, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
+
+
+def gps(time_us: int, alt_mm: int = 430_000, fix: int = 3) -> Message:
+    return mavlink.MAVLink_gps_raw_int_message(
+        time_us, fix, 471_000_000, 85_000_000, alt_mm, 120, 65535, 1500, 9000, 11
+    )
+
+
+def position(time_ms: int, vz_cmps: int) -> Message:
+    return mavlink.MAVLink_global_position_int_message(
+        time_ms, 471_000_000, 85_000_000, 430_000, 0, 0, 1500, vz_cmps, 9000
+    )
+
+
+def rows_of(reader: AutopilotReader, frames: list[tuple[int, bytes]], chunk: int) -> list[TableRow]:
+    """Read a recording in chunks of so many bytes."""
+    scanner = TlogScanner(strict=True)
+    data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
+    cells = [
+        reader.feed(scanner.feed(data[begin : begin + chunk], final=begin >= len(data)))
+        for begin in range(0, len(data) + chunk, chunk)
+    ]
+    cells.append(reader.flush())
+    vehicle_id = reader.system_id or 1
+    return [row_of_cells(row, vehicle_id) for rows in cells for row in rows.tolist()]
+
+
+def read(
+    messages: list[tuple[int, Message]], system_id: int = 1, component_id: int = 1
+) -> list[Imported]:
+    """Return what is read, in the order of the rows."""
+    mav = mavlink.MAVLink(None, system_id, component_id)
+    frames = [(START_US + at_us, bytes(message.pack(mav))) for at_us, message in messages]
+    rows = rows_of(AutopilotReader(), frames, 1 << 20)
+    held = [record for row in rows for record in (row.baro, row.gps, row.state, row.imu)]
+    return [record for record in held if record is not None]
+
+
+def test_highres_imu_is_taken_in_si() -> None:
+    (imu,) = read([(0, highres(5_000_000))])
+    assert isinstance(imu, ImuCalibrated)
+    assert imu.time_us == 0
+    assert imu.accel_b_mps2 == pytest.approx((0.1, 0.2, -9.8))
+    assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
+    assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
+    assert imu.temperature_degc == pytest.approx(21.5)
+    assert imu.flags is ImuFlags.MAG_NEW
+
+
+def test_a_magnetometer_that_has_nothing_new_is_left_out() -> None:
+    (imu,) = read([(0, highres(0, updated=0b111111))])
+    assert isinstance(imu, ImuCalibrated)
+    assert imu.mag_b_ut is None
+
+
+def test_raw_and_scaled_imu_are_in_thousandths() -> None:
+    scaled = mavlink.MAVLink_scaled_imu_message(20, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
+    for message in (raw(20_000), scaled):
+        (imu,) = read([(0, message)])
+        assert isinstance(imu, ImuCalibrated)
+        assert imu.accel_b_mps2 == pytest.approx((0.01 * G, 0.02 * G, -G))
+        assert imu.gyro_b_radps == pytest.approx((0.01, 0.02, 0.03))
+        assert imu.mag_b_ut == pytest.approx((20.0, 5.0, -40.0))
+        assert math.isnan(imu.temperature_degc)
+
+
+def test_the_best_imu_message_wins() -> None:
+    records = read([(0, raw(1000)), (10_000, highres(11_000)), (20_000, raw(21_000))])
+    assert [r.time_us for r in records] == [0, 10_000]
+
+
+def test_pressure_in_pascal() -> None:
+    pressure = mavlink.MAVLink_scaled_pressure_message(15, 950.25, 0, 2150)
+    baro = read([(0, raw(10_000)), (5_000, pressure)])[1]
+    assert isinstance(baro, BaroRaw)
+    assert (baro.time_us, baro.pressure_pa, baro.temperature_degc) == (5_000, 95_025.0, 21.5)
+
+
+def test_a_fix_has_the_velocity_of_its_course_and_the_climb_of_the_position() -> None:
+    climb = (100_000, position(100, vz_cmps=-500))
+    first, second = read([(0, raw(0)), (0, gps(1_000)), climb, (200_000, gps(201_000, 431_000))])[
+        1:
+    ]
+    assert isinstance(first, GpsFix)
+    assert isinstance(second, GpsFix)
+    assert (first.lat_dege7, first.lon_dege7) == (471_000_000, 85_000_000)
+    assert first.fix_type is GpsFixType.FIX_3D
+    assert first.pdop == pytest.approx(1.2)
+    assert math.isnan(first.vel_n_mps[2])
+    assert second.vel_n_mps == pytest.approx((0.0, 15.0, -5.0))
+    assert math.isnan(second.h_acc_m)
+    assert second.utc_us is None
+
+
+def test_no_fix_is_reported_as_none() -> None:
+    (fix,) = read([(0, raw(0)), (0, gps(0, fix=1))])[1:]
+    assert isinstance(fix, GpsFix)
+    assert not fix.fix_ok
+
+
+def test_other_systems_and_components_are_left_out() -> None:
+    assert read([(0, raw(0))], component_id=191) == []
+    frame = bytes(raw(0).pack(mavlink.MAVLink(None, 1, 1)))
+    assert rows_of(AutopilotReader(system_id=2), [(START_US, frame)], 100) == []
+
+
+def test_the_clock_never_falls_whatever_the_messages_say() -> None:
+    times = [5_000_000, 5_010_000, 4_000_000, 100, 5_030_000, 9_000_000_000]
+    records = read([(i * 10_000, raw(t)) for i, t in enumerate(times)])
+    stamps = [r.time_us for r in records]
+    assert stamps == sorted(stamps)
+    assert stamps[-1] <= 60_000
+
+
+@pytest.mark.parametrize("lead_us", [300_000, 900_000, 1_500_000, -300_000])
+def test_fixes_of_another_clock_leave_the_imu_its_spacing(lead_us: int) -> None:
+    messages: list[tuple[int, Message]] = []
+    for at_us in range(0, 4_000_000, 20_000):
+        messages.append((at_us, raw(2_000_000 + at_us)))
+        if at_us % 200_000 == 100_000:
+            messages.append((at_us + 5_000, gps(2_000_000 + at_us + lead_us)))
+            messages.append((at_us + 6_000, attitude((2_000_000 + at_us) // 1000 + 8)))
+    records = read(messages)
+    samples = [r.time_us for r in records if isinstance(r, ImuCalibrated)]
+    assert samples == [*range(0, 4_000_000, 20_000)]
+    # A fix whose stamp cannot be of the IMU's clock came when it was recorded.
+    late_us = lead_us if 0 <= lead_us <= 1_000_000 else 5_000
+    fixes = [r.time_us for r in records if isinstance(r, GpsFix)]
+    assert fixes == [*range(100_000 + late_us, 4_000_000 + late_us, 200_000)]
+    states = [r.time_us for r in records if isinstance(r, NavState)]
+    assert states == [*range(108_000, 4_000_000, 200_000)]
+
+
+def test_a_fix_without_a_stamp_follows_the_imu_though_the_recording_drifts() -> None:
+    """The recording's clock is slower by a percent; a fix comes 4 ms after each tenth sample."""
+    messages: list[tuple[int, Message]] = []
+    for at_us in range(0, 4_000_000, 20_000):
+        messages.append((at_us * 99 // 100, raw(2_000_000 + at_us)))
+        if at_us % 200_000 == 0:
+            messages.append((at_us * 99 // 100 + 4_000, gps(0)))
+    fixes = [r.time_us for r in read(messages) if isinstance(r, GpsFix)]
+    assert fixes == [*range(4_000, 4_000_000, 200_000)]
+
+
+def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
+    return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
+
+
+@pytest.mark.parametrize(("age_us", "is_told"), [(500_000, True), (500_001, False)])
+def test_a_climb_of_long_ago_is_unknown(age_us: int, is_told: bool) -> None:
+    (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
+    assert math.isfinite(fix.vel_n_mps[2]) == is_told
+
+
+def test_a_lost_fix_makes_no_climb() -> None:
+    """Without a fix the height may be zero: found again, 484 m would be a climb of 968 m/s."""
+    heights = [(484_000, 3), (0, 1), (484_000, 3), (484_500, 3)]
+    flight: list[tuple[int, Message]] = []
+    for n, (alt_mm, fix) in enumerate(heights):
+        flight += [(n * 500_000, gps(n * 500_000 + 1, alt_mm, fix))]
+    assert [math.isfinite(fix.vel_n_mps[2]) for fix in fixes_of(flight)] == [False] * 4
+    lost = fixes_of(flight)[1]
+    assert not any(map(math.isfinite, lost.vel_n_mps))
+    positions = [(at_us, position(at_us // 1000, 20)) for at_us, _ in flight]
+    both = [message for pair in zip(positions, flight, strict=True) for message in pair]
+    downs = [fix.vel_n_mps[2] for fix in fixes_of(both)]
+    assert downs == pytest.approx([0.2, math.nan, 0.2, 0.2], nan_ok=True)
+
+
+def test_a_flat_fix_has_no_climb() -> None:
+    (fix,) = fixes_of([(0, position(0, -150)), (0, gps(1, fix=2))])
+    assert math.isnan(fix.vel_n_mps[2])
+
+
+def attitude(time_ms: int) -> Message:
+    return mavlink.MAVLink_attitude_message(time_ms, 0.1, -0.2, 1.5, 0.01, 0.02, 0.03)
+
+
+def test_what_the_autopilot_believes_goes_along() -> None:
+    own = [(0, raw(0)), (0, position(0, -150)), (10_000, attitude(10)), (20_000, raw(20_000))]
+    later = [(590_000, attitude(590)), (600_000, attitude(600)), (600_000, raw(600_000))]
+    records = read([*own, *later])
+    fresh, stale = (record for record in records if isinstance(record, NavState))
+    assert to_euler(fresh.q_nb) == pytest.approx((0.1, -0.2, 1.5))
+    assert fresh.rate_b_radps == pytest.approx((0.01, 0.02, 0.03))
+    assert (fresh.lat_deg, fresh.alt_amsl_m) == pytest.approx((47.1, 430.0))
+    assert fresh.vel_n_mps == pytest.approx((0.0, 15.0, -1.5))
+    assert NavFlags.POSITION_VALID in fresh.flags
+    assert math.isnan(stale.lat_deg)
+    assert NavFlags.POSITION_VALID not in stale.flags
+    kinds = [type(record) for record in records]
+    assert kinds == [ImuCalibrated, NavState, ImuCalibrated, NavState, ImuCalibrated]
+    assert stale.time_us == 600_000, "of two the newer"
+
+
+def recorded(seed: int) -> list[tuple[int, bytes]]:
+    """Make what an autopilot, a second one and a station say in any order, stamps that fall too."""
+    chance, records, at_us = random.Random(seed), [], 0
+    links = [mavlink.MAVLink(None, *sender) for sender in ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))]
+    for _ in range(600):
+        at_us += chance.choice((0, 4, 1000, 20_000, -30_000, 700_000))
+        own_ms = max(0, at_us) // 1000
+        message = chance.choice(
+            (
+                highres(own_ms * 1000, chance.choice((0, 0x1FF))),
+                highres(own_ms * 1000),
+                raw(own_ms * 1000),
+                gps(own_ms * 1000, fix=chance.randint(0, 4)),
+                position(own_ms, chance.randint(-500, 500)),
+                mavlink.MAVLink_attitude_message(own_ms, chance.random(), 0.1, 0.2, 0.3, 0.4, 0.5),
+                mavlink.MAVLink_scaled_pressure_message(own_ms, 950.0, 0.5, 2100),
+                mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3),
+            )
+        )
+        link = chance.choice(links)
+        version_1 = chance.random() < 0.2
+        frame = bytes(message.pack(link, force_mavlink1=version_1))
+        records.append((START_US + at_us, frame))
+    return records
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_batch_gives_the_rows_that_single_frames_give(seed: int) -> None:
+    records = recorded(seed)
+    singly, builder = SingleReader(), RowBuilder()
+    expected = [
+        repr(row)
+        for time_us, frame in records
+        for item in singly.feed(frame, time_us)
+        for row in builder.add(item)
+    ] + [repr(row) for row in builder.flush()]
+    reader = AutopilotReader()
+    assert len(expected) > 20
+    assert [repr(row) for row in rows_of(reader, records, 5000)] == expected
+    assert (reader.system_id, reader.unix_us_at_zero) == (singly.system_id, singly.unix_us_at_zero)

@@ -1,0 +1,199 @@
+"""MCAP as its own reader opens it, and the layout that shows it."""
+
+import json
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from pymavlink.dialects.v20 import all as mavlink
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.config import GatewaySettings
+from gateway.geometry.quaternion import rotate
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.convert import WRITERS, FlightToWrite
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.tlog import TlogRecord
+from tests.recordings.formats import flown
+from tests.recordings.frames import START_US, make_tlog
+
+pytestmark = pytest.mark.io
+
+ROOT = Path(__file__).resolve().parents[3]
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+Message = tuple[str, str, int, dict[str, Any]]
+"""Topic, name of its schema, log time in ns, content."""
+
+
+def messages_of(path: Path) -> list[Message]:
+    with path.open("rb") as stream:
+        return [
+            (channel.topic, schema.name if schema else "", m.log_time, json.loads(m.data))
+            for schema, channel, m in make_reader(stream).iter_messages()
+        ]
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a simulated flight, out of its log, as MCAP."""
+    folder = tmp_path_factory.mktemp("mcap")
+    log = flown.write(folder / "flight.ulg", flown.make_ulog())
+    out = folder / "flight.mcap"
+    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS))))
+    return out
+
+
+@pytest.fixture(scope="module")
+def shown(flight: Path) -> list[Message]:
+    return messages_of(flight)
+
+
+def of(shown: list[Message], topic: str) -> Iterator[tuple[float, dict[str, Any]]]:
+    """Yield what a topic has, with its time since the records began."""
+    begin_ns = shown[0][2]
+    return ((1e-9 * (ns - begin_ns), content) for name, _, ns, content in shown if name == topic)
+
+
+def test_every_message_has_the_fields_of_its_schema(flight: Path, shown: list[Message]) -> None:
+    with flight.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    schemas = {s.name: json.loads(s.data) for s in summary.schemas.values()}
+    assert {s.encoding for s in summary.schemas.values()} == {"jsonschema"}
+    assert {c.message_encoding for c in summary.channels.values()} == {"json"}
+    for name in ("FrameTransform", "PoseInFrame", "LocationFix", "Log"):
+        assert f"foxglove.{name}" in schemas
+    for _, name, _, content in shown[::7]:
+        assert set(content) == set(schemas[name]["properties"])
+
+
+def test_it_is_where_it_was(shown: list[Message]) -> None:
+    fixes = [(t, fix) for t, fix in of(shown, "/vehicle_7/location") if t > 30]
+    truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in fixes]))
+    for k, (_, fix) in enumerate(fixes):
+        assert fix["latitude"] == pytest.approx(truth.lat_deg[k], abs=1e-4)
+        assert fix["longitude"] == pytest.approx(truth.lon_deg[k], abs=1e-4)
+        assert fix["altitude"] == pytest.approx(truth.alt_amsl_m[k], abs=10.0)
+        assert fix["position_covariance_type"] == 1
+        east, north, up = (fix["position_covariance"][i] for i in (0, 4, 8))
+        assert 0.01 < east == north < 100.0
+        assert 0.01 < up < 400.0
+    assert {fix["position_covariance_type"] for _, fix in of(shown, "/vehicle_7/gps")} == {2}
+
+
+def test_the_frames_turn_as_the_aircraft_did(shown: list[Message]) -> None:
+    poses = [(t, pose) for t, pose in of(shown, "/vehicle_7/pose") if t > 30]
+    assert len(poses) > 1000
+    truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in poses]))
+    for k in range(0, len(poses), 50):
+        q = poses[k][1]["pose"]["orientation"]
+        forward = rotate((q["w"], q["x"], q["y"], q["z"]), (1.0, 0.0, 0.0))
+        north, east, down = rotate(tuple(truth.q_nb[k]), (1.0, 0.0, 0.0))
+        assert forward == pytest.approx((east, north, -down), abs=0.2)
+        left = rotate((q["w"], q["x"], q["y"], q["z"]), (0.0, 1.0, 0.0))
+        north, east, down = rotate(tuple(truth.q_nb[k]), (0.0, -1.0, 0.0))
+        assert left == pytest.approx((east, north, -down), abs=0.2)
+    last = poses[-1][1]["pose"]["position"]
+    (_, first_fix), (_, last_fix) = (list(of(shown, "/vehicle_7/location"))[i] for i in (0, -1))
+    north_m = math.radians(last_fix["latitude"] - first_fix["latitude"]) * 6_371_000
+    assert last["y"] == pytest.approx(north_m, rel=0.02, abs=3.0)
+    assert last["z"] == pytest.approx(last_fix["altitude"] - first_fix["altitude"], abs=1.0)
+    (_, transform) = list(of(shown, "/tf"))[-1]
+    assert (transform["parent_frame_id"], transform["child_frame_id"]) == ("map", "vehicle_7")
+    assert transform["translation"] == last
+
+
+def test_the_state_is_in_degrees(shown: list[Message]) -> None:
+    states = [(t, s) for t, s in of(shown, "/vehicle_7/state") if t > 30]
+    truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in states]))
+    speeds = np.hypot(truth.vel_n_mps[:, 0], truth.vel_n_mps[:, 1])
+    assert (
+        np.median([abs(s["speed_mps"] - v) for (_, s), v in zip(states, speeds, strict=True)]) < 1
+    )
+    assert max(s["height_m"] for _, s in states) > 5
+    assert all(0 <= s["heading_deg"] < 360 for _, s in states)
+
+
+def pack(message: Any, system: int, component: int) -> bytes:
+    return bytes(message.pack(mavlink.MAVLink(None, system, component)))
+
+
+def test_every_message_of_a_tlog_is_in_it(tmp_path: Path) -> None:
+    one, station = "/mavlink/3/1/", "/mavlink/255/190/"
+    battery = mavlink.MAVLink_battery_status_message(0, 0, 0, 99, [4000] * 10, -1, -1, -1, 50)
+    messages = [
+        (one, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)),
+        (station, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)),
+        (one, mavlink.MAVLink_statustext_message(2, b"motor lost")),
+        (one, mavlink.MAVLink_statustext_message(6, b"A" * 50, 5, 0)),
+        (one, mavlink.MAVLink_statustext_message(6, b"end", 5, 1)),
+        (station, mavlink.MAVLink_statustext_message(6, b"not the vehicle's")),
+        (one, mavlink.MAVLink_attitude_message(9, 0.5, math.nan, 0, 0, 0, 0)),
+        (one, battery),
+        (one, mavlink.MAVLink_param_value_message(b"RATE", 1.5, 9, 3, 0)),
+    ]
+    senders = {one: (3, 1), station: (255, 190)}
+    said = [(pack(m, *senders[sender]), sender + m.msgname) for sender, m in messages]
+    records = [TlogRecord(START_US + k * 1000, frame) for k, (frame, _) in enumerate(said)]
+    path = tmp_path / "a.tlog"
+    path.write_bytes(make_tlog(records))
+    done = CliRunner().invoke(app, ["convert", str(path), "-o", str(tmp_path / "a.mcap")])
+    assert done.exit_code == 0, done.output
+    found = messages_of(tmp_path / "a.mcap")
+    raw = [(topic, ns) for topic, _, ns, _ in found if topic.startswith("/mavlink")]
+    assert raw == [(topic, (START_US + k * 1000) * 1000) for k, (_, topic) in enumerate(said)]
+    content = {topic: content for topic, _, _, content in found}
+    assert content["/mavlink/3/1/ATTITUDE"]["pitch"] is None
+    assert content["/mavlink/3/1/ATTITUDE"]["roll"] == 0.5
+    assert content["/mavlink/3/1/BATTERY_STATUS"]["voltages"] == [4000] * 10
+    assert content["/mavlink/3/1/PARAM_VALUE"]["param_id"] == "RATE"
+    texts = [(c["level"], c["message"], c["name"]) for topic, _, _, c in found if topic == "/log"]
+    assert texts == [(5, "motor lost", "vehicle_3"), (2, "A" * 50 + "end", "vehicle_3")]
+    assert Counter(topic for topic, *_ in found)["/tf"] == 0
+
+
+def paths_of(value: Any, key: str = "") -> Iterator[str]:
+    """Yield everything in a layout that names a topic."""
+    if isinstance(value, dict):
+        for name, inner in value.items():
+            yield from [name] if name.startswith("/") else []
+            yield from paths_of(inner, name)
+    elif isinstance(value, list):
+        for inner in value:
+            yield from paths_of(inner, key)
+    elif isinstance(value, str) and value.startswith("/"):
+        yield value
+
+
+def test_the_layout_shows_what_is_in_a_file(flight: Path) -> None:
+    text = (ROOT / "config" / "foxglove-layout.json").read_text()
+    layout = json.loads(text)
+    with flight.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    fields = {
+        # The layout is for vehicle 1; the flight's is 7.
+        re.sub("/7/", "/1/", channel.topic.replace("_7", "_1")): json.loads(
+            summary.schemas[channel.schema_id].data
+        )["properties"]
+        for channel in summary.channels.values()
+    }
+    named = list(paths_of(layout))
+    assert len(named) > 12
+    for path in named:
+        topic, _, field = path.partition(".")
+        assert topic in fields, path
+        assert not field or field in fields[topic], path
+    panels = set(
+        re.findall(r'"((?:3D|map|Gauge|Plot|RosOut)![a-z]+)"', json.dumps(layout["layout"]))
+    )
+    assert panels == set(layout["configById"])
+    assert all("foxglovePanelTitle" in panel for panel in layout["configById"].values())
+    assert {panel.split("!")[0] for panel in panels} == {"3D", "map", "Gauge", "Plot", "RosOut"}

@@ -1,0 +1,170 @@
+"""Parquet as pyarrow reads it, and back as the table that it was made of."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.config import GatewaySettings
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.columns import COLUMNS
+from gateway.recordings.convert import WRITERS, FlightToWrite
+from gateway.recordings.formats import parquet as parquet_file
+from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.table import TableMark, encode_header, encode_mark
+from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
+from tests.recordings.test_replay import fly, make_flight
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+
+
+def run(*arguments: object, code: int = 0) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code == code, result.output
+    return " ".join(result.output.split())
+
+
+@pytest.fixture
+def table(tmp_path: Path, rng: np.random.Generator) -> Path:
+    """A table with marks and changed settings among its rows, and a mark behind the last."""
+    settings = GatewaySettings().default_aircraft
+    text = fly(settings, make_flight(rng, 12))[0].decode()
+    text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
+    lines = text.splitlines(keepends=True)
+    lines.insert(300, encode_header(header_for(settings, 1)))
+    lines.insert(300, encode_mark(TableMark(123, "over the wood")))
+    lines.append(encode_mark(TableMark(456, "landed")))
+    path = tmp_path / "flight.csv"
+    path.write_text("".join(lines))
+    return path
+
+
+def test_a_table_comes_back_as_it_was(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parquet_file, "ROWS", 100)
+    columns, again = tmp_path / "flight.parquet", tmp_path / "again.csv"
+    run("convert", table, "-o", columns)
+    run("convert", columns, "-o", again)
+    assert again.read_bytes() == table.read_bytes()
+    assert pq.ParquetFile(columns).num_row_groups > 5
+    # What it holds is fused again like the table itself.
+    for source, out in ((table, "a.csv"), (columns, "b.csv")):
+        run("convert", source, "-o", tmp_path / out, "--fuse")
+    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
+
+
+def test_columns_have_types_and_units(table: Path, tmp_path: Path) -> None:
+    run("convert", table, "-o", tmp_path / "a.parquet")
+    found = pq.read_table(tmp_path / "a.parquet")
+    assert found.column_names == ["time", *COLUMNS, "comments"]
+    kinds = {field.name: field.type for field in found.schema}
+    assert kinds["time"] == pa.timestamp("us", "UTC")
+    assert kinds["time_us"] == kinds["accel_x_raw"] == kinds["gps_lat_dege7"] == pa.int64()
+    assert kinds["gps_fix_ok"] == pa.bool_()
+    assert kinds["accel_x_b_mps2"] == kinds["nav_q_w"] == pa.float64()
+    units = {f.name: f.metadata[b"unit"].decode() for f in found.schema if f.metadata}
+    assert units["accel_x_b_mps2"] == "m/s^2"
+    assert units["nav_vel_north_mps"] == "m/s"
+    assert units["mag_x_b_ut"] == "uT"
+    assert units["nav_lat_deg"] == "deg"
+    assert units["gps_lat_dege7"] == "1e-7 deg"
+    assert json.loads(found.schema.metadata[b"mavgate.header"])["vehicle_id"] == 1
+    rows = [line for line in table.read_text().splitlines() if line[0].isdigit()]
+    assert len(found) == len(rows)
+    first = rows[0].split(",")
+    assert found["time_us"][0].as_py() == int(first[0])
+    assert found["time"].cast(pa.int64())[0].as_py() == START_US + int(first[0])
+    assert found["nav_q_w"][0].as_py() == float(first[COLUMNS.index("nav_q_w")])
+    assert found["gps_pdop"][0].as_py() is None
+
+
+def test_the_commands_take_it(table: Path, tmp_path: Path) -> None:
+    columns = tmp_path / "flight.parquet"
+    run("convert", table, "-o", columns)
+    described = [json.loads(run("info", file, "--json")) for file in (table, columns)]
+    assert described[1]["kind"] == "Parquet"
+    for each in described:
+        for name in ("kind", "size"):
+            each.pop(name)
+    assert described[0] == described[1]
+    run("convert", columns, "-o", tmp_path / "a.tlog")
+    run("convert", table, "-o", tmp_path / "b.tlog")
+    assert (tmp_path / "a.tlog").read_bytes() == (tmp_path / "b.tlog").read_bytes()
+
+
+def test_one_message_is_one_typed_table(tmp_path: Path) -> None:
+    path, out = tmp_path / "a.tlog", tmp_path / "a.parquet"
+    path.write_bytes(make_tlog(make_records(300)))
+    run("convert", path, "-o", out, "--message", "ATTITUDE_QUATERNION")
+    found = pq.read_table(out)
+    assert len(found) == 100
+    assert found.schema.field("q1").type == pa.float32()
+    assert found.schema.field("time_boot_ms").metadata == {b"unit": b"ms"}
+    assert found.schema.field("repr_offset_q").type == pa.list_(pa.float32())
+    assert found["time"].cast(pa.int64())[0].as_py() == START_US + STEP_US
+    assert set(found["system_id"].to_pylist()) == {1}
+    run("convert", path, "-o", out, "--message", "STATUSTEXT", "--force")
+    assert pq.read_table(out)["text"][0].as_py() == "number 2"
+    mode = pq.read_schema(out).field("severity")
+    assert (mode.type, mode.metadata) == (pa.uint8(), {b"enum": b"MAV_SEVERITY"})
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--message", "VFR_HUD", "-o", "a.parquet"), "holds no VFR_HUD, but ATTITUDE_QUATERNION"),
+        (("--message", "NONSENSE", "-o", "a.parquet"), "no MAVLink message is called NONSENSE"),
+        (("--message", "HEARTBEAT", "-o", "a.csv"), "--message is for .parquet"),
+    ],
+)
+def test_wrong_wishes_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "x.tlog").write_bytes(make_tlog(make_records(30)))
+    assert said in run("convert", "x.tlog", *words, code=2)
+    assert not (tmp_path / "a.parquet").exists()
+
+
+def test_memory_is_that_of_a_few_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is written comes out piece by piece, long before the flight has ended."""
+    monkeypatch.setattr(parquet_file, "ROWS", 50)
+    path = tmp_path / "a.tlog"
+    path.write_bytes(make_tlog(make_records(3000)))
+    flight = FlightToWrite([path], OPTIONS, message="HEARTBEAT")
+    sizes = [len(piece) for piece in WRITERS[".parquet"](flight)]
+    assert len(sizes) == 3000 // 3 // 50 + 1
+    assert max(sizes[:-1]) < 10_000
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:-100], lambda data: data[:9000] + bytes(400) + data[9400:]]
+)
+def test_a_damaged_file_is_refused(table: Path, tmp_path: Path, damage: object) -> None:
+    columns, spoilt = tmp_path / "flight.parquet", tmp_path / "spoilt.parquet"
+    run("convert", table, "-o", columns)
+    assert callable(damage)
+    spoilt.write_bytes(damage(columns.read_bytes()))
+    assert "cannot be read as Parquet" in run("convert", spoilt, "-o", tmp_path / "x.csv", code=2)
+
+
+def test_another_programs_parquet_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "other.parquet"
+    pq.write_table(pa.table({"a": [1, 2]}), path)
+    assert "no column time_us" in run("convert", path, "-o", tmp_path / "x.csv", code=2)
+
+
+def test_messages_of_a_table_are_those_that_the_gateway_sends(table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "a.parquet"
+    run("convert", table, "-o", out, "--message", "GLOBAL_POSITION_INT")
+    found = pq.read_table(out)
+    assert len(found) > 50
+    assert found["lat"][len(found) // 2].as_py() == pytest.approx(471_234_567, abs=30_000)

@@ -1,0 +1,87 @@
+"""Columns out of payload bytes, field by field as pymavlink decodes each frame."""
+
+import random
+from typing import Any
+
+import numpy as np
+import pytest
+from fastcrc.crc16 import mcrf4xx
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.formats.mavlink import columns_of, layout_of
+from gateway.recordings.tlog import Batch, TlogScanner, encode_record
+from gateway.wire.mavlink_messages import CRC_EXTRA
+
+KINDS = sorted(mavlink.mavlink_map.items())
+FRAMES = 3
+
+
+def frame_of(message_id: int, payload: bytes, version: int) -> bytes:
+    """Make a frame of any payload bytes."""
+    if version == 1:
+        head = bytes((0xFE, len(payload), 7, 1, 1, message_id))
+    else:
+        head = bytes((0xFD, len(payload), 0, 0, 7, 1, 1)) + message_id.to_bytes(3, "little")
+    crc: int = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(head[1:] + payload))
+    return head + payload + crc.to_bytes(2, "little")
+
+
+def some_frames(message_id: int, kind: Any, chance: random.Random) -> list[bytes]:
+    """Make frames whose payloads are whole or cut off, of both versions where there are two."""
+    size = layout_of(kind).itemsize
+    frames = []
+    for _ in range(FRAMES):
+        length = chance.choice((size, chance.randint(1, size)))
+        version = chance.choice((1, 2)) if message_id < 256 else 2
+        frames.append(frame_of(message_id, chance.randbytes(length), version))
+    return frames
+
+
+def batch_of(frames: list[bytes]) -> Batch:
+    data = b"".join(encode_record(1_700_000_000_000_000 + i, f) for i, f in enumerate(frames))
+    batch = TlogScanner().feed(data, final=True)
+    assert len(batch) == len(frames)
+    return batch
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 1 << 32))
+def test_every_message_of_the_dialect(seed: int) -> None:
+    chance = random.Random(seed)
+    link = mavlink.MAVLink(None)
+    for message_id, kind in KINDS:
+        frames = some_frames(message_id, kind, chance)
+        rows = columns_of(batch_of(frames), np.arange(FRAMES), kind)
+        for frame, row in zip(frames, rows, strict=True):
+            message = link.decode(bytearray(frame))
+            for name in kind.ordered_fieldnames:
+                if row[name].dtype.kind == "S":
+                    text = getattr(message, f"_{name}_raw", None) or getattr(message, name)
+                    expected = text.encode("latin-1") if isinstance(text, str) else text
+                    assert row[name] == expected.rstrip(b"\0"), (kind.msgname, name)
+                else:
+                    expected = getattr(message, name)
+                    assert np.array_equal(row[name].tolist(), expected, equal_nan=True), (
+                        kind.msgname,
+                        name,
+                    )
+
+
+def test_only_those_that_are_wanted() -> None:
+    kind = mavlink.MAVLink_heartbeat_message
+    frames = [frame_of(0, bytes([n, 0, 0, 0, 6]), 2) for n in range(4)]
+    rows = columns_of(batch_of(frames), np.array([1, 3]), kind)
+    assert rows["custom_mode"].tolist() == [1, 3]
+    assert rows["mavlink_version"].tolist() == [0, 0]
+    assert len(columns_of(batch_of(frames), np.array([], np.int64), kind)) == 0
+
+
+@pytest.mark.parametrize("message_id", [0, 30, 331])
+def test_longer_than_it_is_known(message_id: int) -> None:
+    """A later dialect may have added fields at the end."""
+    kind = mavlink.mavlink_map[message_id]
+    payload = bytes(range(1, layout_of(kind).itemsize + 1))
+    rows = columns_of(batch_of([frame_of(message_id, payload + b"\7\7", 2)]), np.array([0]), kind)
+    assert rows.tobytes() == payload

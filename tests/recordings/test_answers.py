@@ -1,0 +1,156 @@
+"""What a recording tells of parameters, missions, home and version, and from when on."""
+
+import struct
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.recordings.answers import LogAnswers, VehicleAnswers
+from gateway.recordings.tlog import TlogIndex, TlogScanner, encode_record
+from tests.recordings.frames import START_US
+
+SECOND_US = 1_000_000
+MISSION = mavlink.MAV_MISSION_TYPE_MISSION
+FENCE = mavlink.MAV_MISSION_TYPE_FENCE
+ACCEPTED = mavlink.MAV_MISSION_ACCEPTED
+
+
+class Day:
+    """A link of vehicle 3 and station 255 that is being recorded, a message a second."""
+
+    def __init__(self) -> None:
+        self.vehicle = mavlink.MAVLink(None, 3, 1)
+        self.gimbal = mavlink.MAVLink(None, 3, 154)
+        self.station = mavlink.MAVLink(None, 255, 190)
+        self.data = b""
+        self.count = 0
+
+    def say(self, who: Any, *messages: Any) -> None:
+        for message in messages:
+            self.data += encode_record(self.now_us, bytes(message.pack(who)))
+            self.count += 1
+
+    @property
+    def now_us(self) -> int:
+        return START_US + self.count * SECOND_US
+
+    def answers(self, at_us: int | None = None, played_as: int = 3) -> VehicleAnswers:
+        batch = TlogScanner().feed(self.data, final=True)
+        index, found = TlogIndex(), LogAnswers()
+        index.add(batch)
+        found.note(batch, index.stations)
+        time_us = self.now_us if at_us is None else at_us
+        return VehicleAnswers(found, 3, played_as, lambda: time_us)
+
+
+@pytest.fixture
+def day() -> Day:
+    return Day()
+
+
+def value(name: str, number: float, index: int = 0, count: int = 2) -> Any:
+    return mavlink.MAVLink_param_value_message(name.encode(), number, 9, count, index)
+
+
+def item(sequence: int, kind: int = MISSION, target: int = 255) -> Any:
+    return mavlink.MAVLink_mission_item_int_message(
+        target, 1, sequence, 6, 16, 0, 1, 0, 0, 0, 0, 470_000_000 + sequence, 85_000_000, 50, kind
+    )
+
+
+def count_of(items: int, kind: int = MISSION, target: int = 255) -> Any:
+    return mavlink.MAVLink_mission_count_message(target, 1, items, kind)
+
+
+def decode(frame: bytes) -> Any:
+    return mavlink.MAVLink(None).decode(bytearray(frame))
+
+
+def test_parameters_are_whole_and_numbered_anew(day: Day) -> None:
+    day.say(day.vehicle, value("BETA", 2.0, 7, 900), value("ALPHA", 1.0, 3, 900))
+    day.say(day.vehicle, value("GAMMA", 5.0, 65535, 900))
+    day.say(day.gimbal, value("GIMBAL", 9.0))
+    found = [decode(frame) for frame in day.answers(played_as=8).parameters().values()]
+    assert [(m.param_id, m.param_index, m.param_count) for m in found] == [
+        ("ALPHA", 0, 3), ("BETA", 1, 3), ("GAMMA", 2, 3),
+    ]  # fmt: skip
+    assert {m.get_srcSystem() for m in found} == {8}
+
+
+def test_a_parameter_holds_from_when_it_was_sent_and_the_first_before(day: Day) -> None:
+    day.say(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
+    moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
+    answers = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
+    assert [decode(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
+
+
+def test_a_value_keeps_its_bits_whatever_its_type(day: Day) -> None:
+    # A signalling NaN as a float: autopilots put the bits of integers there.
+    bits = struct.pack("<i", -5_000_000)
+    frame = bytearray(value("COUNT", 1.0).pack(day.vehicle))
+    frame[10:14] = bits
+    crc = mavlink.x25crc(frame[1:-2] + bytes([220])).crc
+    day.data = encode_record(START_US, bytes(frame[:-2]) + struct.pack("<H", crc))
+    assert day.answers().parameters()["COUNT"][10:14] == bits
+
+
+def test_a_download_that_is_whole_is_the_mission(day: Day) -> None:
+    day.say(day.vehicle, count_of(2), item(0), item(1))
+    mission = day.answers().mission(MISSION)
+    assert mission is not None
+    assert [decode(frame).x for frame in mission] == [470_000_000, 470_000_001]
+
+
+def test_a_download_that_was_broken_off_is_none(day: Day) -> None:
+    day.say(day.vehicle, count_of(2), item(0))
+    assert day.answers().mission(MISSION) is None
+
+
+def test_an_upload_counts_when_the_vehicle_took_it(day: Day) -> None:
+    day.say(day.station, count_of(1, FENCE, 3), item(0, FENCE, 3))
+    assert day.answers().mission(FENCE) is None
+    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, FENCE))
+    assert len(day.answers().mission(FENCE) or ()) == 1
+
+
+def test_a_refused_upload_changes_nothing(day: Day) -> None:
+    day.say(day.vehicle, count_of(1), item(0))
+    day.say(day.station, count_of(1, target=3), item(0, target=3))
+    denied = mavlink.MAV_MISSION_DENIED
+    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, denied, MISSION))
+    mission = day.answers().mission(MISSION)
+    assert mission is not None
+    assert decode(mission[0]).get_srcSystem() == 3
+
+
+def test_clearing_all_leaves_three_empty_lists(day: Day) -> None:
+    everything = mavlink.MAV_MISSION_TYPE_ALL
+    day.say(day.vehicle, count_of(1), item(0))
+    loaded_us = day.now_us - 1
+    day.say(day.station, mavlink.MAVLink_mission_clear_all_message(3, 1, everything))
+    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, everything))
+    assert [day.answers().mission(kind) for kind in (0, 1, 2)] == [(), (), ()]
+    assert len(day.answers(loaded_us).mission(MISSION) or ()) == 1
+
+
+def test_home_is_that_of_the_moment(day: Day) -> None:
+    for lat, since_us in ((470_000_000, 1), (470_000_000, 2), (480_000_000, 3)):
+        home = mavlink.MAVLink_home_position_message(
+            lat, 85_000_000, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, since_us
+        )
+        day.say(day.vehicle, home)
+    latitudes = []
+    for second in (0, 1, 2):
+        (frame,) = day.answers(START_US + second * SECOND_US).frames(242)
+        latitudes.append(decode(frame).latitude)
+    assert latitudes == [470_000_000, 470_000_000, 480_000_000]
+
+
+def test_what_was_not_sent_is_not_known(day: Day) -> None:
+    day.say(day.station, value("ALPHA", 1.0))
+    answers = day.answers()
+    assert answers.parameters() == {}
+    assert answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == []
+    assert answers.mission(MISSION) is None
+    assert not answers.has_message(mavlink.MAVLINK_MSG_ID_PARAM_VALUE)

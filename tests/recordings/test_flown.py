@@ -1,0 +1,105 @@
+"""Any recording becomes a flight that the simulated receiver sends again."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.flown import open_flown
+from gateway.recordings.reading import FlightError, ReadOptions
+from gateway.recordings.table import encode_head
+from gateway.recordings.tlog import encode_record
+from tests.recordings.frames import START_US, make_records, make_tlog
+from tests.recordings.test_replay import fly, make_flight, read
+
+pytestmark = pytest.mark.io
+
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+
+
+def test_a_recording_of_two_parts(tmp_path: Path, rng: np.random.Generator) -> None:
+    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 12))[0])
+    half = len(rows) // 2
+    parts = []
+    for number, some in ((1, rows[:half]), (2, rows[half:])):
+        parts.append(tmp_path / f"a_{number:02d}_v1.csv")
+        parts[-1].write_text(encode_head(header) + "".join(map(row_to_line, some)))
+    flight = open_flown(parts, OPTIONS)
+    sampled = [row for row in rows if row.imu is not None]
+    assert len(flight.time_s) == len(sampled)
+    np.testing.assert_array_equal(
+        flight.accel_b_mps2, [row.imu.accel_b_mps2 for row in sampled if row.imu]
+    )
+    fixes = [row.gps for row in rows if row.gps is not None and row.gps.fix_ok]
+    assert 0 < len(flight.gps_time_s) <= len(fixes)
+    assert flight.gps_lat_deg[-1] == pytest.approx(fixes[-1].lat_dege7 * 1e-7)
+    assert np.isfinite(flight.baro_alt_m).sum() > 10
+
+
+def test_counts_alone_are_calibrated(tmp_path: Path, rng: np.random.Generator) -> None:
+    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 2))[0])
+    whole, bare = tmp_path / "whole.csv", tmp_path / "bare.csv"
+    names = encode_head(header).splitlines()[-1].split(",")
+    whole.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
+    kept = [
+        i for i, name in enumerate(names) if not name.endswith(("_b_mps2", "_b_radps", "_b_ut"))
+    ]
+    lines = [encode_head(header).splitlines()[-1], *map(row_to_line, rows)]
+    head = "\n".join(encode_head(header).splitlines()[:-1])
+    cut = [",".join(line.rstrip("\n").split(",")[i] for i in kept) for line in lines]
+    bare.write_text("\n".join([head, *cut]) + "\n")
+    a, b = open_flown([whole], OPTIONS), open_flown([bare], OPTIONS)
+    np.testing.assert_allclose(a.accel_b_mps2, b.accel_b_mps2, atol=1e-9)
+    np.testing.assert_allclose(a.gyro_b_radps, b.gyro_b_radps, atol=1e-9)
+
+
+def test_an_autopilots_tlog(tmp_path: Path) -> None:
+    mav = mavlink.MAVLink(None, 1, 1)
+    data = b""
+    for k in range(300):
+        at_us = 20_000 * k
+        imu = mavlink.MAVLink_highres_imu_message(
+            at_us, 0.1, 0.2, -9.8, 0.01, 0.02, 0.03, 0.2, 0.0, 0.4, 950.0, 0.0, 540.0, 20.0, 0x1FFF
+        )
+        data += encode_record(START_US + at_us, bytes(imu.pack(mav)))
+        if k % 10 == 0:
+            gps = mavlink.MAVLink_gps_raw_int_message(
+                at_us, 3, 470_000_000 + k, 85_000_000, 540_000, 100, 100, 500, 0, 9
+            )
+            data += encode_record(START_US + at_us, bytes(gps.pack(mav)))
+    path = tmp_path / "other.tlog"
+    path.write_bytes(data)
+    flight = open_flown([path], OPTIONS)
+    assert len(flight.time_s) == 300
+    assert flight.rate_hz == pytest.approx(50.0)
+    np.testing.assert_allclose(flight.accel_b_mps2[0], [0.1, 0.2, -9.8], atol=1e-6)
+    np.testing.assert_allclose(flight.gps_lat_deg[-1], 47.000029, atol=1e-7)
+
+
+def test_another_programs_csv(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "log.csv"
+    rows = [f"{k / 50},{k},0,-9.8,0,0,0,{100 + k},90,7\n" for k in range(9)]
+    rows[3] = "oops" + rows[3]
+    names = "time_s,ax,ay,az,gx,gy,gz,baro_alt_m,gps_course_deg,gps_speed_ms"
+    for name, value in {"gps_lat": 47, "gps_lon": 8}.items():
+        names += f",{name}"
+        rows[5] = rows[5].replace("\n", f",{value}\n")
+    path.write_text(f"# gps_latency_s=0.17\n{names}\n" + "".join(rows))
+    flight = open_flown([path], OPTIONS)
+    assert flight.accel_b_mps2[:, 0].tolist() == [0, 1, 2, 4, 5, 6, 7, 8]
+    np.testing.assert_allclose(flight.time_s, flight.accel_b_mps2[:, 0] / 50)
+    np.testing.assert_allclose(flight.baro_alt_m, 100 + flight.accel_b_mps2[:, 0])
+    np.testing.assert_allclose(flight.gps_vel_n_mps, [[0.0, 7.0, 0.0]], atol=1e-9)
+    assert (flight.gps_latency_s, flight.gps_time_s.tolist()) == (0.17, [0.1])
+    assert "left out 1 line that cannot be read" in caplog.text
+
+
+def test_what_holds_no_flight_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.tlog"
+    path.write_bytes(make_tlog(make_records(9)))
+    with pytest.raises(FlightError, match=r"a\.tlog: holds no HIGHRES_IMU"):
+        open_flown([path], OPTIONS)

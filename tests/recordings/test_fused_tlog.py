@@ -1,0 +1,137 @@
+"""A tlog that is made while it is played."""
+
+import asyncio
+import tempfile
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.live.player_edge import PlayerEdge
+from gateway.recordings import files as recording_streams
+from gateway.recordings.files import temporary_copy
+from gateway.recordings.opening import PIECE, FusedTlog
+from gateway.recordings.play import Player, Track
+from gateway.recordings.tlog import TlogRecord
+from tests.conftest import ManualClock
+from tests.recordings.frames import START_US, STEP_US, make_records
+
+pytestmark = pytest.mark.io
+
+RECORDS = make_records(1000)
+END_US = RECORDS[-1].time_us
+
+
+class Making:
+    """Records that tell how many of them were made."""
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def __iter__(self) -> Iterator[TlogRecord]:
+        for record in RECORDS:
+            self.made += 1
+            yield record
+
+
+@pytest.fixture
+def making() -> Making:
+    return Making()
+
+
+@pytest.fixture
+def tlog(making: Making) -> Iterator[FusedTlog]:
+    opened = FusedTlog(iter(making), END_US)
+    yield opened
+    opened.close()
+
+
+def play_all(track: Track) -> list[TlogRecord]:
+    found = []
+    while (time_us := track.peek_us()) is not None:
+        found.append(TlogRecord(time_us, track.take()))
+    return found
+
+
+def test_it_is_made_as_it_is_wanted(making: Making, tlog: FusedTlog) -> None:
+    assert making.made <= 2 * PIECE
+    track = Track(tlog)
+    assert (track.first_us, track.last_us, tlog.index.origins) == (START_US, END_US, {0x101})
+    for record in RECORDS[:100]:
+        assert track.peek_us() == record.time_us
+        assert track.take() == record.frame
+    assert making.made <= 100 + 2 * PIECE
+    assert play_all(track) == RECORDS[100:]
+
+
+def test_one_can_seek_back_and_play_it_again(tlog: FusedTlog) -> None:
+    track = Track(tlog)
+    assert play_all(track) == RECORDS
+    track.seek(START_US + 300 * STEP_US)
+    assert play_all(track) == RECORDS[300:]
+
+
+def test_preparing_goes_in_small_pieces_and_ends(making: Making, tlog: FusedTlog) -> None:
+    made = making.made
+    assert not tlog.prepare(START_US + 500 * STEP_US)
+    assert making.made <= made + PIECE
+    while not tlog.prepare(START_US + 500 * STEP_US):
+        pass
+    assert 500 <= making.made <= 500 + 2 * PIECE
+    while not tlog.prepare(2 * END_US):
+        pass
+    assert making.made == len(RECORDS)
+
+
+async def test_the_old_place_plays_on_until_a_seek_is_ready(
+    making: Making, tlog: FusedTlog, clock: ManualClock
+) -> None:
+    frames: list[bytes] = []
+
+    def emit(new: Iterable[bytes]) -> None:
+        frames.extend(new)
+
+    edge = PlayerEdge(Player([Track(tlog)], clock()), emit, clock)
+    edge.start()
+    edge.seek(10.0)
+    assert edge.status().state == "seeking"
+    assert edge.status().duration_s == pytest.approx((END_US - START_US) / 1e6)
+    clock.advance(STEP_US / 1e6)
+    edge.seek(5.0, relative=True)
+    assert frames == [record.frame for record in RECORDS[:2]]
+    for _ in range(2 * len(RECORDS)):
+        await asyncio.sleep(0)
+    assert edge.status().state == "playing"
+    assert edge.status().position_s == pytest.approx(15.0)
+    assert frames[-1] == RECORDS[15_000_000 // STEP_US].frame
+    assert making.made < len(RECORDS)
+    edge.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_ends_the_playback_and_nothing_else(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("w+b"))  # noqa: SIM115
+    file = FusedTlog(iter(RECORDS))
+    assert file.prepare(RECORDS[-1].time_us)
+    assert "The rest cannot be played" in caplog.text
+    file.close()
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_copy_that_finds_no_room_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.bin"
+    monkeypatch.setattr(
+        recording_streams,
+        "NamedTemporaryFile",
+        lambda **_: Path("/dev/full").open("wb"),  # noqa: SIM115
+    )
+    with (
+        pytest.raises(OSError, match=f"No space left on device for a copy of {path}") as caught,
+        temporary_copy(path, [b"1"]),
+    ):
+        pass
+    assert caught.value.filename == tempfile.gettempdir()

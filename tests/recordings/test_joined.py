@@ -1,0 +1,98 @@
+"""Recordings behind one another: in their place by civil time, and nothing twice."""
+
+import numpy as np
+import pytest
+
+from gateway.recordings.columns import COLUMNS
+from gateway.recordings.join import joined_tables
+from gateway.recordings.reading import FlightError, RecordedTable
+from gateway.recordings.table import TableBlock, TableHeader, TableMark
+
+SECOND_US = 1_000_000
+EPOCH_US = 1_780_000_000 * SECOND_US
+
+
+def table(begin_s: int, end_s: int, zero_us: int | None, session: str = "") -> RecordedTable:
+    """Return a row a second; each tenth is remarked.
+
+    They are on a clock of their own, which begins at 0, unless they are part of a session.
+    """
+    seconds = np.arange(begin_s, end_s)
+    zero_s = 0 if session else begin_s
+    cells = np.full((len(seconds), len(COLUMNS)), np.nan)
+    cells[:, 0] = (seconds - zero_s) * SECOND_US
+    if zero_us is not None:
+        zero_us += zero_s * SECOND_US
+    head = TableHeader(vehicle_id=1, unix_us_at_zero=zero_us, session=session)
+    marks = [
+        (k, TableMark((second - zero_s) * SECOND_US, f"{second}"))
+        for k, second in enumerate(seconds.tolist())
+        if second % 10 == 0
+    ]
+    half = len(seconds) // 2
+    first = TableBlock(cells[:half], tuple((k, m) for k, m in marks if k < half))
+    rest = TableBlock(cells[half:], tuple((k - half, m) for k, m in marks if k >= half))
+    return RecordedTable(head, iter([first, rest]))
+
+
+def seconds_of(joined: RecordedTable) -> tuple[list[int], list[int]]:
+    """Return the times of rows and of remarks, which have their own second as text."""
+    blocks = list(joined.blocks)
+    marks = [mark for block in blocks for _, mark in block.comments]
+    assert [mark.time_us / SECOND_US for mark in marks] == [int(mark.text) for mark in marks]
+    times = np.concatenate([block.cells[:, 0] for block in blocks])
+    return (times / SECOND_US).astype(int).tolist(), [int(mark.text) for mark in marks]
+
+
+@pytest.mark.parametrize("spans", [((0, 40), (40, 80)), ((0, 40), (60, 90), (90, 99))])
+def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int], ...]) -> None:
+    joined = joined_tables([table(*span, EPOCH_US) for span in spans])
+    times, _ = seconds_of(joined)
+    assert times == [second for span in spans for second in range(*span)]
+    assert joined.remarks == []
+
+
+@pytest.mark.parametrize("session", ["", "20260611-142530"])
+@pytest.mark.parametrize(
+    ("spans", "kept", "left_out"),
+    [
+        (((0, 40), (25, 60)), range(60), 14),
+        (((0, 40), (5, 12), (39, 50)), range(50), 7),
+        (((0, 40), (0, 40)), range(40), 39),
+    ],
+)
+def test_what_two_recordings_hold_is_taken_once(
+    spans: tuple[tuple[int, int], ...], kept: range, left_out: int, session: str
+) -> None:
+    joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
+    times, marks = seconds_of(joined)
+    # The last second of a recording may hold more than one row.
+    assert sorted(set(times)) == [*kept]
+    assert times == sorted(times)
+    assert sorted(set(marks)) == [*kept[::10]]
+    (remark,) = joined.remarks
+    assert remark.startswith(f"left out {left_out} rows")
+
+
+@pytest.mark.parametrize("session", ["", "20260611-142530"])
+@pytest.mark.parametrize("spans", [((50, 90), (0, 40)), ((0, 40), (80, 90), (40, 80))])
+def test_an_older_recording_behind_a_newer_one_is_refused(
+    spans: tuple[tuple[int, int], ...], session: str
+) -> None:
+    joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
+    with pytest.raises(FlightError, match="give the oldest first"):
+        list(joined.blocks)
+
+
+def test_recordings_without_a_civil_time_stay_on_their_clock() -> None:
+    joined = joined_tables([table(0, 9, None), table(20, 29, None)])
+    times = np.concatenate([block.cells[:, 0] for block in joined.blocks]) / SECOND_US
+    assert times.tolist() == [*range(9), *range(9)]
+
+
+def test_parts_of_a_recording_stay_on_their_clock() -> None:
+    """GPS has corrected the time between them; a row that came late is in its place."""
+    first, second = table(0, 10, EPOCH_US, "flight"), table(9, 20, EPOCH_US + 10**9, "flight")
+    times, marks = seconds_of(joined := joined_tables([first, second]))
+    assert times == [*range(10), *range(9, 20)]
+    assert (marks, joined.remarks) == ([0, 10], [])

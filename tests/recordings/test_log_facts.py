@@ -1,0 +1,105 @@
+"""What a log of another program tells of its GPS, the same for every command that fuses it."""
+
+import gzip
+from pathlib import Path
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from gateway.analysis.case import make_case
+from gateway.analysis.reporting.sections.estimators import estimators
+from gateway.cli.app import app
+from gateway.cli.support.loading import Loading, load_flight
+from gateway.config import GatewaySettings
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.flown import open_flown
+from gateway.recordings.fuse import RecordedFusion, aircraft_for
+from gateway.recordings.reading import ReadOptions, open_rows, settings_of
+from gateway.season.batch.flight_tasks import read_season_flight
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "take_off.csv.gz"
+SETTINGS = GatewaySettings().default_aircraft
+OPTIONS = ReadOptions(PipelineSettings(SETTINGS))
+
+
+@pytest.fixture
+def without_latency(tmp_path: Path) -> Path:
+    path = tmp_path / "log.csv"
+    path.write_text(gzip.decompress(GOLDEN.read_bytes()).decode().replace("gps_latency_s=0.16", ""))
+    return path
+
+
+def test_every_command_takes_the_latency_that_the_manoeuvres_tell(without_latency: Path) -> None:
+    table = open_rows(without_latency, OPTIONS)
+    latency_s = aircraft_for([without_latency], table, OPTIONS).estimation.reference.gps_latency_s
+    assert latency_s == pytest.approx(0.16, abs=0.02)
+    assert "gives no GPS latency; 0.1" in table.remarks[0]
+    assert "s is estimated from its manoeuvres" in table.remarks[0]
+    assert load_flight(without_latency, Loading(GatewaySettings())).latency_s == latency_s
+    assert read_season_flight([without_latency], OPTIONS, "log").flight.latency_s == latency_s
+    fusion = RecordedFusion([without_latency], OPTIONS)
+    assert fusion.remarks == table.remarks
+    assert open_flown([without_latency], OPTIONS).gps_latency_s == latency_s
+    settings = settings_of(fusion.table().header)
+    assert settings.estimation.reference.gps_latency_s == latency_s
+
+
+def test_the_rows_are_read_once(without_latency: Path) -> None:
+    """The first reader leaves them to the next."""
+    table, again = open_rows(without_latency, OPTIONS), open_rows(without_latency, OPTIONS)
+    aircraft_for([without_latency], table, OPTIONS)
+    assert sum(map(len, table.blocks)) == sum(map(len, again.blocks)) > 0
+
+
+@pytest.mark.parametrize("set_s", [0.16, 0.4])
+def test_a_recording_that_was_fused_with_another_latency_is_reported(
+    without_latency: Path, tmp_path: Path, set_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    own, config = tmp_path / "own.csv", tmp_path / "c.toml"
+    config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
+    convert = ["convert", str(without_latency), "-o", str(own), "--fuse", "--config", str(config)]
+    assert CliRunner().invoke(app, convert).exit_code == 0
+    assert load_flight(own, Loading(GatewaySettings())).latency_s == set_s
+    words = " ".join(capsys.readouterr().err.split())
+    assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
+
+
+def test_what_the_log_the_user_or_the_settings_tell_is_taken(without_latency: Path) -> None:
+    def latency_s(path: Path, options: ReadOptions, told_s: float | None = None) -> float:
+        table = open_rows(path, options)
+        found = aircraft_for([path], table, options, told_s).estimation.reference.gps_latency_s
+        assert table.remarks == []
+        return found
+
+    assert latency_s(GOLDEN, OPTIONS) == 0.16
+    assert latency_s(GOLDEN, OPTIONS, 0.3) == latency_s(without_latency, OPTIONS, 0.3) == 0.3
+    reference = msgspec.structs.replace(SETTINGS.estimation.reference, gps_latency_s=0.2)
+    estimation = msgspec.structs.replace(SETTINGS.estimation, reference=reference)
+    set_s = PipelineSettings(msgspec.structs.replace(SETTINGS, estimation=estimation))
+    assert latency_s(without_latency, ReadOptions(set_s)) == 0.2
+
+
+def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
+    tmp_path: Path,
+) -> None:
+    path, out = tmp_path / "log.csv", tmp_path / "smoothed.csv"
+    text = gzip.decompress(GOLDEN.read_bytes()).decode()
+    path.write_text(text.replace("gps_latency_s=0.16", "gps_latency_s=0.4"))
+    remark = "smoothed with a GPS latency of 0.1"
+    fused = CliRunner().invoke(app, ["fuse", str(path), "-o", str(out), "--smooth"])
+    assert remark in " ".join(fused.output.split())
+    table = open_rows(out, OPTIONS)
+    latency_s = settings_of(table.header).estimation.reference.gps_latency_s
+    assert latency_s == pytest.approx(0.16, abs=0.02)
+    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    assert remark in fusion.remarks[0]
+    settings = settings_of(fusion.table().header)
+    assert settings.estimation.reference.gps_latency_s == latency_s
+    case = make_case(load_flight(path, Loading(GatewaySettings())), smooth=True)
+    assert case.smoothed_latency_s == latency_s
+    section = estimators(case)
+    assert section is not None
+    assert f"0.40 s: `smoothed` uses the {latency_s:.2f} s" in section.lead

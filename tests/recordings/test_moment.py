@@ -1,0 +1,37 @@
+"""Moments as people write them."""
+
+import pytest
+
+from gateway.recordings.join import Moment, parse_moment, place_in
+
+DAY_US = 86_400_000_000
+
+
+@pytest.mark.parametrize(
+    ("text", "moment"),
+    [
+        ("80", Moment(80.0)),
+        ("80.5s", Moment(80.5)),
+        ("1:20", Moment(80.0)),
+        ("1:02:03.25", Moment(3723.25)),
+        ("+10", Moment(10.0, relative=True)),
+        ("-0:30", Moment(-30.0, relative=True)),
+        (" 0 ", Moment(0.0)),
+        ("1970-01-02T00:00:00Z", Moment(time_us=DAY_US)),
+        ("1970-01-02", Moment(time_us=DAY_US)),
+        ("1970-01-02T02:00:00+02:00", Moment(time_us=DAY_US)),
+    ],
+)
+def test_ways_to_write_a_moment(text: str, moment: Moment) -> None:
+    assert parse_moment(text) == moment
+
+
+@pytest.mark.parametrize("text", ["", "soon", "1:2:3:4", "--5", "1:", "2026-13-01", "nan", "1e3"])
+def test_what_is_no_moment(text: str) -> None:
+    with pytest.raises(ValueError, match="no moment"):
+        parse_moment(text)
+
+
+def test_place_in_a_recording() -> None:
+    assert place_in(parse_moment("1:20"), 1_000) == 80_001_000
+    assert place_in(parse_moment("1970-01-02"), 1_000) == DAY_US

@@ -1,0 +1,126 @@
+"""What the player makes of its files before it begins."""
+
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.answers import VehicleAnswers
+from gateway.recordings.columns import row_to_line
+from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
+from gateway.recordings.reading import FlightError, ReadOptions, header_for
+from gateway.recordings.table import encode_head, encode_header
+from gateway.recordings.tlog import TlogRecord
+from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
+from tests.recordings.test_replay import fly, make_flight, read
+
+pytestmark = pytest.mark.io
+
+RECORDS = make_records(300)
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+
+
+def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
+    path = folder / name
+    path.write_bytes(make_tlog(records))
+    return path
+
+
+def laid_out(files: list[Path], *wished: int) -> list[PlayedFlight]:
+    with ExitStack() as opened:
+        return lay_out(open_flights(files, OPTIONS, opened), wished, with_commands=False)
+
+
+def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
+    parts = [write(tmp_path, f"a_0{n}.tlog", RECORDS[100 * n :][:100]) for n in (0, 1, 2)]
+    (flight,) = laid_out(parts)
+    assert flight.system_ids == {1: 1}
+    firsts = [track.first_us for track in flight.tracks]
+    assert firsts == [START_US + n * 100 * STEP_US for n in (0, 1, 2)]
+
+
+def test_other_recordings_are_vehicles_of_their_own(tmp_path: Path) -> None:
+    first = write(tmp_path, "first.tlog", RECORDS[:100])
+    later = write(tmp_path, "later.tlog", RECORDS[200:])
+    flights = laid_out([first, later, first], 5)
+    assert [flight.system_ids for flight in flights] == [{1: 5}, {1: 1}, {1: 2}]
+    # Flights of other days begin together.
+    assert [track.first_us for flight in flights for track in flight.tracks] == [START_US] * 3
+    assert [flight.shift_us for flight in flights] == [0, -200 * STEP_US, 0]
+
+
+def test_parts_of_a_table_are_fused_as_one(tmp_path: Path, rng: np.random.Generator) -> None:
+    header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
+    parts = []
+    for number, some in ((1, rows[:200]), (2, rows[200:])):
+        parts.append(tmp_path / f"a_0{number}_v1.csv")
+        parts[-1].write_text(encode_head(header) + "".join(map(row_to_line, some)))
+    (flight,) = laid_out(parts)
+    (track,) = flight.tracks
+    assert track.last_us == rows[-1].time_us
+
+
+def test_a_fused_flight_answers_with_the_settings_that_it_is_fused_by(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    then = GatewaySettings().default_aircraft
+    vehicle = msgspec.structs.replace(then.vehicle, node_silent_s=7.5)
+    header, rows = read(fly(msgspec.structs.replace(then, vehicle=vehicle), make_flight(rng, 3))[0])
+    path = tmp_path / "a_01_v1.csv"
+    path.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
+    (flight,) = laid_out([path])
+    answers = VehicleAnswers(flight.answers, 1, 1, lambda: START_US)
+    (silent,) = (f for n, f in answers.parameters().items() if "SILENT" in n)
+    assert mavlink.MAVLink(None).decode(bytearray(silent)).param_value == 7.5
+    assert len(answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)) == 1
+
+
+def test_settings_changed_in_flight_are_answered_from_then_on(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    then = GatewaySettings().default_aircraft
+    sensing = msgspec.structs.replace(then.sensing, accel_cutoff_hz=3.5)
+    changed = header_for(msgspec.structs.replace(then, sensing=sensing), 1)
+    header, rows = read(fly(then, make_flight(rng, 6))[0])
+    half = len(rows) // 2
+    path = tmp_path / "a_01_v1.csv"
+    lines = [*map(row_to_line, rows[:half]), encode_header(changed), *map(row_to_line, rows[half:])]
+    path.write_text(encode_head(header) + "".join(lines))
+    with ExitStack() as opened:
+        (flight,) = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)
+        (track,) = flight.tracks
+        while not track.prepare(rows[-1].time_us):
+            pass
+    answered = {}
+    for at_us in (rows[0].time_us, rows[-1].time_us):
+        answers = VehicleAnswers(flight.answers, 1, 1, lambda at_us=at_us: at_us).parameters()
+        (cutoff,) = (frame for name, frame in answers.items() if "ACC_CUTOFF" in name)
+        answered[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
+    assert list(answered.values()) == [then.sensing.accel_cutoff_hz, 3.5]
+
+
+def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:
+    station = mavlink.MAVLink(None, 42, 190)
+    beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+    records = [*RECORDS[:9], TlogRecord(RECORDS[9].time_us, bytes(beat.pack(station)))]
+    (flight,) = laid_out([write(tmp_path, "a.tlog", records)])
+    assert flight.system_ids == {1: 1}
+
+
+def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(FlightError, match=r"empty.tlog: is no recording"):
+        laid_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])
+
+
+def test_vehicles_of_a_recording_follow_the_id_of_its_first(tmp_path: Path) -> None:
+    both = write(tmp_path, "both.tlog", [*RECORDS[:50], *make_records(50, system_id=7)])
+    assert [flight.system_ids for flight in laid_out([both, both], 200)] == [
+        {1: 200, 7: 201},
+        {1: 1, 7: 7},
+    ]
+    assert laid_out([both], 249)[0].system_ids[7] < 249, "ground stations begin at 250"

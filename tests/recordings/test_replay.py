@@ -1,0 +1,338 @@
+"""A recorded flight, fused again, is the flight."""
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from gateway.aircraft import AircraftSettings, SettingsChanged
+from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
+from gateway.recordings.fuse import InterpolatedPosition, Replay
+from gateway.recordings.reading import header_for, settings_of
+from gateway.recordings.table import (
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_head,
+    encode_header,
+    encode_state,
+)
+from gateway.records import (
+    BaroRaw,
+    FusedSample,
+    FusionState,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    ImuRaw,
+    NavState,
+    NodeId,
+    Outgoing,
+    RawRecord,
+)
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensingSettings
+from gateway.vehicle.actions import SettingsChange
+from gateway.vehicle.vehicle_settings import VehicleSettings
+
+IMU_US = 16_000
+CALIBRATION = NodeCalibration(
+    accel_bias_mps2=(0.1, -0.2, 1 / 3), gyro_bias_radps=(0.01, 0.02, -0.03)
+)
+
+
+def make_settings(estimator: str) -> AircraftSettings:
+    return AircraftSettings(
+        sensing=SensingSettings(accel_cutoff_hz=7.3),
+        estimation=msgspec.convert({"estimator": estimator}, EstimationSettings),
+        vehicle=VehicleSettings(signing_passphrase="secret"),
+        calibration=CALIBRATION,
+    )
+
+
+def make_flight(rng: np.random.Generator, seconds: float) -> list[RawRecord]:
+    """Fly a circle, with fixes and pressures that sometimes bunch up or come out of step."""
+    records: list[RawRecord] = []
+    node, count = NodeId(1, 0), int(seconds * 1e6 / IMU_US)
+    for i in range(count):
+        t = i * IMU_US + int(rng.integers(2000))
+        if i % 6 == 0 or rng.random() < 0.02:
+            records.append(BaroRaw(t, node, t, 100_000.0 - 0.1 * i + rng.normal(), 20.1))
+        if i % 12 == 3 or rng.random() < 0.02:
+            records.append(make_fix(t, rng))
+        accel = (rng.normal(size=3) * 40 + (0, 600, 4096)).astype(int).tolist()
+        gyro = (rng.normal(size=3) * 10 + (0, 0, 600)).astype(int).tolist()
+        mag = (rng.normal(size=3) * 3 + (200, 30, -400)).astype(int).tolist()
+        flags = ImuFlags.MAG_NEW if i % 4 == 0 else ImuFlags(0)
+        records.append(
+            ImuRaw(t, node, t, tuple(accel), tuple(gyro), tuple(mag), 500, 8, 500, 1090, flags)
+        )
+    return records
+
+
+def make_fix(time_us: int, rng: np.random.Generator) -> GpsFix:
+    angle = time_us * 1e-6 * 0.2
+    return GpsFix(
+        time_us=time_us,
+        node=NodeId(1, 1),
+        node_time_us=time_us,
+        itow_ms=time_us // 1000,
+        fix_type=GpsFixType.FIX_3D,
+        fix_ok=True,
+        satellites=11,
+        lat_dege7=471_234_567 + round(9000 * math.sin(angle)),
+        lon_dege7=85_678_901 + round(13_000 * math.cos(angle)),
+        alt_amsl_m=430.123 + float(rng.normal()),
+        vel_n_mps=(20 * math.cos(angle), -20 * math.sin(angle), 0.1),
+        alt_ellipsoid_m=math.nan,
+        h_acc_m=1.5,
+        v_acc_m=2.5,
+        speed_acc_mps=0.3,
+        course_acc_deg=2.0,
+        pdop=1.4,
+        utc_us=1_781_187_930_000_000 + time_us,
+    )
+
+
+def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, list[NavState]]:
+    """Fuse live, and record as the recorder does."""
+    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
+    lines, states = [encode_head(header_for(settings, 1))], []
+    for record in records:
+        for action in pipeline.take(record, record.time_us):
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                lines += map(row_to_line, rows.add(action))
+            if isinstance(action, FusedSample):
+                states.append(action.state)
+    return "".join(lines).encode(), states
+
+
+def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:
+    reader = TableReader()
+    rows = [row for row in reader.feed(table, final=True) if isinstance(row, TableRow)]
+    assert reader.header is not None
+    return reader.header, rows
+
+
+def fuse_again(settings: AircraftSettings, rows: list[TableRow]) -> list[NavState]:
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    return [
+        action.state
+        for row in rows
+        for _, action in replay.take(row)
+        if isinstance(action, FusedSample)
+    ]
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary"])
+def test_a_table_fused_again_gives_the_recorded_states_to_the_last_bit(
+    rng: np.random.Generator, estimator: str
+) -> None:
+    settings = make_settings(estimator)
+    table, states = fly(settings, make_flight(rng, 30))
+    header, rows = read(table)
+    assert repr([row.state for row in rows if row.state]) == repr(states)
+    assert repr(fuse_again(settings_of(header), rows)) == repr(states)
+    assert math.isfinite(states[-1].lat_deg)
+
+
+def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) -> None:
+    settings = make_settings("paper")
+    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
+    text, states = encode_head(header_for(settings, 1)), []
+    changes = {
+        400: SettingsChange(1, "estimation", make_settings("complementary").estimation, ""),
+        800: SettingsChange(1, "calibration", NodeCalibration(), ""),
+        1200: SettingsChange(1, "vehicle", VehicleSettings(), ""),
+    }
+    records = make_flight(rng, 30)
+    for number, record in enumerate(records):
+        actions = pipeline.take(record, record.time_us)
+        if number in changes:
+            aircraft = pipeline.aircraft[1]
+            actions += aircraft.perform([changes[number]], record.time_us)
+        for action in actions:
+            if isinstance(action, SettingsChanged):
+                text += "".join(map(row_to_line, rows.flush()))
+                text += encode_header(header_for(pipeline.aircraft[1].settings, 1))
+            elif isinstance(action, FusedSample | BaroRaw | GpsFix):
+                text += "".join(map(row_to_line, rows.add(action)))
+            if isinstance(action, FusedSample):
+                states.append(action.state)
+    reader = TableReader()
+    events = reader.feed(text.encode(), final=True)
+    assert sum(isinstance(event, TableHeader) for event in events) == 2
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    again = [
+        action.state
+        for event in events
+        if isinstance(event, TableRow | TableHeader)
+        for _, action in replay.take(event)
+        if isinstance(action, FusedSample)
+    ]
+    assert repr(again) == repr(states)
+
+
+def fly_from_the_middle(
+    estimator: str, rng: np.random.Generator
+) -> tuple[AircraftSettings, FusionState, list[TableRow]]:
+    """Fly, and keep only what was remembered in the middle and the rows behind it."""
+    settings = make_settings(estimator)
+    pipeline, builder = Pipeline(PipelineSettings(settings)), RowBuilder()
+    records = make_flight(rng, 30)
+    state: FusionState | None = None
+    rows: list[TableRow] = []
+    for number, record in enumerate(records):
+        if number == len(records) // 2:
+            state = pipeline.aircraft[1].fusion_state
+            builder.flush()
+            rows.clear()
+        for action in pipeline.take(record, record.time_us):
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                rows += builder.add(action)
+    assert state is not None
+    text = encode_head(header_for(settings, 1)) + encode_state(state)
+    text += "".join(map(row_to_line, rows))
+    found, *again = TableReader().feed(text.encode(), final=True)
+    assert isinstance(found, FusionState)
+    assert repr(again) == repr(rows)
+    return settings, found, rows
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
+    rng: np.random.Generator, estimator: str
+) -> None:
+    settings, state, rows = fly_from_the_middle(estimator, rng)
+    recorded = [row.state for row in rows if row.state]
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    again = [
+        action.state
+        for line in [state, *rows]
+        for _, action in replay.take(line)
+        if isinstance(action, FusedSample)
+    ]
+    assert repr(again) == repr(recorded)
+    assert repr(fuse_again(settings, rows)) != repr(recorded)
+    assert state.home is not None
+    assert state.home[3] < rows[0].time_us
+    # With other settings, home is still where it was.
+    pipeline = Pipeline(PipelineSettings(make_settings("paper" if estimator == "eskf" else "eskf")))
+    assert not Replay(pipeline).restore(state)
+    for _ in Replay(pipeline).take(rows[0]):
+        pass
+    assert pipeline.aircraft[1].fusion_state.home == state.home
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary"])
+def test_a_state_that_does_not_fit_is_reported_and_left_alone(
+    rng: np.random.Generator, estimator: str
+) -> None:
+    settings, state, rows = fly_from_the_middle(estimator, rng)
+    other = msgspec.structs.replace(settings, sensing=SensingSettings(accel_cutoff_hz=7.4))
+    for settings_now, found, reason in (
+        (other, state, "other settings"),
+        (
+            settings,
+            msgspec.structs.replace(state, fits="0.0.1 0"),
+            "another version",
+        ),
+        (settings, msgspec.structs.replace(state, sensing=b"\x01"), "Expected"),
+        (settings, msgspec.structs.replace(state, estimation=state.estimation[:-40]), "truncated"),
+    ):
+        replay = Replay(Pipeline(PipelineSettings(settings_now)))
+        assert not list(replay.take(found))
+        (refused,) = replay.refused
+        assert reason in refused
+        states = [
+            action.state
+            for row in rows[:50]
+            for _, action in replay.take(row)
+            if isinstance(action, FusedSample)
+        ]
+        assert repr(states) == repr(fuse_again(settings_now, rows[:50]))
+
+
+def test_other_settings_give_another_flight(rng: np.random.Generator) -> None:
+    table, states = fly(make_settings("paper"), make_flight(rng, 10))
+    again = fuse_again(make_settings("complementary"), read(table)[1])
+    assert len(again) == len(states)
+    assert again != states
+
+
+def test_rows_without_counts_are_fused_too(rng: np.random.Generator) -> None:
+    settings = make_settings("paper")
+    table, states = fly(settings, make_flight(rng, 10))
+    rows = [replace(row, raw=None) for row in read(table)[1]]
+    again = fuse_again(settings, rows)
+    # The calibrated values of the same samples, so the same states.
+    assert repr(again) == repr(states)
+
+
+def test_replay_tells_the_vehicle_at_its_rates(rng: np.random.Generator) -> None:
+    settings = make_settings("complementary")
+    table, _ = fly(settings, make_flight(rng, 10))
+    replay = Replay(Pipeline(PipelineSettings(settings)))
+    told = [
+        (now_us, action.message_id)
+        for row in read(table)[1]
+        for now_us, action in replay.take(row)
+        if isinstance(action, Outgoing)
+    ]
+    times = [now_us for now_us, _ in told]
+    assert times == sorted(times)
+    assert 9 <= sum(message_id == 0 for _, message_id in told) <= 11
+
+
+def test_what_was_noted_in_flight_happens_again_at_its_time(rng: np.random.Generator) -> None:
+    settings = make_settings("complementary")
+    _, rows = read(fly(settings, make_flight(rng, 3))[0])
+    for follow in (True, False):
+        pipeline = Pipeline(PipelineSettings(settings))
+        playing = Replay(pipeline, follow=follow)
+        for row in rows:
+            *_, (last_us, _) = playing.take(row)
+        texts = [
+            (now_us, action.message_id)
+            for now_us, action in playing.take(TableMark(last_us + 40_000, "over the gate"))
+            if isinstance(action, Outgoing) and b"over the gate" in action.frame
+        ]
+        assert texts == [(last_us + 40_000, 253)]
+        changed = list(playing.take(header_for(make_settings("paper"), 1)))
+        assert {now_us for now_us, _ in changed} == ({last_us + 40_000} if follow else set())
+        estimator = pipeline.aircraft[1].settings.estimation.estimator
+        assert estimator == ("paper" if follow else "complementary")
+
+
+def test_settings_come_back_from_the_head() -> None:
+    settings = make_settings("paper")
+    header = header_for(settings, 1)
+    assert "secret" not in repr(header)
+    open_vehicle = msgspec.structs.replace(settings.vehicle, signing_passphrase="")
+    assert settings_of(header) == msgspec.structs.replace(settings, vehicle=open_vehicle)
+
+
+def test_settings_of_another_version_are_refused() -> None:
+    with pytest.raises(msgspec.ValidationError, match="wings"):
+        settings_of(TableHeader(settings={"sensing": {"wings": 2}}))
+
+
+def test_interpolated_positions_lie_on_the_line_between_the_fixes(
+    rng: np.random.Generator,
+) -> None:
+    first, second = make_fix(1_000_000, rng), make_fix(2_000_000, rng)
+    first = msgspec.structs.replace(first, lon_dege7=1_799_999_000, alt_amsl_m=10.0)
+    second = msgspec.structs.replace(second, lon_dege7=-1_799_999_000, alt_amsl_m=20.0)
+    position = InterpolatedPosition([first, second], 0.25)
+    _, states = fly(make_settings("paper"), make_flight(rng, 1))
+    middle = position(msgspec.structs.replace(states[0], time_us=1_250_000))
+    assert middle.alt_amsl_m == pytest.approx(15.0)
+    assert middle.lon_deg == pytest.approx(-180.0)
+    assert middle.lat_deg == pytest.approx((first.lat_dege7 + second.lat_dege7) * 0.5e-7)
+    assert middle.q_nb == states[0].q_nb
+    outside = msgspec.structs.replace(states[0], time_us=2_000_000)
+    assert position(outside) is outside

@@ -1,0 +1,117 @@
+"""Rows fused many at once have the states that they have record by record through the pipeline."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import msgspec
+import pytest
+
+from gateway.aircraft import Aircraft, AircraftSettings
+from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
+from gateway.recordings.fuse import Replay, RowFusion
+from gateway.recordings.reading import Line, header_for
+from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
+from gateway.sensing.chain import SensingSettings
+from gateway.simulator.flight import fly
+from gateway.simulator.simulator_settings import SimulatorSettings
+
+DURATION_S = 25.0
+BLOCK = 700
+
+
+def settings_for(estimator: str) -> AircraftSettings:
+    return AircraftSettings(estimation=EstimationSettings(estimator=estimator))
+
+
+def flown() -> list[Line]:
+    """Return rows as a recording has them, with rows that no sample stands in."""
+    rows: list[Line] = []
+    simulator = SimulatorSettings(gps_first_fix_s=2.0)
+    baro: BaroRaw | None = None
+    gps: GpsFix | None = None
+    for number, record in enumerate(fly(simulator, duration_s=DURATION_S).records()):
+        if isinstance(record, BaroRaw):
+            if baro is not None or gps is not None or number % 7 == 0:
+                rows += [TableRow(r.time_us, b, g) for r, b, g in [(gps or baro, baro, gps)] if r]
+                gps = None
+            baro = record
+        elif isinstance(record, GpsFix):
+            gps = record
+        elif isinstance(record, ImuRaw):
+            rows.append(TableRow(record.time_us, baro, gps, record))
+            baro = gps = None
+    return rows
+
+
+def one_by_one(lines: list[Line], settings: AircraftSettings) -> Iterator[TableRow]:
+    """Fuse as if every record came live."""
+    replay, builder = Replay(Pipeline(PipelineSettings(settings))), RowBuilder()
+    for line in lines:
+        for _, action in replay.take(line):
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                yield from builder.add(action)
+        yield from builder.flush()
+
+
+def at_once(lines: list[Line], settings: AircraftSettings) -> list[TableEvent]:
+    fusion = RowFusion(Aircraft(1, settings), follow=True)
+    blocks = [block_of(lines[k : k + BLOCK]) for k in range(0, len(lines), BLOCK)]
+    return [event for block in fusion.blocks(blocks) for event in block.events(1)]
+
+
+@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+def test_the_same_bits(estimator: str) -> None:
+    lines, settings = flown(), settings_for(estimator)
+    assert any(row.raw is None for row in lines if isinstance(row, TableRow))
+    assert len(lines) > 2 * BLOCK
+    expected = [row_to_line(row) for row in one_by_one(lines, settings)]
+    found = at_once(lines, settings)
+    assert [row_to_line(row) for row in found if isinstance(row, TableRow)] == expected
+
+
+@pytest.mark.parametrize("estimator", ["complementary", "eskf"])
+def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -> None:
+    lines, settings = flown()[:900], settings_for(estimator)
+    rows = [row for row in lines if isinstance(row, TableRow)]
+    for k, row in enumerate(rows):
+        if k % 50 == 20 and row.raw is not None:
+            back = msgspec.structs.replace(row.raw, time_us=row.time_us - 10_000 * (k % 3))
+            rows[k] = replace(row, time_us=back.time_us, raw=back)
+    first = next(row for row in rows if row.baro and row.raw)
+    fix = next(row.gps for row in rows if row.gps)
+    for k in range(300, 800, 100):
+        rows.insert(
+            k, TableRow(rows[k].time_us, gps=msgspec.structs.replace(fix, time_us=rows[k].time_us))
+        )
+        rows.insert(k + 1, TableRow(rows[k].time_us, baro=first.baro))
+    expected = [row_to_line(row) for row in one_by_one([*rows], settings)]
+    assert [
+        row_to_line(r) for r in at_once([*rows], settings) if isinstance(r, TableRow)
+    ] == expected
+
+
+def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None:
+    lines, settings = flown(), settings_for("complementary")
+    other = msgspec.structs.replace(
+        settings, sensing=SensingSettings(accel_cutoff_hz=3.0), estimation=EstimationSettings()
+    )
+    mark, header = TableMark(1, "here"), header_for(other, 1)
+    begun = Aircraft(1, settings).fusion_state
+    lines = [begun, *lines[:500], mark, header, *lines[500:900]]
+    expected = [row_to_line(row) for row in one_by_one(lines, settings)]
+    found = at_once(lines, settings)
+    assert [row_to_line(row) for row in found if isinstance(row, TableRow)] == expected
+    assert [type(line) for line in found if not isinstance(line, TableRow)] == [
+        FusionState, TableMark, TableHeader
+    ]  # fmt: skip
+    assert found[501:503] == [mark, header]
+
+
+def test_a_state_of_other_settings_is_refused_and_left_out() -> None:
+    state = Aircraft(1, settings_for("eskf")).fusion_state
+    fusion = RowFusion(Aircraft(1, settings_for("paper")), follow=True)
+    assert [block.comments for block in fusion.blocks([block_of([state])])] == [()]
+    assert fusion.refused == ["it is of another version or other settings"]

@@ -1,0 +1,54 @@
+"""A recording whose clock is not always in order is smoothed, or refused with words that help."""
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gateway.aircraft import AircraftSettings
+from gateway.cli.app import app
+from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.fuse import RecordedFusion, smooth_blocks
+from gateway.recordings.reading import FlightError, ReadOptions, open_rows
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
+OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
+HEAD_LINES = 2
+
+
+def rows_of_golden() -> tuple[list[str], list[str]]:
+    lines = gzip.decompress(GOLDEN.read_bytes()).decode().splitlines()
+    return lines[:HEAD_LINES], lines[HEAD_LINES:]
+
+
+def smoothed(path: Path) -> tuple[IntArray, FloatArray]:
+    time_us, states, _ = smooth_blocks(open_rows(path, OPTIONS).blocks, AircraftSettings())
+    return time_us, states
+
+
+def test_samples_that_came_late_are_put_into_their_place(tmp_path: Path) -> None:
+    head, rows = rows_of_golden()
+    rows[500], rows[501] = rows[501], rows[500]
+    path = tmp_path / "late.csv"
+    path.write_text("\n".join([*head, *rows]))
+    for found, expected in zip(smoothed(path), smoothed(GOLDEN), strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_clock_that_was_set_back_is_refused_with_what_can_be_done(tmp_path: Path) -> None:
+    head, rows = rows_of_golden()
+    path, own, out = (tmp_path / f"{name}.csv" for name in ("log", "own", "out"))
+    path.write_text("\n".join([*head, *rows]))
+    assert CliRunner().invoke(app, ["convert", str(path), "-o", str(own)]).exit_code == 0
+    # A recording of our own tells the gateway's clock, so nothing goes on where it stood.
+    lines = own.read_text().splitlines()
+    own.write_text("\n".join([*lines, *lines[-500:]]))
+    text = "own.csv: its clock goes back by 20.0 s at IMU sample 1877"
+    refused = CliRunner().invoke(app, ["fuse", str(own), "-o", str(out), "--smooth"])
+    assert text in " ".join(refused.output.split())
+    assert refused.exit_code == 2
+    with pytest.raises(FlightError, match=f"{text}.*leave out --smooth"):
+        RecordedFusion([own], OPTIONS, smooth=True)

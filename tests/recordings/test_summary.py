@@ -1,0 +1,141 @@
+"""What a recording is said to hold is what was put in."""
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.recordings.columns import RowBuilder, row_to_line
+from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
+from gateway.recordings.table import TableHeader, TableMark, TableReader, encode_head, encode_mark
+from gateway.recordings.tlog import TlogRecord, TlogScanner
+from tests.recordings.frames import START_US, make_tlog
+from tests.recordings.samples import make_baro, make_fused
+
+SECOND_US = 1_000_000
+M_PER_DEG_LAT = 111_132.0
+
+
+def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list[TlogRecord]:
+    """Fly north at 10 m/s, telling so once a second."""
+    mav = mavlink.MAVLink(None, system_id, 1)
+    records = []
+    for i in range(seconds):
+        late_us = 30 * SECOND_US if gap_at is not None and i >= gap_at else 0
+        lat = 470_000_000 + round(10 * i / M_PER_DEG_LAT * 1e7)
+        for message in (
+            mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3),
+            mavlink.MAVLink_global_position_int_message(i, lat, 80_000_000, 0, 0, 0, 0, 0, 0),
+        ):
+            frame = bytes(message.pack(mav))
+            records.append(TlogRecord(START_US + i * SECOND_US + late_us, frame))
+    return records
+
+
+def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
+    summary, scanner = TlogSummary(), TlogScanner()
+    for begin in range(0, len(data), chunk):
+        summary.add(scanner.feed(data[begin : begin + chunk]))
+    summary.add(scanner.feed(b"", final=True))
+    return summary.result(len(data))
+
+
+def test_a_tlog_is_summed_up() -> None:
+    data = make_tlog(make_flight(101, 7))
+    info = sum_up(data)
+    assert (info.kind, info.size, info.records) == ("tlog", len(data), 202)
+    assert (info.first_us, info.duration_s) == (START_US, 100.0)
+    (vehicle,) = info.vehicles
+    assert (vehicle.system_id, vehicle.mav_type, vehicle.autopilot) == (7, 1, 3)
+    assert vehicle.distance_m == pytest.approx(1000, rel=0.01)
+    assert vehicle.rates == (Rate("HEARTBEAT", 101, 1.01), Rate("GLOBAL_POSITION_INT", 101, 1.01))
+    assert info.gaps == ()
+    assert info.damaged_bytes == 0
+
+
+@pytest.mark.parametrize("chunk", [50, 100_000])
+def test_gaps_and_damage_are_found(chunk: int) -> None:
+    data = make_tlog(make_flight(20, 1, gap_at=10))
+    info = sum_up(data[:300] + b"\xaa" * 40 + data[300:], chunk)
+    (gap,) = info.gaps
+    assert (gap.time_us, gap.duration_s) == (START_US + 9 * SECOND_US, 31.0)
+    assert info.damaged_runs >= 1
+    assert info.damaged_bytes >= 40
+
+
+def test_a_last_record_that_is_being_written_is_no_damage() -> None:
+    data = make_tlog(make_flight(20, 1))
+    info = sum_up(data[:300] + b"\xaa" * 40 + data[300:-4])
+    assert info.damaged_bytes == sum_up(data[:300] + b"\xaa" * 40 + data[300:]).damaged_bytes
+    assert 0 < info.unfinished_bytes < 40
+    wrong = sum_up(data + b"\xaa" * 4)
+    assert (wrong.damaged_bytes, wrong.unfinished_bytes) == (4, 0)
+
+
+def test_a_cut_record_that_others_follow_is_damage() -> None:
+    """Also where the file ends before its length would be over."""
+    flight = make_flight(20, 1)
+    message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251)
+    frame = bytes(message.pack(mavlink.MAVLink(None, 1, 1)))
+    cut = make_tlog([TlogRecord(flight[-1].time_us, frame)])[:100]
+    info = sum_up(make_tlog(flight[:-1]) + cut + make_tlog(flight[-1:]))
+    assert (info.records, info.damaged_bytes, info.unfinished_bytes) == (40, len(cut), 0)
+
+
+@pytest.mark.parametrize(
+    ("tail", "damaged", "unfinished"),
+    [(b"1000,0,", 0, 7), (b"1000," + bytes(3), 8, 0), (b"1000,0,\n", 8, 0)],
+)
+def test_a_last_line_that_is_being_written_is_no_damage(
+    rng: np.random.Generator, tail: bytes, damaged: int, unfinished: int
+) -> None:
+    rows = RowBuilder().add(make_fused(rng, 0))
+    text = encode_head(TableHeader()) + "".join(map(row_to_line, rows))
+    summary, reader = TableSummary(), TableReader()
+    summary.add(reader.feed_block(text.encode() + tail, final=True), reader.header)
+    info = summary.result(0)
+    assert (info.damaged_bytes, info.unfinished_bytes) == (damaged, unfinished)
+
+
+@pytest.mark.parametrize("chunk", [50, 100_000])
+@pytest.mark.parametrize("years", [56, -30])
+def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(years: int, chunk: int) -> None:
+    leap_us = years * 31_556_952 * SECOND_US
+    records = [
+        TlogRecord(record.time_us + (leap_us if number >= 40 else 0), record.frame)
+        for number, record in enumerate(make_flight(101, 1))
+    ]
+    info = sum_up(make_tlog(records), chunk)
+    assert info.duration_s == 99.0
+    assert info.vehicles[0].rates[0].rate_hz == pytest.approx(1.0, abs=0.03)
+    assert [gap.duration_s for gap in info.gaps] == ([leap_us / 1e6 + 1.0] if years > 0 else [])
+
+
+def test_vehicles_are_told_apart() -> None:
+    records = [r for pair in zip(make_flight(9, 1), make_flight(9, 2), strict=True) for r in pair]
+    info = sum_up(make_tlog(records))
+    assert [vehicle.system_id for vehicle in info.vehicles] == [1, 2]
+
+
+def test_a_table_is_summed_up(rng: np.random.Generator) -> None:
+    builder = RowBuilder()
+    text = encode_head(TableHeader(vehicle_id=3))
+    for i in range(100):
+        records = [make_fused(rng, i * 10_000)]
+        for record in [make_baro(rng, i * 10_000), *records] if i % 10 == 0 else records:
+            text += "".join(map(row_to_line, builder.add(record)))
+    text += encode_mark(TableMark(5, "here")) + "broken,line\n"
+    summary, reader = TableSummary(), TableReader()
+    summary.add(reader.feed_block(text.encode(), final=True), reader.header)
+    info = summary.result(len(text))
+    assert (info.kind, info.records, info.duration_s) == ("table", 100, 0.99)
+    rates = {rate.name: rate.count for rate in info.vehicles[0].rates}
+    assert rates["imu"] == rates["state"] == 100
+    assert rates["baro"] == 10
+    assert info.vehicles[0].system_id == 3
+    assert [mark.text for mark in info.marks] == ["here"]
+    assert (info.damaged_runs, info.damaged_bytes) == (1, 12)
+
+
+def test_nothing_is_nothing() -> None:
+    info = sum_up(b"")
+    assert (info.records, info.duration_s, info.vehicles) == (0, 0.0, ())

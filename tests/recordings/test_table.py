@@ -1,0 +1,145 @@
+"""Tables come back whole, in any chunks, cut anywhere, edited by people."""
+
+import numpy as np
+import pytest
+
+from gateway.recordings.columns import COLUMNS, RowBuilder, TableRow, row_to_line
+from gateway.recordings.table import (
+    MAX_LINE,
+    TableEvent,
+    TableFault,
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_head,
+    encode_line,
+    encode_mark,
+)
+from gateway.records import NodeId, NodeStatus
+from tests.recordings.samples import make_flight
+
+HEADER = TableHeader(
+    mavgate_version="0.1.0",
+    vehicle_id=3,
+    session="flight",
+    unix_us_at_zero=1_760_000_000_000_000,
+    settings={"sensing": {"accel_cutoff_hz": 10.0}},
+    calibration={"accel_bias_mps2": [0.1, 0.2, 0.3]},
+)
+
+
+def make_rows(seed: int, count: int = 20) -> list[TableRow]:
+    builder = RowBuilder()
+    records = make_flight(np.random.default_rng(seed), count)
+    return [row for record in records for row in builder.add(record)] + builder.flush()
+
+
+def make_table(rows: list[TableRow]) -> bytes:
+    return (encode_head(HEADER) + "".join(map(row_to_line, rows))).encode()
+
+
+def read(data: bytes, chunk: int | None = None) -> tuple[TableReader, list[TableEvent]]:
+    reader = TableReader()
+    chunk = chunk or max(len(data), 1)
+    events = [e for i in range(0, len(data), chunk) for e in reader.feed(data[i : i + chunk])]
+    return reader, events + reader.feed(b"", final=True)
+
+
+@pytest.mark.parametrize("chunk", [None, 1, 13, 1000])
+def test_what_is_written_is_read_in_any_chunks(chunk: int | None) -> None:
+    rows = make_rows(1)
+    reader, events = read(make_table(rows), chunk)
+    assert reader.header == HEADER
+    assert repr(events) == repr(rows)
+
+
+def test_marks_stand_between_rows() -> None:
+    rows = make_rows(2, 4)
+    mark = TableMark(1234, 'over the "gate", # 2')
+    data = make_table(rows[:1]) + encode_mark(mark).encode() + row_to_line(rows[1]).encode()
+    assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
+
+
+def test_what_a_node_reports_of_itself_stands_between_rows() -> None:
+    rows = make_rows(2, 4)
+    status = NodeStatus(5, NodeId(3, 1), 4, (1, 2), 1, 8, 0, 3, 2, 1, 900, 5, 3290)
+    data = "".join(map(encode_line, [rows[0], status, rows[1]]))
+    assert repr(read(make_table([]) + data.encode())[1]) == repr([rows[0], status, rows[1]])
+
+
+def test_every_prefix_opens_and_loses_at_most_the_cut_line() -> None:
+    rows = make_rows(3, 4)
+    data = make_table(rows)
+    head = len(encode_head(HEADER))
+    ends = head + np.cumsum([len(row_to_line(row)) for row in rows])
+    for size in range(len(data) + 1):
+        events = read(data[:size])[1]
+        whole = int(np.searchsorted(ends, size, side="right"))
+        assert repr([e for e in events if isinstance(e, TableRow)]) == repr(rows[:whole])
+        faults = [e for e in events if isinstance(e, TableFault)]
+        assert len(faults) == (0 if size in (0, *_line_ends(data)) else 1)
+
+
+def _line_ends(data: bytes) -> list[int]:
+    return [i + 1 for i, byte in enumerate(data) if byte == ord("\n")]
+
+
+def test_a_damaged_line_costs_itself_alone() -> None:
+    rows = make_rows(4, 6)
+    lines = make_table(rows).split(b"\n")
+    lines[4] = bytes(300)
+    lines[5] = b"1,2,3"
+    events = read(b"\n".join(lines))[1]
+    assert [e.line for e in events if isinstance(e, TableFault)] == [5, 6]
+    assert repr([e for e in events if isinstance(e, TableRow)]) == repr([rows[0], *rows[3:]])
+
+
+def test_a_damaged_line_is_counted_from_the_files_first() -> None:
+    reader = TableReader()
+    whole = make_table(make_rows(4, 6))
+    reader.feed(whole)
+    rows = "".join(map(row_to_line, make_rows(4, 6))).encode()
+    reader.feed(rows)
+    (fault,) = reader.feed(b"1,2,3\n")
+    assert isinstance(fault, TableFault)
+    assert fault.line == (whole + rows).count(b"\n") + 1
+
+
+@pytest.mark.parametrize("chunk", [None, 4096])
+def test_zeros_without_an_end_do_not_fill_the_memory(chunk: int | None) -> None:
+    rows = make_rows(5, 4)
+    data = make_table(rows) + bytes(3 * MAX_LINE)
+    events = read(data, chunk)[1]
+    assert repr(events[:-1]) == repr(rows)
+    assert isinstance(events[-1], TableFault)
+    assert events[-1].size == 3 * MAX_LINE
+
+
+def test_columns_are_found_by_name() -> None:
+    rows = make_rows(6)
+    table = make_table(rows).decode().splitlines()
+    moved = [table[0], table[1]] + [
+        ",".join(["more", *reversed(line.split(","))]) for line in table[2:]
+    ]
+    assert repr(read("\r\n".join([*moved, ""]).encode())[1]) == repr(rows)
+
+
+def test_missing_columns_are_unknown() -> None:
+    events = read(b"time_us,accel_x_b_mps2,accel_y_b_mps2,accel_z_b_mps2\n7,0.0,0.0,-9.81\n")[1]
+    (row,) = events
+    assert isinstance(row, TableRow)
+    assert row.imu is not None
+    assert row.imu.accel_b_mps2 == (0.0, 0.0, -9.81)
+    assert row.imu.mag_b_ut is None
+    assert row.raw is row.gps is row.baro is row.state is None
+
+
+def test_a_file_of_something_else_gives_faults_only() -> None:
+    reader, events = read(b"a,b,c\n1,2,3\n")
+    assert reader.header is None
+    assert all(isinstance(event, TableFault) for event in events)
+
+
+def test_column_names_are_settled() -> None:
+    assert COLUMNS[0] == "time_us"
+    assert COLUMNS[-1] == "nav_flags"
