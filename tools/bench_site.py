@@ -52,7 +52,9 @@ PIECES = ".bench_01.tlog.part"
 
 CONFIG = """
 [hub]
-endpoints = ["udp:127.0.0.1:{udp}", "tcp-listen:127.0.0.1:{tcp}", "zenoh:{place}?site=field"]
+endpoints = [
+    "udp:127.0.0.1:{udp}", "tcp-listen:127.0.0.1:{tcp}", "zenoh:{place}?site=field&trusted=yes",
+]
 
 [recording]
 mode = "manual"

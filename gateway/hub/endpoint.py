@@ -50,6 +50,7 @@ SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
 """How Zenoh names a place."""
 RAW_KEYS: Final = "mavlink_raw"
+JSON_KEYS: Final = "mavlink_json"
 SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
 """A segment of a Zenoh key or of a path without special characters."""
 
@@ -150,7 +151,7 @@ class Endpoint:
     site: str = ""
     """The site's name in a fleet."""
     keys: str = SITE_KEYS
-    """Where a fleet finds the frames: `site`, or `mavlink_raw` as mavlink-server has it."""
+    """Keys of a fleet: `site`, or those of mavlink-server, `mavlink_raw` or `mavlink_json`."""
     config: str = ""
     """Zenoh's own configuration file; empty for none."""
 
@@ -312,8 +313,8 @@ def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
     if kind != EndpointKind.ZENOH:
         return {}
     site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
-    if keys not in (SITE_KEYS, RAW_KEYS):
-        raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}")
+    if keys not in (SITE_KEYS, RAW_KEYS, JSON_KEYS):
+        raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}, {JSON_KEYS}")
     if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
         raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
     return {"site": site, "keys": keys}

@@ -38,6 +38,18 @@ LOGIN_S: Final = 10.0
 """Longest time for the body of a login request."""
 UPLOAD: Final = "/recordings/"
 """Paths below it accept a whole recording."""
+API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
+"""Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
+CORS_HEADERS: Final = {
+    "access-control-allow-credentials": "true",
+    "access-control-allow-headers": "content-type",
+    "access-control-allow-methods": "GET, POST",
+    "access-control-allow-private-network": "true",
+    "access-control-expose-headers": "x-error-detail",
+    "access-control-max-age": "600",
+    "vary": "Origin",
+}
+"""Answer to an allowed page of another origin, its preflight request included."""
 MAX_DIGITS: Final = 18
 """Of a length; Python reads no number of more than some thousand."""
 WS_POLICY_VIOLATION: Final = 1008
@@ -204,6 +216,7 @@ class AccessControl:
         self._names = {*LOOPBACK, settings.address, *settings.hosts}
         self._secure = bool(settings.certificate)
         self._upload_limit = settings.upload_limit_mb * 1_000_000
+        self._origins = frozenset(settings.origins)
         self._sockets: dict[str, set[_SessionSocket]] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -212,9 +225,16 @@ class AccessControl:
             await self.app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        if refusal := self._refusal(headers):
+        origin = headers.get("origin", "").lower()
+        is_allowed = origin in self._origins and scope["path"].startswith(API_PATHS)
+        if refusal := self._refusal(headers, is_allowed=is_allowed):
             await _refuse(scope, receive, send, HTTPStatus.FORBIDDEN, refusal)
             return
+        if is_allowed and scope["type"] == "http":
+            send = _with_cors(send, headers["origin"])
+            if scope["method"] == "OPTIONS":
+                await Response(status_code=HTTPStatus.NO_CONTENT)(scope, receive, send)
+                return
         token = _token(headers)
         role = self._logins.role_of(token)
         if scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
@@ -230,11 +250,13 @@ class AccessControl:
         else:
             await _refuse(scope, receive, send, HTTPStatus.UNAUTHORIZED, "log in first")
 
-    def _refusal(self, headers: Headers) -> str:
-        """Return why a request is not from this page; empty if it is."""
+    def _refusal(self, headers: Headers, *, is_allowed: bool) -> str:
+        """Return why a request is not from this page or an allowed one; empty if it is."""
         host = headers.get("host", "")
         if not self._is_ours(host):
             return f"this panel is not called {host!r}; settings: panel.hosts"
+        if is_allowed:
+            return ""
         origin = headers.get("origin")
         if origin is not None and _split(origin).netloc.lower() != host.lower():
             return f"a page of {origin!r} may not use this panel"
@@ -418,6 +440,19 @@ def _with_headers(send: Send) -> Send:
         await send(message)
 
     return dressed
+
+
+def _with_cors(send: Send, origin: str) -> Send:
+    """Return a `send` that lets a page of another origin read the response."""
+
+    async def shared(message: Message) -> None:
+        if message["type"] == "http.response.start":
+            headers = MutableHeaders(scope=message)
+            headers.update({"access-control-allow-origin": origin, **CORS_HEADERS})
+            headers["cross-origin-resource-policy"] = "cross-origin"
+        await send(message)
+
+    return shared
 
 
 async def _small_body(receive: Receive) -> bytes:

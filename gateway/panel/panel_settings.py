@@ -1,10 +1,13 @@
 """Settings of the panel."""
 
+import re
 from typing import Annotated, Final, Literal
 
 from gateway.settings import Settings, setting
 
 LOOPBACK: Final = ("127.0.0.1", "::1", "localhost")
+ORIGIN: Final = re.compile(r"https?://[a-z0-9.-]+(:\d{1,5})?|https?://\[[0-9a-f:]+\](:\d{1,5})?")
+"""Origin of a page as a browser writes it; the port only if it is not the default one."""
 
 
 class MapStyle(Settings, frozen=True):
@@ -39,6 +42,13 @@ class PanelSettings(Settings, frozen=True):
         setting(
             "Further host names of the panel, without port. All others are refused, so "
             "that no foreign page can control the gateway through the browser."
+        ),
+    ] = ()
+    origins: Annotated[
+        tuple[str, ...],
+        setting(
+            "Pages of other programs that may use the JSON API through the browser, as in "
+            "https://example.org:8080. They have the rights of the browser's login."
         ),
     ] = ()
     password: Annotated[
@@ -111,6 +121,11 @@ class PanelSettings(Settings, frozen=True):
 
     def __post_init__(self) -> None:
         """Refuse to be open to other machines without a password, and a key of nothing."""
+        for origin in self.origins:
+            if not ORIGIN.fullmatch(origin):
+                raise ValueError(
+                    f"origins: {origin!r} is not like https://example.org:8080, in lower case"
+                )
         if self.certificate_key and not self.certificate:
             raise ValueError("certificate_key is set: it needs a certificate")
         if self.address in LOOPBACK:

@@ -22,11 +22,11 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 from websockets.sync.client import connect as follow
 
-from gateway.panel.api.messages import template
+from gateway.wire.mavlink_json import template
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
 from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
-from tests.panel.api.test_messages import as_pymavlink_tells
 from tests.ports import free_port
+from tests.wire.test_mavlink_json import as_pymavlink_tells
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -36,7 +36,7 @@ OFF_S = {"field-2": 20 * YEAR_S, "field-3": -2 * YEAR_S}
 WRONG_CLOCK = Path(__file__).with_name("wrong_clock.c")
 SITE = """
 [hub]
-endpoints = ["zenoh:{place}?site={site}"]
+endpoints = ["zenoh:{place}?site={site}&trusted=yes"]
 
 [recording]
 folder = "{folder}"

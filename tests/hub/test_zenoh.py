@@ -26,7 +26,8 @@ from gateway.hub.transports.zenoh.session import (
     LoopQueue,
     Subscription,
 )
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_json import template
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from tests.hub.conftest import LIMIT_S, Rig
 from tests.ports import free_port
 
@@ -267,6 +268,32 @@ class TestTrouble:
         assert not far.messages(76)
         numbers = [data[4] for data in far.messages(30)]
         assert len(set(numbers)) == len(numbers), "no frame twice"
+
+    async def test_json_keys_of_mavlink_server(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
+        hub = await open_site(rig, router, "keys=mavlink_json&trusted=yes")
+        far = visit("mavlink/out", "mavlink/*/*/*", "mavlink/1/1/ATTITUDE/rollspeed")
+        await until_heard(rig, hub, far)
+        await until(rig, hub, lambda: len({key for key, _ in far.got}) >= 3)
+        by_key = {key: json.loads(data) for key, data in far.got}
+        whole = by_key["mavlink/1/1/ATTITUDE"]
+        assert whole["header"] | {"sequence": 0} == {
+            "system_id": 1, "component_id": 1, "sequence": 0, "message_id": 30,
+        }  # fmt: skip
+        assert whole["message"]["type"] == "ATTITUDE"
+        assert by_key["mavlink/1/1/ATTITUDE/rollspeed"] == whole["message"]["rollspeed"]
+        command = {
+            "header": {"system_id": 255, "component_id": 190, "sequence": 7},
+            "message": template("COMMAND_LONG") | {"target_system": 1, "target_component": 1},
+        }
+        for wrong in (b"no JSON", b"{}", b'{"header": {"system_id": 256}}', b"[" * 4000):
+            far.session.put("mavlink/in", wrong)
+        far.session.put("mavlink/in", json.dumps(command))
+        await until(rig, hub, lambda: bool(rig.incoming))
+        assert origin_of(rig.incoming[0].frame) == (255, 190)
+        assert rig.incoming[0].frame[4] == 7
+        assert hub.clients()[0].bytes_garbage > 4000
 
     async def test_no_router_yet(self, rig: Rig) -> None:
         place = f"tcp/127.0.0.1:{free_port()}"

@@ -64,7 +64,7 @@ async def locked() -> AsyncIterator[httpx.AsyncClient]:
         yield client
 
 
-async def websocket_answer(guard: AccessControl, **headers: str) -> str:
+async def websocket_answer(guard: AccessControl, path: str = "/telemetry", **headers: str) -> str:
     """Ask for the telemetry as a page would; what the guard says first."""
     said: list[str] = []
 
@@ -79,7 +79,7 @@ async def websocket_answer(guard: AccessControl, **headers: str) -> str:
 
     guard.app = accept
     raw = [(name.encode(), value.encode()) for name, value in headers.items()]
-    scope = {"type": "websocket", "path": "/telemetry", "headers": raw, "client": ("127.0.0.1", 1)}
+    scope = {"type": "websocket", "path": path, "headers": raw, "client": ("127.0.0.1", 1)}
     await guard(scope, receive, send)
     return said[0]
 
@@ -143,6 +143,67 @@ async def test_other_page_of_the_same_browser_cannot_steer(origin: str) -> None:
     async with client_of(guarded()) as client:
         answer = await client.post("/", headers={"origin": origin})
     assert answer.status_code == http.HTTPStatus.FORBIDDEN
+
+
+FOREIGN = "http://cockpit.example:8080"
+ALLOWED = PanelSettings(origins=(FOREIGN,))
+
+
+@pytest.mark.parametrize(
+    ("path", "origin", "is_allowed"),
+    [
+        ("/v1/mavlink", FOREIGN, True),
+        ("/mavlink2rest/mavlink", FOREIGN, True),
+        ("/mavlink", FOREIGN.upper().replace("HTTP", "http"), True),
+        ("/", FOREIGN, False),
+        ("/recordings/x", FOREIGN, False),
+        ("/v1/mavlink", "http://cockpit.example", False),
+        ("/v1/mavlink", "null", False),
+    ],
+)
+async def test_page_of_a_listed_origin_may_use_the_api_only(
+    path: str, origin: str, is_allowed: bool
+) -> None:
+    headers = {"origin": origin, "sec-fetch-site": "cross-site", "sec-fetch-mode": "cors"}
+    async with client_of(guarded(ALLOWED)) as client:
+        answer = await client.post(path, headers=headers)
+        preflight = await client.options(
+            path, headers={**headers, "access-control-request-method": "POST"}
+        )
+    expected = http.HTTPStatus.OK if is_allowed else http.HTTPStatus.FORBIDDEN
+    assert answer.status_code == expected
+    assert answer.headers.get("access-control-allow-origin") == (origin if is_allowed else None)
+    expected = http.HTTPStatus.NO_CONTENT if is_allowed else http.HTTPStatus.FORBIDDEN
+    assert preflight.status_code == expected
+    assert ("content-type" in preflight.headers.get("access-control-allow-headers", "")) == (
+        is_allowed
+    )
+
+
+async def test_listed_origin_opens_the_websocket_api_but_not_under_a_foreign_host() -> None:
+    host = "127.0.0.1:14590"
+    guard = guarded(ALLOWED)
+    answer = await websocket_answer(guard, "/v1/ws/mavlink", host=host, origin=FOREIGN)
+    assert answer == "websocket.accept"
+    answer = await websocket_answer(guard, "/v1/ws/mavlink", host="evil.example", origin=FOREIGN)
+    assert answer == "websocket.close"
+
+
+async def test_listed_origin_needs_the_login_too() -> None:
+    settings = PanelSettings(
+        address="0.0.0.0", password=OPERATOR, insecure=True, origins=(FOREIGN,)
+    )
+    async with client_of(guarded(settings), "http://192.168.1.7:14590") as client:
+        answer = await client.get("/v1/mavlink", headers={"origin": FOREIGN})
+    assert answer.status_code == http.HTTPStatus.UNAUTHORIZED
+
+
+@pytest.mark.parametrize(
+    "origin", ["*", "null", "example.org", "https://example.org/page", "https://Example.org"]
+)
+def test_origin_that_no_browser_sends_is_refused(origin: str) -> None:
+    with pytest.raises(ValueError, match=r"https://example\.org:8080"):
+        PanelSettings(origins=(origin,))
 
 
 async def test_own_page_may_post() -> None:

@@ -1,6 +1,6 @@
 """MAVLink for scripts and pages: REST and JSON over WebSocket, compatible with mavlink2rest.
 
-All paths exist with and without `/v1` in front. Viewers may not send.
+All paths exist with and without `/v1` in front, and below `/mavlink2rest`. Viewers may not send.
 
 References
 ----------
@@ -14,6 +14,7 @@ from contextlib import suppress
 from http import HTTPStatus
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
 from starlette.responses import FileResponse
@@ -21,9 +22,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway import __version__
 from gateway.panel.access import ROLE, WS_POLICY_VIOLATION, Role
-from gateway.panel.api.messages import CLASSES, BadMessageError, MessageBook, from_json, template
+from gateway.panel.api.message_book import MessageBook
 from gateway.panel.api.stream import EVERYTHING, MessageStream, NameFilters, Subscriber, pretty
 from gateway.panel.uplink import Uplink
+from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template
 
 API_VERSION: Final = 0
 """Version of the answers' format, as in mavlink2rest."""
@@ -34,6 +36,8 @@ NOTHING: Final = "None"
 NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
 NOT_ALLOWED: Final = "viewers may not send; log in as the operator"
 WS_INVALID: Final = 1007
+PREFIX: Final = "/mavlink2rest"
+"""Prefix under which some clients expect these paths, as BlueOS serves them."""
 DOCS: Final = Path(__file__).parent.parent / "web" / "rest.html"
 DOCS_POLICY: Final = (
     "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -61,9 +65,15 @@ class RestApi:
         """Return the routers to include in an application."""
         service = APIRouter(tags=["service"])
         service.add_api_route("/info", self.info)
-        service.add_api_route("/v1/info", self.info, include_in_schema=False)
+        for path in ("/v1/info", f"{PREFIX}/info", f"{PREFIX}/v1/info"):
+            service.add_api_route(path, self.info, include_in_schema=False)
         service.add_api_route("/docs", _docs, include_in_schema=False)
-        return [service, self._router("/v1", shown=True), self._router("", shown=False)]
+        prefixes = ("", f"{PREFIX}/v1", PREFIX)
+        return [
+            service,
+            self._router("/v1", shown=True),
+            *(self._router(prefix, shown=False) for prefix in prefixes),
+        ]
 
     async def info(self) -> Response:
         """Return name and version of the program."""
@@ -108,7 +118,7 @@ class RestApi:
         except UnicodeDecodeError as error:
             return _refused(f"Failed to parse input as UTF-8 string: {error}")
         except ValueError as error:
-            return _refused(f"{NOT_A_MESSAGE} {error}")
+            return _refused(NOT_A_MESSAGE, str(error))
         return Response("Ok.", media_type="application/json")
 
     async def follow(self, socket: WebSocket) -> None:
@@ -215,8 +225,12 @@ def _read_json5(text: str) -> Any:
         raise BadMessageError(str(error.args[0])) from None
 
 
-def _refused(text: str) -> Response:
-    return Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+def _refused(text: str, detail: str = "") -> Response:
+    """Return mavlink2rest's text, on which its clients rely; the reason is in a header."""
+    answer = Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+    if detail:
+        answer.headers["x-error-detail"] = quote(detail, safe=" '\":;,./()[]{}<>|=+*&-_")
+    return answer
 
 
 def _sender(header: Any) -> tuple[int, int]:

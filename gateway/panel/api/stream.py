@@ -18,7 +18,7 @@ from collections.abc import Iterable, Iterator, Set
 from contextlib import contextmanager
 from typing import Any, Final
 
-from gateway.panel.api.messages import to_json
+from gateway.wire.mavlink_json import to_json
 
 MAX_WAITING_BYTES: Final = 1 << 20
 """Of one subscriber: some seconds of one aircraft."""

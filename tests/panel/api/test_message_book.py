@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.api import messages as message_book
-from gateway.panel.api.messages import MessageBook
+from gateway.panel.api import message_book
+from gateway.panel.api.message_book import MessageBook
 
 
 class Wall:

@@ -22,7 +22,6 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.panel.access import COOKIE, AccessControl, Logins, hash_password
-from gateway.panel.api.messages import template
 from gateway.panel.api.rest import RestApi
 from gateway.panel.api.stream import MAX_WAITING_BYTES, MessageStream, Subscriber
 from gateway.panel.control_client import ControlClient
@@ -30,6 +29,7 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.state.fleet_picture import FleetPicture
 from gateway.panel.uplink import Uplink
 from gateway.records import Incoming, Outgoing
+from gateway.wire.mavlink_json import template
 
 pytestmark = pytest.mark.io
 
@@ -230,8 +230,31 @@ class TestWriting:
         pytest.importorskip("pyjson5", reason="older than the lock file: install it anew")
         answer = await world.client.post("/v1/mavlink", content=body)
         assert answer.status_code == 404
-        assert answer.text.startswith("Failed to parse message, not a valid MAVLinkMessage. ")
+        assert answer.text == "Failed to parse message, not a valid MAVLinkMessage."
+        assert answer.headers["x-error-detail"].isprintable()
         assert not world.commands()
+
+    async def test_detail_of_a_wrong_field_is_in_a_header(self, world: World) -> None:
+        body = {**COMMAND, "message": {**COMMAND["message"], "param1": "\r\nx: y"}}
+        answer = await world.client.post("/v1/mavlink", json=body)
+        assert "COMMAND_LONG.param1" in answer.headers["x-error-detail"]
+        assert "x" not in answer.headers
+
+    @pytest.mark.parametrize("prefix", ["", "/v1", "/mavlink2rest", "/mavlink2rest/v1"])
+    async def test_every_prefix_serves_reading_and_a_command_without_target(
+        self, world: World, prefix: str
+    ) -> None:
+        world.attitude(0.5)
+        await world.until_json(f"{ATTITUDE}/message/roll", 0.5)
+        path = ATTITUDE.removeprefix("/v1")
+        answer = await world.client.get(f"{prefix}{path}/message/roll")
+        assert answer.json() == 0.5
+        assert (await world.client.get(f"{prefix}/info")).json()["service"]["name"] == "mavgate"
+        fields = {k: v for k, v in COMMAND["message"].items() if not k.startswith("target_")}
+        sent = await world.client.post(f"{prefix}/mavlink", json={**COMMAND, "message": fields})
+        assert sent.status_code == 200
+        command = await world.until_commanded()
+        assert (command.target_system, command.target_component) == (0, 0)
 
     async def test_what_is_no_text(self, world: World) -> None:
         answer = await world.client.post("/v1/mavlink", content=b"\xff")

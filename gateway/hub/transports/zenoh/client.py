@@ -8,13 +8,18 @@ import asyncio
 import logging
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from gateway.hub.endpoint import RAW_KEYS, Endpoint
+from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import READ_BYTES, Client
 from gateway.hub.transports.listener import RETRY_US
 from gateway.hub.transports.zenoh.keys import (
     ALL_SYSTEMS,
+    JSON_IN,
+    JSON_OUT,
     OWN,
+    RAW_IN,
+    RAW_OUT,
+    ROOT,
     in_key,
     out_key,
     ping_key,
@@ -38,6 +43,7 @@ from gateway.hub.transports.zenoh.session import (
 )
 from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_json import frame_from_json, json_from_frame
 from gateway.wire.mavlink_splitter import origin_of, split_datagram
 
 if TYPE_CHECKING:
@@ -45,8 +51,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RAW_OUT: Final = "mavlink_raw/out"
-RAW_IN: Final = "mavlink_raw/in"
 LOCAL: Final = ("tcp/127.", "tcp/[::1]", "tcp/localhost:", "unixsock-stream/")
 MAX_NAMESAKES: Final = 16
 """Other sessions under this site's name that are remembered; more are forged."""
@@ -86,8 +90,11 @@ class ZenohClient(Client):
         if self.state != "open" or self._publishers is None:
             self.counters.dropped += 1
             return
+        if self.endpoint.keys == JSON_KEYS:
+            self._publish_json(frame, message_id)
+            return
         origin = origin_of(frame)
-        if self._is_raw:
+        if self.endpoint.keys == RAW_KEYS:
             topic = _Topic(RAW_OUT, None)
         else:
             attachment = OWN if self.context.is_own(origin) else None
@@ -133,10 +140,6 @@ class ZenohClient(Client):
         self._packers.clear()
         super().reconfigure(endpoint)
 
-    @property
-    def _is_raw(self) -> bool:
-        return self.endpoint.keys == RAW_KEYS
-
     async def _open(self) -> None:
         try:
             config = session_config(self.endpoint.host, self.endpoint.config)
@@ -174,11 +177,12 @@ class ZenohClient(Client):
         presence: LoopQueue[tuple[bool, str]] = LoopQueue(self._handle_presence)
         self._queues = [frames, presence]
         self._namesakes.clear()
-        wanted = RAW_IN if self._is_raw else in_key(self.endpoint.site, ALL_SYSTEMS)
+        keys = {RAW_KEYS: RAW_IN, JSON_KEYS: JSON_IN}
+        wanted = keys.get(self.endpoint.keys) or in_key(self.endpoint.site, ALL_SYSTEMS)
         self._declared = [
             session.declare_subscriber(wanted, lambda sample: frames.put(payload_of(sample)))
         ]
-        if self._is_raw:
+        if self.endpoint.keys != SITE_KEYS:
             return
         site, liveliness = self.endpoint.site, session.liveliness()
         here = zenoh.SampleKind.PUT
@@ -203,6 +207,12 @@ class ZenohClient(Client):
             self.counters.bytes_received += size
             self.counters.bytes_garbage += size
             return
+        if self.endpoint.keys == JSON_KEYS:
+            data = frame_from_json(data)
+            if not data:
+                self.counters.bytes_received += size
+                self.counters.bytes_garbage += size
+                return
         self.receive(split_datagram(data), size, self.context.now_us())
 
     def _handle_presence(self, news: tuple[bool, str]) -> None:
@@ -224,6 +234,26 @@ class ZenohClient(Client):
         self.reason = text
         if text:
             log.warning("%s: %s; rename one of them", self.name, text)
+
+    def _publish_json(self, frame: bytes, message_id: int) -> None:
+        """Publish a message as mavlink-server does: as a whole, by its name, and by its fields."""
+        if self._publishers is None or (found := json_from_frame(frame)) is None:
+            self.counters.dropped += 1
+            return
+        name, whole, fields = found
+        system_id, component_id = origin_of(frame)
+        key = f"{ROOT}/{system_id}/{component_id}/{name}"
+        self._publish_json_text(JSON_OUT, whole, reliable=message_id in RELIABLE_IDS)
+        self._publishers.put_once(key, whole)
+        for field, value in fields.items():
+            self._publishers.put_once(f"{key}/{field}", value)
+
+    def _publish_json_text(self, key: str, text: bytes, *, reliable: bool) -> None:
+        if self._publishers is not None and self._publishers.publish(key, text, reliable=reliable):
+            self.counters.sent += 1
+            self.counters.bytes_sent += len(text)
+        else:
+            self.counters.dropped += 1
 
     def _pack(self, topic: _Topic, frame: bytes) -> None:
         packer = self._packers.setdefault(topic, Packer(self.endpoint.pack_bytes))

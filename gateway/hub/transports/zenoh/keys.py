@@ -7,7 +7,9 @@
 | `mavlink/SITE/site/SESSION`  | a liveliness token of one session of the site               |
 | `mavlink/SITE/ping`          | the site answers queries at once                            |
 | `mavlink/SITE/recordings`    | the site answers queries for its recordings                 |
-| `mavlink_raw/out`, `…/in`    | the same without sites, as mavlink-server has it            |
+| `mavlink_raw/out`, `…/in`    | frames without sites, as mavlink-server has them            |
+| `mavlink/out`, `…/in`        | messages as JSON, as mavlink-server has them by default     |
+| `mavlink/SYSTEM/COMPONENT/NAME[/FIELD]` | the newest one of each kind, and its fields      |
 
 `OWN` is attached to frames of the site's own gateway. The hub accepts no frame in their name from a
 client, so such a frame began here and has not gone round a loop. Frames of a client of the site, as
@@ -19,6 +21,10 @@ from typing import Final
 ROOT: Final = "mavlink"
 ALL_SYSTEMS: Final = "*"
 OWN: Final = b"own"
+RAW_OUT: Final = "mavlink_raw/out"
+RAW_IN: Final = "mavlink_raw/in"
+JSON_OUT: Final = "mavlink/out"
+JSON_IN: Final = "mavlink/in"
 MAX_KEY: Final = 256
 """Letters of a key; ours have at most 150."""
 

@@ -388,6 +388,15 @@ class Publishers:
             return False
         return True
 
+    def put_once(self, key: str, payload: bytes) -> None:
+        """Publish under a key that is not declared, as one of very many."""
+        self._session.put(
+            key,
+            payload,
+            congestion_control=self._zenoh.CongestionControl.DROP,
+            priority=self._zenoh.Priority.DATA,
+        )
+
     @property
     def queued(self) -> int:
         """Messages that wait for a congested link."""

@@ -1,4 +1,4 @@
-"""MAVLink messages as JSON and back, in the format of mavlink2rest, and the newest of each kind.
+"""MAVLink messages as JSON and back, in the format of mavlink2rest and mavlink-server.
 
 | field of MAVLink       | JSON                                                    |
 | ---------------------- | ------------------------------------------------------- |
@@ -10,7 +10,8 @@
 | NaN or infinity        | `null`                                                  |
 
 Input may also name a bitmask's flags (`"A | B"`), give a bare number for an enum or a bitmask, and
-a plain text for an array of characters. A value unknown to its enum is written as a number.
+a plain text for an array of characters, and leave out the target. A value unknown to its enum is
+written as a number.
 
 References
 ----------
@@ -19,11 +20,10 @@ References
 
 import inspect
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import Any, Final
+import struct
+from typing import Annotated, Any, Final
 
+import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import counted
@@ -31,6 +31,8 @@ from gateway.units import counted
 CLASSES: Final = {kind.msgname: kind for kind in mavlink.mavlink_map.values()}
 NUL: Final = "\0"
 BITMASK: Final = "bitmask"
+TARGETS: Final = ("target_system", "target_component")
+"""Fields that may be missing: 0 addresses all systems or components."""
 RENAMED: Final = {"type": "mavtype"}
 INTEGERS: Final = {
     **{f"uint{bits}_t": (0, (1 << bits) - 1) for bits in (8, 16, 32, 64)},
@@ -42,11 +44,23 @@ MAX_FLOAT: Final = 3.4028234663852886e38
 MAX_SHOWN: Final = 40
 """Characters of a rejected value in an error message."""
 
-MAX_KINDS: Final = 8192
-"""Enough for some fifty aircraft; forged ids must not fill the memory."""
 
-Key = tuple[int, int, str]
-"""System, component and name of the message."""
+_Byte = Annotated[int, msgspec.Meta(ge=0, le=255)]
+
+
+class _Header(msgspec.Struct, frozen=True):
+    """Sender of a message."""
+
+    system_id: _Byte
+    component_id: _Byte
+    sequence: _Byte = 0
+
+
+class _Given(msgspec.Struct, frozen=True):
+    """A message to be sent."""
+
+    header: _Header
+    message: dict[str, Any]
 
 
 class BadMessageError(ValueError):
@@ -78,7 +92,7 @@ def from_json(fields: Any) -> Any:
     Parameters
     ----------
     fields : dict
-        As `to_json` returns it; extension fields may be missing.
+        As `to_json` returns it; extension fields and the target may be missing.
 
     Returns
     -------
@@ -101,6 +115,8 @@ def from_json(fields: Any) -> Any:
                 given[name] = _in(kind, name, fields[key])
             except (ValueError, TypeError, OverflowError) as error:
                 raise BadMessageError(f"{kind.msgname}.{key}: {_words(error)}") from None
+        elif name in TARGETS:
+            given[name] = 0
         elif parameter.default is inspect.Parameter.empty:
             raise BadMessageError(f"{kind.msgname}.{key} is missing")
     return kind(**given)
@@ -128,6 +144,55 @@ def template(name: str) -> dict[str, Any]:
     return to_json(kind(**given))
 
 
+def json_from_frame(frame: bytes) -> tuple[str, bytes, dict[str, bytes]] | None:
+    """Return a frame as mavlink-server publishes it.
+
+    Parameters
+    ----------
+    frame : bytes
+        A complete frame.
+
+    Returns
+    -------
+    tuple or None
+        Name of the message, `{"header": ..., "message": ...}` as JSON, and the JSON of each field
+        by its name; None for an unknown message.
+    """
+    try:
+        message = mavlink.MAVLink(None).decode(bytearray(frame))
+    except mavlink.MAVError:
+        return None
+    if message.msgname not in CLASSES:
+        return None
+    fields = to_json(message)
+    header = {
+        "system_id": message.get_srcSystem(),
+        "component_id": message.get_srcComponent(),
+        "sequence": message.get_seq(),
+        "message_id": message.get_msgId(),
+    }
+    whole = msgspec.json.encode({"header": header, "message": fields})
+    return message.msgname, whole, {key: msgspec.json.encode(fields[key]) for key in fields}
+
+
+def frame_from_json(data: bytes) -> bytes:
+    """Return the frame of a message given as JSON; empty if it is invalid.
+
+    Parameters
+    ----------
+    data : bytes
+        `{"header": {"system_id": 255, "component_id": 190, "sequence": 0}, "message": ...}`.
+    """
+    try:
+        given = msgspec.json.decode(data, type=_Given)
+        message = from_json(given.message)
+        link = mavlink.MAVLink(None, given.header.system_id, given.header.component_id)
+        link.seq = given.header.sequence
+        return bytes(message.pack(link))
+    except (ValueError, TypeError, OverflowError, RecursionError, struct.error):
+        return b""
+
+
 def class_of(name: Any) -> Any:
     """Return pymavlink's class of a message.
 
@@ -139,112 +204,6 @@ def class_of(name: Any) -> Any:
     if not isinstance(name, str) or name not in CLASSES:
         raise BadMessageError(f"no MAVLink message is called {name!r}")
     return CLASSES[name]
-
-
-@dataclass(slots=True)
-class _Entry:
-    message: Any
-    first_s: float
-    last_s: float
-    counter: int = 1
-
-    def as_json(self) -> dict[str, Any]:
-        span_s = self.last_s - self.first_s
-        return {
-            "message": to_json(self.message),
-            "status": {
-                "time": {
-                    "first_update": _written(self.first_s),
-                    "last_update": _written(self.last_s),
-                    "counter": self.counter,
-                    "frequency": (self.counter - 1) / span_s if span_s > 0 else 0.0,
-                }
-            },
-        }
-
-
-class MessageBook:
-    """Received MAVLink messages, as a tree.
-
-    Parameters
-    ----------
-    now_s : callable
-        Civil time in s since the epoch, to show when a message came.
-    """
-
-    def __init__(self, now_s: Callable[[], float]) -> None:
-        self._now_s = now_s
-        self._entries: dict[Key, _Entry] = {}
-        self._heard: set[tuple[int, int]] = set()
-        self.left_out = 0
-        """Messages of kinds for which there was no room."""
-
-    def take(self, message: Any, *, is_sent: bool = False) -> None:
-        """Take in one message, received or sent from here."""
-        key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
-        if not is_sent:
-            self._heard.add(key[:2])
-        now_s = self._now_s()
-        entry = self._entries.get(key)
-        if entry is not None:
-            entry.message = message
-            entry.last_s = now_s
-            entry.counter += 1
-        elif len(self._entries) < MAX_KINDS:
-            self._entries[key] = _Entry(message, now_s, now_s)
-        else:
-            self.left_out += 1
-
-    def has_heard(self, system_id: int, component_id: int) -> bool:
-        """Return whether anything came from a component."""
-        return (system_id, component_id) in self._heard
-
-    def look_up(self, path: str) -> Any:
-        """Return the value at a path of the tree.
-
-        Parameters
-        ----------
-        path : str
-            As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all. A JSON
-            pointer without its first slash, so a trailing slash means an empty name.
-
-        Returns
-        -------
-        Any
-            A JSON value.
-
-        Raises
-        ------
-        KeyError
-            If the path does not exist.
-        """
-        parts = path.split("/") if path else []
-        node: Any = self._tree(parts)
-        for part in parts:
-            if isinstance(node, dict):
-                node = node[part]
-            elif isinstance(node, list) and part in map(str, range(len(node))):
-                node = node[int(part)]
-            else:
-                raise KeyError(part)
-        return node
-
-    def _tree(self, parts: list[str]) -> dict[str, Any]:
-        """Build as much of the tree as a path needs."""
-        vehicles: dict[str, Any] = {}
-        for (system_id, component_id, name), entry in self._chosen(parts):
-            vehicle = vehicles.setdefault(str(system_id), {"id": system_id, "components": {}})
-            component = vehicle["components"].setdefault(
-                str(component_id), {"id": component_id, "messages": {}}
-            )
-            component["messages"][name] = entry.as_json()
-        return {"vehicles": vehicles}
-
-    def _chosen(self, parts: list[str]) -> Iterator[tuple[Key, _Entry]]:
-        wanted = [*parts[1::2], "", "", ""] if parts[:1] == ["vehicles"] else [""] * 3
-        for key, entry in self._entries.items():
-            if all(want in ("", str(have)) for want, have in zip(wanted, key, strict=False)):
-                yield key, entry
 
 
 def _out(message: Any, name: str, kind: str) -> Any:
@@ -342,7 +301,3 @@ def _is_bitmask(kind: Any, name: str) -> bool:
 
 def _words(error: Exception) -> str:
     return str(error.args[0]) if error.args else str(error)
-
-
-def _written(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).astimezone().isoformat()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.api.messages import (
+from gateway.wire.mavlink_json import (
     CLASSES,
     BadMessageError,
     from_json,
