@@ -1,151 +1,292 @@
-"""Run the daemon for long on a line that corrupts bytes, and check its account and its memory.
+"""Run `mavgate run` for long while its computer misbehaves, and report the gaps of every stream.
 
-The simulated tracker's frames pass a pseudo-terminal on which a share of all bytes is replaced by
-others. At the end the daemon's counts are compared with what was really sent, and its memory with
-what it was after a minute.
+A simulated receiver feeds the gateway over a pseudo-terminal. From time to time the process is
+stopped, the port is pulled, the disk of the recordings is full, or the civil clock steps. The
+longest gap of each message is printed with the disturbances during it; a gap that is longer than
+its disturbances by more than 7 s ends the program with status 1.
+
+The full disk needs root (it is a small tmpfs), the clock steps need a C compiler; without them
+these disturbances are left out.
 """
 
 import argparse
 import asyncio
 import os
+import shutil
+import signal
 import socket
+import subprocess
+import sys
+import tempfile
 import time
-import tty
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import msgspec
 import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
 from rich.progress import Progress
 
-from gateway.config import GatewaySettings
-from gateway.live.daemon import Daemon
-from gateway.records import GpsFixType, ImuFlags, LinkReport, NodeId
-from gateway.wire import payloads
-from gateway.wire.framing import encode_frame
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.cli.support.made_ahead import made_ahead
+from gateway.live.pty_port import PtyPort
+from gateway.simulator.receiver import simulate
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 
-GPS_EVERY = 40
-"""One fix to so many IMU payloads: 5 Hz beside 200 Hz."""
-ALLOWED_GROWTH_KIB = 2048
-SETTLED_SHARE = 0.2
-"""The memory after this share of the run is the one to compare with."""
+MAX_UNEXPLAINED_S = 7.0
+REOPENING_S = 1.5
+"""The gateway looks for a lost port at least every second."""
+DISK = "8m"
+STREAMS = (
+    "HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "VFR_HUD", "HIGHRES_IMU",
+    "GPS_RAW_INT", "SCALED_PRESSURE", "SYS_STATUS",
+)  # fmt: skip
+CLOCK = Path(__file__).resolve().parent.parent / "tests/end_to_end/wrong_clock.c"
 
+CONFIG = """
+[serial]
+port = "{port}"
 
-class Tracker:
-    """Two nodes with true counters."""
+[hub]
+endpoints = ["udp:127.0.0.1:{client}"]
 
-    def __init__(self) -> None:
-        self.seq = [0, 0]
-        self.frame_seq = 0
-
-    def frame(self, time_us: int, node: int, payload: payloads.Payload) -> bytes:
-        """Build the next frame of a node."""
-        header = payloads.Header(NodeId(1, node), self.seq[node] % 65536, time_us % 2**32)
-        packet = payloads.encode_payload(header, payload)
-        content = payloads.encode_radio(self.frame_seq % 256, node, time_us % 2**32, packet)
-        self.seq[node] += 1
-        self.frame_seq += 1
-        return encode_frame(content)
-
-
-def sample(index: int) -> payloads.ImuPayload:
-    """Make the counts of a level node that turns slowly."""
-    gyro = round(300 * np.sin(index / 500))
-    return payloads.ImuPayload(
-        (20, -15, 4096), (3, -2, gyro), (200, 30, -380), -3900, ImuFlags.MAG_NEW, 2, 2, 1
-    )
+[recording]
+mode = "always"
+folder = "{recordings}"
+"""
 
 
-def fix(index: int) -> payloads.GpsFixPayload:
-    """Make a fix that stands still."""
-    itow_ms = index * 5
-    place = (-77_656_000, 1_103_728_000, 110_000)
-    return payloads.GpsFixPayload(itow_ms, *place, (0, 0, 0), GpsFixType.FIX_3D, True, 12)
+@dataclass(slots=True)
+class Disturbance:
+    """One disturbance, in seconds since the start."""
+
+    name: str
+    begin_s: float
+    end_s: float
+
+    def overlap_s(self, begin_s: float, end_s: float) -> float:
+        """Return how much of a gap it covers."""
+        return max(0.0, min(self.end_s, end_s) - max(self.begin_s, begin_s))
 
 
-def corrupt(frame: bytes, share: float, burst: int, rng: np.random.Generator) -> bytes:
-    """Replace a share of the bytes by others, in runs of `burst`."""
-    data = np.frombuffer(frame, np.uint8).copy()
-    starts = np.flatnonzero(rng.random(data.size) < share / burst)
-    for start in starts:
-        run = data[start : start + burst]
-        run ^= rng.integers(1, 256, run.size, dtype=np.uint8)
-    return data.tobytes()
+@dataclass(slots=True)
+class Gap:
+    """A time without a message."""
+
+    begin_s: float = 0.0
+    end_s: float = 0.0
+
+    @property
+    def length_s(self) -> float:
+        """Its duration."""
+        return self.end_s - self.begin_s
 
 
-def resident_kib() -> int:
-    """Return how much memory this process holds."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") // 1024
+@dataclass
+class Listener(asyncio.DatagramProtocol):
+    """A client that notes when each message arrives, and texts."""
+
+    begin_s: float
+    last_s: dict[int, float] = field(default_factory=dict)
+    gaps: dict[int, list[Gap]] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    texts: list[str] = field(default_factory=list)
+
+    def datagram_received(self, data: bytes, _address: object) -> None:
+        """Note the messages of one datagram."""
+        now_s = time.monotonic() - self.begin_s
+        while len(data) >= 12:
+            message_id = int.from_bytes(data[7:10], "little")
+            if message_id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
+                text = data[11 : 10 + data[1]].partition(b"\0")[0].decode()
+                self.texts.append(f"{now_s:8.1f} {text}")
+            self.note(message_id, now_s)
+            data = data[12 + data[1] :]
+
+    def note(self, message_id: int, now_s: float) -> None:
+        """Keep the longest gaps of a message."""
+        gap = Gap(self.last_s.get(message_id, now_s), now_s)
+        self.last_s[message_id] = now_s
+        self.counts[message_id] = self.counts.get(message_id, 0) + 1
+        longest = self.gaps.setdefault(message_id, [])
+        if gap.length_s > 1.0:
+            longest.append(gap)
+
+
+class Receiver:
+    """The simulated receiver on a device that comes and goes under one name."""
+
+    def __init__(self, link: Path) -> None:
+        self._link = link
+        self._frames = made_ahead(simulate(SimulatorSettings(), 0).frames())
+        self._begin_s = time.monotonic()
+        self._port: PtyPort | None = None
+
+    def plug(self) -> None:
+        """Appear; the nodes' clocks went on meanwhile."""
+        elapsed_s = time.monotonic() - self._begin_s
+        self._port = PtyPort(self._from(elapsed_s))
+        self._link.unlink(missing_ok=True)
+        self._link.symlink_to(self._port.path)
+        self._port.start()
+
+    def _from(self, begin_s: float) -> Iterator[TimedFrame]:
+        for frame in self._frames:
+            if frame.time_s >= begin_s:
+                yield replace(frame, time_s=frame.time_s - begin_s)
+
+    def pull(self) -> None:
+        """Disappear."""
+        assert self._port is not None
+        self._port.close()
+        self._link.unlink(missing_ok=True)
+
+
+class Gateway:
+    """The process under test, with what is needed to disturb it."""
+
+    def __init__(self, folder: Path, client_port: int) -> None:
+        self.folder = folder
+        self.disk = folder / "disk"
+        self.disk.mkdir()
+        self.has_disk = self._mount()
+        self.clock = folder / "clock_off"
+        self.receiver = Receiver(folder / "receiver")
+        config = folder / "gateway.toml"
+        config.write_text(
+            CONFIG.format(port=folder / "receiver", client=client_port, recordings=self.disk)
+        )
+        environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
+        library = self._clock_library()
+        if library is not None:
+            environment |= {"LD_PRELOAD": str(library), "CLOCK_OFF_FILE": str(self.clock)}
+        self.has_clock = library is not None
+        with (folder / "mavgate.log").open("w") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "gateway.cli", "run", "--plain", "--config", str(config)],
+                env=environment,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+            )
+
+    def _mount(self) -> bool:
+        if os.geteuid() != 0:
+            return False
+        mount = ["mount", "-t", "tmpfs", "-o", f"size={DISK}", "tmpfs", str(self.disk)]
+        return subprocess.run(mount, check=False, capture_output=True).returncode == 0
+
+    def _clock_library(self) -> Path | None:
+        compiler = shutil.which("cc")
+        if compiler is None:
+            return None
+        library = self.folder / "clock.so"
+        subprocess.run(
+            [compiler, "-shared", "-fPIC", "-o", str(library), str(CLOCK), "-ldl"], check=True
+        )
+        return library
+
+    async def disturb(self, kind: str, rng: np.random.Generator) -> None:
+        """Disturb it for a while."""
+        if kind == "stopped":
+            self.process.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(rng.uniform(0.3, 6.0))
+            self.process.send_signal(signal.SIGCONT)
+        elif kind == "port pulled":
+            self.receiver.pull()
+            await asyncio.sleep(rng.uniform(0.2, 8.0))
+            self.receiver.plug()
+        elif kind == "disk full":
+            filler = self.disk / "filler"
+            with filler.open("wb") as file:
+                try:
+                    while True:
+                        file.write(b"\0" * 65536)
+                        file.flush()
+                except OSError:
+                    pass
+            await asyncio.sleep(rng.uniform(1.0, 8.0))
+            filler.unlink()
+            for old in sorted(self.disk.rglob("*.*"))[:-4]:
+                old.unlink()
+        elif kind == "clock step":
+            self.clock.write_text(str(int(rng.integers(-7200, 7200))))
+            await asyncio.sleep(1.0)
+
+    def close(self) -> None:
+        """End it."""
+        self.process.send_signal(signal.SIGCONT)
+        self.process.terminate()
+        self.process.wait(30.0)
+        self.receiver.pull()
+        if self.has_disk:
+            subprocess.run(["umount", "--lazy", str(self.disk)], check=False)
 
 
 async def soak(options: argparse.Namespace) -> int:
-    """Run, print the account, and return the exit status."""
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)
-    sink = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sink.bind(("127.0.0.1", 0))
-    settings = GatewaySettings()
-    serial = msgspec.structs.replace(settings.serial, port=os.ttyname(slave))
-    endpoint = f"udp:127.0.0.1:{sink.getsockname()[1]}"
-    hub = msgspec.structs.replace(settings.hub, endpoints=(endpoint,))
-    settings = msgspec.structs.replace(settings, serial=serial, hub=hub)
-    daemon = Daemon(settings, {}, lambda: settings)
-    daemon.start()
-    tracker, rng = Tracker(), np.random.default_rng(options.seed)
-    total = round(options.seconds * options.rate)
-    begin, settled_kib = time.monotonic(), 0
-    with Progress() as progress:
-        task = progress.add_task("soaking", total=total)
-        for index in range(total):
-            time_us = round(index * 1e6 / options.rate)
-            data = tracker.frame(time_us, 0, sample(index))
-            if index % GPS_EVERY == 0:
-                data += tracker.frame(time_us, 1, fix(index))
-            os.write(master, corrupt(data, options.share, options.burst, rng))
-            if index == round(SETTLED_SHARE * total):
-                settled_kib = resident_kib()
-            if index % round(options.rate) == 0:
-                progress.update(task, completed=index)
-            await asyncio.sleep(max(0.0, begin + index / options.rate - time.monotonic()))
-    await asyncio.sleep(1.5)
-    snapshot = daemon.snapshot()
-    daemon.close()
-    sink.close()
-    return judge(snapshot.report, tracker, settled_kib)
+    """Run, print the gaps, and return the exit status."""
+    rng = np.random.default_rng(options.seed)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    begin_s = time.monotonic()
+    listener = Listener(begin_s)
+    transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(
+        lambda: listener, local_addr=("127.0.0.1", port)
+    )
+    folder = Path(tempfile.mkdtemp(prefix="mavgate-soak-"))
+    gateway = Gateway(folder, port)
+    kinds = ["stopped", "port pulled"]
+    kinds += ["disk full"] * gateway.has_disk + ["clock step"] * gateway.has_clock
+    found: list[Disturbance] = []
+    try:
+        gateway.receiver.plug()
+        with Progress() as progress:
+            task = progress.add_task("soaking", total=options.seconds)
+            while (elapsed_s := time.monotonic() - begin_s) < options.seconds:
+                progress.update(task, completed=elapsed_s)
+                await asyncio.sleep(rng.exponential(options.every))
+                kind = str(rng.choice(kinds))
+                start_s = time.monotonic() - begin_s
+                await gateway.disturb(kind, rng)
+                found.append(Disturbance(kind, start_s, time.monotonic() - begin_s))
+        await asyncio.sleep(REOPENING_S)
+    finally:
+        gateway.close()
+        transport.close()
+    return judge(listener, found, folder)
 
 
-def judge(report: LinkReport, tracker: Tracker, settled_kib: int) -> int:
-    """Print the account and tell whether it adds up."""
+def judge(listener: Listener, found: list[Disturbance], folder: Path) -> int:
+    """Print the longest gap of every stream with its cause."""
     status = 0
-    for link in sorted(report.nodes, key=lambda node: node.node.node_id):
-        if link.node.vehicle_id != 1 or link.node.node_id > 1:
-            print(f"a ghost: {link}")
-            continue
-        sent = tracker.seq[link.node.node_id]
-        counted = link.received + link.lost
-        print(
-            f"node {link.node.node_id}: sent {sent}, received {link.received} "
-            f"({100 * link.received / sent:.2f} %), lost {link.lost}, together {counted}"
-        )
-        # What was lost before the first and after the last good frame cannot be known.
-        status |= not 0 <= sent - counted < 0.02 * sent + 500
-    faults = ", ".join(f"{count} {kind}" for kind, count in report.faults)
-    growth = resident_kib() - settled_kib
-    print(f"frames: sent {tracker.frame_seq}, accepted {report.frames}, faults: {faults}")
-    print(f"memory: {settled_kib} KiB settled, {growth:+d} KiB at the end")
-    status |= growth > ALLOWED_GROWTH_KIB
-    print("the account does not add up" if status else "the account adds up, memory is flat")
-    return status
+    print(f"{len(found)} disturbances; log and files in {folder}")
+    print(f"{'message':22} {'count':>8} {'gap s':>7} {'at s':>8} {'unexplained s':>14}  cause")
+    for name in STREAMS:
+        message_id = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+        gaps = listener.gaps.get(message_id, [])
+        count = listener.counts.get(message_id, 0)
+        worst, cause, left_s = Gap(), "", 0.0
+        for gap in gaps:
+            during = [d for d in found if d.overlap_s(gap.begin_s - REOPENING_S, gap.end_s)]
+            reopening_s = REOPENING_S * sum(d.name == "port pulled" for d in during)
+            covered_s = sum(d.overlap_s(gap.begin_s, gap.end_s) for d in during) + reopening_s
+            unexplained_s = max(0.0, gap.length_s - covered_s)
+            if unexplained_s > left_s or not worst.length_s:
+                worst, left_s = gap, unexplained_s
+                cause = ", ".join(f"{d.name} {d.end_s - d.begin_s:.1f} s" for d in during)
+        status |= left_s > MAX_UNEXPLAINED_S or not count
+        figures = f"{worst.length_s:7.1f} {worst.begin_s:8.1f} {left_s:14.1f}"
+        print(f"{name:22} {count:8} {figures}  {cause}")
+    print("texts:", *listener.texts[-40:], sep="\n  ")
+    return int(status)
 
 
 def main() -> None:
     """Read the options and run."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--rate", type=float, default=200.0, help="IMU frames a second")
-    parser.add_argument("--share", type=float, default=0.1, help="of bytes that are corrupted")
-    parser.add_argument("--burst", type=int, default=1, help="bytes corrupted in a row")
+    parser.add_argument("--seconds", type=float, default=3600.0)
+    parser.add_argument("--every", type=float, default=20.0, help="mean time between disturbances")
     parser.add_argument("--seed", type=int, default=1)
     raise SystemExit(asyncio.run(soak(parser.parse_args())))
 

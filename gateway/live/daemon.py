@@ -290,6 +290,9 @@ class Daemon:
         return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)
 
     def _on_bytes(self, data: bytes, now_us: int) -> None:
+        if now_us > self._lag.stalled_after_us:
+            # Before the samples that waited in the kernel: they are late for the same reason.
+            self._watch_loop(now_us)
         self._perform(self._pipeline.feed(data, now_us))
 
     def _on_frame(self, incoming: Incoming) -> None:

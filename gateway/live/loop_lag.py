@@ -20,6 +20,7 @@ RECOVERED_US: Final = 60 * US_PER_S
 MAX_DELAYS: Final = 1000
 """In a span; the timer fires at most every millisecond, but only delays are kept."""
 LEAST_DELAY_US: Final = 20_000
+NEVER_US: Final = 1 << 62
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +42,14 @@ class LoopLag:
         """The longest delay since the state changed to slow."""
         self._delays: deque[tuple[int, int]] = deque(maxlen=MAX_DELAYS)
         self._slow_us = 0
+        self.stalled_after_us = NEVER_US
+        """After this time the timer, if it has not been called, is late by a stall."""
         self._due_us: int | None = None
 
     def expect(self, due_us: int) -> None:
         """Set when the timer is to be called next."""
         self._due_us = due_us
+        self.stalled_after_us = due_us + STALL_US
 
     def update(self, now_us: int) -> LagReport:
         """Add one call of a timer.
@@ -59,7 +63,9 @@ class LoopLag:
         -------
         LagReport
         """
+        self.stalled_after_us = NEVER_US
         delay_us = 0 if self._due_us is None else now_us - self._due_us
+        self._due_us = None
         if delay_us >= LEAST_DELAY_US:
             self._delays.append((now_us, delay_us))
         while self._delays and self._delays[0][0] <= now_us - SPAN_US:

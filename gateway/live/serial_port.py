@@ -30,7 +30,8 @@ from gateway.wire.framing import Frame, FrameDecoder
 log = logging.getLogger(__name__)
 
 FIRST_RETRY_S: Final = 0.25
-LONGEST_RETRY_S: Final = 4.0
+LONGEST_RETRY_S: Final = 1.0
+"""A port that returns and is lost again within the delay would be missed."""
 READ_SIZE: Final = 48
 """A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
 of the loop, so that clients are not kept waiting until all of it is worked off."""

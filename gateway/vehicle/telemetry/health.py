@@ -73,9 +73,11 @@ class Health:
 
     def on_state(self, state: NavState, sample: ImuSample) -> None:
         """Note an IMU sample and what the estimator made of it."""
-        self._seen_us[GYRO] = self._seen_us[ACCEL] = sample.time_us
+        # Samples that waited in the kernel during a stall are older than what the stall excuses.
+        seen_us = max(sample.time_us, self._seen_us.get(GYRO, sample.time_us))
+        self._seen_us[GYRO] = self._seen_us[ACCEL] = seen_us
         if sample.mag_b_ut is not None:
-            self._seen_us[MAG] = sample.time_us
+            self._seen_us[MAG] = seen_us
         self._nav_flags = state.flags
         flags = sample.flags
         self._imu_faults = GYRO | ACCEL if flags & ImuFlags.SELF_TEST_FAILED else 0
@@ -87,12 +89,15 @@ class Health:
 
     def on_baro(self, sample: BaroSample) -> None:
         """Note a barometer sample."""
-        self._seen_us[PRESSURE] = sample.time_us
+        self._see(PRESSURE, sample.time_us)
 
     def on_gps(self, fix: GpsFix) -> None:
         """Note a GPS fix, good or not."""
-        self._seen_us[GPS] = fix.time_us
+        self._see(GPS, fix.time_us)
         self._fix = fix
+
+    def _see(self, sensor: int, time_us: int) -> None:
+        self._seen_us[sensor] = max(time_us, self._seen_us.get(sensor, time_us))
 
     def on_node_status(self, status: NodeStatus) -> list[Finding]:
         """Note a node's report about itself; return the state of its board."""
