@@ -119,8 +119,8 @@
 #define GPS_RATE_HZ 5
 #endif
 
-// The speed that is set in the M8N, one that this crystal can make: 16 MHz gives 57143, 8 MHz
-// 38462.
+// The speed that is set in the GPS receiver, one that this crystal can make: 16 MHz gives 57143,
+// 8 MHz 38462.
 #ifndef GPS_BAUD
 #define GPS_BAUD (F_CPU >= 16000000UL ? 57600UL : 38400UL)
 #endif

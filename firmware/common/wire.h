@@ -41,6 +41,14 @@ enum WireSensor : uint8_t {
     WIRE_SENSOR_GPS = 1 << 3,
 };
 
+// What a GPS receiver turned out to be; 6 to 10 are the generations of u-blox.
+enum WireGpsModule : uint8_t {
+    WIRE_GPS_UNKNOWN = 0,
+    WIRE_GPS_NMEA = 1,
+    WIRE_GPS_UBX = 2,  // of a generation that it does not name
+    WIRE_GPS_UBX_6 = 6,
+};
+
 // Scales of the magnetometer: 0 to 7 are the HMC5883L's gain codes.
 enum WireMagScale : uint8_t {
     WIRE_MAG_QMC5883L_8G = 8,  // 3000 counts per gauss

@@ -94,7 +94,7 @@ TEST(reader_survives_garbage_and_finds_the_next_message) {
         count_messages(&reader, bytes);
         // Garbage may end in what looks like a header; its length is bounded, so a run of zeros
         // ends it.
-        count_messages(&reader, Bytes(UBX_NAV_PVT_SIZE + 8));
+        count_messages(&reader, Bytes(UBX_SIZE_MAX + 8));
         CHECK(count_messages(&reader, message(UBX_NAV_PVT, nav_pvt())) == 1);
     }
 }
@@ -173,4 +173,29 @@ TEST(quality_is_held_at_its_ends) {
     CHECK(quality.course_acc_cdeg == 65535);
     CHECK(quality.geoid_separation_cm == 32767);
     CHECK(quality.hundredths == 0);
+}
+
+TEST(a_long_message_is_read_past_and_its_head_kept) {
+    UbxReader reader = {};
+    Bytes version(220, ' ');
+    std::memcpy(version.data() + 30, "00190000", 8);
+    CHECK(count_messages(&reader, message(UBX_MON_VER, version)) == 1);
+    CHECK(reader.size == 220 && ubx_generation(&reader) == 9);
+    CHECK(count_messages(&reader, message(UBX_NAV_PVT, nav_pvt())) == 1);
+    CHECK(ubx_generation(&reader) == 0);
+}
+
+TEST(every_generation_is_known_by_its_hardware_version) {
+    const struct {
+        const char *version;
+        int generation;
+    } cases[] = {{"00040007", 6}, {"00070000", 7}, {"00080000", 8}, {"00190000", 9},
+                 {"000A0000", 10}, {"00180000", 0}, {"\0\0\0\0\0\0\0\0", 0}};
+    for (const auto &one : cases) {
+        UbxReader reader = {};
+        Bytes version(40);
+        std::memcpy(version.data() + 30, one.version, 8);
+        CHECK(count_messages(&reader, message(UBX_MON_VER, version)) == 1);
+        CHECK(ubx_generation(&reader) == one.generation);
+    }
 }

@@ -1,6 +1,6 @@
 """The three boards: a chip, its program, and what is soldered to it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
@@ -10,9 +10,9 @@ from firmware.rig.air import Air
 from firmware.rig.barometer import make_barometer
 from firmware.rig.bench import Bench, Timer
 from firmware.rig.compass import make_compass
+from firmware.rig.gps import COMPUTING_S, GPS_MODULES, Gps
 from firmware.rig.i2c import I2cBus
 from firmware.rig.imu import IMU_CHIPS, Imu
-from firmware.rig.m8n import COMPUTING_S, M8n
 from firmware.rig.mcu import FIRMWARE, Mcu
 from firmware.rig.nrf24 import Nrf24
 from firmware.rig.world import World
@@ -30,6 +30,9 @@ class Parts:
     imu: str = "MPU6050"
     compass: str = "HMC5883L"
     barometer: str = "BMP180"
+    gps: str = "u-blox M8"
+    gps_baud: int | None = None
+    """Stored speed; that of the module if None."""
 
 
 @dataclass
@@ -136,23 +139,27 @@ class ImuNode(Board):
 
 
 class GpsNode(Board):
-    """ATmega328P, NEO-M8N, radio."""
+    """ATmega328P, GPS receiver, radio."""
 
     def __init__(self, setup: Setup, clock_ppm: float = 0.0, program: str = "gps_node") -> None:
         super().__init__(setup, program, clock_ppm)
-        self.m8n = M8n(
+        module = GPS_MODULES[setup.parts.gps]
+        if setup.parts.gps_baud is not None:
+            module = replace(module, baud=setup.parts.gps_baud)
+        self.gps = Gps(
             setup.bench,
             setup.world,
             setup.rng(),
             self.mcu.uart_feed,
             lambda: self.mcu.uart_baud,
+            module,
             setup.gps_computing_s,
         )
         setup.bench.after_step.append(self._pass_bytes)
 
     def _pass_bytes(self) -> None:
-        for _, byte in self.mcu.uart_take():
-            self.m8n.hear(byte)
+        for cycle, byte in self.mcu.uart_take():
+            self.gps.hear(self.timer.time_of(cycle), byte)
 
 
 class Receiver(Board):

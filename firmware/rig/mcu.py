@@ -64,7 +64,7 @@ def library() -> ctypes.CDLL:
         "board_patch_flash": (None, (pointer, u32, u16)),
         "board_set_pin": (None, (pointer, ctypes.c_char, u8, u8)),
         "board_hold_sda": (None, (pointer, u8)),
-        "board_uart_feed": (None, (pointer, u8)),
+        "board_uart_feed": (None, (pointer, u8, u8)),
         "board_uart_cycles_per_byte": (u32, (pointer,)),
         "board_uart_take": (u32, (pointer, ctypes.c_char_p, ctypes.POINTER(u64))),
     }
@@ -184,9 +184,9 @@ class Mcu:
         self._lib.board_hold_sda(self._board, held)
         self.set_pin("C", 4, not held)
 
-    def uart_feed(self, byte: int) -> None:
+    def uart_feed(self, byte: int, framing_error: bool = False) -> None:
         """Start one byte on the receive line; the program has it a byte's time later."""
-        self._lib.board_uart_feed(self._board, byte)
+        self._lib.board_uart_feed(self._board, byte, framing_error)
 
     @property
     def uart_baud(self) -> float:

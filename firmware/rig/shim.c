@@ -382,9 +382,10 @@ void board_set_pin(board_t *board, char port, uint8_t bit, uint8_t level)
 
 void board_hold_sda(board_t *board, uint8_t stuck) { board->twi_stuck = stuck; }
 
-void board_uart_feed(board_t *board, uint8_t byte)
+void board_uart_feed(board_t *board, uint8_t byte, uint8_t framing_error)
 {
-    avr_raise_irq(avr_io_getirq(board->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT), byte);
+    avr_irq_t *irq = avr_io_getirq(board->avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_INPUT);
+    avr_raise_irq(irq, byte | (framing_error ? UART_INPUT_FE : 0));
 }
 
 uint32_t board_uart_cycles_per_byte(const board_t *board)

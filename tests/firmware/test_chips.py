@@ -8,12 +8,15 @@ import pytest
 from firmware.rig.barometer import BAROMETERS
 from firmware.rig.boards import Parts
 from firmware.rig.compass import make_compass
+from firmware.rig.gps import GPS_MODULES
 from firmware.rig.imu import IMU_CHIPS
-from firmware.rig.world import Moment, World
-from gateway.records import ImuFlags
+from firmware.rig.world import Moment, Solution, World
+from gateway.records import GpsFixType, ImuFlags
 from gateway.wire.payloads import (
     MAG_LSB_PER_GAUSS,
     BaroPayload,
+    GpsFixPayload,
+    GpsQualityPayload,
     ImuPayload,
     NodeStatusPayload,
 )
@@ -22,7 +25,7 @@ from tests.firmware.harness import Bench
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 MakeBench = Callable[..., Bench]
-IMU, MAG, BARO = 1, 2, 4
+IMU, MAG, BARO, GPS = 1, 2, 4, 8
 START_S = 0.45
 """Reset, self-test and set-up."""
 MOMENT = Moment(
@@ -175,3 +178,112 @@ def test_barometer_that_disappears_and_returns_is_found_again(bench: MakeBench, 
     rig.run(0.5)
     assert ImuFlags.BARO_ABSENT not in rig.last(ImuPayload).flags
     assert len(rig.payloads(BaroPayload, since_s=1.5)) >= 6
+
+
+GPS_BAUDS = (4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400)
+FOUND_S = 5.0
+UBX_HZ, NMEA_HZ = 5, 1
+SPEED_CASES = [
+    *((name, None) for name in GPS_MODULES),
+    *((name, baud) for name in ("u-blox M8", "u-blox M10", "NMEA") for baud in GPS_BAUDS),
+    *(("u-blox, no acknowledgement", baud) for baud in (4800, 57_600, 230_400)),
+]
+
+
+@pytest.mark.parametrize(("name", "baud"), SPEED_CASES)
+def test_gps_is_found_at_its_stored_speed_and_sends_its_full_rate(
+    bench: MakeBench, name: str, baud: int | None
+) -> None:
+    rig = bench(parts=Parts(gps=name, gps_baud=baud))
+    node = rig.gps_node()
+    rig.run(FOUND_S)
+    assert rig.payloads(GpsFixPayload)
+    rig.run(2.0)
+    is_nmea = name.startswith("NMEA")
+    fixes = rig.payloads(GpsFixPayload, since_s=FOUND_S)
+    assert len(fixes) == (2 * NMEA_HZ if is_nmea else 2 * UBX_HZ)
+    assert node.gps.dynamic_model == (0 if is_nmea else 8)
+    # NMEA has no velocity down: there it is the difference of two heights, which are the same.
+    down_cmps = 0 if is_nmea else -89
+    for fix in fixes:
+        assert fix.lat_dege7 == pytest.approx(-77_123_456, abs=2)
+        assert fix.lon_dege7 == pytest.approx(1_103_654_321, abs=2)
+        assert fix.alt_amsl_mm == pytest.approx(153_250, abs=50 if is_nmea else 0)
+        assert fix.vel_n_cmps == pytest.approx((1234, -567, down_cmps), abs=1)
+        assert (fix.fix_type, fix.fix_ok) == (GpsFixType.FIX_3D, True)
+    utc = rig.last(GpsQualityPayload).utc
+    assert utc is not None
+    assert utc.isoformat().startswith("2026-11-19T00:00:06")
+    status = rig.last(NodeStatusPayload)
+    assert (status.sensors_present, status.sensors_failed) == (GPS, 0)
+    assert node.mcu.resets == 0
+
+
+@pytest.mark.parametrize("name", ["u-blox 6", "u-blox M10"])
+@pytest.mark.parametrize("baud", [4800, 38_400, 57_600, 230_400])
+def test_gps_that_sends_nothing_is_found(bench: MakeBench, name: str, baud: int) -> None:
+    rig = bench(parts=Parts(gps=name, gps_baud=baud))
+    rig.gps_node().gps.store_silence()
+    rig.run(FOUND_S + 1.0)
+    assert rig.payloads(GpsFixPayload)
+    assert len(rig.payloads(GpsFixPayload, since_s=FOUND_S)) == UBX_HZ
+
+
+def test_gps_that_never_acknowledges_loses_no_fix_once_it_is_set_up(bench: MakeBench) -> None:
+    rig = bench(parts=Parts(gps="u-blox, no acknowledgement"))
+    rig.gps_node()
+    rig.run(7.0)
+    assert len(rig.payloads(GpsFixPayload, since_s=3.0)) == 4 * UBX_HZ
+
+
+@pytest.mark.parametrize(
+    ("name", "baud"),
+    [("u-blox M8", 9600), ("u-blox M10", 38_400), ("u-blox 6", 9600), ("NMEA", 9600)],
+)
+def test_gps_that_resets_in_flight_is_found_again(bench: MakeBench, name: str, baud: int) -> None:
+    rig = bench(parts=Parts(gps=name, gps_baud=57_600))
+    node = rig.gps_node()
+    rig.run(FOUND_S)
+    node.gps.reset(baud)
+    reset_s = rig.now_s
+    rig.run(FOUND_S + 1.0)
+    again = [t for t, f in rig.frames if isinstance(f.payload, GpsFixPayload) and t > reset_s + 0.3]
+    # An NMEA receiver counts as lost only after three seconds: it sends once a second.
+    assert again[0] - reset_s < (6.0 if name == "NMEA" else FOUND_S)
+    assert node.mcu.resets == 0
+
+
+def test_gps_that_disappears_is_reported_and_found_when_it_returns(bench: MakeBench) -> None:
+    rig = bench(parts=Parts(gps="u-blox M10"))
+    node = rig.gps_node()
+    rig.run(FOUND_S)
+    node.gps.absent = True
+    rig.run(3.5)
+    assert rig.last(NodeStatusPayload).sensors_failed == GPS
+    assert rig.last(NodeStatusPayload).bus_errors < 10
+    node.gps.absent = False
+    rig.run(FOUND_S)
+    assert len(rig.payloads(GpsFixPayload, since_s=rig.now_s - 1.0)) == UBX_HZ
+    assert rig.last(NodeStatusPayload).sensors_failed == 0
+
+
+def test_nmea_accuracy_comes_from_the_dilution_of_precision(bench: MakeBench) -> None:
+    solution = Solution(pdop=3.0, alt_amsl_m=100.0, geoid_separation_m=-7.5)
+    rig = bench(world=World(solution=lambda _time_s: solution), parts=Parts(gps="NMEA"))
+    rig.gps_node()
+    rig.run(FOUND_S)
+    quality = rig.last(GpsQualityPayload)
+    # The model's horizontal dilution is half, its vertical dilution 0.8 of that of the position.
+    assert (quality.h_acc_cm, quality.v_acc_cm, quality.speed_acc_cmps) == (600, 960, 150)
+    assert (quality.pdop_centi, quality.geoid_separation_cm) == (300, -750)
+    assert quality.course_acc_cdeg == 65_535
+
+
+def test_nmea_receiver_without_a_fix_reports_none(bench: MakeBench) -> None:
+    blind = Solution(fix_type=0, fix_ok=False, satellites=2)
+    rig = bench(world=World(solution=lambda _time_s: blind), parts=Parts(gps="NMEA"))
+    rig.gps_node()
+    rig.run(FOUND_S)
+    fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
+    assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 2)
+    assert quality.h_acc_cm == 65_535

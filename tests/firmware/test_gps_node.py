@@ -1,11 +1,11 @@
-"""The GPS node's program against the model of the M8N."""
+"""The GPS node's program against the model of a u-blox M8."""
 
 from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 
-from firmware.rig.m8n import FACTORY_BAUD, ubx
+from firmware.rig.gps import ubx
 from firmware.rig.world import Solution, World
 from gateway.records import GpsFixType
 from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, NodeStatusPayload, RadioFrame
@@ -15,7 +15,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 MakeBench = Callable[..., Bench]
 GPS = 1 << 3
-CONFIGURED_S = 1.5
+CONFIGURED_S = 3.0
 
 
 def always(solution: Solution) -> World:
@@ -26,12 +26,12 @@ def test_a_receiver_fresh_from_the_factory_is_configured(bench: MakeBench) -> No
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S)
-    m8n = node.m8n
-    assert m8n.baud == 57_600
-    assert m8n.period_s == 0.2
-    assert m8n.dynamic_model == 8
-    assert m8n.ubx_only
-    assert m8n.pvt_on
+    gps = node.gps
+    assert gps.baud == 57_600
+    assert gps.period_s == 0.2
+    assert gps.dynamic_model == 8
+    assert gps.messages_on == {0x07}
+    assert not gps.nmea_on
     rig.run(2.0)
     assert len(rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)) == pytest.approx(10, abs=1)
     status = rig.last(NodeStatusPayload)
@@ -95,13 +95,12 @@ def test_a_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> N
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S + 0.5)
-    node.m8n.reset()
-    assert node.m8n.baud == FACTORY_BAUD
+    node.gps.reset(baud=9600)
     lost_s = rig.now_s
     rig.run(4.0)
     found = [t for t, f in rig.frames if isinstance(f.payload, GpsFixPayload) and t > lost_s + 0.5]
     assert found[0] - lost_s < 3.0
-    assert node.m8n.dynamic_model == 8
+    assert node.gps.dynamic_model == 8
     assert node.mcu.resets == 0
 
 
@@ -121,7 +120,8 @@ def test_garbage_on_the_line_costs_no_more_than_the_message_it_hits(bench: MakeB
     node = rig.gps_node()
     rig.run(CONFIGURED_S)
     for _ in range(8):
-        node.m8n.say_garbage(60)
+        node.gps.send(b"\xb5\x62")
+        node.gps.send_garbage(60)
         rig.run(0.25)
     fixes = rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)
     assert len(fixes) >= 7
@@ -136,9 +136,9 @@ def test_garbage_on_the_line_costs_no_more_than_the_message_it_hits(bench: MakeB
 def test_a_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left: bytes) -> None:
     rig = bench()
     node = rig.gps_node()
-    rig.run(CONFIGURED_S + 0.1)
-    node.m8n._say(left)
-    rig.run(0.8)
+    rig.run(CONFIGURED_S)
+    node.gps.send(left)
+    rig.run(1.0)
     fixes = [f for t, f in rig.frames if t > CONFIGURED_S and isinstance(f.payload, GpsFixPayload)]
     assert len(fixes) == 5
     assert all(abs(f.header.node_time_us % 200_000 - 150_000) < 1000 for f in fixes)
@@ -147,12 +147,12 @@ def test_a_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left
 def test_without_a_receiver_the_node_says_so_and_goes_on_asking(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()
-    node.m8n.absent = True
+    node.gps.absent = True
     rig.run(2.3)
     assert not rig.payloads(GpsFixPayload)
     status = rig.last(NodeStatusPayload)
     assert (status.sensors_present, status.sensors_failed) == (0, GPS)
-    node.m8n.absent = False
+    node.gps.absent = False
     rig.run(2.5)
     assert len(rig.payloads(GpsFixPayload)) >= 5
     assert rig.last(NodeStatusPayload).sensors_present == GPS
@@ -164,7 +164,7 @@ def test_ten_fixes_a_second_at_8_mhz(bench: MakeBench, build: Callable[..., obje
     rig = bench(build=folder, frequency_hz=8_000_000)
     node = rig.gps_node()
     rig.run(CONFIGURED_S + 1.5)
-    assert (node.m8n.baud, node.m8n.dynamic_model) == (38_400, 6)
+    assert (node.gps.baud, node.gps.dynamic_model) == (38_400, 6)
     assert len(rig.payloads(GpsFixPayload, since_s=CONFIGURED_S)) == pytest.approx(15, abs=1)
 
 
