@@ -35,8 +35,7 @@ from gateway.vehicle.stored import StoredPlaces
 from gateway.vehicle.telemetry.events import StatusText
 from gateway.wire.gps_time import GpsTime
 from gateway.wire.link import Link
-from gateway.wire.mavlink_signing import Signer
-from gateway.wire.mavlink_splitter import origin_of, restamp
+from gateway.wire.mavlink_signing import FrameSigner
 
 REPORT_INTERVAL_US: Final = US_PER_S
 GONE_US: Final = 600 * US_PER_S
@@ -72,8 +71,9 @@ class Pipeline:
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
         self._link = Link()
-        self._signer = Signer()
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
+        self.signer = FrameSigner(self._signing_clock)
+        """Signs the frames of every aircraft with a passphrase where they are sent."""
         self._stamps = {key: StampBook(kept) for key, kept in settings.stamps.items()}
         self._gps_time = GpsTime()
         self._connected = False
@@ -118,7 +118,7 @@ class Pipeline:
 
     def _new(self, vehicle_id: int) -> Aircraft:
         known = self._settings
-        return Aircraft(
+        aircraft = Aircraft(
             vehicle_id,
             known.aircraft.get(vehicle_id, known.default),
             clock=self._signing_clock,
@@ -126,6 +126,16 @@ class Pipeline:
             stored=known.places.get(vehicle_id),
             correct=known.correct,
         )
+        self._set_key(aircraft)
+        return aircraft
+
+    def _set_key(self, aircraft: Aircraft) -> None:
+        """Let the signer use an aircraft's key, or none."""
+        key = aircraft.vehicle.signing_key
+        if key is None:
+            self.signer.keys.pop(aircraft.vehicle_id, None)
+        else:
+            self.signer.keys[aircraft.vehicle_id] = key
 
     def find(self, vehicle_id: int) -> Aircraft:
         """Return an aircraft that was ever heard; raises KeyError for another."""
@@ -170,6 +180,7 @@ class Pipeline:
         actions: list[Action] = []
         for each in self._ever():
             actions += each.sign_by(own.get(each.vehicle_id, common), now_us)
+            self._set_key(each)
         return actions
 
     def stamps_to_keep(self) -> dict[int, Stamps] | None:
@@ -181,17 +192,6 @@ class Pipeline:
     def newest_stamps(self) -> dict[int, Stamps]:
         """Return the signing time stamps of all aircraft, for a clean shutdown."""
         return {key: found for key, book in self._stamps.items() if (found := book.exact())}
-
-    def seal(self, frame: bytes, sequence: int, now_us: Callable[[], int]) -> bytes:
-        """Set a leaving frame's sequence number, and sign it if its aircraft signs.
-
-        `now_us` is the gateway clock, asked for a signature alone.
-        """
-        aircraft = self.aircraft.get(origin_of(frame)[0])
-        key = None if aircraft is None else aircraft.vehicle.signing_key
-        if key is None:
-            return restamp(frame, sequence)
-        return self._signer.sign(frame, sequence, key, self._signing_clock.stamp(now_us()))
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; partly received data is dropped."""

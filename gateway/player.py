@@ -25,7 +25,7 @@ from gateway.recordings.reading import FlightError
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, sequence_of
+from gateway.wire.mavlink_splitter import message_id_of, origin_of, sequence_of, with_sequence
 
 READY_S: Final = 3.0
 """A name that takes longer to be resolved is not waited for."""
@@ -217,11 +217,11 @@ class _Numbering:
         origin = origin_of(frame)
         sequence = sequence_of(frame) + self._added.get(origin, 0) & 0xFF
         self._last[origin] = sequence
-        return restamp(frame, sequence)
+        return with_sequence(frame, sequence)
 
     def inserted(self, frame: bytes) -> bytes:
         """Return an answer, numbered in between the recorded frames."""
         origin = origin_of(frame)
         sequence = self._last[origin] = self._last.get(origin, 0xFF) + 1 & 0xFF
         self._added[origin] = self._added.get(origin, 0) + 1
-        return restamp(frame, sequence)
+        return with_sequence(frame, sequence)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gateway.hub.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
 from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus
 
 

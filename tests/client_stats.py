@@ -1,6 +1,6 @@
 """A client as the hub tells of it, before anything has come or gone."""
 
-from gateway.hub.client_table import ClientStats
+from gateway.hub.stats import ClientStats
 
 TABLET = ClientStats(
     client_id=1,

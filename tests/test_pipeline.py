@@ -27,6 +27,7 @@ from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
+from gateway.wire.mavlink_splitter import frame_of
 
 UNIX_US = 1_790_000_000_000_000
 LEVEL = payloads.ImuPayload(
@@ -237,7 +238,8 @@ def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None
             actions += pipeline.handle(incoming, time_us)
         for action in actions:
             if isinstance(action, Outgoing):
-                signed = pipeline.seal(action.frame, action.frame[4], lambda now_us=time_us: now_us)
+                frame = frame_of(action.frame)
+                signed = pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us).data
                 # It steps over the signatures of messages that it does not know.
                 assert receiver.decode(bytearray(signed)) is not None
                 assert signed[2] & 1
@@ -288,9 +290,11 @@ def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipe
         actions = []
         for tracker in trackers.values():
             actions += pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
-        frames = [a.frame for a in actions if isinstance(a, Outgoing)]
-        sealed = [pipeline.seal(frame, frame[4], lambda now_us=time_us: now_us) for frame in frames]
-        return {frame[5]: bool(frame[2] & 1) for frame in sealed}
+        frames = [frame_of(a.frame) for a in actions if isinstance(a, Outgoing)]
+        signed = [
+            pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us) for frame in frames
+        ]
+        return {frame.origin[0]: frame.signed for frame in signed}
 
     pipeline.feed(trackers[1].frame(0, LEVEL), 0)
     pipeline.sign_by("", {1: "mine", 3: "theirs"}, 1_000_000)

@@ -45,7 +45,7 @@ from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import Link
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
+from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, message_id_of
 
 NUMBERS: Final = (
     *("0", "-1", "1", "47.0", "99999", "-99999", "inf", "-inf", "nan", "1e308", "5e-324", "1e999"),
@@ -115,10 +115,10 @@ def splitter(data: bytes, cuts: list[int]) -> None:
     Where a message is unknown its checksum proves nothing: it passes if it ends where another frame
     or the chunk does, so chunks may differ about that.
     """
-    whole = [event for event in MavlinkSplitter().feed(data) if isinstance(event, bytes)]
+    whole = [event.data for event in MavlinkSplitter().feed(data) if isinstance(event, MavFrame)]
     split = MavlinkSplitter()
     events = [event for chunk in chunks_of(data, cuts) for event in split.feed(chunk)]
-    frames = [event for event in events if isinstance(event, bytes)]
+    frames = [event.data for event in events if isinstance(event, MavFrame)]
     if all(message_id_of(frame) in CRC_EXTRA for frame in whole + frames):
         assert frames == whole
     assert all(frame in data for frame in whole + frames)
@@ -129,7 +129,8 @@ def whole_frames(frames: list[bytes], cuts: list[int]) -> None:
     """Every good frame comes out, whatever the chunks."""
     split = MavlinkSplitter()
     data = b"".join(frames)
-    assert [f for chunk in chunks_of(data, cuts) for f in split.feed(chunk)] == frames
+    events = [event for chunk in chunks_of(data, cuts) for event in split.feed(chunk)]
+    assert [event.data for event in events if isinstance(event, MavFrame)] == frames
 
 
 @given(damaged(radio_frames()), CUTS, st.integers(-1, 10_000_000))

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -23,7 +23,6 @@ from gateway.fleet.site import SiteClient, site_endpoint
 from gateway.hub.endpoint import SITE_NAME
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
-from gateway.hub.transports.base import Client
 from gateway.hub.transports.zenoh.session import Payload
 from gateway.live.control_socket import (
     ControlError,
@@ -34,6 +33,7 @@ from gateway.live.control_socket import (
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
 from gateway.vehicle.signing import key_from_passphrase
+from gateway.wire.mavlink_splitter import frame_of
 
 log = logging.getLogger(__name__)
 
@@ -54,33 +54,6 @@ class IdParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     system_id: int
     own_id: int
     """0 to exclude it."""
-
-
-class FleetHub(Hub):
-    """A hub without vehicles of its own, which drops frames that clients return from sites.
-
-    Parameters
-    ----------
-    settings : HubSettings
-        Endpoints of the ground stations.
-    now_us : callable
-        The gateway clock.
-    loops : LoopDetection
-        Remembers frames sent to sites.
-    """
-
-    def __init__(
-        self, settings: HubSettings, now_us: Callable[[], int], loops: LoopDetection
-    ) -> None:
-        super().__init__(settings, lambda _: None, now_us)
-        self._loops = loops
-        self._deliver_new = self.deliver
-        self.deliver = self._deliver_once
-
-    def _deliver_once(self, client: Client, frame: bytes, now_us: int) -> None:
-        # A returned frame has an id of the site, which is another vehicle's here.
-        if not self._loops.is_returned_by_client(frame, now_us):
-            self._deliver_new(client, frame, now_us)
 
 
 class FleetServer:
@@ -117,7 +90,9 @@ class FleetServer:
         self._ping_interval_us = round(hub_settings.ping_interval_s * US_PER_S)
         self._ping_us = 0
         self._loops = LoopDetection()
-        self._hub = FleetHub(hub_settings, self._now_us, self._loops)
+        self._hub = Hub(
+            hub_settings, lambda _: None, self._now_us, rejects=self._loops.is_returned_by_client
+        )
         self._metrics = MetricsServer(self._metrics_text)
         self._metrics_port = hub_settings.metrics_port
         self._sites: dict[str, SiteClient] = {}
@@ -285,5 +260,5 @@ class FleetServer:
                 continue
             link = mavlink.MAVLink(None, own_id, ONBOARD)
             message = mavlink.MAVLink_statustext_message(mavlink.MAV_SEVERITY_WARNING, text)
-            frame = bytes(message.pack(link))
-            site.receive([frame], len(frame), self._now_us())
+            frame = frame_of(bytes(message.pack(link)))
+            site.receive([frame], len(frame.data), self._now_us())

@@ -1,1 +1,36 @@
-"""Hub."""
+"""The hub: MAVLink frames from any client to the clients that take them.
+
+Theory of operation
+-------------------
+
+    bytes ─ transport ─ MavFrame ─ cached route? ──yes── the clients of the route
+                                        │ no
+                                      Router ─┬─ our vehicles' requests (quota, one a turn)
+                                              ├─ addressed: the clients behind which the target is
+                                              └─ broadcast: a new route, which is kept
+    our frames ─ queue (answers first) ─ Fanout ─ own route ─ numbered and signed ─ transport
+
+1. A transport turns bytes into `MavFrame`s with the splitter. A frame's header is read once, there;
+   after that everything uses the fields of the record, and the bytes are sent on unchanged.
+2. `fanout.RouteCache` holds, for each source and kind of frame, the clients that get it. A hit is
+   one dictionary look-up and one send per client. The one rule: any change on which a route depends
+   (clients, options, requested intervals, bandwidths, paths to a system, our vehicles) clears the
+   cache, and the next frame of each kind is routed again.
+3. `router.Router` handles frames without a cached route: our own that came back, round-trip
+   requests, requests to our vehicles, frames that address a system, and the first broadcast of each
+   kind. `routing_table.RoutingTable` has the paths to each system. `routing_table.DuplicateFilter`
+   drops copies and late frames of systems that are received on several paths.
+4. Our own frames wait in two queues, answers and telemetry, and some are sent at each turn of the
+   event loop. When the processor is short of time, old telemetry is dropped and answers are not.
+   `fanout.Fanout` renumbers for each client, so that filters leave no gaps; `FrameSigner` signs.
+5. A client whose link is slow has a bounded `send_queue.SendQueue`, where answers and attitudes
+   overtake; a link of known bandwidth gets telemetry at lower rates (`bandwidth.Bandwidth`).
+6. Untrusted clients may cause a bounded number of reads, requests and answers (`limits`), are in no
+   routing table, and reach our vehicles only.
+
+An endpoint kind is one file in `transports/` over `base.Client` or `base.Listener`, with
+`datagram` and `stream` between for what datagram sockets and byte streams share. No transport
+blocks or raises; each closes itself on an error, and `tick` opens it again. Everything but
+`transports/`, `hub.py`, `router.py` and `accepting.py` is pure: time is an argument, and nothing is
+read or written.
+"""

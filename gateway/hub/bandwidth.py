@@ -1,17 +1,18 @@
-"""How often each message goes to a link that is too narrow for all of them.
+"""Message intervals on a link whose bandwidth is too small for all telemetry.
 
-Theory of operation. A link has a width in bytes a second. What is offered to it is counted by kind
-of message; when all of it does not fit, each kind is thinned by one factor that is found by
+Theory of operation. A link has a bandwidth in bytes a second. The offered frames are counted by
+kind of message; when not all of them fit, each kind is thinned by one factor that is found by
 bisection, divided by the kind's importance:
 
     rate = offered * min(1, factor * importance), at least `FLOOR_HZ`
 
 Answers that a client waits for, heartbeats and texts are never thinned; their bytes are subtracted
-from the width first. If even the floors do not fit they are all lowered alike, so nothing starves.
+from the bandwidth first. If even the floors do not fit they are all lowered alike, so that no
+message stops.
 
 A radio reports in RADIO_STATUS how full its own buffer is, since the air carries less than the
-serial line: the share of the width that is used goes down while the buffer fills and up again
-slowly.
+serial line: the used share of the bandwidth decreases while the buffer fills and increases
+again slowly.
 
 A link of a few bytes a second gets HIGH_LATENCY2 alone, which carries a whole vehicle in 54 bytes.
 """
@@ -25,8 +26,8 @@ from gateway.units import US_PER_S
 
 HIGH_LATENCY2: Final = dialect.MAVLINK_MSG_ID_HIGH_LATENCY2
 RADIO_STATUS: Final = dialect.MAVLINK_MSG_ID_RADIO_STATUS
-NARROW: Final = 100
-"""Bytes a second, below which a link is one of satellites."""
+SATELLITE_BUDGET: Final = 100
+"""Bytes a second, below which a link is a satellite link."""
 HIGH_LATENCY2_BYTES: Final = 54
 NEVER_THINNED: Final = frozenset(
     {
@@ -46,7 +47,7 @@ IMPORTANCE: Final[dict[int, float]] = {
     dialect.MAVLINK_MSG_ID_ATTITUDE: 2.0,
     dialect.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 2.0,
 }
-"""Others have 1: where the vehicle is and whether it is well comes first, then how it moves."""
+"""Others have 1: position and health come first, then motion."""
 FLOOR_HZ: Final = 0.5
 SMOOTHING: Final = 0.3
 """Weight of the newest second."""
@@ -63,26 +64,26 @@ Key = bytes
 """System, component and message of a frame, as `key_of` gives them."""
 
 
-class Width:
-    """The rates of the messages on one link of a known width.
+class Bandwidth:
+    """Message intervals on one link of a known bandwidth.
 
     Parameters
     ----------
     bytes_per_s : int
-        Of all that goes out.
+        Of everything sent.
     """
 
     def __init__(self, bytes_per_s: int) -> None:
         self.share = 1.0
-        """Part of the width that the radio behind it takes."""
+        """Part of the bandwidth that the radio behind it accepts."""
         self._bytes_per_s = bytes_per_s
         self._offered: dict[Key, tuple[int, float, float]] = {}
         """Message id, and smoothed frames and bytes a second."""
         self._answered = 0.0
         self._intervals_us: dict[Key, int] = {}
 
-    def note_buffer(self, free_percent: int) -> None:
-        """Take in how much of a radio's buffer is free."""
+    def update_buffer(self, free_percent: int) -> None:
+        """Adapt the used share to the free part of a radio's buffer."""
         if free_percent < FULL_PERCENT:
             self.share *= 0.7
         elif free_percent < LOW_PERCENT:

@@ -13,8 +13,22 @@
     serial:DEVICE:BAUD       a telemetry radio or an autopilot on a serial port
 
 IPv6 addresses are written in brackets. Options follow as in any URL:
-`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of other programs are understood too:
-`spelling.py`.
+`?name=tablet&deny=RAW_IMU&pack=1100`. The spellings of other programs are read with their meaning:
+
+| written                                        | by                         | here             |
+| ---------------------------------------------- | -------------------------- | ---------------- |
+| `udpin:`, `udpin://`, `udps:`                  | MAVProxy, MAVSDK, mavp2p   | `udp-listen:`    |
+| `udpout:`, `udpout://`, `udpc:`                | MAVProxy, MAVSDK, mavp2p   | `udp:`           |
+| `HOST:PORT`                                    | MAVProxy, mavlink-router   | `udp:`           |
+| `udpbcast:`, `udpb:`                          | pymavlink, mavp2p          | `udp-broadcast:` |
+| `tcp://`, `tcpout:`, `tcpout://`, `tcpc:`      | MAVSDK, pymavlink, mavp2p  | `tcp:`           |
+| `tcpin:`, `tcpin://`, `tcps:`                  | MAVProxy, MAVSDK, mavp2p   | `tcp-listen:`    |
+| `ws://`, `wss://`                              | browsers, pymavlink        | `ws:`, `wss:`    |
+| `wsserver:`                                    | pymavlink                  | `ws-listen:`     |
+| `serial://DEV:BAUD`, `DEV:BAUD`, `DEV,BAUD`    | MAVSDK, routers, MAVProxy  | `serial:`        |
+
+`udp://` listens in MAVSDK, binds and sends in MAVROS, and looks like `udp:`, which sends here: it
+is refused, and so is an address to send to that can only be one to listen on.
 """
 
 import re
@@ -24,15 +38,15 @@ from typing import Final
 from urllib.parse import parse_qsl
 
 from gateway.hub.hosts import NULL_ORIGIN, is_group, is_loopback, is_name, is_numeric
-from gateway.hub.option_values import (
-    intervals_from,
-    messages_from,
-    name_from,
-    number_from,
-    yes_or_no,
-)
-from gateway.hub.spelling import respell
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
+MAX_NAME: Final = 64
+MAX_MESSAGE_ID: Final = (1 << 24) - 1
+MIN_RATE_HZ: Final = 0.001
+
+NO_MESSAGES: Final = -1
+"""An interval that stops a message."""
 BITS_PER_BYTE: Final = 10
 """On a serial line: start bit, eight data bits, stop bit."""
 MAX_BUDGET: Final = 1_000_000_000
@@ -48,7 +62,7 @@ MAX_BAUD: Final = 12_000_000
 
 SITE_KEYS: Final = "site"
 LOCATOR: Final = re.compile(r"(tcp|tls|quic|udp|ws|unixsock-stream)/\S+")
-"""How Zenoh names a place."""
+"""How Zenoh names an address."""
 RAW_KEYS: Final = "mavlink_raw"
 JSON_KEYS: Final = "mavlink_json"
 SITE_NAME: Final = re.compile(r"(?!\.+$)[A-Za-z0-9_.-]{1,64}")
@@ -91,11 +105,11 @@ LISTENING: Final = frozenset(
         EndpointKind.WSS_LISTEN,
     }
 )
-"""Kinds that bind to their port; to port 0 they bind to any that is free."""
+"""Kinds that bind to their port; port 0 is any free one."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
 COMMON_OPTIONS: Final = frozenset(
-    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted"}
+    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor"}
 )
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
@@ -114,6 +128,23 @@ HOSTED: Final = frozenset(
 """Kinds whose frames go to hosts by their addresses, one by one."""
 ADDED_KINDS: Final[set[str]] = set()
 """Kinds of other packages, which parse the rest of the URL themselves."""
+ALIASES: Final = {
+    "udpin": "udp-listen",
+    "udps": "udp-listen",
+    "udpout": "udp",
+    "udpc": "udp",
+    "udpbcast": "udp-broadcast",
+    "udpb": "udp-broadcast",
+    "mcast": "udp-multicast",
+    "tcpin": "tcp-listen",
+    "tcps": "tcp-listen",
+    "tcpout": "tcp",
+    "tcpc": "tcp",
+    "wsserver": "ws-listen",
+}
+ANY_ADDRESS: Final = "0.0.0.0"
+_SENDING: Final = frozenset({"udp", "tcp", "ws", "wss"})
+_LISTENING: Final = frozenset({"udp-listen", "tcp-listen", "ws-listen", "wss-listen"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,13 +155,13 @@ class Endpoint:
     kind: str
     """An `EndpointKind`, or one of `ADDED_KINDS`."""
     host: str
-    """Address or name without brackets; device of a serial port; otherwise the whole place."""
+    """Address or name without brackets; device of a serial port; otherwise the whole location."""
     port: int
     """Port number; the baud rate of a serial port; 0 of an added kind."""
-    place: str
+    location: str
     """The URL in our own spelling and without options; no two endpoints share one."""
     name: str
-    """The name given by the operator; the place by default."""
+    """The name given by the operator; the location by default."""
     allow: frozenset[int] = frozenset()
     """Only these messages pass; empty lets all pass."""
     deny: frozenset[int] = frozenset()
@@ -144,6 +175,8 @@ class Endpoint:
     """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers except fleets."""
+    monitor: bool = False
+    """Send all traffic, addressed frames included, and ignore everything received."""
     origins: frozenset[str] = frozenset()
     """Pages of other machines that may connect by WebSocket, as browsers name them."""
     path: str = "/"
@@ -163,7 +196,7 @@ class Endpoint:
 
     def name_of(self, peer: str) -> str:
         """Return the name of a client of this port, which begins with the port's name."""
-        return peer if self.name == self.place else f"{self.name} {peer}"
+        return peer if self.name == self.location else f"{self.name} {peer}"
 
     def passes(self, message_id: int) -> bool:
         """Return whether the `allow` and `deny` lists let a message out to this endpoint."""
@@ -178,8 +211,8 @@ def parse_endpoint(url: str) -> Endpoint:
     url : str
         As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
         separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
-        `wait` (milliseconds), `budget` (bytes a second), `trusted` (yes or no), and of some kinds
-        `origins` (separated by commas) or `path`.
+        `wait` (milliseconds), `budget` (bytes a second), `trusted` and `monitor` (yes or no), and
+        of some kinds `origins` (separated by commas) or `path`.
 
     Returns
     -------
@@ -193,23 +226,24 @@ def parse_endpoint(url: str) -> Endpoint:
     """
     address, _, query = url.partition("?")
     try:
-        kind, place = _kind_and_place(address)
-        host, port = _split_place(kind, place)
+        kind, rest = _kind_and_rest(address)
+        host, port = _split_address(kind, rest)
         options = _options(kind, query)
         return Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            place=_own_place(kind, place, options),
-            name=name_from(options.get("name", f"{kind}:{place}")),
+            location=_own_location(kind, rest, options),
+            name=name_from(options.get("name", f"{kind}:{rest}")),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
             interval_us=intervals_from(options.get("rate", "")),
             pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
             pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,
             budget=_budget(kind, port, options.get("budget")),
-            trusted=yes_or_no(options.get("trusted")),
+            trusted=yes_or_no("trusted", options.get("trusted")),
+            monitor=yes_or_no("monitor", options.get("monitor")) or False,
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
             config=options.get("config", ""),
@@ -224,55 +258,55 @@ def host_and_port(host: object, port: object) -> str:
     return f"[{host}]:{port}" if ":" in str(host) else f"{host}:{port}"
 
 
-def _kind_and_place(address: str) -> tuple[str, str]:
+def _kind_and_rest(address: str) -> tuple[str, str]:
     if not address.isprintable():
-        raise ValueError("it cannot be shown")
-    word, _, place = address.partition(":")
+        raise ValueError("contains characters that cannot be printed")
+    word, _, rest = address.partition(":")
     if word in ADDED_KINDS:
-        return word, place
-    word, place = respell(address)
+        return word, rest
+    word, rest = respell(address)
     if word not in set(EndpointKind):
         raise ValueError(f"{word!r} is none of {', '.join([*EndpointKind, *sorted(ADDED_KINDS)])}")
-    return EndpointKind(word), place
+    return EndpointKind(word), rest
 
 
-def _split_place(kind: str, place: str) -> tuple[str, int]:
+def _split_address(kind: str, rest: str) -> tuple[str, int]:
     if kind in ADDED_KINDS:
-        return place, 0
+        return rest, 0
     if kind is EndpointKind.SERIAL:
-        device, colon, baud = place.rpartition(":")
+        device, colon, baud = rest.rpartition(":")
         if not colon:
-            device, baud = place, str(DEFAULT_BAUD)
+            device, baud = rest, str(DEFAULT_BAUD)
         if not device:
             raise ValueError(f"write {kind}:DEVICE:BAUD, as in {kind}:/dev/ttyUSB0:57600")
         return device, number_from(baud, "baud rate", MIN_BAUD, MAX_BAUD)
     if kind is EndpointKind.ZENOH:
-        if not LOCATOR.fullmatch(place):
-            raise ValueError(f"{place!r} is no place of a router; write {kind}:tcp/HOST:7447")
-        return place, 0
-    host, _, port = place.rpartition(":")
+        if not LOCATOR.fullmatch(rest):
+            raise ValueError(f"{rest!r} is not the address of a router; write {kind}:tcp/HOST:7447")
+        return rest, 0
+    host, _, port = rest.rpartition(":")
     bracketed = host.startswith("[") and host.endswith("]")
     if not host or (":" in host and not bracketed):
         raise ValueError(f"write {kind}:HOST:PORT, an IPv6 host in [brackets]")
     number = number_from(port, "port", 0, MAX_PORT)
     host = host[1:-1] if bracketed else host
     if number == 0 and kind not in LISTENING:
-        raise ValueError(f"port 0 is nowhere; name one of 1 to {MAX_PORT}")
+        raise ValueError(f"port must be 1 to {MAX_PORT}: 0 cannot be sent to")
     _check_host(kind, host)
     return host, number
 
 
 def _check_host(kind: str, host: str) -> None:
     if kind in OPEN_TO_ALL and not is_numeric(host):
-        raise ValueError(f"{host!r} is no address, such as 127.0.0.1 or 0.0.0.0")
+        raise ValueError(f"{host!r} is not an address such as 127.0.0.1 or 0.0.0.0")
     if kind is EndpointKind.UDP_MULTICAST and not is_group(host):
-        raise ValueError(f"{host!r} is no multicast group, such as 239.255.145.50")
+        raise ValueError(f"{host!r} is not a multicast group such as 239.255.145.50")
     if not is_numeric(host) and not is_name(host):
         raise ValueError(f"{host!r} is neither an address nor a name")
 
 
 def stays_here(endpoint: Endpoint) -> bool:
-    """Return whether nothing that goes to an endpoint can leave this machine."""
+    """Return whether all traffic of an endpoint stays on this machine."""
     return endpoint.kind in HOSTED and is_loopback(endpoint.host)
 
 
@@ -301,8 +335,8 @@ def _budget(kind: str, baud: int, text: str | None) -> int:
 def _origins(text: str) -> frozenset[str]:
     origins = frozenset(filter(None, text.lower().split(",")))
     for origin in origins:
-        scheme, _, place = origin.partition("://")
-        if origin != NULL_ORIGIN and (not scheme or not place or "/" in place):
+        scheme, _, rest = origin.partition("://")
+        if origin != NULL_ORIGIN and (not scheme or not rest or "/" in rest):
             raise ValueError(
                 f"origin {origin!r} is not {NULL_ORIGIN} or like https://example.org:8080"
             )
@@ -320,13 +354,135 @@ def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
     return {"site": site, "keys": keys}
 
 
-def _own_place(kind: str, place: str, options: dict[str, str]) -> str:
-    """Return what no two endpoints may share: one router takes several sites of a gateway."""
+def _own_location(kind: str, rest: str, options: dict[str, str]) -> str:
+    """Return the text that no two endpoints may share: one router serves several sites."""
     site = options.get("site", "") if kind == EndpointKind.ZENOH else ""
-    return f"{kind}:{place}?site={site}" if site else f"{kind}:{place}"
+    return f"{kind}:{rest}?site={site}" if site else f"{kind}:{rest}"
 
 
 def _path(text: str) -> str:
     if not text.startswith("/") or not text.isascii() or not text.isprintable() or " " in text:
         raise ValueError(f"path {text!r} does not begin with / or has spaces")
     return text
+
+
+def respell(address: str) -> tuple[str, str]:
+    """Read an endpoint without its options, in any of the spellings.
+
+    Parameters
+    ----------
+    address : str
+        In our own spelling or in one of the table above.
+
+    Returns
+    -------
+    kind : str
+        The word before our own first colon, whether there is such a kind or not.
+    rest : str
+        What follows it.
+
+    Raises
+    ------
+    ValueError
+        If programs differ about its meaning; the error names the unambiguous spellings.
+    """
+    if address.startswith("/"):
+        device, comma, baud = address.partition(",")
+        return "serial", f"{device}:{baud}" if comma else address
+    word, colon, rest = address.partition(":")
+    if colon and _is_bare(word, rest):
+        return "udp", address
+    slashes = rest.startswith("//")
+    kind = ALIASES.get(word, word)
+    rest = rest.removeprefix("//")
+    if slashes and word == "udp":
+        raise ValueError(_either(word, rest))
+    host, _, port = rest.rpartition(":")
+    if kind in _LISTENING and not host:
+        rest = f"{ANY_ADDRESS}:{port}"
+    elif kind in _SENDING and port.isdecimal() and host in ("", ANY_ADDRESS, "[::]"):
+        raise ValueError(_either(kind, rest))
+    return kind, rest
+
+
+def _is_bare(word: str, rest: str) -> bool:
+    """Return whether there is no kind: `HOST:PORT`, where a host has a dot or a bracket."""
+    return (word.startswith("[") or "." in word or word == "localhost") and not (
+        rest.startswith("//")
+    )
+
+
+def _either(kind: str, rest: str) -> str:
+    """Return how to write both possible meanings."""
+    host, _, port = rest.rpartition(":")
+    if not port.isdecimal():
+        host, port = rest, "PORT"
+    anywhere = host in ("", ANY_ADDRESS, "[::]")
+    listening = f"{host or ANY_ADDRESS}:{port}"
+    sending = f"{'HOST' if anywhere else host}:{port}"
+    return (
+        f"write {kind}-listen:{listening} to wait for clients there, {kind}:{sending} to send there"
+    )
+
+
+def message_id_from(text: str) -> int:
+    """Return a message id from its name or number.
+
+    Raises
+    ------
+    ValueError
+        If no message has that name.
+    """
+    if text.isdecimal():
+        return number_from(text, "message id", 0, MAX_MESSAGE_ID)
+    try:
+        return MESSAGE_IDS[text.upper()]
+    except KeyError:
+        raise ValueError(f"no MAVLink message is called {text!r}") from None
+
+
+def number_from(text: str, what: str, low: int, high: int) -> int:
+    """Read a whole number within bounds; raises ValueError naming what it is."""
+    # A number of thousands of digits is refused by Python itself, in words about Python.
+    if not text.isascii() or not text.isdecimal() or len(text) > len(str(high)):
+        raise ValueError(f"{what} {text!r} is not {low} to {high}")
+    if not low <= int(text) <= high:
+        raise ValueError(f"{what} {text} is not {low} to {high}")
+    return int(text)
+
+
+def name_from(text: str) -> str:
+    """Read a printable name."""
+    if not text.strip() or not text.isprintable():
+        raise ValueError(f"name {text!r} cannot be printed")
+    return text[:MAX_NAME]
+
+
+def messages_from(text: str) -> frozenset[int]:
+    """Read message names or numbers, separated by commas."""
+    return frozenset(message_id_from(part) for part in text.split(",") if part)
+
+
+def intervals_from(text: str) -> dict[int, int]:
+    """Read `NAME:hertz`, separated by commas; return the least times between two frames in us."""
+    intervals = {}
+    for part in filter(None, text.split(",")):
+        message, _, rate = part.partition(":")
+        try:
+            rate_hz = float(rate)
+        except ValueError:
+            raise ValueError(f"rate {part!r} is not NAME:hertz") from None
+        if not (rate_hz == 0 or MIN_RATE_HZ <= rate_hz <= US_PER_S):
+            raise ValueError(f"rate {part!r} is not 0, or {MIN_RATE_HZ} to {US_PER_S} Hz")
+        interval = round(US_PER_S / rate_hz) if rate_hz else NO_MESSAGES
+        intervals[message_id_from(message)] = interval
+    return intervals
+
+
+def yes_or_no(option: str, text: str | None) -> bool | None:
+    """Read `yes` or `no`; None stays None."""
+    if text is None:
+        return None
+    if text not in {"yes", "no"}:
+        raise ValueError(f"{option} {text!r} is not yes or no")
+    return text == "yes"

@@ -1,101 +1,93 @@
-"""Which outlet gets which frame, in which order and with which sequence number.
+"""Which client gets which frame, with which sequence number; the cache of these decisions.
 
-Theory of operation. The first frame of each (system, component, message) makes a plan: the outlets
-that take every such frame, those that take it at a limited rate, and those that do not take it.
-Plans are discarded when an outlet or a requested rate changes, so the usual frame costs one
-dictionary look-up and one call per outlet.
+Theory of operation. The first frame of each kind (system, component, message) from each source is
+routed by the endpoints' filters, rates and the requested intervals; the resulting `Route` is kept,
+so that the usual frame costs one dictionary look-up and one call per client. There is one cache and
+one rule: whatever changes a fact on which a route depends calls `RouteCache.clear`, and the next
+frame of each kind is routed again. State that must survive a change, such as when a limited message
+is due next, is not in the routes.
 
-A frame that one outlet does not get (filtered, limited, or an answer to another client) leaves a
-gap in the sequence numbers there, which ground stations show as radio loss. So our own frames are
-renumbered for those outlets: each outlet remembers how many it was not given, and all outlets that
-lack the same number share one copy, which is signed too if our vehicle signs. Frames of other
-vehicles are never touched; a filter on those does show as loss.
+A frame that a client does not get (filtered, limited, or an answer to another client) would leave a
+gap in its sequence numbers, which ground stations show as radio loss. So our own frames are
+renumbered: each client has a count of the frames that it was not sent, and all clients with the
+same count share one copy, which is signed too if its vehicle signs. Frames of other vehicles are
+never changed; a filter on those does show as loss.
 
-What goes to an outlet of a known width is counted, and thinned once a second so that it fits: see
-`width.py`.
+The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
+see `bandwidth.py`. A client whose endpoint has `monitor=yes` gets every frame.
 """
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol
 
-from gateway.hub.bandwidth import HIGH_LATENCY2, HIGH_LATENCY2_BYTES, NARROW, Width
-from gateway.hub.endpoint import Endpoint
-from gateway.hub.option_values import NO_MESSAGES
+from gateway.hub.bandwidth import (
+    HIGH_LATENCY2,
+    HIGH_LATENCY2_BYTES,
+    SATELLITE_BUDGET,
+    Bandwidth,
+)
+from gateway.hub.endpoint import NO_MESSAGES, Endpoint
+from gateway.hub.routing_table import Origin, Path
+from gateway.hub.stats import ClientCounters
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import (
-    key_of,
-    message_id_of,
-    origin_of,
-    restamp,
-    sequence_of,
-)
-
-Transmit = Callable[[bytes, int], None]
-"""Hands a frame and its message id to a transport."""
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame
 
 SEQUENCE_MASK: Final = 0xFF
 SLACK_SHIFT: Final = 2
-"""A limited frame may come a quarter of its interval early, or jitter would halve the rate."""
+"""A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
+MAX_KINDS: Final = 4096
+"""Kinds of frame per client: a vehicle sends some fifty; forged headers must not fill memory."""
+MAX_ROUTES: Final = 1024
+"""Cached routes per source; beyond a few hundred they are forged."""
 
-MAX_PLANS: Final = 4096
-"""A vehicle sends some fifty kinds of message; forged headers must not fill the memory."""
+
+class Recipient(Protocol):
+    """The properties of a client on which routes depend, and the ways to send to it."""
+
+    @property
+    def client_id(self) -> int:
+        """Unique for the lifetime of the hub."""
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The present options."""
+
+    @property
+    def counters(self) -> ClientCounters:
+        """Its counters."""
+
+    @property
+    def write(self) -> Callable[[bytes], object]:
+        """Sends one frame at once or raises OSError; only of a client that is direct."""
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether a frame may be passed to `write` directly."""
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Handle a failed `write` whose frame will still be counted as sent."""
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Send one frame now or queue it; never block, never raise."""
 
 
 @dataclass(slots=True)
-class _Stamp:
-    """How many frames of one component an outlet was not given, modulo 256."""
+class _Gap:
+    """Frames of one component that a client was not sent, modulo 256."""
 
     skipped: int = 0
 
-
-@dataclass(slots=True, eq=False)
-class _Outlet:
-    client_id: int
-    transmit: Transmit
-    endpoint: Endpoint
-    width: Width | None = None
-    answered: int = 0
-    """Bytes of answers since the last plan of the width."""
-    wishes: dict[tuple[int, int], int] = field(default_factory=dict)
-    stamps: dict[tuple[int, int], _Stamp] = field(default_factory=dict)
-
-    def stamp_of(self, origin: tuple[int, int]) -> _Stamp:
-        stamp = self.stamps.get(origin)
-        if stamp is None:
-            if len(self.stamps) >= MAX_PLANS:
-                self.stamps.clear()
-            stamp = self.stamps[origin] = _Stamp()
-        return stamp
-
-    def interval_us(self, key: bytes, plan: "_Plan") -> int:
-        """Return the least time between two frames; the settings bound a client's request."""
-        endpoint, message_id, system = self.endpoint, plan.message_id, plan.origin[0]
-        if not endpoint.passes(message_id):
-            return NO_MESSAGES
-        if 0 < endpoint.budget < NARROW:
-            if message_id != HIGH_LATENCY2:
-                return NO_MESSAGES
-            return round(HIGH_LATENCY2_BYTES * US_PER_S / endpoint.budget)
-        if message_id == HIGH_LATENCY2 and plan.is_ours and message_id not in endpoint.allow:
-            # All that it says goes there in full.
-            return NO_MESSAGES
-        limit = endpoint.interval_us.get(message_id, 0)
-        wish = self.wishes.get((system, message_id), 0)
-        if NO_MESSAGES in (limit, wish):
-            return NO_MESSAGES
-        return max(limit, wish, self.width.interval_us(key) if self.width else 0)
+    def skip(self) -> None:
+        self.skipped = (self.skipped + 1) & SEQUENCE_MASK
 
 
-@dataclass(slots=True, eq=False)
-class _Lane:
-    """One kind of frame on its way to one outlet."""
+@dataclass(slots=True)
+class _RateLimit:
+    """Least time between two frames of one kind to one client."""
 
-    client_id: int
-    transmit: Transmit
-    stamp: _Stamp
     interval_us: int
     due_us: int = 0
 
@@ -107,214 +99,368 @@ class _Lane:
         return True
 
     def change(self, interval_us: int) -> None:
-        """Let the frame that is next be as far from the last one as later ones will be."""
+        """Apply another interval to the next frame already."""
         if self.due_us:
             self.due_us += interval_us - self.interval_us
         self.interval_us = interval_us
 
 
-@dataclass(slots=True)
-class _Plan:
-    message_id: int
-    origin: tuple[int, int]
-    is_ours: bool
-    open: list[_Lane] = field(default_factory=list)
-    limited: list[_Lane] = field(default_factory=list)
-    closed: list[_Stamp] = field(default_factory=list)
+@dataclass(slots=True, eq=False)
+class _Subscription:
+    """One client with its limits; survives every change of routes."""
 
-    def due(self, now_us: int) -> list[_Lane]:
-        """Return the lanes that get a frame now; those for which it is too soon skip its number."""
-        lanes = list(self.open)
-        for lane in self.limited:
-            if lane.is_due(now_us):
-                lanes.append(lane)
-            else:
-                _skip(lane.stamp)
-        return lanes
+    client: Recipient
+    bandwidth: Bandwidth | None
+    answered: int = 0
+    """Bytes of answers since the bandwidth was planned last."""
+    requested: dict[tuple[int, int], int] = field(default_factory=dict)
+    """Requested intervals by system and message."""
+    gaps: dict[Origin, _Gap] = field(default_factory=dict)
+    limits: dict[bytes, _RateLimit] = field(default_factory=dict)
+
+    def gap_of(self, origin: Origin) -> _Gap:
+        gap = self.gaps.get(origin)
+        if gap is None:
+            if len(self.gaps) >= MAX_KINDS:
+                self.gaps.clear()
+            gap = self.gaps[origin] = _Gap()
+        return gap
+
+    def limit_of(self, key: bytes, interval_us: int) -> _RateLimit:
+        limit = self.limits.get(key)
+        if limit is None:
+            if len(self.limits) >= MAX_KINDS:
+                self.limits.clear()
+            limit = self.limits[key] = _RateLimit(interval_us)
+        elif limit.interval_us != interval_us:
+            limit.change(interval_us)
+        return limit
+
+    def interval_us(self, frame: MavFrame, *, is_ours: bool) -> int:
+        """Return the least time between two frames; the settings bound a client's request."""
+        endpoint, message_id = self.client.endpoint, frame.message_id
+        if endpoint.monitor:
+            return 0
+        if not endpoint.passes(message_id):
+            return NO_MESSAGES
+        if 0 < endpoint.budget < SATELLITE_BUDGET:
+            if message_id != HIGH_LATENCY2:
+                return NO_MESSAGES
+            return round(HIGH_LATENCY2_BYTES * US_PER_S / endpoint.budget)
+        if message_id == HIGH_LATENCY2 and is_ours and message_id not in endpoint.allow:
+            # Its content is sent there in full by other messages.
+            return NO_MESSAGES
+        limit = endpoint.interval_us.get(message_id, 0)
+        requested = self.requested.get((frame.origin[0], message_id), 0)
+        if NO_MESSAGES in (limit, requested):
+            return NO_MESSAGES
+        planned = self.bandwidth.interval_us(frame.key) if self.bandwidth else 0
+        return max(limit, requested, planned)
 
 
-class Fanout:
-    """Give frames to outlets by their filters, rates and addresses.
+class Route:
+    """The clients that get one kind of frame from one client.
 
     Parameters
     ----------
-    seal : callable
-        Numbers, and signs, each frame of ours that leaves.
+    message_id : int
+        Of the frames.
+    targets : sequence of (Recipient, _RateLimit or None)
+        The clients that get them, and how often.
+    path : Path
+        Of the frames' system.
+    rejects : callable, optional
+        Whether a frame is dropped: a copy.
+    on_foreign : callable, optional
+        Called with each forwarded frame.
     """
 
-    def __init__(self, seal: Seal = restamp) -> None:
-        self._seal = seal
-        self._outlets: dict[int, _Outlet] = {}
-        self._plans: dict[bytes, _Plan] = {}
-        self._is_metered = False
-        self._offered: dict[bytes, tuple[int, int, int]] = {}
-        """Message id, frames and bytes of each kind since the last plan of the widths."""
-        self._thinned_us = 0
+    __slots__ = (
+        "_direct", "_limited", "_on_foreign", "_others", "_path", "_rejects", "frames",
+        "message_id", "size",
+    )  # fmt: skip
 
-    def add(self, client_id: int, transmit: Transmit, endpoint: Endpoint) -> None:
-        """Let an outlet take part from the next frame on."""
-        self._outlets[client_id] = _Outlet(client_id, transmit, endpoint, _width(endpoint))
-        self._change()
+    def __init__(
+        self,
+        message_id: int,
+        targets: Sequence[tuple[Recipient, _RateLimit | None]],
+        path: Path,
+        rejects: Callable[[MavFrame, int], bool] | None,
+        on_foreign: Callable[[bytes], None] | None,
+    ) -> None:
+        self.message_id = message_id
+        self.frames = self.size = 0
+        """Not yet in the counters of the direct clients."""
+        self._path = path
+        self._rejects = rejects
+        self._on_foreign = on_foreign
+        free = [client for client, limit in targets if limit is None]
+        self._direct = [client for client in free if client.is_direct]
+        self._others = [client for client in free if not client.is_direct]
+        self._limited = [(client, limit) for client, limit in targets if limit is not None]
+
+    def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
+        """Send a frame to every client; a rejected one to none."""
+        self._path.heard_us = now_us
+        if self._rejects is not None and not is_checked and self._rejects(frame, now_us):
+            return
+        data = frame.data
+        self.frames += 1
+        self.size += len(data)
+        for client in self._direct:
+            try:
+                client.write(data)
+            except OSError as error:
+                client.recover_uncounted(data, error)
+        for client in self._others:
+            client.transmit(frame)
+        for client, limit in self._limited:
+            if limit.is_due(now_us):
+                client.transmit(frame)
+        if self._on_foreign is not None:
+            self._on_foreign(data)
+
+    def settle(self) -> tuple[int, int]:
+        """Add the common count to the clients' counters; return the frames and bytes."""
+        frames, size = self.frames, self.size
+        self.frames = self.size = 0
+        if frames:
+            for client in self._direct:
+                client.counters.sent += frames
+                client.counters.bytes_sent += size
+        return frames, size
+
+
+class OwnRoute:
+    """The clients that get one kind of our own frames."""
+
+    __slots__ = ("closed", "frames", "message_id", "size", "targets")
+
+    def __init__(self, message_id: int) -> None:
+        self.message_id = message_id
+        self.frames = self.size = 0
+        self.targets: list[tuple[Recipient, _Gap, _RateLimit | None]] = []
+        self.closed: list[_Gap] = []
+        """Of clients that get none of these frames."""
+
+    def settle(self) -> tuple[int, int]:
+        """Return the frames and bytes since the last call."""
+        frames, size = self.frames, self.size
+        self.frames = self.size = 0
+        return frames, size
+
+
+class RouteCache:
+    """Cached routes by source and kind of frame; any change discards all of them."""
+
+    def __init__(self) -> None:
+        self.own: dict[bytes, OwnRoute] = {}
+        self.forwarded = 0
+        """Frames of other systems that were forwarded by cached routes."""
+        self.offered: dict[bytes, tuple[int, int, int]] = {}
+        """Message id, frames and bytes of each kind since the bandwidths were planned last."""
+        self.is_metered = False
+        """Whether `offered` is needed."""
+        self.others: dict[tuple[int, bytes], Route] = {}
+        """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
+        self._by_source: dict[int, dict[bytes, Route]] = {}
+
+    def of(self, client_id: int) -> dict[bytes, Route]:
+        """Return the routes from a client by `MavFrame.key`; the same dictionary at any time."""
+        return self._by_source.setdefault(client_id, {})
+
+    def clear(self) -> None:
+        """Discard all routes, because a fact has changed on which some depend."""
+        self.settle()
+        self.own.clear()
+        self.others.clear()
+        for routes in self._by_source.values():
+            routes.clear()
 
     def remove(self, client_id: int) -> None:
-        """Forget an outlet; unknown ids are ignored."""
-        if self._outlets.pop(client_id, None):
-            self._change()
+        """Discard all routes, and forget a client that has gone."""
+        self.clear()
+        self._by_source.pop(client_id, None)
 
-    def reconfigure(self, client_id: int, endpoint: Endpoint) -> None:
+    def settle(self) -> None:
+        """Bring all counters up to date."""
+        for routes in self._by_source.values():
+            for key, route in routes.items():
+                self.forwarded += self._meter(key, route)
+        for (_, key), route in self.others.items():
+            self.forwarded += self._meter(key, route)
+        for key, own in self.own.items():
+            self._meter(key, own)
+
+    def _meter(self, key: bytes, route: Route | OwnRoute) -> int:
+        """Count the frames that a route has sent since the last time; return their number."""
+        message_id, (frames, size) = route.message_id, route.settle()
+        if frames and self.is_metered and len(self.offered) < MAX_KINDS:
+            _, known_frames, known_size = self.offered.get(key, (0, 0, 0))
+            self.offered[key] = message_id, known_frames + frames, known_size + size
+        return frames
+
+
+class Fanout:
+    """Give frames to clients by their filters, rates and addresses.
+
+    Parameters
+    ----------
+    signer : FrameSigner
+        Numbers and signs our own frames.
+    """
+
+    def __init__(self, signer: FrameSigner) -> None:
+        self.cache = RouteCache()
+        self._signer = signer
+        self._subscriptions: dict[int, _Subscription] = {}
+        self._monitors: list[Recipient] = []
+        self._planned_us = 0
+
+    def add(self, client: Recipient) -> None:
+        """Include a client from the next frame on."""
+        bandwidth = _bandwidth(client.endpoint)
+        self._subscriptions[client.client_id] = _Subscription(client, bandwidth)
+        self._changed()
+
+    def remove(self, client_id: int) -> None:
+        """Remove a client; unknown ids are ignored."""
+        self._subscriptions.pop(client_id, None)
+        self.cache.remove(client_id)
+        self._changed()
+
+    def reconfigure(self, client: Recipient, budget_before: int) -> None:
         """Apply changed lists and rates from the next frame on."""
-        if outlet := self._outlets.get(client_id):
-            if outlet.endpoint.budget != endpoint.budget:
-                outlet.width = _width(endpoint)
-            outlet.endpoint = endpoint
-            self._change()
+        if subscription := self._subscriptions.get(client.client_id):
+            if client.endpoint.budget != budget_before:
+                subscription.bandwidth = _bandwidth(client.endpoint)
+            self._changed()
 
-    def set_interval(self, wish: ClientInterval) -> None:
-        """Apply a client's requested rate; that of a client that has gone is ignored."""
-        if outlet := self._outlets.get(wish.client_id):
-            outlet.wishes[wish.system_id, wish.message_id] = wish.interval_us
-            self._plans.clear()
+    def set_interval(self, request: ClientInterval) -> None:
+        """Apply a requested message interval; that of a client that has gone is ignored."""
+        if subscription := self._subscriptions.get(request.client_id):
+            key = (request.system_id, request.message_id)
+            subscription.requested[key] = request.interval_us
+            self.cache.clear()
 
-    def publish(self, frame: bytes, now_us: int) -> None:
-        """Send one of our own frames to every outlet that takes it."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=True)
-        message_id = plan.message_id
-        if self._is_metered:
-            self.meter(key_of(frame), message_id, 1, len(frame))
-        sequence = sequence_of(frame)
-        copies: dict[int, bytes] = {}
-        for lane in plan.due(now_us) if plan.limited else plan.open:
-            skipped = lane.stamp.skipped
-            if skipped not in copies:
-                copies[skipped] = self._seal(frame, sequence - skipped & SEQUENCE_MASK)
-            lane.transmit(copies[skipped], message_id)
-        for stamp in plan.closed:
-            _skip(stamp)
+    def publish(self, frame: MavFrame, sequence: int, now_us: int) -> None:
+        """Send one of our own frames, with a sequence number, to every client that takes it."""
+        route = self.cache.own.get(frame.key) or self._make_own_route(frame)
+        route.frames += 1
+        route.size += len(frame.data)
+        copies: dict[int, MavFrame] = {}
+        for client, gap, limit in route.targets:
+            if limit is not None and not limit.is_due(now_us):
+                gap.skip()
+                continue
+            skipped = gap.skipped
+            copy = copies.get(skipped)
+            if copy is None:
+                number = sequence - skipped & SEQUENCE_MASK
+                copy = copies[skipped] = self._signer.sequence_and_sign(frame, number, now_us)
+            client.transmit(copy)
+        for gap in route.closed:
+            gap.skip()
+
+    def answer(
+        self, frame: MavFrame, sequence: int, client_ids: Collection[int], now_us: int
+    ) -> None:
+        """Send one of our own frames to some clients only, past their filters."""
+        # A copy: a client that breaks at this frame removes itself.
+        for client_id, subscription in tuple(self._subscriptions.items()):
+            gap = subscription.gap_of(frame.origin)
+            if client_id in client_ids or subscription.client.endpoint.monitor:
+                subscription.answered += len(frame.data)
+                number = sequence - gap.skipped & SEQUENCE_MASK
+                copy = self._signer.sequence_and_sign(frame, number, now_us)
+                subscription.client.transmit(copy)
+            else:
+                gap.skip()
+
+    def deliver(self, frame: MavFrame, client_ids: Collection[int], source_id: int) -> None:
+        """Forward a frame to some clients, past their filters, unchanged."""
+        for client_id in client_ids:
+            if subscription := self._subscriptions.get(client_id):
+                subscription.answered += len(frame.data)
+                subscription.client.transmit(frame)
+        for monitor in self._monitors:
+            if monitor.client_id not in client_ids and monitor.client_id != source_id:
+                monitor.transmit(frame)
+
+    def make_route(
+        self,
+        frame: MavFrame,
+        source_id: int,
+        path: Path,
+        rejects: Callable[[MavFrame, int], bool] | None,
+        on_foreign: Callable[[bytes], None] | None,
+    ) -> Route:
+        """Make the route of broadcasts like this one from a client; see `Route`."""
+        if max(len(self.cache.of(source_id)), len(self.cache.others)) >= MAX_ROUTES:
+            self.cache.clear()
+        targets: list[tuple[Recipient, _RateLimit | None]] = []
+        for subscription in self._subscriptions.values():
+            interval_us = subscription.interval_us(frame, is_ours=False)
+            if subscription.client.client_id != source_id and interval_us != NO_MESSAGES:
+                limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
+                targets.append((subscription.client, limit))
+        return Route(frame.message_id, targets, path, rejects, on_foreign)
 
     def align(self, client_ids: Sequence[int]) -> None:
-        """Send outlets to one peer the same frames, number for number, from now on.
+        """Send links to one peer the same frames, number for number, from now on.
 
-        A rate that one of them requested holds for all; where they differ, the first decides.
+        A message interval that one of them requested applies to all; where they differ, the first
+        decides.
         """
-        outlets = [self._outlets[key] for key in client_ids if key in self._outlets]
-        origins = {origin for outlet in outlets for origin in outlet.stamps}
-        wishes = {k: v for outlet in reversed(outlets) for k, v in outlet.wishes.items()}
-        for outlet in outlets:
-            outlet.wishes = dict(wishes)
+        links = [self._subscriptions[key] for key in client_ids if key in self._subscriptions]
+        origins = {origin for link in links for origin in link.gaps}
+        requested = {k: v for link in reversed(links) for k, v in link.requested.items()}
+        for link in links:
+            link.requested = dict(requested)
             for origin in origins:
-                outlet.stamp_of(origin).skipped = outlets[0].stamp_of(origin).skipped
-        self._plans.clear()
+                link.gap_of(origin).skipped = links[0].gap_of(origin).skipped
+        self.cache.clear()
 
-    def answer(self, frame: bytes, client_ids: Collection[int]) -> None:
-        """Send one of our own frames to some outlets only, past their filters."""
-        origin = origin_of(frame)
-        # A copy: an outlet that breaks at this frame removes itself.
-        for outlet in tuple(self._outlets.values()):
-            stamp = outlet.stamp_of(origin)
-            if outlet.client_id in client_ids:
-                outlet.answered += len(frame)
-                sequence = sequence_of(frame) - stamp.skipped & SEQUENCE_MASK
-                outlet.transmit(self._seal(frame, sequence), message_id_of(frame))
-            else:
-                _skip(stamp)
+    def thin(self, now_us: int) -> None:
+        """Plan the message intervals to clients of known bandwidth; call it once a second."""
+        if not self.cache.is_metered or now_us - self._planned_us < US_PER_S:
+            return
+        elapsed_s = (now_us - self._planned_us) / US_PER_S
+        self._planned_us = now_us
+        self.cache.clear()
+        for subscription in self._subscriptions.values():
+            if subscription.bandwidth is not None:
+                subscription.bandwidth.plan(self.cache.offered, subscription.answered, elapsed_s)
+                subscription.answered = 0
+        self.cache.offered = {}
 
-    def forward(self, frame: bytes, source_id: int, now_us: int) -> None:
-        """Pass another system's broadcast on to all outlets but the one it came from."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=False)
-        if self._is_metered:
-            self.meter(key_of(frame), plan.message_id, 1, len(frame))
-        for lane in plan.open:
-            if lane.client_id != source_id:
-                lane.transmit(frame, plan.message_id)
-        for lane in plan.limited:
-            if lane.client_id != source_id and lane.is_due(now_us):
-                lane.transmit(frame, plan.message_id)
+    def update_buffer(self, client_id: int, free_percent: int) -> None:
+        """Adapt the rate to a client to the free part of its radio's buffer."""
+        subscription = self._subscriptions.get(client_id)
+        if subscription is not None and subscription.bandwidth is not None:
+            subscription.bandwidth.update_buffer(free_percent)
 
-    def takers(self, frame: bytes, source_id: int) -> list[int] | None:
-        """Return who gets all frames like this one from a source; None if that varies."""
-        plan = self._plans.get(key_of(frame)) or self._make_plan(frame, is_ours=False)
-        if plan.limited:
-            return None
-        return [lane.client_id for lane in plan.open if lane.client_id != source_id]
+    def _changed(self) -> None:
+        self.cache.clear()
+        subscriptions = self._subscriptions.values()
+        self.cache.is_metered = any(each.bandwidth for each in subscriptions)
+        self._monitors = [each.client for each in subscriptions if each.client.endpoint.monitor]
 
-    def deliver(self, frame: bytes, client_ids: Iterable[int]) -> None:
-        """Pass a frame on to some outlets, past their filters, untouched."""
-        message_id = message_id_of(frame)
-        for client_id in client_ids:
-            if outlet := self._outlets.get(client_id):
-                outlet.answered += len(frame)
-                outlet.transmit(frame, message_id)
-
-    def thin(self, now_us: int) -> bool:
-        """Thin the frames to outlets of a known width so that they fit; call it once a second.
-
-        Returns
-        -------
-        bool
-            Whether an outlet that got all frames of a kind gets fewer now, or all of them again.
-        """
-        if not self._is_metered or now_us - self._thinned_us < US_PER_S:
-            return False
-        elapsed_s = (now_us - self._thinned_us) / US_PER_S
-        self._thinned_us = now_us
-        for outlet in self._outlets.values():
-            if outlet.width is not None:
-                outlet.width.plan(self._offered, outlet.answered, elapsed_s)
-                outlet.answered = 0
-        self._offered = {}
-        stale = [key for key, plan in self._plans.items() if self._rethin(key, plan)]
-        for key in stale:
-            del self._plans[key]
-        return bool(stale)
-
-    def _rethin(self, key: bytes, plan: _Plan) -> bool:
-        """Give a plan's lanes new intervals; return whether one belongs to another list now."""
-        is_stale = False
-        for lanes, is_limited in ((plan.open, False), (plan.limited, True)):
-            for lane in lanes:
-                outlet = self._outlets[lane.client_id]
-                if outlet.width is not None:
-                    # In place: a new lane would send at once.
-                    lane.change(outlet.interval_us(key, plan))
-                    is_stale |= (lane.interval_us > 0) != is_limited
-        return is_stale
-
-    def meter(self, key: bytes, message_id: int, frames: int, size: int) -> None:
-        """Count frames that went to all who take them, whichever way they went."""
-        _, known_frames, known_size = self._offered.get(key, (0, 0, 0))
-        if self._is_metered and len(self._offered) < MAX_PLANS:
-            self._offered[key] = message_id, known_frames + frames, known_size + size
-
-    def note_buffer(self, client_id: int, free_percent: int) -> None:
-        """Take in how much of the buffer of an outlet's radio is free."""
-        outlet = self._outlets.get(client_id)
-        if outlet is not None and outlet.width is not None:
-            outlet.width.note_buffer(free_percent)
-
-    def _change(self) -> None:
-        self._plans.clear()
-        self._is_metered = any(outlet.width for outlet in self._outlets.values())
-
-    def _make_plan(self, frame: bytes, *, is_ours: bool) -> _Plan:
-        if len(self._plans) >= MAX_PLANS:
-            self._plans.clear()
-        origin = origin_of(frame)
-        plan = _Plan(message_id_of(frame), origin, is_ours)
-        for outlet in self._outlets.values():
-            interval_us = outlet.interval_us(key_of(frame), plan)
+    def _make_own_route(self, frame: MavFrame) -> OwnRoute:
+        if len(self.cache.own) >= MAX_KINDS:
+            self.cache.clear()
+        route = OwnRoute(frame.message_id)
+        for subscription in self._subscriptions.values():
+            interval_us = subscription.interval_us(frame, is_ours=True)
+            gap = subscription.gap_of(frame.origin)
             if interval_us == NO_MESSAGES:
-                if is_ours:
-                    plan.closed.append(outlet.stamp_of(origin))
+                route.closed.append(gap)
                 continue
-            lane = _Lane(outlet.client_id, outlet.transmit, outlet.stamp_of(origin), interval_us)
-            (plan.limited if interval_us else plan.open).append(lane)
-        self._plans[key_of(frame)] = plan
-        return plan
+            limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
+            route.targets.append((subscription.client, gap, limit))
+        self.cache.own[frame.key] = route
+        return route
 
 
-def _skip(stamp: _Stamp) -> None:
-    stamp.skipped = (stamp.skipped + 1) & SEQUENCE_MASK
-
-
-def _width(endpoint: Endpoint) -> Width | None:
-    return Width(endpoint.budget) if endpoint.budget >= NARROW else None
+def _bandwidth(endpoint: Endpoint) -> Bandwidth | None:
+    return Bandwidth(endpoint.budget) if endpoint.budget >= SATELLITE_BUDGET else None

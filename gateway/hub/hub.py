@@ -1,4 +1,4 @@
-"""The hub: every frame of ours goes to every client, and clients' frames are routed."""
+"""The hub: every frame of ours is sent to every client, and clients' frames are routed."""
 
 import asyncio
 import contextlib
@@ -6,49 +6,67 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from gateway.hub.client_alerts import TroubleWatch
-from gateway.hub.client_table import ClientStats, HubCounters, ListenerStats
-from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.fanout import Fanout
-from gateway.hub.log_rate_limiter import Digest
+from gateway.hub.endpoint import Endpoint, parse_endpoint
+from gateway.hub.fanout import Fanout, Route
+from gateway.hub.limits import TokenBucket
 from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin
+from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
 from gateway.hub.settings import HubSettings
-from gateway.hub.token_bucket import Purse
+from gateway.hub.stats import (
+    ClientAlerts,
+    ClientStats,
+    HubCounters,
+    ListenerStats,
+    LogRateLimiter,
+)
 from gateway.hub.transports.base import (
     READ_BYTES,
-    STRANGERS_READ_BURST,
-    STRANGERS_READ_RATE,
+    UNTRUSTED_READ_BURST,
+    UNTRUSTED_READ_RATE,
     Client,
+    Listener,
 )
-from gateway.hub.transports.listener import Listener
 from gateway.hub.transports.registry import CLIENTS, LISTENERS
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import restamp
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 log = logging.getLogger(__name__)
 
 TICK_S: Final = 0.25
 """Often enough for expiry and reconnection, too seldom to cost anything."""
-VISITS_IN_FULL: Final = 30
+CONNECTIONS_IN_FULL: Final = 30
 """Connects and disconnects at listening ports that are logged one by one in a minute."""
+CONNECTIONS_NOT_LOGGED: Final = "more connects and disconnects at listening ports"
 SENDS_AT_ONCE: Final = 8
-"""Of a burst of our own frames, before the loop does other work: each takes some tens of µs."""
+"""Maximum sends of our own frames per event-loop turn: each takes some tens of µs."""
 LEAST_READ_BYTES: Final = 192
-"""Some frames: of fewer each wake-up would cost more than they do."""
+"""Some frames: with fewer, each wake-up would cost more than the frames do."""
 PASSED_ON_BYTES: Final = 12_288
-"""Read from one client at one wake-up, times the clients that may take it: some 250 sends, about a
+"""Read from one client at one wake-up, times the clients that may get it: some 250 sends, about a
 millisecond, so that a flooding client delays the others by no more."""
 MAX_WAITING: Final = 256
-"""Frames of a burst that wait. More are sent at once, so a loop that is too slow reads less."""
+"""Frames of a burst that wait. More are sent at once, so that a fast playback is slowed down."""
+SHED_AFTER_US: Final = 150_000
+"""Telemetry that has waited longer is dropped: the processor is short of time, and newer telemetry
+is waiting already."""
+
+
+class _Queued(NamedTuple):
+    """One of our own frames that waits for a turn of the loop."""
+
+    frame: MavFrame
+    step: int | None
+    client_id: int | None
+    since_us: int
 
 
 class Hub:
@@ -59,7 +77,7 @@ class Hub:
     settings : HubSettings
         Endpoints and limits.
     on_frame : callable
-        Called with every frame for our vehicles, every request to all, and every heartbeat, within
+        Called with every frame to our vehicles, every request to all, and every heartbeat, within
         the client's quota of answers.
     now_us : callable
         The gateway clock.
@@ -67,10 +85,12 @@ class Hub:
         Called with every frame of another system, once, byte for byte, as for a recorder.
     on_gone : callable, optional
         Called with the id of a client that has gone for good.
-    on_trouble : callable, optional
+    on_alert : callable, optional
         Called when a problem of a client begins (True) or ends, with a short text.
-    seal : callable, optional
-        Numbers, and signs, each frame of ours that leaves; without it none is signed.
+    signer : FrameSigner, optional
+        Numbers and signs each frame of ours where it is sent; by default none is signed.
+    rejects : callable, optional
+        Called with each received frame and the time; True drops it.
     recordings : Path, optional
         Folder of the recordings that a fleet may fetch.
     """
@@ -82,41 +102,49 @@ class Hub:
         now_us: Callable[[], int],
         on_foreign: Callable[[bytes], None] | None = None,
         on_gone: Callable[[int], None] | None = None,
-        on_trouble: Callable[[bool, str], None] | None = None,
-        seal: Seal = restamp,
+        on_alert: Callable[[bool, str], None] | None = None,
+        signer: FrameSigner | None = None,
+        rejects: Callable[[bytes, int], bool] | None = None,
         recordings: Path | None = None,
     ) -> None:
         self.settings = settings
         self.recordings = recordings
-        self.seal = seal
+        self.signer = signer = signer or FrameSigner()
         self.now_us = now_us
-        self.strangers = Purse(STRANGERS_READ_RATE, STRANGERS_READ_BURST, STRANGERS_READ_BURST)
+        self.untrusted_reads = TokenBucket(
+            UNTRUSTED_READ_RATE, UNTRUSTED_READ_BURST, UNTRUSTED_READ_BURST
+        )
         self._on_gone = on_gone
-        self._on_trouble = on_trouble
-        self._trouble = TroubleWatch()
-        self._visits = Digest(VISITS_IN_FULL, "more comings and goings at listening ports")
-        self._fanout = Fanout(seal)
-        self._probe = RoundTrip(seal)
+        self._on_alert = on_alert
+        self._alerts = ClientAlerts()
+        self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)
         self._clients: dict[int, Client] = {}
         self._endpoints: dict[str, Client | Listener[Any]] = {}
         self._next_id = 1
-        self._vehicles = OwnVehicles(seal)
+        self._fanout = Fanout(signer)
+        self._round_trip = RoundTrip(signer)
+        self._vehicles = OwnVehicles()
         self._router = Router(
+            settings,
             self._clients,
             self._fanout,
             self._vehicles,
-            self._probe,
+            self._round_trip,
             on_frame,
             on_foreign,
+            rejects,
             now_us,
         )
         self.deliver = self._router.deliver
-        self._ping_us = self._trouble_us = 0
+        self._ping_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._published = 0
+        self._published = self._shed = 0
         self._gathering: dict[float, list[Callable[[], None]]] = {}
         """Callbacks to flush, by their wait."""
-        self._burst: deque[Outgoing] = deque()
+        self._numbering = Numbering(lambda _: True)
+        """Answers overtake telemetry, so frames are numbered when they leave the queues."""
+        self._answers: deque[_Queued] = deque()
+        self._telemetry: deque[_Queued] = deque()
         self._burst_turn: asyncio.Handle | None = None
 
     def start(self) -> None:
@@ -133,55 +161,72 @@ class Hub:
         self._router.close()
         if self._burst_turn is not None:
             self._burst_turn.cancel()
-        for outgoing in self._burst:
-            self._send(outgoing)
-        for place in list(self._endpoints):
-            self.remove(place)
+        for queued in (*self._answers, *self._telemetry):
+            self._send(queued)
+        for location in list(self._endpoints):
+            self.remove(location)
 
     def send(self, outgoing: Outgoing) -> None:
-        """Send one of our own frames to every client that takes it, or to the one it answers."""
-        self._router.charge(outgoing.client_id, len(outgoing.frame))
-        self._send(outgoing)
+        """Send one of our own frames now: to all clients that take it, or to the one it answers."""
+        self._send(self._queued(outgoing))
 
     def send_all(self, frames: Iterable[Outgoing]) -> None:
-        """Send frames of ours in their order; those of a burst over several turns of the loop."""
+        """Send frames of ours over several turns of the loop, answers first.
+
+        Each kind leaves in its order. When the processor is short of time, telemetry that has
+        waited for `SHED_AFTER_US` is dropped.
+        """
         for outgoing in frames:
-            # Now, while it is known who has asked.
-            self._router.charge(outgoing.client_id, len(outgoing.frame))
-            self._burst.append(outgoing)
+            queued = self._queued(outgoing)
+            is_answer = (
+                outgoing.client_id is not None or queued.frame.message_id in NOT_TELEMETRY_IDS
+            )
+            (self._answers if is_answer else self._telemetry).append(queued)
         if self._burst_turn is None:
             self._send_some()
 
+    def _queued(self, outgoing: Outgoing) -> _Queued:
+        frame, client_id = frame_of(outgoing.frame), outgoing.client_id
+        # Now, while it is known which client has made the request.
+        self._router.charge(client_id, len(frame.data))
+        return _Queued(frame, self._numbering.enter(frame), client_id, self.now_us())
+
     def _send_some(self) -> None:
         self._burst_turn = None
-        room = SENDS_AT_ONCE
+        room, shed_us = SENDS_AT_ONCE, self.now_us() - SHED_AFTER_US
+        answers, telemetry = self._answers, self._telemetry
         try:
-            while self._burst and (room > 0 or len(self._burst) > MAX_WAITING):
-                outgoing = self._burst.popleft()
-                room -= len(self._clients) if outgoing.client_id is None else 1
-                self._send(outgoing)
+            while telemetry and telemetry[0].since_us < shed_us:
+                telemetry.popleft()
+                self._shed += 1
+            while (answers or telemetry) and (
+                room > 0 or len(answers) + len(telemetry) > MAX_WAITING
+            ):
+                queued = (answers or telemetry).popleft()
+                room -= len(self._clients) if queued.client_id is None else 1
+                self._send(queued)
         finally:
-            if self._burst:
+            if answers or telemetry:
                 self._burst_turn = asyncio.get_running_loop().call_soon(self._send_some)
 
-    def _send(self, outgoing: Outgoing) -> None:
-        frame = outgoing.frame
-        self._published += 1
-        if self._vehicles.has_newcomers:
-            self._welcome(frame)
-        if outgoing.client_id is not None:
-            self._fanout.answer(frame, self._router.group(outgoing.client_id))
-            return
+    def _send(self, queued: _Queued) -> None:
+        frame, step, client_id, _ = queued
         now_us = self.now_us()
-        if self._vehicles.note(frame, outgoing.message_id, now_us):
-            self._router.forget_express()
-        self._fanout.publish(frame, now_us)
+        self._published += 1
+        sequence = frame.sequence if step is None else self._numbering.leave(frame, step)
+        if self._vehicles.has_waiting:
+            self._greet(frame, sequence, now_us)
+        if client_id is not None:
+            self._fanout.answer(frame, sequence, self._router.group(client_id), now_us)
+            return
+        if self._vehicles.register(frame, now_us):
+            self._fanout.cache.clear()
+        self._fanout.publish(frame, sequence, now_us)
 
-    def set_interval(self, wish: ClientInterval) -> None:
-        """Send a client one message of one system at the rate that it requested."""
-        for client_id in self._router.group(wish.client_id):
-            self._fanout.set_interval(msgspec.structs.replace(wish, client_id=client_id))
-        self._router.forget_express()
+    def set_interval(self, request: ClientInterval) -> None:
+        """Send a client one message of one system at the interval that it requested."""
+        for client_id in self._router.group(request.client_id):
+            self._fanout.set_interval(msgspec.structs.replace(request, client_id=client_id))
 
     def add(self, url: str) -> None:
         """Open one more endpoint.
@@ -192,15 +237,15 @@ class Hub:
             If the URL is not understood, or the same endpoint exists already.
         """
         endpoint = parse_endpoint(url)
-        if endpoint.place in self._endpoints:
-            raise ValueError(f"endpoint {endpoint.place!r} is there already")
+        if endpoint.location in self._endpoints:
+            raise ValueError(f"endpoint {endpoint.location!r} already exists")
         now_us = self.now_us()
         if listen := LISTENERS.get(endpoint.kind):
-            listener = self._endpoints[endpoint.place] = listen(self, endpoint)
+            listener = self._endpoints[endpoint.location] = listen(self, endpoint)
             self._tick_one(listener, now_us)
             return
         client = CLIENTS[endpoint.kind](self, self.new_client_id(), endpoint)
-        self._endpoints[endpoint.place] = client
+        self._endpoints[endpoint.location] = client
         self._tick_one(client, now_us)
         self.appear(client)
 
@@ -217,12 +262,12 @@ class Hub:
         ValueError
             If there is no such endpoint.
         """
-        for place, opened in self._endpoints.items():
-            if name in (place, opened.endpoint.name, opened.endpoint.url):
+        for location, opened in self._endpoints.items():
+            if name in (location, opened.endpoint.name, opened.endpoint.url):
                 break
         else:
             raise ValueError(f"no endpoint is called {name!r}")
-        gone = self._endpoints.pop(place)
+        gone = self._endpoints.pop(location)
         if isinstance(gone, Client):
             self.vanish(gone)
         else:
@@ -233,21 +278,22 @@ class Hub:
 
         Those whose options changed are changed in place, those added at run time stay.
         """
-        before = {parse_endpoint(url).place for url in self.settings.endpoints}
-        after = {parse_endpoint(url).place: url for url in settings.endpoints}
+        before = {parse_endpoint(url).location for url in self.settings.endpoints}
+        after = {parse_endpoint(url).location: url for url in settings.endpoints}
         self.settings = settings
-        for place in before - after.keys():
-            if place in self._endpoints:
-                self.remove(place)
-        for place, url in after.items():
-            if place not in self._endpoints:
+        self._router.apply(settings)
+        for location in before - after.keys():
+            if location in self._endpoints:
+                self.remove(location)
+        for location, url in after.items():
+            if location not in self._endpoints:
                 self.add(url)
-            elif (opened := self._endpoints[place]).endpoint.url != url:
+            elif (opened := self._endpoints[location]).endpoint.url != url:
                 opened.reconfigure(parse_endpoint(url))
 
     def clients(self) -> tuple[ClientStats, ...]:
         """Return the present figures of every client, in the order of their ids."""
-        self._router.settle_express()
+        self._fanout.cache.settle()
         return tuple(
             self._clients[key].stats(self._router.origins(key)) for key in sorted(self._clients)
         )
@@ -269,6 +315,8 @@ class Hub:
             published=self._published,
             forwarded=router.forwarded,
             duplicates=router.duplicates,
+            late=router.late,
+            shed=self._shed,
             looped=router.looped,
             unroutable=router.unroutable,
             unserved=router.unserved,
@@ -280,7 +328,7 @@ class Hub:
 
     @property
     def read_bytes(self) -> int:
-        """How much to read from one client at one wake-up: less where it may go to many."""
+        """Bytes to read from one client at one wake-up: fewer where they may go to many."""
         fair = PASSED_ON_BYTES // max(len(self._clients), 1)
         return min(max(fair, LEAST_READ_BYTES), READ_BYTES)
 
@@ -293,20 +341,23 @@ class Hub:
         """Return whether a system and component is one of our vehicles."""
         return self._vehicles.is_own(origin, self.now_us())
 
+    def routes_from(self, client_id: int) -> dict[bytes, Route]:
+        """Return the cached routes of frames from a client, by `MavFrame.key`."""
+        return self._fanout.cache.of(client_id)
+
     def appear(self, client: Client) -> None:
         """Add a client."""
         self._clients[client.client_id] = client
-        self._fanout.add(client.client_id, client.transmit, client.endpoint)
-        self._router.forget_express()
-        self._log_visit(client, f"client {client.client_id}: {client.remote}")
+        self._fanout.add(client)
+        self._log_connection(client, f"client {client.client_id}: {client.remote}")
 
     def greet(self, client: Client) -> None:
         """Send the vehicles' greetings, heartbeat and home, to a new peer."""
         self._vehicles.await_greeting(client.client_id)
 
-    def reconfigure(self, client: Client) -> None:
-        """Apply a client's changed lists and rates from the next frame on."""
-        self._fanout.reconfigure(client.client_id, client.endpoint)
+    def reconfigure(self, client: Client, before: Endpoint) -> None:
+        """Apply a client's changed options from the next frame on."""
+        self._fanout.reconfigure(client, before.budget)
         self._router.reconfigure(client)
 
     def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
@@ -322,37 +373,39 @@ class Hub:
         if wait_s:
             loop.call_later(wait_s, self._flush, wait_s)
         else:
-            # Not before the sockets were looked at once more: a wake-up may read one datagram only.
+            # Not before the sockets were polled once more: a wake-up may read one datagram only.
             loop.call_soon(loop.call_soon, self._flush, wait_s)
 
     def _flush(self, wait_s: float) -> None:
         for flush in self._gathering.pop(wait_s, ()):
             flush()
 
-    def note_buffer(self, client: Client, free_percent: int) -> None:
-        """Adapt the rate to a radio to the room in its buffer."""
-        self._fanout.note_buffer(client.client_id, free_percent)
+    def update_buffer(self, client: Client, free_percent: int) -> None:
+        """Adapt the rate to a radio to the free part of its buffer."""
+        self._fanout.update_buffer(client.client_id, free_percent)
 
     def vanish(self, client: Client) -> None:
         """Close a client and remove it."""
         self._fanout.remove(client.client_id)
-        self._router.forget(client.client_id)
-        self._vehicles.forget(client.client_id)
+        self._router.remove(client.client_id)
+        self._vehicles.remove(client.client_id)
         if self._clients.pop(client.client_id, None):
-            self._log_visit(client, f"client {client.client_id} has gone: {client.remote}")
+            self._log_connection(client, f"client {client.client_id} has gone: {client.remote}")
             if self._on_gone is not None:
                 self._on_gone(client.client_id)
         client.close()
 
-    def _welcome(self, frame: bytes) -> None:
-        newcomers, greeting = self._vehicles.greet(frame)
-        for client_id in newcomers:
+    def _greet(self, frame: MavFrame, sequence: int, now_us: int) -> None:
+        waiting, greeting = self._vehicles.greet(frame.origin)
+        for client_id in waiting:
             if client := self._clients.get(client_id):
-                for greeting_frame, message_id in greeting:
-                    client.transmit(greeting_frame, message_id)
+                passing = [each for each in greeting if client.endpoint.passes(each.message_id)]
+                for before, each in zip(range(len(passing), 0, -1), passing, strict=True):
+                    number = sequence - before & 0xFF
+                    client.transmit(self.signer.sequence_and_sign(each, number, now_us))
 
     def _tick(self) -> None:
-        # First, so that the next tick comes whatever happens below.
+        # First, so that the next tick follows whatever happens below.
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
         for endpoint in list(self._endpoints.values()):
@@ -363,42 +416,47 @@ class Hub:
         self._router.tick(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         # One at a tick: either takes as long as several frames.
-        if now_us - self._trouble_us >= US_PER_S:
-            self._trouble_us = now_us
-            self._report_trouble(now_us)
+        if now_us - self._alerts_us >= US_PER_S:
+            self._alerts_us = now_us
+            self._report_alerts(now_us)
         elif interval_us and now_us - self._ping_us >= interval_us:
             self._ping_us = now_us
-            self._ask_round_trips(now_us)
+            self._measure_round_trips(now_us)
 
     def _tick_one(self, link: Client | Listener[Any], now_us: int) -> None:
         """Tick one link; one that raises is closed, logged, and retried."""
         try:
             link.tick(now_us)
         except Exception as error:
-            log.exception("%s is closed and tried again", link.endpoint.name)
+            log.exception("%s is closed and opened again", link.endpoint.name)
             with contextlib.suppress(Exception):
                 link.fail(error)
 
-    def _report_trouble(self, now_us: int) -> None:
-        for line in self._visits.poll(now_us):
+    def _report_alerts(self, now_us: int) -> None:
+        for line in self._connections.poll(now_us):
             log.info("%s", line)
-        for is_trouble, text in self._trouble.update(self.clients(), self.listeners(), now_us):
-            log.log(logging.WARNING if is_trouble else logging.INFO, "%s", text)
-            if self._on_trouble is not None:
-                self._on_trouble(is_trouble, text)
+        for is_problem, text in self._alerts.update(self.clients(), self.listeners(), now_us):
+            log.log(logging.WARNING if is_problem else logging.INFO, "%s", text)
+            if self._on_alert is not None:
+                self._on_alert(is_problem, text)
 
-    def _log_visit(self, client: Client, text: str) -> None:
-        is_caller = client.endpoint.kind in LISTENERS
-        for line in self._visits.say(text, self.now_us()) if is_caller else [text]:
+    def _log_connection(self, client: Client, text: str) -> None:
+        is_of_listener = client.endpoint.kind in LISTENERS
+        for line in self._connections.add(text, self.now_us()) if is_of_listener else [text]:
             log.info("%s", line)
 
-    def _ask_round_trips(self, now_us: int) -> None:
+    def _measure_round_trips(self, now_us: int) -> None:
         """Send round-trip requests to every client that sends; the others only receive."""
-        asked = [client for client in self._clients.values() if client.heard_us is not None]
+        asked = [
+            client
+            for client in self._clients.values()
+            if client.heard_us is not None and not client.endpoint.monitor
+        ]
         systems = self._vehicles.systems(now_us)
         if not asked or not systems:
             return
-        questions = self._probe.ask(systems[0], now_us)
+        requests = self._round_trip.ask(systems[0], now_us)
         for client in asked:
-            for frame, message_id in questions:
-                client.transmit(frame, message_id)
+            for frame in requests:
+                if client.endpoint.passes(frame.message_id):
+                    client.transmit(frame)

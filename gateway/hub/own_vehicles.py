@@ -1,49 +1,42 @@
-"""Which systems are ours, and which frames greet a new client at once."""
+"""Which systems are ours, and the frames that greet a new client."""
 
 from typing import Final
 
 from gateway.hub.routing_table import Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of
+from gateway.wire.mavlink_splitter import MavFrame
 
 HEARTBEAT_ID: Final = 0
 HOME_POSITION_ID: Final = 242
 GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
-"""In this order: that there is a vehicle, and its home."""
+"""In this order: a vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S
 """A system whose heartbeat we have not sent for so long is no longer ours: a playback ended."""
 
 
 class OwnVehicles:
-    """Remember the newest greeting frames of our vehicles and who waits for them.
+    """Remember the newest greeting frames of our vehicles and the clients that wait for them.
 
-    A newcomer is greeted just before the next frame of a vehicle, with the two sequence numbers
+    A new client is greeted just before the next frame of a vehicle, with the sequence numbers
     before it, so that its stream begins without a gap.
-
-    Parameters
-    ----------
-    seal : callable
-        Numbers, and signs, each frame of ours that leaves.
     """
 
-    def __init__(self, seal: Seal = restamp) -> None:
-        self._seal = seal
+    def __init__(self) -> None:
         self._seen_us: dict[Origin, int] = {}
-        self._frames: dict[Origin, dict[int, bytes]] = {}
-        self._newcomers: dict[Origin, list[int]] = {}
+        self._frames: dict[Origin, dict[int, MavFrame]] = {}
+        self._waiting: dict[Origin, list[int]] = {}
 
     @property
-    def has_newcomers(self) -> bool:
-        """Whether a newcomer waits."""
-        return bool(self._newcomers)
+    def has_waiting(self) -> bool:
+        """Whether a client waits for a greeting."""
+        return bool(self._waiting)
 
-    def note(self, frame: bytes, message_id: int, now_us: int) -> bool:
-        """Note a frame of ours, maybe for greetings; return whether its vehicle is new."""
-        origin = origin_of(frame)
+    def register(self, frame: MavFrame, now_us: int) -> bool:
+        """Register a frame of ours, maybe for greetings; return whether its vehicle is new."""
+        origin, message_id = frame.origin, frame.message_id
         is_new = not self.is_own(origin, now_us)
         if is_new:
-            # What an earlier playback sent of this system is outdated.
+            # Frames that an earlier playback sent of this system are outdated.
             self._frames[origin] = {}
         if is_new or message_id in GREETING:
             self._seen_us[origin] = now_us
@@ -61,34 +54,20 @@ class OwnVehicles:
         return [origin[0] for origin in self._seen_us if self.is_own(origin, now_us)]
 
     def await_greeting(self, client_id: int) -> None:
-        """Queue a newcomer for the greetings of every vehicle."""
+        """Queue a new client for the greetings of every vehicle."""
         for origin in self._frames:
-            self._newcomers.setdefault(origin, []).append(client_id)
+            self._waiting.setdefault(origin, []).append(client_id)
 
-    def forget(self, client_id: int) -> None:
+    def remove(self, client_id: int) -> None:
         """Do not greet a client that has gone."""
-        for origin, waiting in list(self._newcomers.items()):
+        for origin, waiting in list(self._waiting.items()):
             if client_id in waiting:
                 waiting.remove(client_id)
             if not waiting:
-                del self._newcomers[origin]
+                del self._waiting[origin]
 
-    def greet(self, frame: bytes) -> tuple[list[int], list[tuple[bytes, int]]]:
-        """Return who waits for the sender of a frame, and the frames to send them first.
-
-        Returns
-        -------
-        tuple
-            Client ids, and frames with their message ids.
-        """
-        origin = origin_of(frame)
-        clients = self._newcomers.pop(origin, [])
-        if not clients:
-            return [], []
-        known = self._frames[origin]
-        ids = [message_id for message_id in GREETING if message_id in known]
-        first = sequence_of(frame) - len(ids)
-        return clients, [
-            (self._seal(known[message_id], first + place & 0xFF), message_id)
-            for place, message_id in enumerate(ids)
-        ]
+    def greet(self, origin: Origin) -> tuple[list[int], list[MavFrame]]:
+        """Return the clients that wait for a vehicle, and the frames to send them first."""
+        clients = self._waiting.pop(origin, [])
+        known = self._frames.get(origin, {})
+        return clients, [known[message_id] for message_id in GREETING if message_id in known]

@@ -1,8 +1,8 @@
-"""Round trips, measured by requests that clients answer automatically.
+"""Round-trip times, measured by requests that clients answer automatically.
 
 Some ground stations answer PING, others only TIMESYNC; both are sent. The requests come from a
 separate component (the MAVLink id of a UDP bridge), so they leave no gap in the sequence numbers
-of the vehicle, and no answer meant for the vehicle is mistaken for one of theirs. Requests of
+of the vehicle, and no answer to the vehicle is mistaken for an answer to them. Requests of
 another gateway are answered by that component too and not forwarded: they measure this one link.
 """
 
@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.routing_table import Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, restamp, target_of
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import EVERYBODY, MavFrame, frame_of
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
 LONGEST_US: Final = 60 * US_PER_S
@@ -23,12 +23,12 @@ NOBODY: Final = 0
 MEASURING: Final = frozenset({dialect.MAVLINK_MSG_ID_PING, dialect.MAVLINK_MSG_ID_TIMESYNC})
 
 
-def is_of_probe(frame: bytes) -> bool:
+def is_of_gateway(frame: MavFrame) -> bool:
     """Return whether a frame is a round-trip request or answer of another gateway."""
     return (
-        origin_of(frame)[1] == PROBE_COMPONENT
-        and message_id_of(frame) in MEASURING
-        and target_of(frame) == (0, 0)
+        frame.origin[1] == PROBE_COMPONENT
+        and frame.message_id in MEASURING
+        and frame.target == EVERYBODY
     )
 
 
@@ -37,12 +37,12 @@ class RoundTrip:
 
     Parameters
     ----------
-    seal : callable
-        Numbers, and signs, each request that leaves.
+    signer : FrameSigner
+        Signs the requests of systems that have a key.
     """
 
-    def __init__(self, seal: Seal = restamp) -> None:
-        self._seal = seal
+    def __init__(self, signer: FrameSigner) -> None:
+        self._signer = signer
         self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
 
@@ -51,7 +51,7 @@ class RoundTrip:
         """System and component that the requests come from; system 0 before the first."""
         return self._sender.srcSystem, PROBE_COMPONENT
 
-    def ask(self, system: int, now_us: int) -> list[tuple[bytes, int]]:
+    def ask(self, system: int, now_us: int) -> list[MavFrame]:
         """Build the requests of one round.
 
         Parameters
@@ -59,25 +59,24 @@ class RoundTrip:
         system : int
             One of our vehicles; the gateway sends as one of its components.
         now_us : int
-            Gateway time; comes back in the answers.
+            Gateway time; the answers contain it.
 
         Returns
         -------
-        list of (bytes, int)
-            Frames and their message ids.
+        list of MavFrame
         """
         self._sender.srcSystem = system
         return [
-            self._numbered(message)
+            self._encode(message, now_us)
             for message in (
                 dialect.MAVLink_ping_message(now_us, self._sender.seq, 0, 0),
                 dialect.MAVLink_timesync_message(0, now_us * NS_PER_US),
             )
         ]
 
-    def read(self, frame: bytes, now_us: int) -> int | None:
+    def read(self, frame: MavFrame, now_us: int) -> int | None:
         """Return the round trip in microseconds if a frame answers a request of ours."""
-        message_id = message_id_of(frame)
+        message_id = frame.message_id
         if message_id == dialect.MAVLINK_MSG_ID_PING:
             answer = self._decode(frame)
             if answer is None or (answer.target_system, answer.target_component) != self.origin:
@@ -93,12 +92,12 @@ class RoundTrip:
         round_trip_us: int = now_us - sent_us
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None
 
-    def answer(self, frame: bytes, system: int, now_us: int) -> tuple[bytes, int] | None:
+    def answer(self, frame: MavFrame, system: int, now_us: int) -> MavFrame | None:
         """Answer a round-trip request of another gateway.
 
         Parameters
         ----------
-        frame : bytes
+        frame : MavFrame
             Any frame.
         system : int
             One of our vehicles; the gateway sends as one of its components.
@@ -107,29 +106,29 @@ class RoundTrip:
 
         Returns
         -------
-        tuple of bytes and int, or None
-            Frame and message id; None if the frame is no such request.
+        MavFrame or None
+            None if the frame is no such request.
         """
-        asked = self._decode(frame) if is_of_probe(frame) else None
+        asked = self._decode(frame) if is_of_gateway(frame) else None
         if asked is None:
             return None
         if asked.get_msgId() == dialect.MAVLINK_MSG_ID_PING:
-            message = dialect.MAVLink_ping_message(asked.time_usec, asked.seq, *origin_of(frame))
+            message = dialect.MAVLink_ping_message(asked.time_usec, asked.seq, *frame.origin)
         elif asked.tc1 == 0:
             message = dialect.MAVLink_timesync_message(now_us * NS_PER_US, asked.ts1)
         else:
             return None
         self._sender.srcSystem = system
-        return self._numbered(message)
+        return self._encode(message, now_us)
 
-    def _numbered(self, message: dialect.MAVLink_message) -> tuple[bytes, int]:
-        frame = self._seal(bytes(message.pack(self._sender)), self._sender.seq)
-        self._sender.seq = (self._sender.seq + 1) % 256
-        return frame, message.get_msgId()
+    def _encode(self, message: dialect.MAVLink_message, now_us: int) -> MavFrame:
+        frame, sequence = frame_of(bytes(message.pack(self._sender))), self._sender.seq
+        self._sender.seq = (sequence + 1) % 256
+        return self._signer.sequence_and_sign(frame, sequence, now_us)
 
-    def _decode(self, frame: bytes) -> dialect.MAVLink_message | None:
+    def _decode(self, frame: MavFrame) -> dialect.MAVLink_message | None:
         try:
-            messages = self._reader.parse_buffer(frame)
+            messages = self._reader.parse_buffer(frame.data)
         except dialect.MAVError:
             return None
         return messages[0] if messages else None

@@ -1,23 +1,25 @@
-"""Which client leads to which system, and which frames have been seen before.
+"""Paths to systems, duplicates and late copies, and pairs of redundant links.
 
-Routing follows the MAVLink guide: a frame without a target goes to everybody but its sender; a
-frame with a target system goes only where that system (and component, if it was ever heard) was
-heard. Two paths to one system, or a link that leads back, bring the same bytes twice; all but the
-first are dropped, whichever client brings them, or they would run round a loop for ever. Frames
-are remembered only for systems that are heard by more than one path; a copy of a frame from before
-its path existed passes, because it cannot be told from a program that was restarted and repeats
-its first frames from another port.
+Routing follows the MAVLink guide: a frame without a target is sent to all clients but its sender; a
+frame with a target system only to clients from which that system (and component, if it was ever
+received) was received. One deviation: broadcasts of a ground station are sent only to clients with
+vehicles. Stations need no messages of each other, and scripts take the first heartbeat they receive
+for the vehicle's.
 
-One deviation: broadcasts of a ground station go only where there are vehicles. Stations need no
-messages of each other, and scripts take the first heartbeat they receive for the vehicle's.
+Two paths to one system, or a link that leads back, bring the same bytes twice. All but the first
+are dropped, whichever client brings them, or they would circulate in a loop for ever. A path that
+is seconds behind, as a second LTE link may be, also brings frames that the first path has lost; to
+show them would move the aircraft back, so those are dropped too. See `DuplicateFilter`.
 
-Only trusted clients belong in here: these tables decide who receives what.
+Only trusted clients belong in the routing table: it decides who receives which frames.
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import MavFrame
 
 Origin = tuple[int, int]
 """System and component id."""
@@ -25,30 +27,49 @@ Origin = tuple[int, int]
 MAX_ORIGINS: Final = 256
 """Remembered per client: every system there can be, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
-"""A path on which a system was heard this recently is preferred to silent ones."""
-MEMORY_US: Final = US_PER_S
-"""Copies come within a radio's delay."""
+"""A path on which a system was received this recently is preferred to silent ones."""
+MEMORY_US: Final = 30 * US_PER_S
+"""Duplicates are recognised for this long: longer than a congested mobile network delays them."""
+REPEAT_US: Final = US_PER_S
+"""Copies of a frame by the same path arrive within a radio's delay."""
 MEMORY_OF_ONE: Final = 224
-"""Frames of a component; 256 later one of the same content has the same number and so the same
-bytes."""
-MEMORY_FRAMES: Final = 8192
-"""Per generation: a second of a fast link, at most 2.3 MB."""
+"""Frames of a component; 256 frames later one of the same content has the same number and so the
+same bytes."""
+MEMORY_FRAMES: Final = 32_768
+"""Per generation, of some 200 bytes each: half a minute at 1000 frames a second, 13 MB in all."""
+MAX_STREAMS: Final = 1024
+"""Systems and components with duplicates; 2 kB each."""
+NEIGHBOURS: Final = 8
+"""Sequence numbers before and after a frame that show whether it is late."""
+
+NEW: Final = -1
+LATE: Final = 0
+"""Results of `DuplicateFilter.check`; client ids are positive."""
 
 Note = TypeVar("Note")
 
 
 @dataclass(slots=True)
-class _Way:
+class Path:
     """One system as one client brings it."""
 
     since_us: int
-    """Its first frame after a silence."""
+    """Its first frame after a timeout."""
     heard_us: int
     is_station: bool = False
-    """Whether its last heartbeat by this path was a ground station's."""
+    """Whether the last heartbeat on this path was a ground station's."""
+    lag_us: int = 0
+    """Delay relative to the fastest path, measured by the newest copy."""
+    copied_us: int = 0
+    """When the newest copy was received."""
 
     def is_fresh(self, now_us: int) -> bool:
+        """Return whether a frame was received recently."""
         return now_us - self.heard_us <= ROUTE_FRESH_US
+
+    def is_prompt(self, now_us: int) -> bool:
+        """Return whether copies were received recently, and without much delay."""
+        return max(self.lag_us, now_us - self.copied_us) <= REPEAT_US
 
 
 class RoutingTable:
@@ -56,76 +77,75 @@ class RoutingTable:
 
     Parameters
     ----------
+    changed : callable, optional
+        Called when cached routes may be wrong: a system has one path more, or fewer.
     max_origins : int, optional
         Remembered per client; a new one replaces the one that has been silent longest.
     """
 
-    def __init__(self, max_origins: int = MAX_ORIGINS) -> None:
+    def __init__(
+        self, changed: Callable[[], None] = lambda: None, max_origins: int = MAX_ORIGINS
+    ) -> None:
+        self._changed = changed
         self._max_origins = max_origins
-        self._of_client: dict[int, dict[Origin, _Way]] = {}
-        self._to: dict[Origin, dict[int, _Way]] = {}
-        """The same ways by system and component."""
+        self._of_client: dict[int, dict[Origin, Path]] = {}
+        self._to: dict[Origin, dict[int, Path]] = {}
+        """The same paths by system and component."""
         self._components: dict[int, set[Origin]] = {}
         """By system."""
 
-    def hear(self, client_id: int, origin: Origin, now_us: int) -> bool:
-        """Note that a client has brought a frame of a system.
+    def hear(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
+        """Register that a client has brought a frame of a system.
 
         Returns
         -------
-        bool
-            Whether this is a new path to a system, which other parts must take into account.
+        Path or None
+            The path; None if there is no room for it.
         """
-        ways = self._to.get(origin)
-        way = ways.get(client_id) if ways else None
-        if way is None:
-            return self._discover(client_id, origin, now_us)
-        if way.is_fresh(now_us):
-            way.heard_us = now_us
-            return False
-        way.since_us = way.heard_us = now_us
-        return len(self._to[origin]) > 1
+        paths = self._to.get(origin)
+        path = paths.get(client_id) if paths else None
+        if path is None:
+            path = self._discover(client_id, origin, now_us)
+        elif not path.is_fresh(now_us):
+            path.since_us = path.heard_us = now_us
+        else:
+            path.heard_us = now_us
+            return path
+        if path is not None and len(self._to[origin]) > 1:
+            self._changed()
+        return path
 
     def is_shared(self, origin: Origin, now_us: int) -> bool:
-        """Return whether a system has been heard recently by more than one path."""
-        ways = self._to.get(origin)
-        if ways is None or len(ways) == 1:
+        """Return whether a system has been received recently on more than one path."""
+        paths = self._to.get(origin)
+        if paths is None or len(paths) == 1:
             return False
-        return sum(way.is_fresh(now_us) for way in ways.values()) > 1
-
-    def since_us(self, client_id: int, origin: Origin) -> int:
-        """Return since when a client has brought a system's frames without a long silence."""
-        way = self._to.get(origin, {}).get(client_id)
-        return 0 if way is None else way.since_us
-
-    def note_kind(self, client_id: int, origin: Origin, *, is_station: bool) -> None:
-        """Note what a client's heartbeat says about the type of its sender."""
-        if way := self._to.get(origin, {}).get(client_id):
-            way.is_station = is_station
+        return sum(path.is_fresh(now_us) for path in paths.values()) > 1
 
     def is_station(self, origin: Origin) -> bool:
         """Return whether a system and component is a ground station."""
-        ways = self._to.get(origin)
-        return ways is not None and any(way.is_station for way in ways.values())
+        paths = self._to.get(origin)
+        return paths is not None and any(path.is_station for path in paths.values())
 
-    def ways_to_vehicles(self, source_id: int) -> list[int]:
-        """Return the clients, but the source, behind which there is more than ground stations."""
+    def clients_with_vehicles(self, source_id: int) -> list[int]:
+        """Return the clients, except the source, behind which there are vehicles."""
         return [
             client_id
-            for client_id, ways in self._of_client.items()
-            if client_id != source_id and not all(way.is_station for way in ways.values())
+            for client_id, paths in self._of_client.items()
+            if client_id != source_id and not all(path.is_station for path in paths.values())
         ]
 
-    def forget(self, client_id: int) -> None:
-        """Forget everything about a client."""
+    def remove(self, client_id: int) -> None:
+        """Remove all paths of a client."""
         for origin in self._of_client.pop(client_id, {}):
             self._drop(client_id, origin)
+        self._changed()
 
     def origins(self, client_id: int) -> tuple[Origin, ...]:
-        """Return the systems and components heard from a client, first heard first."""
+        """Return the systems and components received from a client, first received first."""
         return tuple(self._of_client.get(client_id, ()))
 
-    def ways_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
+    def clients_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
         """Find the clients that lead to a target.
 
         Parameters
@@ -133,14 +153,14 @@ class RoutingTable:
         target : tuple of int
             System and component; component 0 is all of the system.
         source_id : int
-            The client that asks; never part of the answer.
+            The client that sends; never part of the result.
         now_us : int
             Gateway time.
 
         Returns
         -------
         list of int
-            Clients heard lately with exactly this component, else with this system; silent ones
+            Clients that recently brought exactly this component, else this system; silent ones
             only if there is no other. Empty if the target is unknown.
         """
         system, component = target
@@ -149,31 +169,31 @@ class RoutingTable:
         for origins in ({target} if exact.keys() - {source_id} else set(), known):
             found: dict[int, bool] = {}
             for origin in origins:
-                for client_id, way in self._to[origin].items():
+                for client_id, path in self._to[origin].items():
                     if client_id != source_id:
-                        found[client_id] = found.get(client_id, False) or way.is_fresh(now_us)
+                        found[client_id] = found.get(client_id, False) or path.is_fresh(now_us)
             if found:
                 return sorted(key for key, fresh in found.items() if fresh) or sorted(found)
         return []
 
-    def _discover(self, client_id: int, origin: Origin, now_us: int) -> bool:
+    def _discover(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
         known = self._of_client.setdefault(client_id, {})
         if len(known) >= self._max_origins:
             stalest = min(known, key=lambda each: known[each].heard_us)
             if known[stalest].is_fresh(now_us):
-                # More live systems than there is room for: keeping this one would lose another.
-                return False
+                # More live systems than there is room for: adding this one would remove another.
+                return None
             del known[stalest]
             self._drop(client_id, stalest)
-        known[origin] = way = _Way(now_us, now_us)
-        self._to.setdefault(origin, {})[client_id] = way
+        known[origin] = path = Path(now_us, now_us)
+        self._to.setdefault(origin, {})[client_id] = path
         self._components.setdefault(origin[0], set()).add(origin)
-        return len(self._to[origin]) > 1
+        return path
 
     def _drop(self, client_id: int, origin: Origin) -> None:
-        ways = self._to[origin]
-        del ways[client_id]
-        if not ways:
+        paths = self._to[origin]
+        del paths[client_id]
+        if not paths:
             del self._to[origin]
             components = self._components[origin[0]]
             components.discard(origin)
@@ -182,12 +202,12 @@ class RoutingTable:
 
 
 class FrameMemory(Generic[Note]):
-    """What is known of the newest frames, by their bytes: of one to two spans, bounded.
+    """Notes on recent frames, kept for one to two spans, bounded.
 
     Parameters
     ----------
     span_us : int
-        How long a generation is.
+        Length of a generation.
     most : int
         Frames of a generation; there are two.
     """
@@ -195,64 +215,193 @@ class FrameMemory(Generic[Note]):
     def __init__(self, span_us: int, most: int) -> None:
         self._span_us = span_us
         self._most = most
-        self._recent: dict[bytes, Note] = {}
-        self._older: dict[bytes, Note] = {}
+        self._recent: dict[Hashable, Note] = {}
+        self._older: dict[Hashable, Note] = {}
         self._turned_us = 0
 
     def turn(self, now_us: int) -> bool:
-        """Begin another generation if it is time, and return whether it was."""
+        """Start another generation if it is due, and return whether it was."""
         if now_us - self._turned_us < self._span_us and len(self._recent) < self._most:
             return False
         self._older, self._recent = self._recent, {}
         self._turned_us = now_us
         return True
 
-    def get(self, frame: bytes) -> Note | None:
-        """Return what is known of a frame."""
+    def get(self, frame: Hashable) -> Note | None:
+        """Return the note on a frame."""
         return self._recent.get(frame) or self._older.get(frame)
 
-    def put(self, frame: bytes, note: Note) -> None:
+    def put(self, frame: Hashable, note: Note) -> None:
         """Remember a frame."""
         self._recent[frame] = note
 
 
-class LoopGuard:
-    """Remember the frames of the last second and recognise copies."""
+@dataclass(slots=True)
+class _Stream:
+    """The frames of one system and component that were accepted."""
+
+    count: int = 0
+    leader: int = 0
+    """The client that brought the newest frame."""
+    newest_us: int = 0
+    """When the newest frame was sent, as estimated by the lag of its path."""
+    sent_us: list[int] = field(default_factory=lambda: [0] * 256)
+    """The same of the newest frame with each sequence number; 0 for none."""
+
+    def is_behind(self, sequence: int, limit_us: int) -> bool:
+        """Return whether the frames after a number were accepted more than a limit ago.
+
+        The number is behind the newest one if a following number was seen later than a preceding
+        one; of a number ahead, the following were seen one turn of the counter ago.
+        """
+        after = self._nearest(sequence, 1)
+        return after > self._nearest(sequence, -1) and self.newest_us - after > limit_us
+
+    def _nearest(self, sequence: int, step: int) -> int:
+        for distance in range(step, step * (NEIGHBOURS + 1), step):
+            if sent_us := self.sent_us[sequence + distance & 0xFF]:
+                return sent_us
+        return 0
+
+
+class DuplicateFilter:
+    """Recognise copies and late frames of systems that are received on several paths.
+
+    Theory of operation. Accepted frames are remembered for `MEMORY_US` by a hash of their bytes,
+    sequence number included; a frame with a known hash is a copy. Two exceptions: a copy of a frame
+    from before its path existed passes, because it cannot be distinguished from a program that was
+    restarted and repeats its first frames from another port; and content that repeats, such as a
+    heartbeat's, has the same bytes again after 256 frames: on a path without delay it is new.
+
+    Each copy measures the lag of its path behind the first one. A frame that is not a copy was
+    sent about one lag before it arrived; if that is more than a limit before the newest frame of
+    its stream, or if its sequence number belongs before frames that old, it is late. The path that
+    brought the newest frame is always accepted, so a restarted system loses nothing.
+    """
 
     def __init__(self) -> None:
-        self._memory: FrameMemory[tuple[int, int, int]] = FrameMemory(MEMORY_US, MEMORY_FRAMES)
-        """When a frame came first, by whom, and as which of its component's."""
-        self._counts: dict[Origin, int] = {}
+        self._memory: FrameMemory[tuple[int, int, int, int, bool]] = FrameMemory(
+            MEMORY_US, MEMORY_FRAMES
+        )
+        """When a frame was sent and received, by which client, as which of its stream, and whether
+        its bytes were accepted before."""
+        self._streams: dict[Origin, _Stream] = {}
 
-    def first_way(
-        self, frame: bytes, origin: Origin, client_id: int, since_us: int, now_us: int
-    ) -> int | None:
-        """Note a frame; return which client brought the same bytes before.
+    def check(self, frame: MavFrame, client_id: int, path: Path, now_us: int, limit_us: int) -> int:
+        """Register a frame of a system with several paths.
 
         Parameters
         ----------
-        frame : bytes
+        frame : MavFrame
             A complete frame.
-        origin : tuple of int
-            Whose it is.
         client_id : int
-            Who brings it.
-        since_us : int
-            Since when that client brings frames of that system; older ones are no copies.
+            The client that brings it.
+        path : Path
+            The path on which it arrives.
         now_us : int
             Gateway time.
+        limit_us : int
+            A frame older than the newest of its stream by more than this is late.
 
         Returns
         -------
-        int or None
-            The client that was first, maybe the same one; None if the frame is no copy.
+        int
+            `NEW`, `LATE`, or the id of the client that brought the same bytes first.
         """
-        if self._memory.turn(now_us) and len(self._counts) > MEMORY_FRAMES:
-            self._counts.clear()
-        known = self._memory.get(frame)
-        count = self._counts.get(origin, 0)
-        if known is not None and known[0] >= since_us and count - known[2] < MEMORY_OF_ONE:
-            return known[1]
-        self._memory.put(frame, (now_us, client_id, count))
-        self._counts[origin] = count + 1
-        return None
+        self._memory.turn(now_us)
+        digest = hash(frame.data)
+        known = self._memory.get(digest)
+        stream = self._stream_of(frame.origin)
+        if known is not None:
+            sent_us, received_us, first, count, is_repeated = known
+            turned = stream.count - count >= MEMORY_OF_ONE
+            if first == client_id:
+                is_copy = now_us - received_us <= REPEAT_US and not turned
+            else:
+                is_prompt = client_id == stream.leader or path.is_prompt(now_us)
+                is_copy = not (turned and (is_repeated or is_prompt))
+            if is_copy and received_us >= path.since_us:
+                if first != client_id:
+                    path.lag_us, path.copied_us = max(0, now_us - sent_us), now_us
+                return first
+        sent_us = now_us - path.lag_us
+        if client_id != stream.leader and self._is_late(frame, stream, sent_us, now_us, limit_us):
+            return LATE
+        stream.count += 1
+        stream.sent_us[frame.sequence] = sent_us
+        if sent_us >= stream.newest_us:
+            stream.newest_us, stream.leader = sent_us, client_id
+        self._memory.put(digest, (sent_us, now_us, client_id, stream.count, known is not None))
+        return NEW
+
+    def _stream_of(self, origin: Origin) -> _Stream:
+        stream = self._streams.get(origin)
+        if stream is None:
+            if len(self._streams) >= MAX_STREAMS:
+                self._streams.clear()
+            stream = self._streams[origin] = _Stream()
+        return stream
+
+    @staticmethod
+    def _is_late(
+        frame: MavFrame, stream: _Stream, sent_us: int, now_us: int, limit_us: int
+    ) -> bool:
+        if sent_us < stream.newest_us - limit_us:
+            return True
+        leader_lives = now_us - stream.newest_us <= limit_us
+        return leader_lives and stream.is_behind(frame.sequence, limit_us)
+
+
+LINKED_US: Final = 60 * US_PER_S
+"""Without a further copy for so long, it was chance, or one of the two links has gone."""
+
+
+class RedundantLinks:
+    """Pairs of clients that are links to one peer, because both brought copies of a frame recently.
+
+    Frames that we forward may return and look the same, so only frames that are not forwarded
+    count. Both links of a pair get every answer, and also any stream that only one of them
+    requested: then both carry the same sequence numbers, and the peer can recognise copies by their
+    bytes too. Two ground stations that share an id and were started at the same moment look like
+    such a pair: each gets the answers to the other's requests.
+    """
+
+    def __init__(self) -> None:
+        self._seen_us: dict[tuple[int, int], int] = {}
+        self._groups: dict[int, tuple[int, ...]] = {}
+
+    def register(self, first: int, second: int, now_us: int) -> bool:
+        """Register that a client brought a copy of another's frame; return if the pair is new."""
+        pair = (first, second) if first < second else (second, first)
+        is_new = pair not in self._seen_us
+        self._seen_us[pair] = now_us
+        if is_new:
+            self._regroup()
+        return is_new
+
+    def group(self, client_id: int) -> tuple[int, ...]:
+        """Return all links to a client's peer, the client included, lowest id first."""
+        return self._groups.get(client_id, (client_id,))
+
+    def expire(self, now_us: int) -> None:
+        """Separate pairs that no longer bring copies."""
+        self._part([pair for pair, us in self._seen_us.items() if now_us - us > LINKED_US])
+
+    def remove(self, client_id: int) -> None:
+        """Separate a client from all others."""
+        self._part([pair for pair in self._seen_us if client_id in pair])
+
+    def _part(self, pairs: list[tuple[int, int]]) -> None:
+        for pair in pairs:
+            del self._seen_us[pair]
+        if pairs:
+            self._regroup()
+
+    def _regroup(self) -> None:
+        """Join pairs that share a client."""
+        groups: dict[int, set[int]] = {}
+        for first, second in self._seen_us:
+            joined = groups.get(first, {first}) | groups.get(second, {second})
+            for client_id in joined:
+                groups[client_id] = joined
+        self._groups = {client_id: tuple(sorted(group)) for client_id, group in groups.items()}

@@ -1,15 +1,15 @@
-"""What waits for a slow link: bounded, the urgent first, numbered as it leaves.
+"""Frames waiting for a slow link: bounded, urgent ones first, numbered as they leave.
 
-Four queues. The answers a person waits for, and after them the attitude, are urgent; other
-telemetry is usual; parameters, missions and files are bulk. An urgent frame goes first, but after
-a few of them one of the others gets its turn, so that a parameter list is slow on a slow radio but
+Four queues. Answers that a person waits for, and after them attitudes, are urgent; other telemetry
+is usual; parameters, missions and files are bulk. An urgent frame leaves first, but after a few of
+them a frame of another queue is sent, so that a parameter list is slow on a slow radio but
 completes. When the bound is reached the oldest telemetry is dropped, usual before urgent, and
-answers last: telemetry comes again, an answer does not. Bulk has a bound of its own, since all
-parameters come at once. Where a link is slower than what is sent, old telemetry expires: it would
-be as late as the queue is long.
+answers last: telemetry is repeated, an answer is not. Bulk has a bound of its own, since all
+parameters arrive at once. Where a link is slower than the telemetry, old telemetry expires: it
+would otherwise be as late as the queue is long.
 
-Frames leave in another order than they came, and some are dropped; so our own frames are numbered
-at the exit. Loss that a ground station shows is then only that of the link.
+Frames leave in another order than they arrived, and some are dropped; so our own frames are
+numbered and signed when they leave. Loss that a ground station shows is then only that of the link.
 """
 
 import math
@@ -20,91 +20,111 @@ from typing import Final
 from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.routing_table import MAX_ORIGINS, Origin
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import origin_of, restamp, sequence_of
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame
 
 ANSWER_IDS: Final = frozenset({0, 75, 76, 77, 253})
-"""HEARTBEAT, commands and their answers, STATUSTEXT: the next one does not make up for one."""
+"""HEARTBEAT, commands and their answers, STATUSTEXT: the next one does not replace a lost one."""
 URGENT_IDS: Final = frozenset({30, 31, 61, 69, 70})
-"""The attitudes, manual control and overrides."""
+"""Attitudes, manual control and overrides."""
 BULK_IDS: Final = frozenset(
     {20, 21, 22, 23, 36, 110, 148, 300, 320, 321, 322, 323, 324, 395, 396, 397, 410}
     | set(range(37, 52)) - {42}
     | {73}
     | set(range(117, 123))
 )
-"""Parameters, mission transfers, files, logs, versions: asked for, and waited for."""
+"""Parameters, mission transfers, files, logs, versions: requested, and waited for."""
+NOT_TELEMETRY_IDS: Final = ANSWER_IDS | BULK_IDS
+"""Messages that are never dropped while there is room, because they are not repeated."""
 
 BULK_BYTES: Final = 16_384
 """Least room for bulk: the parameters of three aircraft."""
 URGENT_RUN: Final = 4
-"""Urgent frames in a row before one of another queue has its turn."""
+"""Urgent frames in a row before a frame of another queue."""
 
 SEQUENCE_MASK: Final = 0xFF
-Waiting = tuple[bytes, int | None]
+Waiting = tuple[MavFrame, int | None]
 """A frame and its step."""
-_Queue = deque[tuple[bytes, int | None, int]]
-"""Frames, their steps, and when they were pushed."""
+_Queue = deque[tuple[MavFrame, int | None, int]]
+"""Frames, their steps, and the time at which they were added."""
 
 
 class Numbering:
-    """Renumber our own frames on a link that drops some and lets others overtake.
+    """Renumber our own frames where some are dropped and others overtake.
 
-    Each frame keeps its step from the one before it in our own order; at the exit the steps of
-    those that leave add up. So without drops every frame leaves as it came, gaps of a recording
-    included, and with drops the numbers run on without a gap.
-    Signed frames are signed again, since a frame that was overtaken has too early a time stamp.
+    Each frame keeps its step from the frame before it in our own order; when frames leave, their
+    steps add up. So without drops every frame leaves with its own number, gaps of a recording
+    included, and with drops the numbers continue without a gap.
 
     Parameters
     ----------
     is_own : callable
-        Whether an origin is one of our vehicles; frames of others are never touched.
-    seal : callable
-        Numbers, and signs, each frame of ours that leaves.
+        Whether an origin is one of our vehicles; frames of others are never changed.
     """
 
-    def __init__(self, is_own: Callable[[Origin], bool], seal: Seal = restamp) -> None:
+    def __init__(self, is_own: Callable[[Origin], bool]) -> None:
         self._is_own = is_own
-        self._seal = seal
-        self._came: dict[Origin, int] = {}
+        self._entered: dict[Origin, int] = {}
         self._left: dict[Origin, int] = {}
 
-    def enter(self, frame: bytes) -> int | None:
-        """Return a frame's step, to be handed to `leave`; None for a frame of others."""
-        origin = origin_of(frame)
+    def enter(self, frame: MavFrame) -> int | None:
+        """Return a frame's step, to be passed to `leave`; None for a frame of others."""
+        origin, sequence = frame.origin, frame.sequence
         if not self._is_own(origin):
             return None
-        sequence = sequence_of(frame)
-        before = self._came.get(origin, sequence - 1)
-        if len(self._came) < MAX_ORIGINS or origin in self._came:
-            self._came[origin] = sequence
+        before = self._entered.get(origin, sequence - 1)
+        if len(self._entered) < MAX_ORIGINS or origin in self._entered:
+            self._entered[origin] = sequence
         return sequence - before & SEQUENCE_MASK
 
-    def leave(self, frame: bytes, step: int | None) -> bytes:
-        """Return a frame as it is to be sent."""
-        if step is None:
-            return frame
-        origin = origin_of(frame)
-        wanted = self._left.get(origin, sequence_of(frame) - step) + step & SEQUENCE_MASK
+    def leave(self, frame: MavFrame, step: int) -> int:
+        """Return the sequence number with which a frame is sent."""
+        origin = frame.origin
+        wanted = self._left.get(origin, frame.sequence - step) + step & SEQUENCE_MASK
         if len(self._left) < MAX_ORIGINS or origin in self._left:
             self._left[origin] = wanted
-        return self._seal(frame, wanted)
+        return wanted
 
 
-class Outbox:
+class LinkEncoder:
+    """Number and sign our own frames on one link, in the order in which they leave.
+
+    Parameters
+    ----------
+    is_own : callable
+        Whether an origin is one of our vehicles.
+    signer : FrameSigner
+        Signs frames of systems that have a key; a frame that was overtaken is signed again, since
+        its timestamp is too early.
+    """
+
+    def __init__(self, is_own: Callable[[Origin], bool], signer: FrameSigner) -> None:
+        self._numbering = Numbering(is_own)
+        self._signer = signer
+        self.enter = self._numbering.enter
+
+    def encode(self, frame: MavFrame, step: int | None, now_us: int) -> bytes:
+        """Return the bytes of a frame to send; `step` is the result of `enter`."""
+        if step is None:
+            return frame.data
+        sequence = self._numbering.leave(frame, step)
+        return self._signer.sequence_and_sign(frame, sequence, now_us).data
+
+
+class SendQueue:
     """A bounded queue in front of one slow link.
 
     Parameters
     ----------
     max_bytes : int
-        Most bytes that wait beside bulk; the newest frame is always taken.
+        Most waiting bytes in addition to bulk; the newest frame is always accepted.
     """
 
     def __init__(self, max_bytes: int) -> None:
         self.max_bytes = max_bytes
         self.max_bulk_bytes = max(max_bytes, BULK_BYTES)
         self._sizes = [0, 0]
-        """Bytes that wait beside bulk, and of bulk."""
+        """Waiting bytes of all but bulk, and of bulk."""
         self._answers: _Queue = deque()
         self._urgent: _Queue = deque()
         self._usual: _Queue = deque()
@@ -117,18 +137,16 @@ class Outbox:
 
     @property
     def size(self) -> int:
-        """Bytes that wait."""
+        """Waiting bytes."""
         return sum(self._sizes)
 
-    def push(self, frame: bytes, message_id: int, step: int | None = None, now_us: int = 0) -> int:
-        """Take a frame in.
+    def push(self, frame: MavFrame, step: int | None = None, now_us: int = 0) -> int:
+        """Add a frame.
 
         Parameters
         ----------
-        frame : bytes
-            A complete frame.
-        message_id : int
-            Decides in which queue it waits.
+        frame : MavFrame
+            Its message decides in which queue it waits.
         step : int, optional
             Returned with the frame; see `Numbering`.
         now_us : int, optional
@@ -137,9 +155,9 @@ class Outbox:
         Returns
         -------
         int
-            How many older frames were dropped for it.
+            Number of older frames that were dropped for it.
         """
-        size, dropped = len(frame), 0
+        message_id, size, dropped = frame.message_id, len(frame.data), 0
         if message_id in BULK_IDS:
             queue = self._bulk
             while queue and self._sizes[1] + size > self.max_bulk_bytes:
@@ -159,7 +177,7 @@ class Outbox:
         return dropped
 
     def expire(self, before_us: int) -> int:
-        """Drop the telemetry that was pushed before a time; return how many frames that were."""
+        """Drop the telemetry that was added before a time; return the number of frames."""
         dropped = 0
         for queue in (self._usual, self._urgent):
             while queue and queue[0][2] < before_us:
@@ -168,7 +186,7 @@ class Outbox:
         return dropped
 
     def pop(self) -> Waiting | None:
-        """Return the frame that leaves next with its step, or None if nothing waits."""
+        """Return the frame that leaves next with its step, or None if the queue is empty."""
         urgent = self._answers or self._urgent
         others = bool(self._usual or self._bulk)
         if urgent and not (others and self._run >= URGENT_RUN):
@@ -184,7 +202,7 @@ class Outbox:
         return self._take(first or second)
 
     def clear(self) -> int:
-        """Forget all that waits; return how many frames that were."""
+        """Discard all frames; return their number."""
         count = len(self)
         for queue in (self._answers, self._urgent, self._usual, self._bulk):
             queue.clear()
@@ -193,7 +211,7 @@ class Outbox:
 
     def _take(self, queue: "_Queue") -> Waiting:
         frame, step, _ = queue.popleft()
-        self._sizes[queue is self._bulk] -= len(frame)
+        self._sizes[queue is self._bulk] -= len(frame.data)
         return frame, step
 
 
@@ -212,7 +230,7 @@ class Packer:
         self._size = 0
 
     def add(self, frame: bytes) -> list[bytes]:
-        """Take a frame in; return the frames of the datagram that is full now, or none."""
+        """Add a frame; return the frames of the datagram that is full now, or none."""
         full: list[bytes] = []
         if self._size + len(frame) > self._max_bytes:
             full = self.flush()
@@ -221,24 +239,24 @@ class Packer:
         return full
 
     def flush(self) -> list[bytes]:
-        """Return what has been gathered."""
+        """Return the gathered frames."""
         frames, self._frames = self._frames, []
         self._size = 0
         return frames
 
 
 class Pacer:
-    """Keep the buffer of a serial line short, so that urgent frames need not wait behind it.
+    """Keep the driver's buffer of a serial line short, so that urgent frames need not wait for it.
 
-    A driver takes kilobytes at once, which at 57600 Bd is most of a second. The pacer computes
-    when the line will have sent what it was given and lets the next frame in just before.
+    A driver accepts kilobytes at once, which at 57600 Bd is most of a second. The pacer computes
+    when the line will have sent them and allows the next frame just before.
 
     Parameters
     ----------
     baud : int
         Line rate.
     ahead_us : int
-        How much may lie in the driver's buffer.
+        Time on the line that may be in the driver's buffer.
     """
 
     def __init__(self, baud: int, ahead_us: int) -> None:
@@ -247,10 +265,10 @@ class Pacer:
         self._free_us = 0
 
     def delay_us(self, now_us: int) -> int:
-        """Return how long to wait until the next frame may be written; 0 is now."""
+        """Return the time until the next frame may be written; 0 is now."""
         return max(0, self._free_us - self._ahead_us - now_us)
 
     def wrote(self, size: int, now_us: int) -> None:
-        """Note that bytes were given to the driver."""
+        """Account for bytes written to the driver."""
         busy_us = math.ceil(size * BITS_PER_BYTE * US_PER_S / self._baud)
         self._free_us = max(self._free_us, now_us) + busy_us

@@ -27,9 +27,9 @@ class HubSettings(Settings, frozen=True):
     idle_timeout_s: Annotated[
         float,
         setting(
-            "A client of a listening UDP port is dropped after this silence. Ground stations "
-            "send a heartbeat every second. A WebSocket client is dropped after so long "
-            "without an answer to the pings that it has answered before.",
+            "A client of a listening UDP port is removed after this time without a frame. "
+            "Ground stations send a heartbeat every second. A WebSocket client is removed after "
+            "this time without an answer to pings, if it has answered some before.",
             "s",
             ge=2,
             le=3600,
@@ -45,6 +45,16 @@ class HubSettings(Settings, frozen=True):
             le=16_777_216,
         ),
     ] = 65_536
+    late_after_s: Annotated[
+        float,
+        setting(
+            "Of a system that is received on several links: a frame that is older than the "
+            "newest by more than this is dropped, as one from a congested mobile network.",
+            "s",
+            ge=0.05,
+            le=30,
+        ),
+    ] = 1.0
     ping_interval_s: Annotated[
         float,
         setting("How often each client's round trip is measured; 0 never.", "s", ge=0, le=3600),
@@ -87,7 +97,7 @@ class HubSettings(Settings, frozen=True):
 
     def __post_init__(self) -> None:
         """Refuse wrong endpoints when the settings are read, not when they are used."""
-        places: set[str] = set()
+        locations: set[str] = set()
         errors = []
         for url in self.endpoints:
             try:
@@ -95,10 +105,10 @@ class HubSettings(Settings, frozen=True):
             except ValueError as error:
                 errors.append(str(error))
                 continue
-            if endpoint.place in places:
-                errors.append(f"endpoint {endpoint.place!r} is given twice")
+            if endpoint.location in locations:
+                errors.append(f"endpoint {endpoint.location!r} is given twice")
             if endpoint.kind is EndpointKind.WSS_LISTEN and not self.tls_certificate:
-                errors.append(f"endpoint {endpoint.place!r} needs a tls_certificate")
-            places.add(endpoint.place)
+                errors.append(f"endpoint {endpoint.location!r} needs a tls_certificate")
+            locations.add(endpoint.location)
         if errors:
             raise ValueError("\n".join(errors))

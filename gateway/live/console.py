@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
-from gateway.hub.client_table import ClientStats, ListenerStats
+from gateway.hub.stats import ClientStats, ListenerStats
 from gateway.live.log_line import UNKNOWN, figure_of
 from gateway.printable import PrintableFormatter
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus

@@ -6,8 +6,8 @@ from collections.abc import Awaitable, Callable
 
 import msgspec
 
-from gateway.hub.client_table import ClientStats
 from gateway.hub.hub import Hub
+from gateway.hub.stats import ClientStats
 from gateway.live.control_socket import ControlError, ControlServer, NoParams
 from gateway.live.player_edge import PlayerEdge, PlayerStatus
 from gateway.live.recorder import Recorder

@@ -106,8 +106,8 @@ class Daemon:
             self.now_us,
             on_foreign=lambda frame: self._record(frame),
             on_gone=self._on_gone,
-            on_trouble=self._announce,
-            seal=partial(self._pipeline.seal, now_us=self.now_us),
+            on_alert=self._announce,
+            signer=self._pipeline.signer,
             recordings=Path(settings.recording.folder).expanduser(),
         )
         self._recorder = Recorder(

@@ -8,7 +8,7 @@ from prometheus_client import generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from gateway.hub.client_table import ClientStats, HubCounters, ListenerStats
+from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
 from gateway.units import US_PER_S
 
 Labels = tuple[str, ...]

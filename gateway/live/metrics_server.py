@@ -9,8 +9,8 @@ from contextlib import suppress
 from typing import Final
 
 from gateway.hub.accepting import accept_each
-from gateway.hub.client_table import ListenerStats
 from gateway.hub.hosts import names_loopback
+from gateway.hub.stats import ListenerStats
 from gateway.reasons import reason_of
 
 log = logging.getLogger(__name__)

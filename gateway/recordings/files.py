@@ -488,12 +488,12 @@ def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:
             rest, at = rest + piece, 0
             found: list[tuple[int, bytes, bytes]] = []
             for event in splitter.feed(piece):
-                size = event.size if isinstance(event, SplitFault) else len(event)
+                size = event.size if isinstance(event, SplitFault) else len(event.data)
                 if isinstance(event, SplitFault):
                     left_out += size
                     lead = (lead + rest[at : at + size])[-2 * TIME_SIZE :]
                 else:
-                    found.append((left_out, lead, event))
+                    found.append((left_out, lead, event.data))
                     lead, left_out = b"", 0
                 at += size
             rest = rest[at:]

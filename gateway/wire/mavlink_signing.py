@@ -1,8 +1,8 @@
-"""Signatures of the frames that leave.
+"""Sequence numbers and signatures of frames, applied where a frame is encoded for a link.
 
-A frame is signed where it leaves, because only there its sequence number and its order are known:
-on the way it may be renumbered, be overtaken, or be kept for a newcomer, and a receiver drops a
-frame whose time stamp is earlier than that of the frame before it.
+A frame is signed where it is sent, because only there its sequence number and its order are known:
+before, it may be renumbered, be overtaken, or be kept for a new client, and a receiver drops a
+frame whose signing timestamp is earlier than that of the frame before it.
 
 References
 ----------
@@ -10,55 +10,101 @@ References
 """
 
 import hashlib
-from collections.abc import Callable
-from typing import Final
+from typing import Final, Protocol
 
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, SIGNED, START_V2, is_signed, message_id_of
+from gateway.wire.mavlink_splitter import (
+    SIGNATURE_SIZE,
+    SIGNED,
+    START_V2,
+    MavFrame,
+    frame_of,
+    with_sequence,
+)
 
 LINK_ID: Final = bytes(1)
-STAMP_BYTES: Final = 6
+TIMESTAMP_BYTES: Final = 6
 HASH_BYTES: Final = 6
 
-Seal = Callable[[bytes, int], bytes]
-"""Gives a frame of ours its sequence number as it leaves, and a signature if its vehicle signs;
-`restamp` is one for vehicles that do not."""
+
+class Clock(Protocol):
+    """Time for signing timestamps."""
+
+    def stamp(self, now_us: int) -> int:
+        """Return gateway time in units of 10 us since 2015."""
 
 
-class Signer:
-    """Number and sign frames; each time stamp is later than the one before."""
+class FrameSigner:
+    """Number our own frames, and sign those of systems that have a key.
 
-    def __init__(self) -> None:
-        self._stamp = 0
+    Parameters
+    ----------
+    clock : Clock, optional
+        Needed once there is a key.
+    """
 
-    def sign(self, frame: bytes, sequence: int, key: bytes, stamp: int) -> bytes:
-        """Return a frame with this sequence number and a new signature.
+    def __init__(self, clock: Clock | None = None) -> None:
+        self.keys: dict[int, bytes] = {}
+        """Signing keys of 32 bytes, by system id; set by the stage that owns the vehicles."""
+        self._clock = clock
+        self._newest = 0
+        """Each timestamp is later than the one before."""
+
+    def sequence_and_sign(self, frame: MavFrame, sequence: int, now_us: int) -> MavFrame:
+        """Return a frame with this sequence number, signed if its system has a key.
 
         Parameters
         ----------
-        frame : bytes
-            A complete frame of MAVLink 2, signed or not. One of version 1 or of an unknown
-            message is returned as it is.
+        frame : MavFrame
+            Signed already or not. A frame of an unknown message is returned as it is; one of
+            version 1 is numbered and never signed.
         sequence : int
             0 to 255.
-        key : bytes
-            32 bytes.
-        stamp : int
-            Time of this moment in units of 10 us since 2015.
+        now_us : int
+            Gateway time.
 
         Returns
         -------
-        bytes
+        MavFrame
             The frame to send instead.
         """
-        extra = CRC_EXTRA.get(message_id_of(frame))
-        if extra is None or frame[0] != START_V2:
-            return frame
-        self._stamp = max(self._stamp + 1, stamp)
-        end = -2 - SIGNATURE_SIZE * is_signed(frame)
-        body = bytes((frame[1], SIGNED, frame[3], sequence)) + frame[5:end]
-        crc = mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
-        signed = frame[:1] + body + crc + LINK_ID + self._stamp.to_bytes(STAMP_BYTES, "little")
-        return signed + hashlib.sha256(key + signed).digest()[:HASH_BYTES]
+        key = self.keys.get(frame.origin[0])
+        if key is None or self._clock is None:
+            if frame.sequence == sequence:
+                return frame
+            return frame_of(with_sequence(frame.data, sequence))
+        self._newest = max(self._newest + 1, self._clock.stamp(now_us))
+        return frame_of(sign(frame.data, sequence, key, self._newest))
+
+
+def sign(data: bytes, sequence: int, key: bytes, timestamp: int) -> bytes:
+    """Return a frame of MAVLink 2 with this sequence number and a new signature.
+
+    Parameters
+    ----------
+    data : bytes
+        A complete frame, signed or not. One of version 1 or of an unknown message is returned as
+        it is.
+    sequence : int
+        0 to 255.
+    key : bytes
+        32 bytes.
+    timestamp : int
+        Time in units of 10 us since 2015.
+
+    Returns
+    -------
+    bytes
+        The frame to send instead.
+    """
+    frame = frame_of(data)
+    extra = CRC_EXTRA.get(frame.message_id)
+    if extra is None or data[0] != START_V2:
+        return data
+    end = -2 - SIGNATURE_SIZE * frame.signed
+    body = bytes((data[1], SIGNED, data[3], sequence)) + data[5:end]
+    crc = mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
+    signed = data[:1] + body + crc + LINK_ID + timestamp.to_bytes(TIMESTAMP_BYTES, "little")
+    return signed + hashlib.sha256(key + signed).digest()[:HASH_BYTES]

@@ -1,24 +1,27 @@
 """Cut MAVLink 1 and 2 frames out of bytes without decoding them.
 
 Theory of operation. A frame starts with 0xFD (version 2) or 0xFE (version 1) and a length byte.
-Nothing is escaped, so both values also occur inside frames; only the checksum tells a real start
-from a coincidence. At each candidate the splitter decides:
+Nothing is escaped, so both values also occur inside frames; only the checksum separates a real
+start from a coincidence. At each candidate:
 
-| it sees                                         | it does                                |
+| condition                                       | action                                 |
 | ----------------------------------------------- | -------------------------------------- |
 | the frame is not complete yet                   | waits; at a datagram's end, as below   |
 | the checksum holds                              | yields the frame's own bytes           |
 | an unknown message, then another start or an end | yields it: routers pass the unknown    |
 | anything else, or a flag other than "signed"    | drops one byte and seeks the next start |
 
-Dropped bytes in a row come out as one fault. The signature is not checked, only stepped over.
+Dropped bytes in a row are reported as one fault. The signature is skipped, not checked. Each frame
+is returned as a `MavFrame`, whose header is read once; routing and transports use its fields.
 """
 
 import re
+import struct
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+import msgspec
 from fastcrc.crc16 import mcrf4xx
 
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
@@ -31,12 +34,21 @@ OVERHEAD_V1: Final = 8
 OVERHEAD_V2: Final = 12
 SIGNATURE_SIZE: Final = 13
 HEARTBEAT_TYPE_OFFSET: Final = 4
-MAV_TYPE_GCS: Final = 6
+_TYPE_GCS: Final = bytes((6,))
+"""MAV_TYPE_GCS."""
 TXBUF_OFFSET: Final = 6
 """Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
 
+PAYLOAD_V1: Final = 6
+PAYLOAD_V2: Final = 10
+"""Where the payload begins."""
+EVERYBODY: Final = (0, 0)
+"""Target of a message without one."""
+
+_HEAD_V2: Final = struct.Struct("<BBBBBBBHB").unpack_from
+"""Start, length, two bytes of flags, sequence, system, component, message id in three bytes."""
 _INCOMPLETE: Final = -1
 _NO_FRAME: Final = 0
 _STARTS: Final = re.compile(rb"[\xfd\xfe]")
@@ -59,14 +71,50 @@ class SplitFault:
     size: int
 
 
+class MavFrame(msgspec.Struct, frozen=True, gc=False):
+    """One complete frame with its header read; made once, then passed on unchanged."""
+
+    data: bytes
+    """The frame, byte for byte."""
+    key: bytes
+    """System, component and message as header bytes: the kind of frame, as a dictionary key."""
+    message_id: int
+    origin: tuple[int, int]
+    """System and component that sent it."""
+    target: tuple[int, int]
+    """System and component that it addresses; 0 is everybody."""
+    sequence: int
+    signed: bool
+
+    @property
+    def payload(self) -> bytes:
+        """The payload as sent: version 2 cuts trailing zeros off."""
+        begin = PAYLOAD_V2 if self.data[0] == START_V2 else PAYLOAD_V1
+        return self.data[begin : begin + self.data[1]]
+
+    @property
+    def is_station_heartbeat(self) -> bool:
+        """Whether this HEARTBEAT reports that its sender is a ground station."""
+        return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_GCS
+
+    @property
+    def free_percent(self) -> int:
+        """Free part of the transmit buffer in this RADIO_STATUS."""
+        payload = self.payload
+        return payload[TXBUF_OFFSET] if len(payload) > TXBUF_OFFSET else 0
+
+
+Event = MavFrame | SplitFault
+
+
 class MavlinkSplitter:
     """Turn chunks of a byte stream (serial, TCP) into frames and faults."""
 
     def __init__(self) -> None:
         self._rest = b""
 
-    def feed(self, data: bytes) -> list[bytes | SplitFault]:
-        """Take the next bytes of the stream.
+    def feed(self, data: bytes) -> list[Event]:
+        """Process the next bytes of the stream.
 
         Parameters
         ----------
@@ -75,7 +123,7 @@ class MavlinkSplitter:
 
         Returns
         -------
-        list of bytes or SplitFault
+        list of MavFrame or SplitFault
             Every complete frame, byte for byte, and every run of dropped bytes. Never raises on
             data.
         """
@@ -84,11 +132,11 @@ class MavlinkSplitter:
         return events
 
     def reset(self) -> None:
-        """Forget a half-received frame, as after reopening the port."""
+        """Discard a half-received frame, as after reopening the port."""
         self._rest = b""
 
 
-def split_datagram(data: bytes) -> list[bytes | SplitFault]:
+def split_datagram(data: bytes) -> list[Event]:
     """Cut one datagram into its frames; nothing carries over to the next.
 
     Parameters
@@ -98,95 +146,97 @@ def split_datagram(data: bytes) -> list[bytes | SplitFault]:
 
     Returns
     -------
-    list of bytes or SplitFault
+    list of MavFrame or SplitFault
         Frames byte for byte, and runs of dropped bytes, in order.
     """
     return _split(data, final=True)[0]
 
 
-def is_frame(data: bytes) -> bool:
-    """Return whether bytes are exactly one unsigned version 2 frame of a known message.
+def read_datagram(data: bytes) -> MavFrame | None:
+    """Return a datagram that is exactly one unsigned version 2 frame of a known message.
 
-    Nearly every datagram is one; this is the fast check for it.
+    Nearly every datagram is one; for any other, None, and `split_datagram` finds its frames.
     """
-    if (
-        len(data) < OVERHEAD_V2
-        or data[0] != START_V2
-        or data[2]
-        or len(data) != data[1] + OVERHEAD_V2
-    ):
-        return False
-    extra = CRC_EXTRA.get(data[7] | data[8] << 8 | data[9] << 16)
-    if extra is None:
-        return False
-    crc: int = mcrf4xx(data[1:-2] + extra)
-    return crc == data[-2] | data[-1] << 8
+    if len(data) < OVERHEAD_V2:
+        return None
+    start, length, flags, _, sequence, system, component, low, high = _HEAD_V2(data)
+    if start != START_V2 or flags or len(data) != length + OVERHEAD_V2:
+        return None
+    message_id = low | high << 16
+    extra = CRC_EXTRA.get(message_id)
+    if extra is None or mcrf4xx(data[1:-2] + extra) != data[-2] | data[-1] << 8:
+        return None
+    target = _target(message_id, data, PAYLOAD_V2)
+    return MavFrame(data, data[5:10], message_id, (system, component), target, sequence, False)
 
 
-def key_of(frame: bytes) -> bytes:
-    """Return the header bytes with system, component and message, as a dictionary key."""
-    return frame[5:10] if frame[0] == START_V2 else frame[3:6]
+def frame_of(data: bytes) -> MavFrame:
+    """Read the header of one complete frame of any version; its checksum is not checked."""
+    if data[0] == START_V2:
+        _, _, flags, _, sequence, system, component, low, high = _HEAD_V2(data)
+        message_id = low | high << 16
+        target = _target(message_id, data, PAYLOAD_V2)
+        signed = bool(flags & SIGNED)
+        return MavFrame(data, data[5:10], message_id, (system, component), target, sequence, signed)
+    target = _target(data[5], data, PAYLOAD_V1)
+    return MavFrame(data, data[3:6], data[5], (data[3], data[4]), target, data[2], False)
 
 
-def origin_of(frame: bytes) -> tuple[int, int]:
-    """Return the system and component that sent a frame."""
-    return (frame[5], frame[6]) if frame[0] == START_V2 else (frame[3], frame[4])
-
-
-def message_id_of(frame: bytes) -> int:
-    """Return the message id of a frame."""
-    if frame[0] == START_V2:
-        return frame[7] | frame[8] << 8 | frame[9] << 16
-    return frame[5]
-
-
-def is_station_heartbeat(frame: bytes) -> bool:
-    """Return whether a HEARTBEAT says that its sender is a ground station.
-
-    Version 2 cuts trailing zeros off the payload, so a type beyond its end is 0: generic.
-    """
-    begin = 10 if frame[0] == START_V2 else 6
-    return frame[1] > HEARTBEAT_TYPE_OFFSET and frame[begin + HEARTBEAT_TYPE_OFFSET] == MAV_TYPE_GCS
-
-
-def free_percent(frame: bytes) -> int:
-    """Return how much of its buffer the sender of a RADIO_STATUS has free."""
-    begin = 10 if frame[0] == START_V2 else 6
-    return frame[begin + TXBUF_OFFSET] if frame[1] > TXBUF_OFFSET else 0
-
-
-def is_signed(frame: bytes) -> bool:
-    """Return whether a frame carries a MAVLink 2 signature."""
-    return frame[0] == START_V2 and bool(frame[2] & SIGNED)
-
-
-def sequence_of(frame: bytes) -> int:
-    """Return the sequence number of a frame."""
-    return frame[4] if frame[0] == START_V2 else frame[2]
-
-
-def target_of(frame: bytes) -> tuple[int, int]:
-    """Return the system and component that a frame addresses; 0 is everybody.
-
-    Version 2 cuts trailing zeros off the payload, so a target beyond its end is 0.
-    """
-    offsets = TARGET_OFFSETS.get(message_id_of(frame))
+def _target(message_id: int, data: bytes, begin: int) -> tuple[int, int]:
+    """Return the addressed system and component; version 2 cuts trailing zeros off the payload."""
+    offsets = TARGET_OFFSETS.get(message_id)
     if offsets is None:
-        return 0, 0
-    begin = 10 if frame[0] == START_V2 else 6
-    length = frame[1]
+        return EVERYBODY
+    length = data[1]
     system, component = (
-        frame[begin + offset] if NO_TARGET < offset < length else 0 for offset in offsets
+        data[begin + offset] if NO_TARGET < offset < length else 0 for offset in offsets
     )
     return system, component
 
 
-def restamp(frame: bytes, sequence: int) -> bytes:
+def origin_of(data: bytes) -> tuple[int, int]:
+    """Return the system and component that sent a frame."""
+    return (data[5], data[6]) if data[0] == START_V2 else (data[3], data[4])
+
+
+def message_id_of(data: bytes) -> int:
+    """Return the message id of a frame."""
+    if data[0] == START_V2:
+        return data[7] | data[8] << 8 | data[9] << 16
+    return data[5]
+
+
+def key_of(data: bytes) -> bytes:
+    """Return the header bytes with system, component and message, as a dictionary key."""
+    return frame_of(data).key
+
+
+def is_station_heartbeat(data: bytes) -> bool:
+    """Return whether a HEARTBEAT reports that its sender is a ground station."""
+    return frame_of(data).is_station_heartbeat
+
+
+def is_signed(data: bytes) -> bool:
+    """Return whether a frame carries a MAVLink 2 signature."""
+    return frame_of(data).signed
+
+
+def sequence_of(data: bytes) -> int:
+    """Return the sequence number of a frame."""
+    return frame_of(data).sequence
+
+
+def target_of(data: bytes) -> tuple[int, int]:
+    """Return the system and component that a frame addresses; 0 is everybody."""
+    return frame_of(data).target
+
+
+def with_sequence(data: bytes, sequence: int) -> bytes:
     """Return an unsigned frame with this sequence number and the checksum that fits.
 
     Parameters
     ----------
-    frame : bytes
+    data : bytes
         A complete frame; a signed or an unknown one is returned as it is.
     sequence : int
         0 to 255.
@@ -196,18 +246,18 @@ def restamp(frame: bytes, sequence: int) -> bytes:
     bytes
         The frame to send instead.
     """
-    at = 4 if frame[0] == START_V2 else 2
-    if frame[at] == sequence:
-        return frame
-    extra = CRC_EXTRA.get(message_id_of(frame))
-    if extra is None or is_signed(frame):
-        return frame
-    body = frame[1:at] + bytes((sequence,)) + frame[at + 1 : -2]
-    return frame[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
+    at = 4 if data[0] == START_V2 else 2
+    if data[at] == sequence:
+        return data
+    extra = CRC_EXTRA.get(message_id_of(data))
+    if extra is None or is_signed(data):
+        return data
+    body = data[1:at] + bytes((sequence,)) + data[at + 1 : -2]
+    return data[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
 
 
-def _split(data: bytes, *, final: bool) -> tuple[list[bytes | SplitFault], int]:
-    events: list[bytes | SplitFault] = []
+def _split(data: bytes, *, final: bool) -> tuple[list[Event], int]:
+    events: list[Event] = []
     position = good = false_starts = 0
     while position < len(data):
         size = _measure(data, position)
@@ -215,7 +265,7 @@ def _split(data: bytes, *, final: bool) -> tuple[list[bytes | SplitFault], int]:
             break
         if size > 0:
             _report(events, data, good, position)
-            events.append(data[position : position + size])
+            events.append(frame_of(data[position : position + size]))
             position = good = position + size
             continue
         false_starts += 1
@@ -225,7 +275,7 @@ def _split(data: bytes, *, final: bool) -> tuple[list[bytes | SplitFault], int]:
     return events, position
 
 
-def _report(events: list[bytes | SplitFault], data: bytes, begin: int, end: int) -> None:
+def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:
     if end > begin:
         started = data[begin] in (START_V1, START_V2)
         kind = SplitFaultKind.CRC if started else SplitFaultKind.GARBAGE

@@ -10,7 +10,8 @@ from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
 from gateway.fleet.signatures import EPOCH_2015_US, SiteSignatures
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import split_datagram, target_of
+from gateway.wire.mavlink_splitter import target_of
+from tests.kit.mavlink import frames_in
 
 KEY = bytes(range(32))
 
@@ -288,7 +289,7 @@ def test_every_message_with_a_target(message_id: int) -> None:
     there = translation()
     system_id, changed = there.to_site(frame, 0) or (0, b"")
     assert system_id == 1
-    assert split_datagram(changed) == [changed]
+    assert frames_in(changed) == [changed]
     assert target_of(changed)[0] == 1
     back = translation().from_site(changed, 0)
     assert back is not None

@@ -6,16 +6,14 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 import pytest
-from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.records import Incoming, Outgoing
-from gateway.wire.mavlink_signing import Seal
-from gateway.wire.mavlink_splitter import message_id_of, restamp
+from gateway.wire.mavlink_signing import FrameSigner
+from tests.kit.mavlink import STATION, Sender, outgoing
 from tests.ports import free_port
 
-STATION = 190
 LIMIT_S = 60.0
 """Until a test is given up: what it waits for takes a moment, on a busy machine some seconds."""
 
@@ -26,45 +24,6 @@ class Clock:
 
     def __call__(self) -> int:
         return self.us
-
-
-class Sender:
-    """A MAVLink system that numbers its frames."""
-
-    def __init__(self, system: int, component: int, *, signed: bool = False) -> None:
-        self.link = dialect.MAVLink(None, system, component)
-        self.is_station = component == STATION
-        if signed:
-            self.link.signing.secret_key = bytes(32)
-            self.link.signing.link_id = 1
-            self.link.signing.timestamp = 1
-            self.link.signing.sign_outgoing = True
-
-    def pack(self, message: dialect.MAVLink_message) -> bytes:
-        frame = bytes(message.pack(self.link))
-        self.link.seq = (self.link.seq + 1) % 256
-        return frame
-
-    def heartbeat(self) -> bytes:
-        kind = dialect.MAV_TYPE_GCS if self.is_station else dialect.MAV_TYPE_FIXED_WING
-        return self.pack(dialect.MAVLink_heartbeat_message(kind, 0, 0, 0, 4, 3))
-
-    def attitude(self) -> bytes:
-        return self.pack(dialect.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0))
-
-    def raw_imu(self) -> bytes:
-        return self.pack(dialect.MAVLink_raw_imu_message(5, 1, 2, 3, 4, 5, 6, 7, 8, 9))
-
-    def home(self) -> bytes:
-        quaternion = [1, 0, 0, 0]
-        return self.pack(
-            dialect.MAVLink_home_position_message(1, 2, 3, 0, 0, 0, quaternion, 0, 0, 0)
-        )
-
-    def command(self, system: int, component: int) -> bytes:
-        return self.pack(
-            dialect.MAVLink_command_long_message(system, component, 512, 0, 1, 0, 0, 0, 0, 0, 0)
-        )
 
 
 class Station:
@@ -107,13 +66,13 @@ class Rig:
     def hub(
         self,
         *endpoints: str,
-        seal: Seal = restamp,
+        signer: FrameSigner | None = None,
         recordings: Path | None = None,
         **settings: object,
     ) -> Hub:
         wanted = HubSettings(endpoints=endpoints, **settings)  # type: ignore[arg-type]
         taps = (self.incoming.append, self.clock, self.foreign.append)
-        hub = Hub(wanted, *taps, seal=seal, recordings=recordings)
+        hub = Hub(wanted, *taps, signer=signer, recordings=recordings)
         self.closing.append(hub.close)
         hub.start()
         return hub
@@ -129,7 +88,7 @@ class Rig:
         return Sender(system, component, signed=signed)
 
     def out(self, frame: bytes, client_id: int | None = None) -> Outgoing:
-        return Outgoing(frame, message_id_of(frame), client_id)
+        return outgoing(frame, client_id)
 
     def tick(self, hub: Hub) -> None:
         """Let the hub do what it does a few times a second, now."""

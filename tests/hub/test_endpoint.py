@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.hub.endpoint import MAX_PORT, EndpointKind, parse_endpoint
-from gateway.hub.option_values import NO_MESSAGES
+from gateway.hub.endpoint import MAX_PORT, NO_MESSAGES, EndpointKind, parse_endpoint
 from gateway.hub.settings import HubSettings
 
 
@@ -67,7 +66,7 @@ def test_places(url: str, kind: EndpointKind, host: str, port: int) -> None:
 )
 def test_what_other_programs_write_means_what_they_mean(written: str, place: str) -> None:
     endpoint = parse_endpoint(written)
-    assert endpoint.place == place
+    assert endpoint.location == place
     assert parse_endpoint(place).kind is endpoint.kind
 
 
@@ -85,7 +84,7 @@ def test_what_other_programs_write_means_what_they_mean(written: str, place: str
 def test_what_programs_differ_about_is_refused_with_both_spellings(
     written: str, right: list[str]
 ) -> None:
-    with pytest.raises(ValueError, match="to wait for callers there") as error:
+    with pytest.raises(ValueError, match="to wait for clients there") as error:
         parse_endpoint(written)
     assert all(spelling in str(error.value) for spelling in right)
 
@@ -121,7 +120,7 @@ def test_a_site_of_a_fleet() -> None:
     assert endpoint.config == "/etc/zenoh.json5"
     assert endpoint.interval_us == {30: 200_000}
     assert parse_endpoint("zenoh:tls/h:7447?keys=mavlink_raw").keys == "mavlink_raw"
-    places = {parse_endpoint(f"zenoh:tcp/h:7447?site={site}&rate=30:5").place for site in "ab"}
+    places = {parse_endpoint(f"zenoh:tcp/h:7447?site={site}&rate=30:5").location for site in "ab"}
     assert places == {"zenoh:tcp/h:7447?site=a", "zenoh:tcp/h:7447?site=b"}
 
 
@@ -138,8 +137,8 @@ def test_lists() -> None:
         ("udp:127.0.0.1", "HOST:PORT"),
         ("udp:::1:14550", "brackets"),
         ("udp:h:99999", "65535"),
-        ("udp-listen:localhost:14550", "no address"),
-        ("udp-multicast:group.example:14550", "no address"),
+        ("udp-listen:localhost:14550", "not an address"),
+        ("udp-multicast:group.example:14550", "not an address"),
         ("udp:127.0.0..1:14550", "neither an address nor a name"),
         ("udp:127.0.0.256:14550", "neither an address nor a name"),
         (f"udp:{'x' * 64}.example:14550", "neither an address nor a name"),
@@ -148,12 +147,12 @@ def test_lists() -> None:
         ("serial:/dev/ttyUSB0:fast", "baud rate"),
         ("serial:/dev/ttyUSB0:9999999999", "baud rate"),
         ("serial:", "DEVICE"),
-        ("serial:/dev/tty\n:57600", "cannot be shown"),
+        ("serial:/dev/tty\n:57600", "cannot be printed"),
         ("udp:h:1?colour=red", "colour"),
         ("tcp-listen:127.0.0.1:1?origins=null", "origins"),
         ("ws-listen:127.0.0.1:1?origins=example.org", "https://example.org:8080"),
         ("ws-listen:127.0.0.1:1?origins=https://example.org/page", "https://example.org:8080"),
-        ("ws-listen:localhost:1", "no address"),
+        ("ws-listen:localhost:1", "not an address"),
         ("ws:h:1?path=raw", "begin with /"),
         ("zenoh:tcp/h:7447", "site"),
         ("zenoh:tcp/h:7447?site=a/b", "a/b"),
@@ -171,7 +170,7 @@ def test_lists() -> None:
         ("udp:h:1?pack=1500", "1100"),
         ("udp:h:1?trusted=no&trusted=yes", "'trusted' is given twice"),
         ("udp:h:1?name=x;trusted=no", "joined by &"),
-        ("udp:h:1?name=%0a", "cannot be shown"),
+        ("udp:h:1?name=%0a", "cannot be printed"),
         ("udp:h:1?trusted=maybe", "yes or no"),
     ],
 )
@@ -233,7 +232,7 @@ def test_any_text_is_an_endpoint_that_can_be_used_or_is_refused_by_name(url: str
     if endpoint.kind is not EndpointKind.SERIAL:
         assert 0 <= endpoint.port <= MAX_PORT
     assert all(us == NO_MESSAGES or 0 < us < 1 << 40 for us in endpoint.interval_us.values())
-    again = parse_endpoint(endpoint.place)
+    again = parse_endpoint(endpoint.location)
     assert (again.kind, again.host, again.port) == (endpoint.kind, endpoint.host, endpoint.port)
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from gateway.hub.transports.base import READ_BYTES, STRANGERS_READ_BURST, STRANGERS_READ_RATE
-from gateway.hub.transports.udp import MAX_DATAGRAM
+from gateway.hub.transports.base import READ_BYTES, UNTRUSTED_READ_BURST, UNTRUSTED_READ_RATE
+from gateway.hub.transports.datagram import MAX_DATAGRAM
 
 pytestmark = pytest.mark.io
 
@@ -68,7 +68,7 @@ async def test_strangers_together_are_read_slowly(rig: Any, kind: str) -> None:
             await asyncio.sleep(0)
 
     async with asyncio.timeout(60):
-        await flood_until(STRANGERS_READ_BURST)
+        await flood_until(UNTRUSTED_READ_BURST)
         for _ in range(20):
             for sock in floods:
                 send(sock)
@@ -76,11 +76,11 @@ async def test_strangers_together_are_read_slowly(rig: Any, kind: str) -> None:
         await caller(rig, other, quiet_port)
         await rig.until(lambda: any(incoming.trusted for incoming in rig.incoming))
         # Each of the two may have been reading when the last was spent.
-        limit = STRANGERS_READ_BURST + len(floods) * (READ_BYTES + MAX_DATAGRAM)
-        assert STRANGERS_READ_BURST <= taken() < limit
+        limit = UNTRUSTED_READ_BURST + len(floods) * (READ_BYTES + MAX_DATAGRAM)
+        assert UNTRUSTED_READ_BURST <= taken() < limit
         rig.clock.us += 2_000_000
-        await flood_until(STRANGERS_READ_BURST + STRANGERS_READ_RATE)
-        assert taken() < limit + 2 * STRANGERS_READ_RATE
+        await flood_until(UNTRUSTED_READ_BURST + UNTRUSTED_READ_RATE)
+        assert taken() < limit + 2 * UNTRUSTED_READ_RATE
 
 
 async def test_who_becomes_trusted_is_read_at_once(rig: Any) -> None:
@@ -88,7 +88,7 @@ async def test_who_becomes_trusted_is_read_at_once(rig: Any) -> None:
     sock = await caller(rig, "tcp-listen", hub.listening_ports()[0])
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub._clients.values()
-    hub.strangers.level = -1.0
+    hub.untrusted_reads.level = -1.0
     send(sock)
     await rig.until(lambda: client.counters.bytes_received > len(NOISE))
     client.trusted = True
@@ -103,7 +103,7 @@ async def test_a_stranger_that_leaves_while_it_waits_is_forgotten(rig: Any) -> N
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub._clients.values()
     paused = client._socket
-    hub.strangers.level = -1.0
+    hub.untrusted_reads.level = -1.0
     send(sock)
     await rig.until(lambda: client.counters.bytes_received > len(NOISE))
     hub.vanish(client)

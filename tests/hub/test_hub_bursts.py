@@ -103,7 +103,7 @@ async def test_those_who_come_at_once_are_admitted_one_a_turn(rig: Any, kind: st
     seen = [0]
 
     def are_all_in() -> bool:
-        seen.append(len(listener._clients) + len(getattr(listener, "_callers", ())))
+        seen.append(len(listener._clients) + len(getattr(listener, "_handshakes", ())))
         return seen[-1] == STATIONS
 
     await rig.until(are_all_in)

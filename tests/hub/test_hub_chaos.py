@@ -139,5 +139,5 @@ async def test_chaos(rig: Any, seed: int) -> None:
     while await last.receive() != frame:
         pass
     assert errors == []
-    assert not chaos.hub._fanout._outlets.keys() - chaos.hub._clients.keys()
+    assert not chaos.hub._fanout._subscriptions.keys() - chaos.hub._clients.keys()
     assert set(chaos.hub._router._table._of_client) <= set(chaos.hub._clients)

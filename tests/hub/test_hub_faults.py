@@ -16,8 +16,8 @@ import msgspec
 import pytest
 from fastcrc.crc16 import mcrf4xx
 
-from gateway.hub.hub import VISITS_IN_FULL
-from gateway.hub.log_rate_limiter import WINDOW_US
+from gateway.hub.hub import CONNECTIONS_IN_FULL
+from gateway.hub.stats import WINDOW_US
 from gateway.wire.mavlink_messages import CRC_EXTRA
 
 pytestmark = pytest.mark.io
@@ -267,7 +267,7 @@ class TestALinkThatRaises:
             for _ in range(3):
                 rig.clock.us += 1_000_000
                 rig.tick(hub)
-            assert "radio is closed and tried again" in caplog.text
+            assert "radio is closed and opened again" in caplog.text
             assert hub.clients()[1].state == "open", "the other one's trouble is called off"
             assert not hub._timer.cancelled()
         rig.clock.us += 1_000_000
@@ -323,15 +323,15 @@ async def test_strangers_without_number_do_not_flood_the_log(
     rig: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="gateway")
-    many = VISITS_IN_FULL + 10
+    many = CONNECTIONS_IN_FULL + 10
     hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
     for _ in range(many):
         stranger = rig.station(hub.listening_ports()[0])
         stranger.say(stranger.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == many)
-    assert len(caplog.messages) == VISITS_IN_FULL
+    assert len(caplog.messages) == CONNECTIONS_IN_FULL
     hub.add("udp:127.0.0.1:9")
     assert caplog.messages[-1].endswith("127.0.0.1:9"), "who is configured is always named"
     rig.clock.us += WINDOW_US
     rig.tick(hub)
-    assert "10 more comings and goings at listening ports" in caplog.messages
+    assert "10 more connects and disconnects at listening ports" in caplog.messages

@@ -1,4 +1,4 @@
-"""All that is ours leaves signed, whatever way it takes; what is not ours leaves as it came."""
+"""Our own frames are sent signed, on every route; frames of others are sent unchanged."""
 
 import asyncio
 import socket
@@ -9,9 +9,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.records import ClientInterval
-from gateway.wire.mavlink_signing import Signer
-from gateway.wire.mavlink_splitter import MavlinkSplitter, is_signed, message_id_of, restamp
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavlinkSplitter, is_signed, message_id_of
 from tests.hub.conftest import LIMIT_S
+from tests.kit.mavlink import frames_of
 
 pytestmark = pytest.mark.io
 
@@ -33,21 +34,19 @@ class Strict:
         return message.get_type(), message.get_srcComponent(), message.get_seq()
 
 
-class Keys:
-    """Stands in for the aircraft: who signs, and by which key."""
-
-    def __init__(self) -> None:
-        self.key: bytes | None = OLD
-        self._signer = Signer()
-
-    def seal(self, frame: bytes, sequence: int) -> bytes:
-        if self.key is None:
-            return restamp(frame, sequence)
-        return self._signer.sign(frame, sequence, self.key, STAMP)
+class Clock:
+    def stamp(self, now_us: int) -> int:
+        return STAMP
 
 
-async def test_greetings_questions_answers_and_limited_telemetry(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", seal=Keys().seal)
+def signer() -> FrameSigner:
+    signer = FrameSigner(Clock())
+    signer.keys[1] = OLD
+    return signer
+
+
+async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
     hub.send(rig.out(rig.vehicle.home()))
     station, receiver = rig.station(hub.listening_ports()[0]), Strict()
@@ -76,8 +75,8 @@ async def test_greetings_questions_answers_and_limited_telemetry(rig: Any) -> No
     }
 
 
-async def test_what_overtakes_in_a_queue_leaves_the_stamps_in_order(rig: Any) -> None:
-    hub = rig.hub("tcp-listen:127.0.0.1:0", seal=Keys().seal)
+async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: Any) -> None:
+    hub = rig.hub("tcp-listen:127.0.0.1:0", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
     client = socket.socket()
     client.setblocking(False)
@@ -93,12 +92,12 @@ async def test_what_overtakes_in_a_queue_leaves_the_stamps_in_order(rig: Any) ->
     splitter, receiver, kinds = MavlinkSplitter(), Strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
         data = await asyncio.wait_for(loop.sock_recv(client, 65536), LIMIT_S)
-        kinds += [receiver.read(frame)[0] for frame in splitter.feed(data)]
+        kinds += [receiver.read(frame)[0] for frame in frames_of(splitter.feed(data))]
     assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
 
 
-async def test_frames_of_others_stay_as_they_came(rig: Any) -> None:
-    hub = rig.hub("udp-listen:127.0.0.1:0", seal=Keys().seal)
+async def test_frames_of_others_are_unchanged(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
     port = hub.listening_ports()[0]
     source, station, receiver = rig.station(port), rig.station(port), Strict()
@@ -124,20 +123,20 @@ async def test_frames_of_others_stay_as_they_came(rig: Any) -> None:
     assert [frame for frame in got if frame in said] == said
 
 
-async def test_another_key_holds_from_the_next_frame_on(rig: Any) -> None:
-    keys = Keys()
-    hub = rig.hub("udp-listen:127.0.0.1:0", seal=keys.seal)
+async def test_another_key_applies_from_the_next_frame_on(rig: Any) -> None:
+    keys = signer()
+    hub = rig.hub("udp-listen:127.0.0.1:0", signer=keys)
     hub.send(rig.out(rig.vehicle.heartbeat()))
     station = rig.station(hub.listening_ports()[0])
     station.say(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 1)
     for key in (OLD, NEW):
-        keys.key = key
+        keys.keys[1] = key
         hub.send(rig.out(rig.vehicle.heartbeat()))
         receiver = Strict(key)
         if key is OLD:
             receiver.read(await station.receive())
         receiver.read(await station.receive())
-    keys.key = None
+    del keys.keys[1]
     hub.send(rig.out(rig.vehicle.heartbeat()))
     assert not is_signed(await station.receive())

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from gateway.hub.request_queue import STRANGERS_BURST
+from gateway.hub.limits import UNTRUSTED_BURST
 
 pytestmark = pytest.mark.io
 
@@ -105,7 +105,7 @@ async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None
     assert await world.autopilot.receive() == request
     client = hub._clients[hub.clients()[-1].client_id]
     client.trusted = False
-    hub.reconfigure(client)
+    hub.reconfigure(client, client.endpoint)
     count = hub.counters().unroutable
     world.station_.say(world.station_.sender.command(42, 1))
     await world.until(lambda: hub.counters().unroutable == count + 1)
@@ -118,7 +118,7 @@ class TestRequests:
     ) -> None:
         before = len(world.incoming)
         hub = world.world
-        hub._router.charge(hub.clients()[0].client_id, STRANGERS_BURST)
+        hub._router.charge(hub.clients()[0].client_id, UNTRUSTED_BURST)
         await lie(world, *(world.stranger.sender.command(1, 1) for _ in range(100)))
         await world.quiet()
         assert len(world.incoming) == before

@@ -1,14 +1,27 @@
-"""Ways to systems, and copies of frames, on the manual clock."""
+"""Paths to systems, duplicates, late copies and redundant links, on the manual clock."""
+
+import random
 
 import pytest
 
 from gateway.hub.routing_table import (
+    LATE,
+    LINKED_US,
     MEMORY_FRAMES,
     MEMORY_US,
+    NEW,
     ROUTE_FRESH_US,
-    LoopGuard,
+    DuplicateFilter,
+    Path,
+    RedundantLinks,
     RoutingTable,
 )
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import MavFrame
+
+FAST, SLOW = 1, 2
+"""Two links to one vehicle."""
+LIMIT_US = US_PER_S
 
 
 @pytest.fixture
@@ -21,7 +34,7 @@ def table() -> RoutingTable:
 
 
 @pytest.mark.parametrize(
-    ("target", "source", "ways"),
+    ("target", "source", "clients"),
     [
         ((10, 1), 9, [1]),
         ((10, 100), 9, [2]),
@@ -32,14 +45,16 @@ def table() -> RoutingTable:
         ((99, 1), 9, []),
     ],
 )
-def test_ways(table: RoutingTable, target: tuple[int, int], source: int, ways: list[int]) -> None:
-    assert table.ways_to(target, source, 0) == ways
+def test_clients_to_a_target(
+    table: RoutingTable, target: tuple[int, int], source: int, clients: list[int]
+) -> None:
+    assert table.clients_to(target, source, 0) == clients
 
 
-def test_a_living_way_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
+def test_a_fresh_path_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
     table.hear(4, (20, 1), ROUTE_FRESH_US + 1)
-    assert table.ways_to((20, 1), 9, ROUTE_FRESH_US + 1) == [4]
-    assert table.ways_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]
+    assert table.clients_to((20, 1), 9, ROUTE_FRESH_US + 1) == [4]
+    assert table.clients_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]
 
 
 def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None:
@@ -50,113 +65,215 @@ def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None
     assert not table.is_shared((10, 1), 0)
 
 
-def test_a_client_that_left_is_no_way(table: RoutingTable) -> None:
-    table.forget(1)
-    table.forget(1)
-    assert table.ways_to((10, 1), 9, 0) == [2]
+def test_a_removed_client_has_no_paths(table: RoutingTable) -> None:
+    table.remove(1)
+    table.remove(1)
+    assert table.clients_to((10, 1), 9, 0) == [2]
     assert table.origins(1) == ()
 
 
 def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
     table.hear(4, (255, 190), 0)
-    table.note_kind(4, (255, 190), is_station=True)
+    path = table.hear(4, (255, 190), 0)
+    path.is_station = True
     assert table.is_station((255, 190))
-    assert table.ways_to_vehicles(1) == [2, 3]
-    table.note_kind(4, (255, 190), is_station=False)
-    assert table.ways_to_vehicles(1) == [2, 3, 4]
+    assert table.clients_with_vehicles(1) == [2, 3]
+    path.is_station = False
+    assert table.clients_with_vehicles(1) == [2, 3, 4]
 
 
-def test_a_way_is_as_old_as_its_last_long_silence(table: RoutingTable) -> None:
+def test_a_path_begins_again_after_a_timeout(table: RoutingTable) -> None:
     later_us = ROUTE_FRESH_US
     table.hear(8, (10, 1), 0)
-    assert not table.hear(1, (10, 1), later_us)
-    assert table.since_us(1, (10, 1)) == 0
-    assert table.hear(1, (10, 1), 2 * later_us + 1)
-    assert table.since_us(1, (10, 1)) == 2 * later_us + 1
-    assert table.since_us(9, (10, 1)) == 0
+    assert table.hear(1, (10, 1), later_us).since_us == 0
+    assert table.hear(1, (10, 1), 2 * later_us + 1).since_us == 2 * later_us + 1
 
 
 class TestBounds:
-    def test_every_system_there_can_be_is_reached(self) -> None:
+    def test_all_255_systems_behind_one_client_are_reached(self) -> None:
         table = RoutingTable()
         for system in range(1, 256):
-            assert not table.hear(1, (system, 1), system)
-        assert all(table.ways_to((system, 1), 9, 255) == [1] for system in range(1, 256))
+            assert table.hear(1, (system, 1), system)
+        assert all(table.clients_to((system, 1), 9, 255) == [1] for system in range(1, 256))
 
-    def test_the_stalest_makes_room(self) -> None:
+    def test_the_stalest_origin_is_replaced(self) -> None:
         table = RoutingTable(max_origins=3)
         for system, us in ((1, 5), (2, 0), (3, 9)):
             table.hear(1, (system, 1), us)
-        assert not table.hear(1, (4, 1), ROUTE_FRESH_US + 1)
+        assert table.hear(1, (4, 1), ROUTE_FRESH_US + 1)
         assert table.origins(1) == ((1, 1), (3, 1), (4, 1))
-        assert table.ways_to((2, 1), 9, 0) == []
+        assert table.clients_to((2, 1), 9, 0) == []
 
-    def test_while_all_are_alive_a_newcomer_is_not_kept_and_is_no_news(self) -> None:
-        table = RoutingTable(max_origins=3)
+    def test_with_all_origins_fresh_a_new_one_is_ignored(self) -> None:
+        changes: list[int] = []
+        table = RoutingTable(lambda: changes.append(1), max_origins=3)
         for system in range(1, 4):
             table.hear(1, (system, 1), 0)
             table.hear(2, (system, 1), 0)
+        changes.clear()
         for system in range(4, 250):
             assert not table.hear(1, (system, 1), 1)
         assert table.origins(1) == ((1, 1), (2, 1), (3, 1))
+        assert changes == []
 
-    def test_only_a_further_way_is_news(self) -> None:
-        table = RoutingTable()
-        assert not table.hear(1, (10, 1), 0)
-        assert table.hear(2, (10, 1), 0)
-        assert not table.hear(2, (10, 1), 1)
-        assert not table.hear(2, (11, 1), 1)
+    def test_only_a_second_path_and_a_removal_change_routes(self) -> None:
+        changes: list[int] = []
+        table = RoutingTable(lambda: changes.append(1))
+        for client_id, system, expected in ((1, 10, 0), (2, 10, 1), (2, 10, 1), (2, 11, 1)):
+            table.hear(client_id, (system, 1), 0)
+            assert len(changes) == expected
+        table.remove(2)
+        assert len(changes) == 2
 
-    def test_stations_without_number_leave_nothing_behind(self) -> None:
+    def test_removed_clients_leave_no_entries(self) -> None:
         table = RoutingTable()
         for client in range(400):
             table.hear(client, (client % 255, 190), 0)
-            table.note_kind(client, (client % 255, 190), is_station=True)
-            table.forget(client)
+            table.remove(client)
         assert (table._to, table._of_client, table._components) == ({}, {}, {})
-        table.hear(1, (255, 190), 0)
-        table.note_kind(1, (255, 190), is_station=True)
-        assert table.is_station((255, 190))
 
 
-def is_new(guard: LoopGuard, frame: bytes, since_us: int, now_us: int) -> bool:
-    return guard.first_way(frame, (9, 1), 5, since_us, now_us) is None
+def frame(number: int, content: bytes | None = None) -> MavFrame:
+    """Return the n-th frame of a vehicle; by default no two have the same content."""
+    data = bytes((number % 256,)) + (number.to_bytes(4, "little") if content is None else content)
+    return MavFrame(data, b"", 30, (9, 1), (0, 0), number % 256, False)
 
 
-class TestLoopGuard:
-    def test_a_copy_is_known_wherever_it_comes_from(self) -> None:
-        guard = LoopGuard()
-        assert guard.first_way(b"frame", (9, 1), 5, 0, 0) is None
-        assert guard.first_way(b"frame", (9, 1), 6, 0, 10) == 5
-        assert guard.first_way(b"frame", (9, 1), 5, 0, 20) == 5
-        assert guard.first_way(b"other", (9, 1), 6, 0, 20) is None
+class Links:
+    """Two links from one vehicle, the second slower."""
 
-    def test_a_newcomer_repeats_nothing(self) -> None:
-        guard = LoopGuard()
-        assert is_new(guard, b"frame", 0, 10)
-        assert is_new(guard, b"frame", 11, 11)
-        assert not is_new(guard, b"frame", 0, 12)
-        assert not is_new(guard, b"frame", 11, 12)
+    def __init__(self) -> None:
+        self.filter = DuplicateFilter()
+        self.paths = {FAST: Path(0, 0), SLOW: Path(0, 0)}
 
-    def test_across_the_turn_of_generations_and_forgotten_after_two(self) -> None:
-        guard = LoopGuard()
-        is_new(guard, b"frame", 0, MEMORY_US)
-        is_new(guard, b"other", 0, 2 * MEMORY_US)
-        assert not is_new(guard, b"frame", 0, 2 * MEMORY_US + 1)
-        is_new(guard, b"third", 0, 3 * MEMORY_US)
-        assert is_new(guard, b"frame", 0, 3 * MEMORY_US)
+    def check(self, client_id: int, number: int, now_us: int, content: bytes | None = None) -> int:
+        return self.filter.check(
+            frame(number, content), client_id, self.paths[client_id], now_us, LIMIT_US
+        )
 
-    def test_the_same_content_under_the_same_number_is_new_when_the_numbers_are_used_up(
-        self,
+
+@pytest.fixture
+def links() -> Links:
+    return Links()
+
+
+class TestDuplicates:
+    def test_a_copy_is_dropped_on_every_path(self, links: Links) -> None:
+        assert links.check(FAST, 1, 0) == NEW
+        assert links.check(SLOW, 1, 10) == FAST
+        assert links.check(FAST, 1, 20) == FAST
+        assert links.check(SLOW, 2, 20) == NEW
+
+    def test_a_frame_from_before_its_path_existed_passes(self, links: Links) -> None:
+        links.check(FAST, 1, 10)
+        links.paths[FAST].since_us = 11
+        assert links.check(FAST, 1, 11) == NEW
+        assert links.check(FAST, 1, 12) == FAST
+
+    def test_copies_are_recognised_for_thirty_seconds(self, links: Links) -> None:
+        for number in range(200):
+            links.check(FAST, number, number * 200_000)
+        assert links.check(SLOW, 50, 199 * 200_000) == FAST
+        assert MEMORY_US >= 29 * US_PER_S
+
+    def test_repeated_content_is_new_when_the_numbers_are_used_up(self, links: Links) -> None:
+        for number in range(3 * 256):
+            assert links.check(FAST, number, number * 5000, b"") == NEW
+            assert links.check(SLOW, number, number * 5000 + 10, b"") == FAST
+
+    def test_memory_is_bounded(self, links: Links) -> None:
+        for number in range(3 * MEMORY_FRAMES):
+            links.check(FAST, number, 1)
+        memory = links.filter._memory
+        assert len(memory._recent) + len(memory._older) <= 2 * MEMORY_FRAMES
+
+
+class TestLateFrames:
+    """The fast link loses every tenth frame, the slow one brings all of them seconds later."""
+
+    @pytest.mark.parametrize("rate_hz", [10, 50, 100, 400])
+    @pytest.mark.parametrize("delay_s", [1.5, 3.0, 10.0])
+    def test_no_frame_moves_the_aircraft_back(
+        self, links: Links, rate_hz: int, delay_s: float
     ) -> None:
-        guard = LoopGuard()
-        for n in range(3 * 256):
-            frame = bytes((n % 256,))
-            assert guard.first_way(frame, (9, 1), 5, 0, n) is None
-            assert guard.first_way(frame, (9, 1), 6, 0, n) == 5
+        interval_us, count = US_PER_S // rate_hz, round(20 * rate_hz)
+        arrivals = [(n * interval_us, FAST, n) for n in range(count) if n % 10 != 5]
+        delay_us = round(delay_s * US_PER_S)
+        arrivals += [(n * interval_us + delay_us, SLOW, n) for n in range(count)]
+        newest = -1
+        for now_us, client_id, number in sorted(arrivals):
+            if links.check(client_id, number, now_us) == NEW:
+                assert number >= newest - rate_hz
+                newest = max(newest, number)
 
-    def test_memory_is_bounded(self) -> None:
-        guard = LoopGuard()
-        for n in range(5 * MEMORY_FRAMES):
-            is_new(guard, n.to_bytes(4, "little"), 0, 1)
-        assert len(guard._memory._recent) + len(guard._memory._older) <= 2 * MEMORY_FRAMES
+    def test_a_frame_within_the_limit_fills_a_gap(self, links: Links) -> None:
+        for number in range(100):
+            if number % 10:
+                assert links.check(FAST, number, number * 20_000) == NEW
+            if number >= 20 and (number - 20) % 10 == 0:
+                assert links.check(SLOW, number - 20, number * 20_000 + 1) == NEW
+
+    def test_the_slow_link_takes_over_when_the_fast_one_fails(self, links: Links) -> None:
+        for number in range(500):
+            now_us = number * 20_000
+            if number < 250:
+                links.check(FAST, number, now_us)
+            if number >= 150:
+                verdict = links.check(SLOW, number - 150, now_us + 1)
+                assert (verdict == NEW) == (number - 150 >= 250)
+
+    def test_a_restarted_vehicle_loses_nothing_on_the_leading_link(self, links: Links) -> None:
+        for number in range(200):
+            links.check(FAST, number, number * 20_000)
+            links.check(SLOW, number, number * 20_000 + 5000)
+        for number in range(1, 200):
+            again = links.check(FAST, number, (number + 200) * 20_000, b"restarted%d" % number)
+            assert again == NEW
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_prompt_links_with_jitter_drop_copies_only(self, links: Links, seed: int) -> None:
+        rng = random.Random(seed)
+        arrivals = sorted(
+            (n * 20_000 + rng.randrange(300_000), client_id, n)
+            for n in range(1000)
+            for client_id in (FAST, SLOW)
+            if rng.random() < 0.9
+        )
+        verdicts: dict[int, list[int]] = {}
+        for now_us, client_id, number in arrivals:
+            verdicts.setdefault(number, []).append(links.check(client_id, number, now_us))
+        assert all(found[0] == NEW and LATE not in found for found in verdicts.values())
+
+
+def test_a_copy_joins_two_links() -> None:
+    links = RedundantLinks()
+    assert links.group(1) == (1,)
+    assert links.register(2, 1, 0)
+    assert not links.register(1, 2, 5)
+    assert links.group(1) == links.group(2) == (1, 2)
+
+
+def test_pairs_that_share_a_client_are_one_group() -> None:
+    links = RedundantLinks()
+    for pair in ((1, 2), (3, 4), (2, 3)):
+        links.register(*pair, 0)
+    assert {links.group(n) for n in range(1, 5)} == {(1, 2, 3, 4)}
+
+
+def test_without_copies_links_are_separated() -> None:
+    links = RedundantLinks()
+    links.register(1, 2, 0)
+    links.register(3, 4, 10)
+    links.expire(LINKED_US)
+    assert links.group(1) == (1, 2)
+    links.expire(LINKED_US + 1)
+    assert links.group(1) == (1,)
+    assert links.group(3) == (3, 4)
+
+
+def test_a_removed_client_is_in_no_group() -> None:
+    links = RedundantLinks()
+    links.register(1, 2, 0)
+    links.register(2, 3, 0)
+    links.remove(2)
+    assert [links.group(n) for n in (1, 2, 3)] == [(1,), (2,), (3,)]

@@ -13,10 +13,11 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.client_table import SILENT_AFTER_US
-from gateway.hub.transports.tcp import UNSENT_BYTES
+from gateway.hub.admission import SILENT_AFTER_US
+from gateway.hub.transports.stream import UNSENT_BYTES
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 from tests.hub.conftest import LIMIT_S
+from tests.kit.mavlink import frames_of
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -44,7 +45,7 @@ async def read_frames(client: socket.socket, count: int) -> list[bytes]:
     while len(frames) < count:
         data = await receive(client)
         assert data
-        frames += splitter.feed(data)
+        frames += frames_of(splitter.feed(data))
     return frames
 
 
@@ -93,9 +94,9 @@ class TestTcpListen:
                 sent += 1
             await asyncio.sleep(0)
             data = await asyncio.get_running_loop().sock_recv(lively, 65536)
-            got += splitter.feed(data)
+            got += frames_of(splitter.feed(data))
         while len(got) < sent + 1:
-            got += splitter.feed(await receive(lively))
+            got += frames_of(splitter.feed(await receive(lively)))
         slow, fast = hub.clients()
         assert (fast.sent, fast.dropped) == (sent + 1, 0)
         assert [frame[4] for frame in got] == [n & 0xFF for n in range(sent + 1)]
@@ -149,7 +150,7 @@ class TestTcpListen:
                 hub.send(rig.out(rig.vehicle.pack(dialect.MAVLink_command_ack_message(512, 0))))
             await asyncio.sleep(0)
             with contextlib.suppress(BlockingIOError):
-                heard += [(now_ms, frame) for frame in splitter.feed(slow.recv(40))]
+                heard += [(now_ms, frame) for frame in frames_of(splitter.feed(slow.recv(40)))]
         late_ms = [now_ms - time_of(f) for now_ms, f in heard if message_id_of(f) == ATTITUDE]
         (answered_ms,) = [now_ms for now_ms, f in heard if message_id_of(f) == COMMAND_ACK]
         assert len(late_ms) > 400
@@ -248,7 +249,7 @@ class TestSerial:
     ) -> None:
         near, device = line
         hub = rig.hub(f"serial:{device}:57600")
-        width = hub._fanout._outlets[1].width
+        width = hub._fanout._subscriptions[1].bandwidth
         radio = rig.sender(51, 68)
         for count, free in enumerate((100, 10), start=1):
             report = dialect.MAVLink_radio_status_message(200, 200, free, 30, 30, 0, 0)
@@ -272,7 +273,7 @@ class TestSerial:
             rig.clock.us += 1_000
             await asyncio.sleep(0.001)
             try:
-                frames += splitter.feed(os.read(near, 4096))
+                frames += frames_of(splitter.feed(os.read(near, 4096)))
             except BlockingIOError:
                 continue
         ids = [message_id_of(frame) for frame in frames]

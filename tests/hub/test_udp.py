@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateway.hub.transports.udp import MAX_DATAGRAM
+from gateway.hub.transports.datagram import MAX_DATAGRAM
 from gateway.records import ClientInterval, Incoming
 
 pytestmark = pytest.mark.io

@@ -415,11 +415,11 @@ class TestFlood:
         client = hub._clients[1]
         beat = rig.sender(255, 190).heartbeat()
         sample = MagicMock(payload=zenoh.ZBytes(beat * 1000))
-        before = hub.strangers.level
+        before = hub.untrusted_reads.level
         client._handle(zenoh_session.payload_of(sample))
         assert client.counters.received == 0
         assert client.counters.bytes_garbage == 1000 * len(beat)
-        assert before - hub.strangers.level == (MAX_MESSAGE if trusted == "no" else 0)
+        assert before - hub.untrusted_reads.level == (MAX_MESSAGE if trusted == "no" else 0)
 
     def test_large_messages_are_taken_one_a_turn(self) -> None:
         assert zenoh_client._cost_of((b"", MAX_MESSAGE)) >= 1.0
@@ -489,7 +489,7 @@ from gateway.hub.transports.zenoh import session as zenoh_session
 from gateway.hub.hub import Hub
 from gateway.records import Outgoing
 from gateway.hub.settings import HubSettings
-from tests.hub.conftest import Sender, dialect
+from tests.kit.mavlink import Sender, dialect
 
 # As patient as the session's configuration.
 zenoh_session.GIVE_UP_S = 3600.0

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from gateway.geometry.quaternion import from_euler
-from gateway.hub.client_table import HubCounters, ListenerStats
+from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.console import LiveView
 from gateway.live.log_line import summary_line
 from gateway.records import (

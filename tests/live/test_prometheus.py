@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from gateway.hub.client_table import HubCounters, ListenerStats
+from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live import metrics_server as prometheus
 from gateway.live.metrics import prometheus_text
 from gateway.live.metrics_server import MetricsServer

@@ -1,11 +1,12 @@
-"""Signatures of what leaves, checked by pymavlink as the strict receiver."""
+"""Signatures of sent frames, checked by pymavlink as the strict receiver."""
 
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.wire.mavlink_signing import Signer
+from gateway.wire.mavlink_signing import FrameSigner, sign
+from gateway.wire.mavlink_splitter import frame_of
 
 KEY = bytes(range(32))
 STAMP = 30_000_000_000_000
@@ -24,37 +25,64 @@ def strict() -> Any:
     return receiver
 
 
-def test_a_strict_receiver_takes_it_with_its_new_number() -> None:
-    signer, receiver = Signer(), strict()
+class Clock:
+    """The time in signing ticks, whatever the gateway's clock says."""
+
+    ticks = STAMP
+
+    def stamp(self, now_us: int) -> int:
+        return self.ticks
+
+
+def signer(clock: Clock) -> FrameSigner:
+    signer = FrameSigner(clock)
+    signer.keys[1] = KEY
+    return signer
+
+
+def signed_by(signer: FrameSigner, data: bytes, sequence: int) -> bytes:
+    return signer.sequence_and_sign(frame_of(data), sequence, 0).data
+
+
+def test_a_strict_receiver_accepts_a_frame_with_its_new_number() -> None:
+    ours, receiver = signer(Clock()), strict()
     for sequence in (9, 255, 0, 1):
-        signed = signer.sign(attitude(7), sequence, KEY, STAMP)
+        signed = signed_by(ours, attitude(7), sequence)
         message = receiver.decode(bytearray(signed))
         assert message.get_signed()
         assert message.get_seq() == sequence
         assert message.roll == pytest.approx(0.1)
 
 
-def test_a_frame_that_was_overtaken_is_signed_anew_in_the_order_of_leaving() -> None:
-    signer, receiver = Signer(), strict()
-    first, second = (signer.sign(attitude(n), n, KEY, STAMP) for n in (0, 1))
+def test_an_overtaken_frame_is_signed_again_when_it_is_sent() -> None:
+    ours, receiver = signer(Clock()), strict()
+    first, second = (signed_by(ours, attitude(n), n) for n in (0, 1))
     receiver.decode(bytearray(second))
     with pytest.raises(mavlink.MAVError):
         receiver.decode(bytearray(first))
-    renewed = signer.sign(first, 2, KEY, STAMP)
+    renewed = signed_by(ours, first, 2)
     assert receiver.decode(bytearray(renewed)).get_seq() == 2
     assert len(renewed) == len(first)
 
 
-def test_stamps_follow_the_clock_and_never_stand_still() -> None:
-    signer = Signer()
-    stamps = [
-        int.from_bytes(signer.sign(attitude(0), 0, KEY, now)[-12:-6], "little")
-        for now in (STAMP, STAMP, STAMP - 5, STAMP + 100)
-    ]
-    assert stamps == [STAMP, STAMP + 1, STAMP + 2, STAMP + 100]
+def test_timestamps_follow_the_clock_and_always_increase() -> None:
+    clock = Clock()
+    ours, found = signer(clock), []
+    for clock.ticks in (STAMP, STAMP, STAMP - 5, STAMP + 100):
+        found.append(int.from_bytes(signed_by(ours, attitude(0), 0)[-12:-6], "little"))
+    assert found == [STAMP, STAMP + 1, STAMP + 2, STAMP + 100]
 
 
-def test_what_cannot_be_signed_stays() -> None:
+def test_frames_that_cannot_be_signed_are_unchanged() -> None:
     old, unknown = attitude(3, version=1), bytes.fromhex("fd000000000101fffe0a1234")
-    assert Signer().sign(old, 9, KEY, STAMP) == old
-    assert Signer().sign(unknown, 9, KEY, STAMP) == unknown
+    assert sign(old, 9, KEY, STAMP) == old
+    assert sign(unknown, 9, KEY, STAMP) == unknown
+
+
+def test_a_system_without_a_key_is_numbered_and_not_signed() -> None:
+    ours = signer(Clock())
+    del ours.keys[1]
+    frame = frame_of(attitude(3))
+    assert ours.sequence_and_sign(frame, 3, 0) is frame
+    numbered = ours.sequence_and_sign(frame, 9, 0)
+    assert (numbered.sequence, numbered.signed) == (9, False)

@@ -9,19 +9,21 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import (
     MAX_FALSE_STARTS,
+    MavFrame,
     MavlinkSplitter,
     SplitFault,
     SplitFaultKind,
-    is_frame,
     is_signed,
     is_station_heartbeat,
     key_of,
     message_id_of,
     origin_of,
-    restamp,
+    read_datagram,
     split_datagram,
     target_of,
+    with_sequence,
 )
+from tests.kit.mavlink import frames_in, frames_of
 
 
 def link(system: int = 7, component: int = 1, *, signed: bool = False) -> dialect.MAVLink:
@@ -55,40 +57,46 @@ FRAMES = {
 @pytest.mark.parametrize("frame", FRAMES.values(), ids=FRAMES.keys())
 class TestOneFrame:
     def test_datagram_with_one_frame(self, frame: bytes) -> None:
-        assert split_datagram(frame) == [frame]
+        assert frames_in(frame) == [frame]
 
     def test_stream_whole_and_byte_by_byte(self, frame: bytes) -> None:
-        assert MavlinkSplitter().feed(frame) == [frame]
+        assert frames_of(MavlinkSplitter().feed(frame)) == [frame]
         splitter = MavlinkSplitter()
         events = [event for byte in frame for event in splitter.feed(bytes((byte,)))]
-        assert events == [frame]
+        assert frames_of(events) == [frame]
+        assert len(events) == 1
 
     def test_next_frame_follows_at_once(self, frame: bytes) -> None:
-        assert split_datagram(frame + V2) == [frame, V2]
-        assert MavlinkSplitter().feed(frame + V2 + V1[:5]) == [frame, V2]
+        assert frames_in(frame + V2) == [frame, V2]
+        assert frames_of(MavlinkSplitter().feed(frame + V2 + V1[:5])) == [frame, V2]
 
     def test_garbage_before_is_one_fault(self, frame: bytes) -> None:
         events = split_datagram(b"hello" + frame)
-        assert events == [SplitFault(SplitFaultKind.GARBAGE, 5), frame]
+        assert events[0] == SplitFault(SplitFaultKind.GARBAGE, 5)
+        assert frames_of(events) == [frame]
 
     def test_a_cut_frame_does_not_swallow_the_next(self, frame: bytes) -> None:
         checked = len(frame) - 13 if frame is V2_SIGNED else len(frame)
         for cut in range(1, checked):
             events = MavlinkSplitter().feed(frame[:cut] + V2_COMMAND + V2 * 30)
-            frames = [event for event in events if isinstance(event, bytes)]
+            frames = frames_of(events)
             assert V2_COMMAND in frames
             assert frames.count(V2) == 30
 
 
 @pytest.mark.parametrize("name", FRAMES)
-def test_short_way_knows_plain_frames_only(name: str) -> None:
+def test_a_datagram_is_read_at_once_only_if_it_is_one_plain_frame(name: str) -> None:
     frame = FRAMES[name]
-    assert is_frame(frame) == (name in {"version 2", "command"})
-    assert not is_frame(frame + b"x")
-    assert not is_frame(frame[:-1])
-    assert not is_frame(b"")
+    found = read_datagram(frame)
+    assert (found is not None) == (name in {"version 2", "command"})
+    if found is not None:
+        assert [found] == split_datagram(frame)
+    assert read_datagram(frame + b"x") is None
+    assert read_datagram(frame[:-1]) is None
+    assert read_datagram(b"") is None
     for at in range(len(frame)):
-        assert not is_frame(frame[:at] + bytes((frame[at] ^ 1,)) + frame[at + 1 :])
+        damaged = frame[:at] + bytes((frame[at] ^ 1,)) + frame[at + 1 :]
+        assert read_datagram(damaged) is None
 
 
 LARGE_IDS = {
@@ -103,9 +111,10 @@ LARGE_IDS = {
 def test_message_ids_of_two_bytes(number: int) -> None:
     frame = bytes(LARGE_IDS[number].pack(link()))
     assert number > 0xFF
-    assert is_frame(frame)
+    assert read_datagram(frame)
     assert message_id_of(frame) == number
-    assert split_datagram(frame) == MavlinkSplitter().feed(frame) == [frame]
+    assert split_datagram(frame) == MavlinkSplitter().feed(frame)
+    assert frames_in(frame) == [frame]
 
 
 def test_damaged_frame_is_a_crc_fault() -> None:
@@ -113,9 +122,8 @@ def test_damaged_frame_is_a_crc_fault() -> None:
     assert split_datagram(damaged) == [SplitFault(SplitFaultKind.CRC, len(V2))]
 
 
-def test_unknown_frame_in_garbage_is_not_believed() -> None:
-    assert split_datagram(UNKNOWN + b"xyz" + V2)[-1] == V2
-    assert UNKNOWN not in split_datagram(UNKNOWN + b"xyz" + V2)
+def test_an_unknown_frame_before_garbage_is_dropped() -> None:
+    assert frames_in(UNKNOWN + b"xyz" + V2) == [V2]
 
 
 def test_unknown_incompatibility_flag_is_refused() -> None:
@@ -141,8 +149,8 @@ def test_noise_gives_only_genuine_frames_and_counts_every_byte(seed: int) -> Non
         size = rng.randrange(1, 40)
         events += splitter.feed(data[position : position + size])
         position += size
-    assert [event for event in events if isinstance(event, bytes)] == sent
-    sizes = [event.size if isinstance(event, SplitFault) else len(event) for event in events]
+    assert frames_of(events) == sent
+    sizes = [event.size if isinstance(event, SplitFault) else len(event.data) for event in events]
     assert sum(sizes) == len(data)
 
 
@@ -157,7 +165,7 @@ def test_reset_forgets_a_half_frame() -> None:
     splitter = MavlinkSplitter()
     splitter.feed(V2[:7])
     splitter.reset()
-    assert splitter.feed(V2) == [V2]
+    assert frames_of(splitter.feed(V2)) == [V2]
 
 
 @pytest.mark.parametrize("frame", [V2, V1, V2_SIGNED], ids=["v2", "v1", "signed"])
@@ -166,6 +174,11 @@ def test_header_fields(frame: bytes) -> None:
     assert message_id_of(frame) == 0
     assert target_of(frame) == (0, 0)
     assert is_signed(frame) == (frame is V2_SIGNED)
+    (found,) = split_datagram(frame)
+    assert isinstance(found, MavFrame)
+    assert (found.data, found.key, found.message_id) == (frame, key_of(frame), 0)
+    assert (found.origin, found.target, found.sequence) == ((7, 1), (0, 0), 0)
+    assert found.signed == (frame is V2_SIGNED)
 
 
 def test_keys_differ_by_system_component_message_and_version() -> None:
@@ -225,18 +238,18 @@ class TestTarget:
         assert target_of(bytes(message_class(**values).pack(link()))) == (5, 6)
 
 
-class TestRestamp:
+class TestSequence:
     @pytest.mark.parametrize("frame", [V2, V1, V2_COMMAND], ids=["v2", "v1", "command"])
     def test_result_is_a_valid_frame_with_the_new_number(self, frame: bytes) -> None:
-        stamped = restamp(frame, 200)
-        assert split_datagram(stamped) == [stamped]
+        stamped = with_sequence(frame, 200)
+        assert frames_in(stamped) == [stamped]
         decoded = dialect.MAVLink(None).parse_buffer(stamped)[0]
         assert decoded.get_seq() == 200
-        assert restamp(stamped, frame[4] if frame[0] == 0xFD else frame[2]) == frame
+        assert with_sequence(stamped, frame[4] if frame[0] == 0xFD else frame[2]) == frame
 
     @pytest.mark.parametrize("frame", [V2_SIGNED, UNKNOWN], ids=["signed", "unknown"])
     def test_signed_and_unknown_frames_stay(self, frame: bytes) -> None:
-        assert restamp(frame, 200) == frame
+        assert with_sequence(frame, 200) == frame
 
 
 def test_catalog_knows_the_message_that_the_dialects_dropped() -> None:

@@ -4,19 +4,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.wire.mavlink_splitter import (
+    Event,
     MavlinkSplitter,
     SplitFault,
-    is_frame,
-    is_signed,
-    is_station_heartbeat,
+    frame_of,
     key_of,
     message_id_of,
     origin_of,
-    restamp,
-    sequence_of,
+    read_datagram,
     split_datagram,
-    target_of,
+    with_sequence,
 )
+from tests.kit.mavlink import frames_in, frames_of
 from tests.wire.test_mavlink_splitter import FRAMES
 
 STARTS = st.sampled_from([b"\xfd", b"\xfe", b"\xfd\x00\x00", b"\xfd\xff\x01"])
@@ -24,8 +23,8 @@ PIECES = st.one_of(st.sampled_from(sorted(FRAMES.values())), STARTS, st.binary(m
 STREAMS = st.lists(PIECES, max_size=12).map(b"".join)
 
 
-def size_of(event: bytes | SplitFault) -> int:
-    return event.size if isinstance(event, SplitFault) else len(event)
+def size_of(event: Event) -> int:
+    return event.size if isinstance(event, SplitFault) else len(event.data)
 
 
 @given(STREAMS)
@@ -34,36 +33,38 @@ def test_every_byte_of_a_datagram_is_in_one_event(data: bytes) -> None:
 
 
 @given(STREAMS, st.lists(st.integers(0, 60), max_size=20))
-def test_it_does_not_matter_where_a_stream_is_cut(data: bytes, sizes: list[int]) -> None:
+def test_frames_do_not_depend_on_the_chunks_of_a_stream(data: bytes, sizes: list[int]) -> None:
     whole, pieces = MavlinkSplitter(), MavlinkSplitter()
-    expected = [event for event in whole.feed(data) if isinstance(event, bytes)]
+    expected = frames_of(whole.feed(data))
     found, rest = [], data
     for size in [*sizes, len(data)]:
-        found += [event for event in pieces.feed(rest[:size]) if isinstance(event, bytes)]
+        found += frames_of(pieces.feed(rest[:size]))
         rest = rest[size:]
-    # An unknown message is believed if the chunk ends with it, wherever that is.
-    assert [f for f in found if is_frame(f)] == [f for f in expected if is_frame(f)]
+    # An unknown message passes if the chunk ends with it, wherever that is.
+    known = [frame for frame in expected if read_datagram(frame)]
+    assert [frame for frame in found if read_datagram(frame)] == known
 
 
 @given(STREAMS, st.integers(0, 255))
-def test_whatever_is_cut_out_can_be_read(data: bytes, sequence: int) -> None:
+def test_every_frame_of_any_bytes_can_be_read(data: bytes, sequence: int) -> None:
     for frame in split_datagram(data):
         if isinstance(frame, SplitFault):
             continue
-        assert 0 <= sequence_of(frame) <= 255
-        assert len(origin_of(frame)) == len(target_of(frame)) == 2
-        assert message_id_of(frame) >= 0
-        assert key_of(frame)
-        assert is_station_heartbeat(frame) in (True, False)
-        numbered = restamp(frame, sequence)
-        assert len(numbered) == len(frame)
-        assert split_datagram(numbered) == [numbered] or is_signed(frame)
+        assert 0 <= frame.sequence <= 255
+        assert frame.origin == origin_of(frame.data)
+        assert frame.message_id == message_id_of(frame.data)
+        assert frame.key == key_of(frame.data)
+        assert len(frame.target) == 2
+        assert frame.is_station_heartbeat in (True, False)
+        numbered = with_sequence(frame.data, sequence)
+        assert len(numbered) == len(frame.data)
+        assert frames_in(numbered) == [numbered] or frame.signed
 
 
 @given(st.integers(0, 255), st.binary(max_size=255), st.integers(0, (1 << 24) - 1))
-def test_a_payload_cut_short_is_read_as_zeros(flags: int, payload: bytes, message_id: int) -> None:
+def test_a_truncated_payload_is_read_as_zeros(flags: int, payload: bytes, message_id: int) -> None:
     head = bytes((len(payload), flags & 1, 0, 0, 9, 9)) + message_id.to_bytes(3, "little")
-    frame = b"\xfd" + head + payload + bytes(2)
-    filled = b"\xfd\xff" + head[1:] + payload.ljust(255, b"\0") + bytes(2)
-    assert target_of(frame) == target_of(filled)
-    assert is_station_heartbeat(frame) == is_station_heartbeat(filled)
+    frame = frame_of(b"\xfd" + head + payload + bytes(2))
+    filled = frame_of(b"\xfd\xff" + head[1:] + payload.ljust(255, b"\0") + bytes(2))
+    assert frame.target == filled.target
+    assert frame.is_station_heartbeat == filled.is_station_heartbeat

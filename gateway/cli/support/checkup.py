@@ -200,7 +200,7 @@ def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if reason := _trouble_of(endpoint):
             taken = True
-            yield Diagnosis(Grade.WRONG, "ports", f"{endpoint.place}: {reason}")
+            yield Diagnosis(Grade.WRONG, "ports", f"{endpoint.location}: {reason}")
     if not taken:
         yield Diagnosis(Grade.GOOD, "ports", "free")
 

@@ -4,10 +4,10 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind
-from gateway.hub.transports.base import Client, HubContext
-from gateway.hub.transports.listener import Listener
-from gateway.hub.transports.serial_line import RadioClient
-from gateway.hub.transports.tcp import TcpClient, TcpListener
+from gateway.hub.transports.base import Client, HubContext, Listener
+from gateway.hub.transports.serial_line import SerialClient
+from gateway.hub.transports.tcp import TcpClient
+from gateway.hub.transports.tcp_listen import TcpListener
 from gateway.hub.transports.udp import UdpClient
 from gateway.hub.transports.udp_group import GroupClient
 from gateway.hub.transports.udp_listen import UdpListener
@@ -24,7 +24,7 @@ def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Clien
 
 
 def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
-    from gateway.hub.transports.websocket import WsListener
+    from gateway.hub.transports.websocket_listen import WsListener
 
     return WsListener(context, endpoint)
 
@@ -37,7 +37,7 @@ CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.WS: _ws_client,
     EndpointKind.WSS: _ws_client,
     EndpointKind.ZENOH: ZenohClient,
-    EndpointKind.SERIAL: RadioClient,
+    EndpointKind.SERIAL: SerialClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
     EndpointKind.UDP_LISTEN: UdpListener,
@@ -64,6 +64,6 @@ def add_endpoint_kind(word: str, make: ClientMaker) -> None:
         If the word is taken.
     """
     if word in CLIENTS or word in LISTENERS:
-        raise ValueError(f"there is an endpoint kind {word!r} already")
+        raise ValueError(f"endpoint kind {word!r} already exists")
     ADDED_KINDS.add(word)
     CLIENTS[word] = make

@@ -1,6 +1,6 @@
 """MAVLink on a serial port: a telemetry radio to the ground, or an autopilot.
 
-The line is slow, so frames wait in our queue and not in the driver's, where the attitude could not
+The line is slow, so frames wait in our queue and not in the driver's, where an attitude could not
 overtake a parameter list. pyserial opens and configures; reading and writing go to the descriptor,
 since pyserial spins on a full buffer.
 """
@@ -15,22 +15,22 @@ import serial
 from gateway.hub.bandwidth import RADIO_STATUS
 from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.send_queue import Pacer
-from gateway.hub.transports.listener import RETRY_US
-from gateway.hub.transports.queued import QueuedClient
+from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.stream import QueuedClient
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import free_percent, message_id_of
+from gateway.wire.mavlink_splitter import MavFrame
 
 log = logging.getLogger(__name__)
 
 READ_BYTES: Final = 4096
 AHEAD_US: Final = 30_000
-"""Most in the driver's buffer: enough to keep the line busy between two wake-ups."""
+"""Most time on the line that is in the driver's buffer: keeps the line busy between wake-ups."""
 QUEUE_US: Final = US_PER_S
-"""What may wait, as time on the line; older telemetry is of no use on a radio."""
+"""Size of the queue as time on the line; older telemetry is of no use on a radio."""
 MIN_QUEUE_BYTES: Final = 2048
 
 
-class RadioClient(QueuedClient):
+class SerialClient(QueuedClient):
     """A peer on a serial port that may come and go."""
 
     _port: serial.Serial | None = None
@@ -44,17 +44,17 @@ class RadioClient(QueuedClient):
 
     @property
     def queue_bytes(self) -> int:
-        """The most that waits for the line."""
+        """Most bytes that wait for the line."""
         bytes_per_s = self.endpoint.port / BITS_PER_BYTE
         return max(MIN_QUEUE_BYTES, round(bytes_per_s * QUEUE_US / US_PER_S))
 
-    def transmit(self, frame: bytes, message_id: int) -> None:
+    def transmit(self, frame: MavFrame) -> None:
         """Queue one frame and write what the line has room for."""
         if self._port is None:
             self.counters.dropped += 1
             return
         self.counters.sent += 1
-        self._push(frame, message_id, self._numbering.enter(frame))
+        self._push(frame, self._encoder.enter(frame))
         if self._timer is None and not self._partial:
             self._pump()
 
@@ -97,7 +97,7 @@ class RadioClient(QueuedClient):
         """Write until the line is busy for a while or nothing waits."""
         self._timer = None
         port = self._port
-        while port is not None and self._port is port and (self._partial or self._outbox):
+        while port is not None and self._port is port and (self._partial or self._queue):
             delay_us = self._pacer.delay_us(self.context.now_us())
             if delay_us:
                 self._timer = self.loop.call_later(delay_us / US_PER_S, self._pump)
@@ -109,11 +109,11 @@ class RadioClient(QueuedClient):
         """Write one frame; if the driver is full, wait for it."""
         now_us = self.context.now_us()
         if not self._partial:
-            self._drop(self._outbox.expire(now_us - QUEUE_US))
-            waiting = self._outbox.pop()
+            self._drop(self._queue.expire(now_us - QUEUE_US))
+            waiting = self._queue.pop()
             if waiting is None:
                 return False
-            self._partial = self._numbering.leave(*waiting)
+            self._partial = self._encoder.encode(*waiting, now_us)
         try:
             taken = os.write(port.fileno(), self._partial)
         except BlockingIOError:
@@ -143,8 +143,8 @@ class RadioClient(QueuedClient):
         if data:
             events = self._splitter.feed(data)
             for frame in events:
-                if isinstance(frame, bytes) and message_id_of(frame) == RADIO_STATUS:
-                    self.context.note_buffer(self, free_percent(frame))
+                if isinstance(frame, MavFrame) and frame.message_id == RADIO_STATUS:
+                    self.context.update_buffer(self, frame.free_percent)
             self.receive(events, len(data), self.context.now_us())
         else:
             self._broke(OSError("the device hung up"))

@@ -1,8 +1,8 @@
 """UDP broadcast and multicast: one datagram for all receivers.
 
 Two sockets. One sends and receives the unicast answers; the other has joined a multicast group and
-receives what others send there. Our own datagrams come back on the second and are recognised by
-the address of the first.
+receives the datagrams of others. It also receives our own, which are recognised by the address of
+the first.
 """
 
 import socket
@@ -10,8 +10,8 @@ import struct
 from typing import Any, Final
 
 from gateway.hub.endpoint import EndpointKind
-from gateway.hub.transports.listener import RETRY_US
-from gateway.hub.transports.udp import MAX_DATAGRAM, READ_BUDGET, DatagramClient
+from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.datagram import MAX_DATAGRAM, READ_BUDGET, DatagramClient
 
 MULTICAST_HOPS: Final = 1
 """The local network only."""
@@ -20,7 +20,7 @@ MULTICAST_HOPS: Final = 1
 class GroupClient(DatagramClient):
     """A broadcast address or a multicast group as one client."""
 
-    _ear: socket.socket | None = None
+    _listening: socket.socket | None = None
     _own_address = ("", 0)
     _retry_us = 0
 
@@ -37,10 +37,10 @@ class GroupClient(DatagramClient):
     def close(self) -> None:
         """Close both sockets."""
         super().close()
-        if self._ear is not None:
-            self.loop.remove_reader(self._ear)
-            self._ear.close()
-            self._ear = None
+        if self._listening is not None:
+            self.loop.remove_reader(self._listening)
+            self._listening.close()
+            self._listening = None
 
     def _open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
@@ -54,8 +54,8 @@ class GroupClient(DatagramClient):
             sock = socket.socket(family, socket.SOCK_DGRAM)
             sock.setblocking(False)
             if multicast:
-                self._ear = _ear(family, address)
-                self.loop.add_reader(self._ear, self._on_group, self._ear)
+                self._listening = _listening_socket(family, address)
+                self.loop.add_reader(self._listening, self._on_group, self._listening)
                 _prepare_sender(sock, address)
             else:
                 sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -83,7 +83,7 @@ class GroupClient(DatagramClient):
                 self.accept(data, self.context.now_us())
             if size >= most:
                 break
-        self.pause_stranger(sock, self._on_group, size)
+        self.limit_reads(sock, self._on_group, size)
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:
@@ -102,7 +102,7 @@ def _prepare_sender(sock: socket.socket, address: tuple[object, ...]) -> None:
         sock.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, MULTICAST_HOPS)
 
 
-def _ear(family: int, address: tuple[object, ...]) -> socket.socket:
+def _listening_socket(family: int, address: tuple[object, ...]) -> socket.socket:
     """Open a socket that has joined the group."""
     sock = socket.socket(family, socket.SOCK_DGRAM)
     try:

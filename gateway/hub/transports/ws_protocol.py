@@ -5,9 +5,9 @@ packed; received messages are read as a byte stream, so that message boundaries 
 
 | received                                        | answer                                   |
 | ----------------------------------------------- | ---------------------------------------- |
-| a request to upgrade from a page that may       | 101, and the connection is open          |
-| one from another page                           | 403 and the end                          |
-| no such request                                 | 400 or 426 and the end                   |
+| an upgrade request of an admitted page          | 101, and the connection is open          |
+| one of another page                             | 403 and the end                          |
+| no upgrade request                              | 400 or 426 and the end                   |
 | a binary message, in any number of fragments    | nothing; its bytes are payload           |
 | a text message                                  | nothing; it is counted as garbage        |
 | a ping                                          | a pong, of several at once the last one  |
@@ -92,7 +92,7 @@ class WsProtocol:
                 if isinstance(event, Ping):
                     pong = event
                 else:
-                    self._note(event, found)
+                    self._handle(event, found)
                 if found.ended:
                     break
         except ProtocolError as error:
@@ -120,7 +120,7 @@ class WsProtocol:
         except ProtocolError:
             return b""
 
-    def _note(self, event: Event, found: WsInput) -> None:
+    def _handle(self, event: Event, found: WsInput) -> None:
         if isinstance(event, BytesMessage):
             found.payload += event.data
             self._measure(len(event.data), found, finished=event.message_finished)
@@ -205,15 +205,15 @@ class WsCaller(WsProtocol):
 
     Parameters
     ----------
-    place : str
+    address : str
         Host and port of the server.
     path : str
         Path of the request.
     """
 
-    def __init__(self, place: str, path: str) -> None:
+    def __init__(self, address: str, path: str) -> None:
         super().__init__(ConnectionType.CLIENT)
-        self.hello = self._wire.send(Request(host=place, target=path))
+        self.hello = self._wire.send(Request(host=address, target=path))
         """The upgrade request."""
 
     def wrap(self, payload: bytes) -> bytes:

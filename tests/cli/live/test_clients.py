@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import clients
 from gateway.config import load
-from gateway.hub.client_table import HubCounters, ListenerStats
+from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.control_socket import ControlError, ControlServer, NoParams, socket_path
 from gateway.records import (
     LinkReport,

@@ -14,6 +14,7 @@ from wsproto.events import AcceptConnection, BytesMessage, Event, Ping, Request
 
 from gateway.wire.mavlink_splitter import MavlinkSplitter
 from tests.hub.conftest import LIMIT_S, Rig
+from tests.kit.mavlink import frames_of
 
 
 @pytest.fixture(scope="session")
@@ -88,7 +89,7 @@ class Page:
     async def frames(self, count: int) -> list[bytes]:
         """Read until so many messages have come; return their frames."""
         await self.until(lambda: len(self.messages) >= count)
-        return [frame for event in self.messages for frame in self.splitter.feed(event)]  # type: ignore[misc]
+        return [frame for event in self.messages for frame in frames_of(self.splitter.feed(event))]
 
     async def end(self) -> None:
         """Read until the server has closed."""

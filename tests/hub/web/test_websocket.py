@@ -184,12 +184,12 @@ class TestTrouble:
         sock = await plug(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
         (listener,) = hub._endpoints.values()
-        await rig.until(lambda: len(listener._callers) == 1)  # type: ignore[union-attr]
+        await rig.until(lambda: len(listener._handshakes) == 1)  # type: ignore[union-attr]
         assert not hub.clients()
         rig.clock.us += 5_000_000
         rig.tick(hub)
         assert await hung_up(sock)
-        assert not listener._callers  # type: ignore[union-attr]
+        assert not listener._handshakes  # type: ignore[union-attr]
 
     async def test_who_never_shakes_hands_keeps_nobody_out(
         self, rig: Rig, plug: Visit, visit: Visit
@@ -238,7 +238,7 @@ class TestTrouble:
 
     @staticmethod
     def callers(hub: Any) -> int:
-        return sum(len(listener._callers) for listener in hub._endpoints.values())
+        return sum(len(listener._handshakes) for listener in hub._endpoints.values())
 
     @staticmethod
     async def shake_hands(rig: Rig, hub: Any, sock: socket.socket) -> None:

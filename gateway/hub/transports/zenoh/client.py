@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
 from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import READ_BYTES, Client
-from gateway.hub.transports.listener import RETRY_US
+from gateway.hub.transports.base import READ_BYTES, RETRY_US, Client
 from gateway.hub.transports.zenoh.keys import (
     ALL_SYSTEMS,
     JSON_IN,
@@ -44,7 +43,7 @@ from gateway.hub.transports.zenoh.session import (
 from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_json import frame_from_json, json_from_frame
-from gateway.wire.mavlink_splitter import origin_of, split_datagram
+from gateway.wire.mavlink_splitter import MavFrame, split_datagram
 
 if TYPE_CHECKING:
     import zenoh
@@ -85,26 +84,26 @@ class ZenohClient(Client):
         """Frames that wait for a congested link and must not be lost."""
         return self._publishers.queued if self._publishers is not None else 0
 
-    def transmit(self, frame: bytes, message_id: int) -> None:
+    def transmit(self, frame: MavFrame) -> None:
         """Publish one frame, or gather it with others."""
         if self.state != "open" or self._publishers is None:
             self.counters.dropped += 1
             return
         if self.endpoint.keys == JSON_KEYS:
-            self._publish_json(frame, message_id)
+            self._publish_json(frame)
             return
-        origin = origin_of(frame)
+        origin = frame.origin
         if self.endpoint.keys == RAW_KEYS:
             topic = _Topic(RAW_OUT, None)
         else:
             attachment = OWN if self.context.is_own(origin) else None
             topic = _Topic(out_key(self.endpoint.site, origin[0]), attachment)
-        if message_id in RELIABLE_IDS:
-            self._publish(topic, [frame], reliable=True)
+        if frame.message_id in RELIABLE_IDS:
+            self._publish(topic, [frame.data], reliable=True)
         elif self.endpoint.pack_bytes:
-            self._pack(topic, frame)
+            self._pack(topic, frame.data)
         else:
-            self._publish(topic, [frame], reliable=False)
+            self._publish(topic, [frame.data], reliable=False)
 
     def tick(self, now_us: int) -> None:
         """Open the session, and check whether it has a router."""
@@ -172,7 +171,7 @@ class ZenohClient(Client):
         import zenoh
 
         frames: LoopQueue[Payload] = LoopQueue(
-            self._handle, _cost_of, lambda: self._pause_us() / US_PER_S
+            self._handle, _cost_of, lambda: self.read_pause_us() / US_PER_S
         )
         presence: LoopQueue[tuple[bool, str]] = LoopQueue(self._handle_presence)
         self._queues = [frames, presence]
@@ -202,7 +201,7 @@ class ZenohClient(Client):
     def _handle(self, payload: Payload) -> None:
         data, size = payload
         if not self.trusted:
-            self.context.strangers.level -= min(size, MAX_MESSAGE)
+            self.context.untrusted_reads.level -= min(size, MAX_MESSAGE)
         if not data:
             self.counters.bytes_received += size
             self.counters.bytes_garbage += size
@@ -235,15 +234,15 @@ class ZenohClient(Client):
         if text:
             log.warning("%s: %s; rename one of them", self.name, text)
 
-    def _publish_json(self, frame: bytes, message_id: int) -> None:
+    def _publish_json(self, frame: MavFrame) -> None:
         """Publish a message as mavlink-server does: as a whole, by its name, and by its fields."""
-        if self._publishers is None or (found := json_from_frame(frame)) is None:
+        if self._publishers is None or (found := json_from_frame(frame.data)) is None:
             self.counters.dropped += 1
             return
         name, whole, fields = found
-        system_id, component_id = origin_of(frame)
+        system_id, component_id = frame.origin
         key = f"{ROOT}/{system_id}/{component_id}/{name}"
-        self._publish_json_text(JSON_OUT, whole, reliable=message_id in RELIABLE_IDS)
+        self._publish_json_text(JSON_OUT, whole, reliable=frame.message_id in RELIABLE_IDS)
         self._publishers.put_once(key, whole)
         for field, value in fields.items():
             self._publishers.put_once(f"{key}/{field}", value)

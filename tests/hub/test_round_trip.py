@@ -1,39 +1,40 @@
-"""Round trips: each question is numbered and comes from the gateway's own component."""
+"""Round trips: each request is numbered and sent by the gateway's own component."""
 
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.round_trip import LONGEST_US, PROBE_COMPONENT, RoundTrip
-from gateway.wire.mavlink_splitter import origin_of
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 SYSTEM = 7
 
 
-def pack(message: dialect.MAVLink_message) -> bytes:
-    return bytes(message.pack(dialect.MAVLink(None, 255, 190)))
+def pack(message: dialect.MAVLink_message) -> MavFrame:
+    return frame_of(bytes(message.pack(dialect.MAVLink(None, 255, 190))))
 
 
-def pong(time_us: int, system: int = SYSTEM) -> bytes:
+def pong(time_us: int, system: int = SYSTEM) -> MavFrame:
     return pack(dialect.MAVLink_ping_message(time_us, 0, system, PROBE_COMPONENT))
 
 
-def test_questions_are_numbered_on_and_come_from_us() -> None:
-    probe = RoundTrip()
+def test_requests_are_numbered_and_sent_by_the_gateways_component() -> None:
+    probe = RoundTrip(FrameSigner())
     assert probe.origin == (0, PROBE_COMPONENT)
-    frames = [frame for _ in range(130) for frame, _ in probe.ask(SYSTEM, 1000)]
-    assert {origin_of(frame) for frame in frames} == {(SYSTEM, PROBE_COMPONENT)} == {probe.origin}
-    assert [frame[4] for frame in frames] == [number % 256 for number in range(260)]
+    frames = [frame for _ in range(130) for frame in probe.ask(SYSTEM, 1000)]
+    assert {frame.origin for frame in frames} == {(SYSTEM, PROBE_COMPONENT)} == {probe.origin}
+    assert [frame.sequence for frame in frames] == [number % 256 for number in range(260)]
 
 
 def test_an_answer_gives_the_round_trip() -> None:
-    probe = RoundTrip()
+    probe = RoundTrip(FrameSigner())
     probe.ask(SYSTEM, 1_000_000)
     assert probe.read(pong(1_000_000), 1_001_500) == 1500
     timesync = dialect.MAVLink_timesync_message(123, 1_000_000 * 1000)
     assert probe.read(pack(timesync), 1_002_000) == 2000
 
 
-def test_what_is_no_answer_of_now_gives_none() -> None:
-    probe = RoundTrip()
+def test_frames_that_are_no_recent_answer_give_none() -> None:
+    probe = RoundTrip(FrameSigner())
     probe.ask(SYSTEM, 1_000_000)
     assert probe.read(pong(1_000_000, system=8), 1_001_500) is None
     assert probe.read(pong(1_000_000), 999_999) is None

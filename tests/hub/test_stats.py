@@ -2,8 +2,15 @@
 
 import dataclasses
 
-from gateway.hub.client_alerts import PATIENCE_US, QUIET_US, TroubleWatch
-from gateway.hub.client_table import ClientStats, ListenerStats
+from gateway.hub.stats import (
+    ALERT_AFTER_US,
+    SLOW_FOR_US,
+    WINDOW_US,
+    ClientAlerts,
+    ClientStats,
+    ListenerStats,
+    LogRateLimiter,
+)
 from tests.client_stats import TABLET
 
 S = 1_000_000
@@ -13,20 +20,20 @@ def client(**changes: object) -> tuple[ClientStats, ...]:
     return (dataclasses.replace(TABLET, **changes),)
 
 
-def look(watch: TroubleWatch, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
+def look(watch: ClientAlerts, clients: tuple[ClientStats, ...], now_us: int) -> list[str]:
     return [text for _, text in watch.update(clients, (), now_us)]
 
 
 def test_a_short_absence_is_not_reported() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     assert look(watch, client(state="unreachable"), 0) == []
-    assert look(watch, client(state="unreachable"), PATIENCE_US - 1) == []
-    assert look(watch, client(), PATIENCE_US) == []
-    assert look(watch, client(state="unreachable"), PATIENCE_US + 1) == []
+    assert look(watch, client(state="unreachable"), ALERT_AFTER_US - 1) == []
+    assert look(watch, client(), ALERT_AFTER_US) == []
+    assert look(watch, client(state="unreachable"), ALERT_AFTER_US + 1) == []
 
 
 def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     texts = [text for n in range(20) for text in look(watch, client(state="unreachable"), n * S)]
     assert texts == ["tablet: unreachable"]
     assert look(watch, client(), 21 * S) == ["tablet is back"]
@@ -34,20 +41,20 @@ def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
 
 
 def test_a_router_that_has_gone_is_reported_in_plain_words() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     texts = [text for n in range(20) for text in look(watch, client(state="connecting"), n * S)]
     assert texts == ["tablet: not connected"]
 
 
 def test_the_reason_is_reported_if_it_is_known() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     away = client(state="unreachable", reason="Permission denied")
     texts = [text for n in range(20) for text in look(watch, away, n * S)]
     assert texts == ["tablet: Permission denied"]
 
 
 def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
-    watch, taken = TroubleWatch(), "Address already in use"
+    watch, taken = ClientAlerts(), "Address already in use"
     closed = ListenerStats("here", "udp-listen:0.0.0.0:14550", "closed", taken, 0, 0, 0)
     news = [each for n in range(20) for each in watch.update((), (closed,), n * S)]
     assert news == [(True, f"here: {taken}")]
@@ -59,39 +66,39 @@ def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
 
 
 def test_a_station_that_is_not_running_is_no_trouble() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     assert all(not look(watch, client(state="refused"), n * S) for n in range(20))
 
 
 def test_drops_are_reported_once_until_they_have_ceased() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     texts = [text for n in range(10) for text in look(watch, client(dropped=n * 10), n * S)]
     assert texts == ["tablet is too slow: telemetry dropped"]
     for n in range(40):
         assert look(watch, client(dropped=90), 10 * S + n * S) == []
-    assert QUIET_US < 40 * S
+    assert SLOW_FOR_US < 40 * S
     assert len(look(watch, client(dropped=91), 60 * S)) == 1
 
 
 def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     look(watch, client(state="unreachable", dropped=10), 0)
     assert look(watch, client(dropped=20), S) == []
     assert look(watch, client(dropped=20), 2 * S) == []
 
 
 def test_a_client_that_left_is_forgotten() -> None:
-    watch = TroubleWatch()
+    watch = ClientAlerts()
     for n in range(10):
         look(watch, client(state="unreachable", dropped=n), n * S)
         look(watch, client(dropped=n), n * S)
     assert look(watch, (), 11 * S) == []
-    assert not watch._away_told
+    assert not watch._away_reported
     assert not watch._dropped
 
 
 def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
-    watch, port = TroubleWatch(), "udp-listen:0.0.0.0:14551"
+    watch, port = ClientAlerts(), "udp-listen:0.0.0.0:14551"
     listeners = (ListenerStats("port", port, "open", "", 14551, 0, 0),)
     texts = []
     for n in range(100):
@@ -105,6 +112,22 @@ def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
         texts += [text for _, text in watch.update(clients, listeners, n * S)]
     assert texts.count("tablet is too slow: telemetry dropped") == 1
     assert len([text for text in texts if text.startswith("stranger")]) == 2 * 3
-    (summed,) = [text for text in texts if "more troubles" in text]
+    (summed,) = [text for text in texts if "more alerts" in text]
     assert int(summed.split()[0]) > 500
     assert len(texts) == 8
+
+
+def test_a_few_in_full_and_the_rest_as_a_number() -> None:
+    limiter = LogRateLimiter(2, "more came")
+    assert [limiter.add(line, 0) for line in "abcde"] == [["a"], ["b"], [], [], []]
+    assert limiter.poll(WINDOW_US - 1) == []
+    assert limiter.poll(WINDOW_US) == ["3 more came"]
+    assert limiter.poll(3 * WINDOW_US) == []
+    assert limiter.add("f", 3 * WINDOW_US) == ["f"]
+
+
+def test_the_sum_comes_before_the_next_line() -> None:
+    limiter = LogRateLimiter(1, "more came")
+    for line in "abc":
+        limiter.add(line, 0)
+    assert limiter.add("d", WINDOW_US) == ["2 more came", "d"]

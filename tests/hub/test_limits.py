@@ -1,12 +1,12 @@
 """Requests in turns, answers within each client's means; on the manual clock."""
 
-from gateway.hub.request_queue import (
+from gateway.hub.limits import (
     CLIENT_BURST,
     CLIENT_RATE,
     MAX_WAITING,
     REQUEST_COST,
-    STRANGERS_BURST,
-    STRANGERS_RATE,
+    UNTRUSTED_BURST,
+    UNTRUSTED_RATE,
     RequestQueue,
 )
 from gateway.records import Incoming
@@ -61,12 +61,12 @@ def test_one_in_debt_holds_up_nobody_else() -> None:
     assert queue.take(0) is None
 
 
-def test_strangers_share_one_purse_and_cannot_flee_their_debt() -> None:
+def test_untrusted_clients_share_one_bucket_that_a_new_client_does_not_refill() -> None:
     queue = RequestQueue()
     queue.offer(asked(1, trusted=False), 0)
     queue.take(0)
-    queue.charge(1, STRANGERS_BURST)
-    queue.forget(1)
+    queue.charge(1, UNTRUSTED_BURST)
+    queue.remove(1)
     for client_id in (2, 3):
         queue.offer(asked(client_id, trusted=False), 0)
     queue.offer(asked(4), 0)
@@ -75,7 +75,7 @@ def test_strangers_share_one_purse_and_cannot_flee_their_debt() -> None:
     assert queue.take(US_PER_S) == asked(2, trusted=False)
 
 
-def test_what_strangers_may_cause_in_a_minute() -> None:
+def test_untrusted_clients_cause_a_bounded_number_of_bytes_in_a_minute() -> None:
     queue = RequestQueue()
     answered = 0
     for ms in range(60_000):
@@ -84,13 +84,13 @@ def test_what_strangers_may_cause_in_a_minute() -> None:
         if taken := queue.take(ms * 1000):
             queue.charge(taken.client_id, 300)
             answered += 1
-    assert answered <= (STRANGERS_BURST + 60 * STRANGERS_RATE) / (REQUEST_COST + 300) + 1
+    assert answered <= (UNTRUSTED_BURST + 60 * UNTRUSTED_RATE) / (REQUEST_COST + 300) + 1
 
 
-def test_trust_taken_away_takes_the_purse_too() -> None:
+def test_a_client_no_longer_trusted_uses_the_shared_bucket() -> None:
     queue = RequestQueue()
     queue.offer(asked(9, trusted=False), 0)
-    queue.charge(9, 2 * STRANGERS_BURST)
+    queue.charge(9, 2 * UNTRUSTED_BURST)
     queue.offer(asked(1), 0)
     assert queue.take(0) == asked(1)
     queue.offer(asked(1, trusted=False), 0)
@@ -101,6 +101,6 @@ def test_who_has_gone_leaves_nothing() -> None:
     queue = RequestQueue()
     for client_id in range(1000):
         queue.offer(asked(client_id), 0)
-        queue.forget(client_id)
+        queue.remove(client_id)
     assert queue.take(0) is None
     assert (queue._lines, queue._turns) == ({}, {})

@@ -7,11 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.hub.bandwidth import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Width
+from gateway.hub.bandwidth import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandwidth
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
+from gateway.hub.routing_table import Path
+from gateway.hub.stats import ClientCounters
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of, sequence_of
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, message_id_of, sequence_of
 
 STREAMS = {
     # Message: rate in Hz and payload in bytes, as the default settings send them.
@@ -22,12 +25,19 @@ STREAMS = {
 
 
 class Sink:
-    def __init__(self) -> None:
+    """A client that keeps the frames that it is sent, with their times."""
+
+    is_direct = False
+
+    def __init__(self, client_id: int, url: str) -> None:
+        self.client_id = client_id
+        self.endpoint = parse_endpoint(url)
+        self.counters = ClientCounters()
         self.frames: list[tuple[int, bytes]] = []
         self.now_us = 0
 
-    def __call__(self, frame: bytes, message_id: int) -> None:
-        self.frames.append((self.now_us, frame))
+    def transmit(self, frame: MavFrame) -> None:
+        self.frames.append((self.now_us, frame.data))
 
     def since(self, since_us: int) -> list[bytes]:
         return [frame for us, frame in self.frames if us >= since_us]
@@ -37,10 +47,10 @@ class Flight:
     """A vehicle at its default rates, and outlets of some widths."""
 
     def __init__(self, *urls: str) -> None:
-        self.fanout = Fanout()
-        self.sinks = [Sink() for _ in urls]
-        for number, (url, sink) in enumerate(zip(urls, self.sinks, strict=True)):
-            self.fanout.add(number, sink, parse_endpoint(url))
+        self.fanout = Fanout(FrameSigner())
+        self.sinks = [Sink(number, url) for number, url in enumerate(urls, start=1)]
+        for sink in self.sinks:
+            self.fanout.add(sink)
         self.now_us = 0
         self.sequence = 0
         self.due_us: dict[int, float] = defaultdict(float)
@@ -63,7 +73,8 @@ class Flight:
             sink.now_us = self.now_us
         head = bytes((size, 0, 0, self.sequence, 1, 1)) + message_id.to_bytes(3, "little")
         self.sequence = (self.sequence + 1) % 256
-        self.fanout.publish(b"\xfd" + head + bytes(size - 1) + b"\1\0\0", self.now_us)
+        frame = frame_of(b"\xfd" + head + bytes(size - 1) + b"\1\0\0")
+        self.fanout.publish(frame, frame.sequence, self.now_us)
 
 
 def rates(frames: list[bytes], seconds: float) -> dict[int, float]:
@@ -105,7 +116,7 @@ def test_telemetry_comes_back_soon_after_many_answers() -> None:
     usual = rates(flight.sinks[0].since(flight.run(10)), 10)
     for number in range(110):
         frame = b"\xfd\x19\0\0" + bytes([number, 1, 1, 22, 0, 0]) + bytes(27)
-        flight.fanout.answer(frame, [0])
+        flight.fanout.answer(frame_of(frame), number, [1], flight.now_us)
         flight.run(0.02)
     flight.run(4)
     again = rates(flight.sinks[0].since(flight.run(6)), 6)
@@ -144,7 +155,9 @@ def test_a_link_of_a_few_bytes_gets_one_message_alone(budget: int) -> None:
 def test_what_another_vehicle_says_over_a_satellite_goes_to_all() -> None:
     flight = Flight("udp:h:1", "udp:h:2?budget=20", "udp:h:3?budget=5760")
     frame = b"\xfd\x01\0\0\0\x2a\1\xeb\0\0" + bytes(3)
-    flight.fanout.forward(frame, 9, 10)
+    flight.fanout.make_route(frame_of(frame), 9, Path(0, 0), None, None).forward(
+        frame_of(frame), 10
+    )
     assert [len(sink.frames) for sink in flight.sinks] == [1, 1, 1]
 
 
@@ -153,7 +166,7 @@ def test_a_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
     flows = []
     for free_percent in (100, 10, 100):
         for _ in range(30):
-            flight.fanout.note_buffer(0, free_percent)
+            flight.fanout.update_buffer(1, free_percent)
             begin_us = flight.run(1)
         begin_us = flight.run(5)
         flows.append(sum(map(len, flight.sinks[0].since(begin_us))) / 5)
@@ -165,13 +178,15 @@ def test_a_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
 def test_answers_come_first(how: str) -> None:
     """Our own answers, and frames that others address to who is behind the link."""
     flight = Flight("udp:h:1?budget=3000")
-    send = getattr(flight.fanout, how)
     flight.run(10)
-    answer = b"\xfd\xc8\0\0\0\1\1\x16\0\0" + bytes(202)
+    answer = frame_of(b"\xfd\xc8\0\0\0\1\1\x16\0\0" + bytes(202))
     begin_us = flight.now_us
     for _ in range(100):
         for _ in range(10):
-            send(answer, [0])
+            if how == "answer":
+                flight.fanout.answer(answer, 0, [1], flight.now_us)
+            else:
+                flight.fanout.deliver(answer, [1], 9)
         flight.run(1)
     frames = flight.sinks[0].since(begin_us + 90 * US_PER_S)
     telemetry = [frame for frame in frames if message_id_of(frame) != 22]
@@ -187,15 +202,15 @@ KINDS = st.dictionaries(
 def test_any_load_is_planned_so_that_it_fits_or_nothing_starves(
     kinds: dict[int, tuple[int, int]], budget: int, answered: int
 ) -> None:
-    width = Width(budget)
+    bandwidth = Bandwidth(budget)
     offered = {
         message_id.to_bytes(5, "big"): (message_id, frames, frames * size)
         for message_id, (frames, size) in kinds.items()
     }
-    width.plan(offered, answered, 1.0)
+    bandwidth.plan(offered, answered, 1.0)
     flow = fixed = floors = 0.0
     for key, (message_id, frames, size) in offered.items():
-        interval_us = width.interval_us(key)
+        interval_us = bandwidth.interval_us(key)
         rate = min(frames, US_PER_S / interval_us) if interval_us else frames
         assert rate > 0
         assert interval_us == 0 or message_id not in NEVER_THINNED

@@ -1,0 +1,246 @@
+"""Figures of clients, listening ports and the hub at one moment, and alerts when they get worse.
+
+Every configured client gets its own alerts. The clients of a listening port may be anybody, and any
+number: only a few of theirs are passed on in a minute, so that an attack cannot hide other texts.
+"""
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from gateway.units import US_PER_S
+
+
+@dataclass(slots=True)
+class ClientCounters:
+    """Counters of one client since it appeared."""
+
+    sent: int = 0
+    dropped: int = 0
+    unheard: int = 0
+    """Sent to a port on which nobody listens."""
+    bytes_sent: int = 0
+    received: int = 0
+    bytes_received: int = 0
+    bytes_garbage: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ClientStats:
+    """One client at one moment, for the live view, the status command and the metrics."""
+
+    client_id: int
+    name: str
+    endpoint: str
+    remote: str
+    """Address of the peer; empty while unknown."""
+    state: str
+    """`open`, or why nothing is sent: `refused`, `unreachable`, `connecting`, `resolving`."""
+    trusted: bool
+    systems: tuple[tuple[int, int], ...]
+    """System and component ids that were heard from it."""
+    sent: int
+    """Frames handed to the network."""
+    dropped: int
+    """Frames discarded: unreachable, or the oldest of a full queue."""
+    bytes_sent: int
+    received: int
+    bytes_received: int
+    bytes_garbage: int
+    """Bytes from it that were not MAVLink."""
+    queued: int
+    """Frames waiting for a slow link."""
+    since_us: int
+    heard_us: int | None
+    round_trip_us: int | None
+    reason: str = ""
+    """Why nothing is sent: the operating system's error; empty if frames are sent."""
+    unheard: int = 0
+    """Frames sent to a port on which nobody listened; they do not count as loss."""
+
+
+@dataclass(frozen=True, slots=True)
+class ListenerStats:
+    """One listening port at one moment."""
+
+    name: str
+    endpoint: str
+    state: str
+    """`open`, or `closed` while it cannot be bound or accept clients."""
+    reason: str
+    """Why it is closed: the operating system's error; empty if it is open."""
+    port: int
+    """The port that is bound, or 0."""
+    clients: int
+    turned_away: int
+    """New clients refused because the port was full."""
+
+
+@dataclass(frozen=True, slots=True)
+class HubCounters:
+    """Totals of the hub since it started."""
+
+    published: int = 0
+    """Frames of ours."""
+    forwarded: int = 0
+    """Frames of other systems that were passed on."""
+    duplicates: int = 0
+    """Copies that arrived on a second path."""
+    late: int = 0
+    """Frames that arrived too long after newer ones of the same stream."""
+    shed: int = 0
+    """Telemetry of ours dropped because the processor was short of time."""
+    looped: int = 0
+    """Frames of ours that came back."""
+    unroutable: int = 0
+    """Frames for an unknown system, or from a client that may not send to it."""
+    unserved: int = 0
+    """Requests dropped because their client exceeded its quota."""
+
+
+WINDOW_US: Final = 60 * US_PER_S
+
+
+class LogRateLimiter:
+    """Lines of one kind: a few of each minute in full, the others as their number.
+
+    Parameters
+    ----------
+    in_full : int
+        Most lines passed in full in one minute.
+    rest : str
+        Text that follows the number of the others.
+    """
+
+    def __init__(self, in_full: int, rest: str) -> None:
+        self._in_full = in_full
+        self._rest = rest
+        self._begin_us = 0
+        self._lines = 0
+
+    def add(self, line: str, now_us: int) -> list[str]:
+        """Return the line if it may pass in full, else nothing."""
+        found = self.poll(now_us)
+        self._lines += 1
+        return [*found, line] if self._lines <= self._in_full else found
+
+    def poll(self, now_us: int) -> list[str]:
+        """Return at the end of a minute how many lines were suppressed, if any."""
+        if now_us - self._begin_us < WINDOW_US:
+            return []
+        suppressed, self._lines, self._begin_us = self._lines - self._in_full, 0, now_us
+        return [f"{suppressed} {self._rest}"] if suppressed > 0 else []
+
+
+ALERT_AFTER_US: Final = 5 * US_PER_S
+"""A shorter outage is not announced."""
+SLOW_FOR_US: Final = 30 * US_PER_S
+"""A client that has dropped nothing for so long is no longer slow."""
+ALERT_STATES: Final = {
+    "unreachable": "unreachable",
+    "resolving": "its address is not known",
+    "connecting": "not connected",
+}
+"""Texts used without a reason. `refused` is not among them: a ground station that is not running
+is not unusual."""
+ALERTS_IN_FULL: Final = 3
+"""Alerts of listening ports' clients that are passed on one by one in a minute."""
+
+Key = int | str
+"""Id of a client, or URL of a listening port."""
+
+
+class ClientAlert(NamedTuple):
+    """The beginning or the end of a problem."""
+
+    is_problem: bool
+    text: str
+
+
+class ClientAlerts:
+    """Detect problems from the figures of clients and listening ports."""
+
+    def __init__(self) -> None:
+        self._away_since_us: dict[Key, int] = {}
+        self._away_reported: set[Key] = set()
+        self._dropped: dict[int, int] = {}
+        """Drops at the last look, of clients that were open then."""
+        self._slow_until_us: dict[int, int] = {}
+        self._limiter = LogRateLimiter(ALERTS_IN_FULL, "more alerts of clients of listening ports")
+
+    def update(
+        self,
+        clients: tuple[ClientStats, ...],
+        listeners: tuple[ListenerStats, ...],
+        now_us: int,
+    ) -> list[ClientAlert]:
+        """Compare all figures with the previous ones.
+
+        Parameters
+        ----------
+        clients : tuple of ClientStats
+            All clients at this moment.
+        listeners : tuple of ListenerStats
+            All listening ports at this moment.
+        now_us : int
+            Gateway time.
+
+        Returns
+        -------
+        list of ClientAlert
+            Short texts.
+        """
+        ports = {listener.endpoint for listener in listeners}
+        self._keep_only({client.client_id for client in clients}, ports)
+        alerts = [ClientAlert(True, text) for text in self._limiter.poll(now_us)]
+        for listener in listeners:
+            alerts += self._away(listener.endpoint, listener.name, listener.reason, now_us)
+        for client in clients:
+            state = ALERT_STATES.get(client.state, "")
+            trouble = client.reason or state if state else ""
+            found = self._away(client.client_id, client.name, trouble, now_us)
+            found += self._slow(client, now_us)
+            if client.endpoint in ports:
+                found = [
+                    ClientAlert(is_problem, line)
+                    for is_problem, text in found
+                    for line in self._limiter.add(text, now_us)
+                ]
+            alerts += found
+        return alerts
+
+    def _away(self, key: Key, name: str, trouble: str, now_us: int) -> list[ClientAlert]:
+        if not trouble:
+            self._away_since_us.pop(key, None)
+            if key in self._away_reported:
+                self._away_reported.remove(key)
+                return [ClientAlert(False, f"{name} is back")]
+            return []
+        since_us = self._away_since_us.setdefault(key, now_us)
+        if key in self._away_reported or now_us - since_us < ALERT_AFTER_US:
+            return []
+        self._away_reported.add(key)
+        return [ClientAlert(True, f"{name}: {trouble}")]
+
+    def _slow(self, client: ClientStats, now_us: int) -> list[ClientAlert]:
+        key = client.client_id
+        before = self._dropped.pop(key, client.dropped)
+        if client.state == "open":
+            self._dropped[key] = client.dropped
+        if client.dropped == before or client.state != "open":
+            if self._slow_until_us.get(key, now_us + 1) <= now_us:
+                del self._slow_until_us[key]
+            return []
+        was_slow = key in self._slow_until_us
+        self._slow_until_us[key] = now_us + SLOW_FOR_US
+        return (
+            [] if was_slow else [ClientAlert(True, f"{client.name} is too slow: telemetry dropped")]
+        )
+
+    def _keep_only(self, clients: set[int], listeners: set[str]) -> None:
+        for known in (self._dropped, self._slow_until_us):
+            for client_id in known.keys() - clients:
+                del known[client_id]
+        there = clients | listeners
+        for key in self._away_since_us.keys() - there:
+            del self._away_since_us[key]
+        self._away_reported &= there

@@ -1,0 +1,289 @@
+"""Base of datagram transports: one socket per peer, a short backlog, optional packing."""
+
+import socket
+import struct
+from collections import deque
+from typing import Final
+
+from gateway.hub.admission import SILENT_AFTER_US
+from gateway.hub.endpoint import Endpoint
+from gateway.hub.send_queue import Packer
+from gateway.hub.transports.base import RETRY_US, Client, Write, not_open
+from gateway.wire.mavlink_splitter import MavFrame, read_datagram, split_datagram
+
+NOBODY_LISTENS: Final = "nobody listens there"
+MAX_DATAGRAM: Final = 4096
+"""Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
+are cut off."""
+READ_BUDGET: Final = 64
+"""Datagrams read at one wake-up, if they are small."""
+ALONE_US: Final = 300
+"""A datagram that arrives so long after the last wake-up is most likely the only one. A second
+read, which would raise BlockingIOError, is omitted; if there are more, the loop wakes again."""
+RECEIVE_BUFFER_BYTES: Final = 1 << 20
+"""The default holds only about 256 small datagrams; a parameter upload bursts more."""
+IP_PKTINFO: Final = 8
+"""Not exported by `socket` before Python 3.14; gives the local address of a datagram."""
+BACKLOG_DATAGRAMS: Final = 256
+"""Most datagrams that wait for a full socket buffer: older ones are of no use."""
+
+
+class DatagramClient(Client):
+    """A peer behind a datagram socket; base of unicast, broadcast and multicast."""
+
+    refused_us: int | None = None
+    _socket: socket.socket | None = None
+    _direct: Write = staticmethod(not_open)
+    _is_gathering = False
+    _woken_us = 0
+
+    def __post_init__(self) -> None:
+        """Start without a socket."""
+        super().__post_init__()
+        self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
+        self._packer = _packer(self.endpoint)
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether a frame may be passed to `write` directly."""
+        return self._packer is None
+
+    @property
+    def queued(self) -> int:
+        """Datagrams that wait for room in the socket buffer."""
+        return len(self._backlog)
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Send one frame; count it as dropped if the network refuses it."""
+        data = frame.data
+        if self._packer is not None:
+            self._pack(data)
+            return
+        try:
+            self.write(data)
+        except OSError as error:
+            self._recover(data, 1, error)
+            return
+        counters = self.counters
+        counters.sent += 1
+        counters.bytes_sent += len(data)
+
+    def close(self) -> None:
+        """Close the socket."""
+        self.write = not_open
+        self.counters.dropped += len(self._backlog)
+        self._backlog.clear()
+        if self._socket is not None:
+            self.loop.remove_reader(self._socket)
+            self.loop.remove_writer(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Apply changed options, packing included."""
+        self._flush()
+        self._packer = _packer(endpoint)
+        super().reconfigure(endpoint)
+
+    def adopt(self, sock: socket.socket, write: Write) -> None:
+        """Use an open socket from now on."""
+        self._socket = sock
+        self.write = self._direct = write
+        self.revive()
+        self.loop.add_reader(sock, self._on_readable, sock)
+
+    def accept(self, data: bytes, now_us: int) -> None:
+        """Process one datagram of this peer."""
+        if self.state != "open":
+            self.revive()
+        frame = read_datagram(data)
+        if frame is None:
+            self.receive(split_datagram(data), len(data), now_us)
+            return
+        self.counters.bytes_received += len(data)
+        self.receive_frame(frame, now_us)
+
+    def revive(self) -> None:
+        """Note that the peer is reachable after all."""
+        self.become("open")
+        self.refused_us = None
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Handle a failed send whose frame will still be counted as sent."""
+        self._count_sent(-1, -len(data))
+        self._recover(data, 1, error)
+
+    def _pack(self, frame: bytes) -> None:
+        assert self._packer is not None
+        self._send_packed(self._packer.add(frame))
+        if not self._is_gathering:
+            self._is_gathering = True
+            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
+
+    def _flush(self) -> None:
+        self._is_gathering = False
+        if self._packer is not None:
+            self._send_packed(self._packer.flush())
+
+    def _send_packed(self, frames: list[bytes]) -> None:
+        if not frames:
+            return
+        data = b"".join(frames)
+        try:
+            self.write(data)
+        except OSError as error:
+            self._recover(data, len(frames), error)
+            return
+        self._count_sent(len(frames), len(data))
+
+    def _count_sent(self, frames: int, size: int) -> None:
+        self.counters.sent += frames
+        self.counters.bytes_sent += size
+
+    def _recover(self, data: bytes, frames: int, error: OSError) -> None:
+        """Handle a failed send: wait for room, retry, or drop the frames."""
+        if isinstance(error, BlockingIOError) and self._socket is not None:
+            self.write = self._wait
+            self.loop.add_writer(self._socket, self._on_writable, self._socket)
+            self._wait(data)
+            self._count_sent(frames, len(data))
+            return
+        if isinstance(error, ConnectionRefusedError):
+            if self._sends_after_refusal(data):
+                self._count_sent(frames, len(data))
+            else:
+                self.counters.unheard += frames
+            return
+        if self._socket is not None:
+            self.become("unreachable", error)
+        self.counters.dropped += frames
+
+    def _sends_after_refusal(self, data: bytes) -> bool:
+        """Send again: a refusal reported now belongs to an earlier datagram."""
+        self._note_refusal()
+        try:
+            self.write(data)
+        except OSError:
+            return False
+        return True
+
+    def _note_refusal(self) -> None:
+        self.become("refused")
+        self.reason = NOBODY_LISTENS
+        self.refused_us = self.context.now_us()
+
+    def _wait(self, data: bytes) -> None:
+        """Queue datagrams while the socket buffer is full; the oldest makes room."""
+        if len(self._backlog) == BACKLOG_DATAGRAMS:
+            self.counters.dropped += 1
+            self.counters.sent -= 1
+        self._backlog.append(data)
+
+    def _on_writable(self, sock: socket.socket) -> None:
+        while self._backlog:
+            try:
+                self._direct(self._backlog[0])
+            except BlockingIOError:
+                return
+            except OSError:
+                self.counters.dropped += 1
+                self.counters.sent -= 1
+            self._backlog.popleft()
+        self.loop.remove_writer(sock)
+        self.write = self._direct
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        now_us = self.context.now_us()
+        is_alone = now_us - self._woken_us > ALONE_US
+        self._woken_us = now_us
+        size, most = 0, 0 if is_alone else self.context.read_bytes
+        for _ in range(READ_BUDGET):
+            try:
+                data = sock.recv(MAX_DATAGRAM)
+            except BlockingIOError:
+                break
+            except ConnectionRefusedError:
+                self._note_refusal()
+                return
+            except OSError as error:
+                self.become("unreachable", error)
+                return
+            size += len(data)
+            self.accept(data, now_us)
+            if self._socket is not sock:
+                return
+            if size >= most:
+                break
+        self.limit_reads(sock, self._on_readable, size)
+
+
+class DatagramPeer(DatagramClient):
+    """A client of a listening port."""
+
+    def revive(self) -> None:
+        """Note that the client is reachable after all."""
+        self._end_hold()
+        super().revive()
+
+    def tick(self, now_us: int) -> None:
+        """Clear a problem that was not repeated; retry a client that refused."""
+        if self._socket is None:
+            return
+        self._end_hold()
+        if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
+            self.become("open")
+
+    def _note_refusal(self) -> None:
+        """Stop sending until the next tick: a dead client costs more than a live one."""
+        super()._note_refusal()
+        if self.write == self._direct:
+            self.write = self._hold
+
+    def _hold(self, data: bytes) -> None:
+        self.counters.unheard += 1
+        self.counters.sent -= 1
+        self.counters.bytes_sent -= len(data)
+
+    def _end_hold(self) -> None:
+        if self.write == self._hold:
+            self.write = self._direct
+
+    def has_died(self, now_us: int) -> bool:
+        """Return whether it failed, or is silent and its machine reports a closed port."""
+        if self._socket is None:
+            return True
+        heard_us = self.heard_us if self.heard_us is not None else self.since_us
+        return self.refused_us is not None and now_us - heard_us >= SILENT_AFTER_US
+
+
+def _packer(endpoint: Endpoint) -> Packer | None:
+    return Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
+
+
+def bound_socket(address: tuple[str, int], *, shared: bool) -> socket.socket:
+    """Open a datagram socket on an address; `shared` if one is bound there already."""
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    sock = socket.socket(family, socket.SOCK_DGRAM)
+    try:
+        sock.setblocking(False)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+        if shared:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        sock.bind(address)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    except OSError:
+        sock.close()
+        raise
+    return sock
+
+
+def local_host_of(ancillary: list[tuple[int, int, bytes]]) -> str:
+    """Return the address of ours that a datagram was sent to."""
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.IPPROTO_IP, IP_PKTINFO):
+            return socket.inet_ntoa(struct.unpack("=I4s4s", data[:12])[1])
+        if (level, kind) == (socket.IPPROTO_IPV6, socket.IPV6_PKTINFO):
+            host = socket.inet_ntop(socket.AF_INET6, data[:16])
+            interface = struct.unpack("=I", data[16:20])[0]
+            return f"{host}%{interface}" if host.startswith("fe80:") else host
+    return ""

@@ -1,0 +1,247 @@
+"""Base of byte-stream transports, with a bounded queue in front of each connection.
+
+A stalled client fills its own queue and loses its own oldest telemetry; the kernel closes the
+connection when nothing was acknowledged for long.
+"""
+
+import socket
+from typing import Any, Final
+
+from gateway.hub.accepting import accept_each
+from gateway.hub.admission import Presence, client_to_remove
+from gateway.hub.endpoint import host_and_port
+from gateway.hub.send_queue import LinkEncoder, SendQueue
+from gateway.hub.transports.base import Client, Listener, Peer
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
+
+CHUNK_BYTES: Final = 4096
+"""Joined into one write while a queue drains."""
+SLOW_CHUNK_BYTES: Final = 512
+"""The same for a slow connection: joined frames can no longer be overtaken."""
+USER_TIMEOUT_MS: Final = 30_000
+"""A peer that acknowledges nothing for so long is gone; a paused one may resume sooner."""
+SEND_BUFFER_BYTES: Final = 32_768
+"""Most bytes that the peer has not acknowledged: those in flight on a long link."""
+UNSENT_BYTES: Final = 2048
+"""Most bytes in the kernel beyond those: frames wait in our queue, where urgent ones are first."""
+JOINED_BYTES: Final = 1024
+"""The kernel joins unsent writes, and checks `UNSENT_BYTES` only when it starts another segment."""
+SLOW_AFTER_US: Final = US_PER_S
+"""A connection that needs longer to drain its queue is slow; after a stall it is faster."""
+FRESH_US: Final = US_PER_S // 2
+"""Telemetry that has waited longer is not sent to a slow one."""
+ACCEPT_BACKLOG: Final = 128
+"""Connections that wait in the kernel, since each wake-up accepts one: pages that all reconnect."""
+
+
+class QueuedClient(Client):
+    """A peer behind a link that may be slow or stalled: frames wait in a bounded queue."""
+
+    _partial = b""
+    """The rest of a write that the system has not accepted completely."""
+
+    def __post_init__(self) -> None:
+        """Start with an empty queue."""
+        super().__post_init__()
+        self._queue = SendQueue(self.queue_bytes)
+        self._encoder = LinkEncoder(self.context.is_own, self.context.signer)
+        self._splitter = MavlinkSplitter()
+
+    @property
+    def queue_bytes(self) -> int:
+        """Most bytes that wait."""
+        return self.context.settings.queue_bytes
+
+    @property
+    def queued(self) -> int:
+        """Frames that wait."""
+        return len(self._queue)
+
+    def _push(self, frame: MavFrame, step: int | None) -> None:
+        """Queue a frame that is counted as sent."""
+        self._drop(self._queue.push(frame, step, self.context.now_us()))
+
+    def _drop(self, frames: int) -> None:
+        self.counters.dropped += frames
+        self.counters.sent -= frames
+
+    def _drop_all(self) -> None:
+        self._partial = b""
+        self._drop(self._queue.clear())
+
+
+class StreamClient(QueuedClient):
+    """A peer behind a socket that carries a byte stream."""
+
+    _socket: socket.socket | None = None
+    _sending_us: int | None = None
+    """Since when the queue was not empty."""
+    _chunk_bytes = CHUNK_BYTES
+    _joined = 0
+    """Bytes written to the present segment."""
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Send one frame at once if nothing waits, else queue it."""
+        if self._socket is None:
+            self.counters.dropped += 1
+            return
+        self.counters.sent += 1
+        step = self._encoder.enter(frame)
+        if self._partial or self._queue:
+            self._push(frame, step)
+        else:
+            data = self._encoder.encode(frame, step, self.context.now_us())
+            self._write(self._socket, self.wrap(data))
+
+    def adopt(self, sock: socket.socket) -> None:
+        """Use a connected socket from now on."""
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, USER_TIMEOUT_MS)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, USER_TIMEOUT_MS // 2000)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
+        self._socket = sock
+        self._splitter.reset()
+        self.loop.add_reader(sock, self._on_readable, sock)
+        self.begin()
+
+    def begin(self) -> None:
+        """Start the protocol on a new connection."""
+        self.become("open")
+        self.context.greet(self)
+
+    def close(self) -> None:
+        """Close the connection; waiting frames are lost."""
+        if self._socket is not None:
+            self.loop.remove_reader(self._socket)
+            self.loop.remove_writer(self._socket)
+            self._socket.close()
+            self._socket = None
+        self._sending_us = None
+        self._drop_all()
+
+    def broke(self) -> None:
+        """Handle the end of the connection."""
+        raise NotImplementedError
+
+    def wrap(self, frames: bytes) -> bytes:
+        """Return the bytes that carry some frames on this connection."""
+        return frames
+
+    def accept(self, data: bytes, now_us: int) -> None:
+        """Process received bytes."""
+        self.receive(self._splitter.feed(data), len(data), now_us)
+
+    def _write(self, sock: socket.socket, data: bytes) -> bool:
+        """Write; keep the bytes that the socket does not accept and wait for room."""
+        self._joined += len(data)
+        flags = socket.MSG_EOR if self._joined >= JOINED_BYTES else 0
+        if flags:
+            self._joined = 0
+        try:
+            taken = sock.send(data, flags)
+        except BlockingIOError:
+            taken = 0
+        except OSError:
+            self.broke()
+            return False
+        self.counters.bytes_sent += taken
+        self._partial = data[taken:]
+        if self._partial:
+            self.loop.add_writer(sock, self._on_writable, sock)
+        return not self._partial
+
+    def _on_writable(self, sock: socket.socket) -> None:
+        self._drop_stale(self.context.now_us())
+        if self._partial and not self._write(sock, self._partial):
+            return
+        while data := self._next_chunk():
+            if not self._write(sock, data):
+                return
+        self.loop.remove_writer(sock)
+        self._sending_us = None
+
+    def _drop_stale(self, now_us: int) -> None:
+        """Drop old telemetry on a connection that is too slow for it."""
+        if self._sending_us is None:
+            self._sending_us = now_us
+        is_slow = now_us - self._sending_us > SLOW_AFTER_US
+        self._chunk_bytes = SLOW_CHUNK_BYTES if is_slow else CHUNK_BYTES
+        if is_slow:
+            self._drop(self._queue.expire(now_us - FRESH_US))
+
+    def _next_chunk(self) -> bytes:
+        messages, frames, size, now_us = [], b"", 0, self.context.now_us()
+        while size < self._chunk_bytes and (waiting := self._queue.pop()) is not None:
+            frame = self._encoder.encode(*waiting, now_us)
+            if frames and len(frames) + len(frame) > self.endpoint.pack_bytes:
+                messages.append(self.wrap(frames))
+                frames = b""
+            frames += frame
+            size += len(frame)
+        if frames:
+            messages.append(self.wrap(frames))
+        return b"".join(messages)
+
+    def _on_readable(self, sock: socket.socket) -> None:
+        try:
+            data = sock.recv(self.context.read_bytes)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.broke()
+            return
+        self.accept(data, self.context.now_us())
+        if self._socket is sock:
+            self.limit_reads(sock, self._on_readable, len(data))
+
+
+class StreamListener(Listener[Peer]):
+    """A port that accepts connections."""
+
+    def _bind(self) -> socket.socket:
+        host, port = self.endpoint.host, self.endpoint.port
+        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            sock.setblocking(False)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind((host, port))
+            sock.listen(ACCEPT_BACKLOG)
+        except OSError:
+            sock.close()
+            raise
+        return sock
+
+    def _watch(self, sock: socket.socket) -> None:
+        accept_each(sock, self._on_connection, self._report)
+
+    def _on_connection(self, connection: socket.socket, address: tuple[Any, ...]) -> None:
+        if self._has_room(str(address[0])):
+            self._admit(connection, host_and_port(*address[:2]))
+        else:
+            self.turned_away += 1
+            connection.close()
+
+    def _has_room(self, host: str) -> bool:
+        """Return whether there is room for a new client, after removing another if needed."""
+        most = self._context.settings.max_clients
+        if len(self._clients) < most:
+            return True
+        present = [
+            Presence(client.client_id, (client.host, 0), client.heard_us or client.since_us)
+            for client in self._clients.values()
+        ]
+        removed = client_to_remove(present, host, most, self._context.now_us())
+        if removed is None:
+            return False
+        self.leave(self._clients[removed.client_id])
+        return True
+
+    def _admit(self, connection: socket.socket, peer: str) -> None:
+        """Make a client of a connection."""
+        raise NotImplementedError

@@ -1,0 +1,182 @@
+"""Queues in front of slow links: order, bounds, numbers, on the manual clock."""
+
+import random
+
+import pytest
+
+from gateway.hub.send_queue import (
+    BULK_BYTES,
+    URGENT_RUN,
+    LinkEncoder,
+    Pacer,
+    Packer,
+    SendQueue,
+)
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.mavlink import frames_in, numbered, raw_frame
+
+HEARTBEAT, ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK = 0, 30, 27, 22, 77
+
+
+def drain(queue: SendQueue) -> list[bytes]:
+    frames = []
+    while (waiting := queue.pop()) is not None:
+        frames.append(waiting[0].data)
+    return frames
+
+
+class TestSendQueue:
+    def test_urgent_first_yet_bulk_ends(self) -> None:
+        queue = SendQueue(10_000)
+        for n in range(8):
+            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n))
+        for n in range(20):
+            queue.push(raw_frame(ATTITUDE, b"a%02d" % n))
+        order = drain(queue)
+        assert order[:URGENT_RUN] == [b"a00", b"a01", b"a02", b"a03"]
+        assert order[URGENT_RUN] == b"b0"
+        assert [f for f in order if f[:1] == b"a"] == [b"a%02d" % n for n in range(20)]
+        assert [f for f in order if f[:1] == b"b"] == [b"b%d" % n for n in range(8)]
+        assert queue.size == 0
+
+    def test_bulk_and_usual_take_turns(self) -> None:
+        queue = SendQueue(10_000)
+        for n in range(3):
+            queue.push(raw_frame(RAW_IMU, b"u%d" % n))
+            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n))
+        assert drain(queue) == [b"b0", b"u0", b"b1", b"u1", b"b2", b"u2"]
+
+    def test_oldest_telemetry_goes_first_and_answers_last(self) -> None:
+        queue = SendQueue(30)
+        queue.push(raw_frame(COMMAND_ACK, b"c" * 10))
+        queue.push(raw_frame(ATTITUDE, b"a" * 10))
+        queue.push(raw_frame(RAW_IMU, b"1" * 10))
+        assert queue.push(raw_frame(RAW_IMU, b"2" * 10)) == 1
+        assert queue.push(raw_frame(ATTITUDE, b"A" * 10)) == 1
+        assert queue.push(raw_frame(COMMAND_ACK, b"C" * 10)) == 1
+        assert drain(queue) == [b"c" * 10, b"C" * 10, b"A" * 10]
+
+    def test_an_answer_overtakes_the_attitude(self) -> None:
+        queue = SendQueue(1000)
+        for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK, HEARTBEAT):
+            queue.push(raw_frame(message_id, bytes([message_id])))
+        order = [frame[0] for frame in drain(queue)]
+        assert order == [COMMAND_ACK, HEARTBEAT, ATTITUDE, PARAM_VALUE, RAW_IMU]
+
+    def test_all_parameters_find_room_beside_the_telemetry_of_the_slowest_line(self) -> None:
+        queue = SendQueue(100)
+        for n in range(300):
+            assert queue.push(raw_frame(PARAM_VALUE, n.to_bytes(2, "big") * 18)) == 0
+            queue.push(raw_frame(ATTITUDE, b"a" * 44))
+        parameters = [frame for frame in drain(queue) if frame[:1] != b"a"]
+        assert parameters == [n.to_bytes(2, "big") * 18 for n in range(300)]
+        for _ in range(BULK_BYTES // 36 + 1):
+            queue.push(raw_frame(PARAM_VALUE, b"b" * 36))
+        assert queue.size <= BULK_BYTES
+
+    def test_old_telemetry_expires_and_answers_do_not(self) -> None:
+        queue = SendQueue(1000)
+        for now_us in (1, 2, 3):
+            for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK):
+                queue.push(raw_frame(message_id, bytes([message_id, now_us])), None, now_us)
+        assert queue.expire(3) == 4
+        assert sorted(drain(queue)) == [
+            bytes([PARAM_VALUE, 1]),
+            bytes([PARAM_VALUE, 2]),
+            bytes([PARAM_VALUE, 3]),
+            bytes([RAW_IMU, 3]),
+            bytes([ATTITUDE, 3]),
+            *(bytes([COMMAND_ACK, now_us]) for now_us in (1, 2, 3)),
+        ]
+        assert queue.size == 0
+
+    @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, COMMAND_ACK])
+    def test_the_newest_is_always_taken(self, message_id: int) -> None:
+        queue = SendQueue(30)
+        for n in range(3):
+            queue.push(raw_frame((ATTITUDE, RAW_IMU, COMMAND_ACK)[n], bytes((n,)) * 10))
+        assert queue.push(raw_frame(message_id, b"n" * 30)) == 3
+        assert drain(queue) == [b"n" * 30]
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_every_frame_leaves_or_is_counted_and_the_bound_holds(self, seed: int) -> None:
+        rng = random.Random(seed)
+        queue, pushed, dropped, left = SendQueue(500), 0, 0, 0
+        for _ in range(2000):
+            if rng.random() < 0.6:
+                frame = bytes(rng.randrange(8, 60))
+                kinds = (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK)
+                dropped += queue.push(raw_frame(rng.choice(kinds), frame), None, pushed)
+                pushed += 1
+            elif rng.random() < 0.05:
+                dropped += queue.expire(pushed - 3)
+            elif queue.pop() is not None:
+                left += 1
+            assert queue.size <= 500 + BULK_BYTES
+        assert pushed == dropped + left + len(queue)
+        assert queue.clear() == pushed - dropped - left
+        assert (len(queue), queue.size, queue.pop()) == (0, 0, None)
+
+
+class TestLinkEncoder:
+    """Numbers of our own frames, and frames of others."""
+
+    @pytest.fixture
+    def encoder(self) -> LinkEncoder:
+        return LinkEncoder(lambda origin: origin == (1, 1), FrameSigner())
+
+    def test_without_drops_every_frame_is_sent_unchanged(self, encoder: LinkEncoder) -> None:
+        for sequence in (254, 255, 0, 9, 9, 3):
+            frame = numbered(1, sequence)
+            assert encoder.encode(frame, encoder.enter(frame), 0) is frame.data
+
+    def test_dropped_frames_leave_no_gap(self, encoder: LinkEncoder) -> None:
+        frames = [numbered(1, sequence & 0xFF) for sequence in range(250, 262)]
+        steps = [encoder.enter(frame) for frame in frames]
+        left = [encoder.encode(frames[n], steps[n], 0) for n in (0, 3, 4, 9, 11)]
+        assert [frame_of(data).sequence for data in left] == [250, 251, 252, 253, 254]
+        assert all(frames_in(data) == [data] for data in left)
+
+    def test_an_overtaking_frame_gets_the_next_number(self, encoder: LinkEncoder) -> None:
+        first = numbered(1, 7)
+        encoder.encode(first, encoder.enter(first), 0)
+        frames = [numbered(1, sequence) for sequence in (8, 9, 10)]
+        steps = [encoder.enter(frame) for frame in frames]
+        left = [encoder.encode(frames[n], steps[n], 0) for n in (2, 0, 1)]
+        assert [frame_of(data).sequence for data in left] == [8, 9, 10]
+
+    def test_frames_of_others_are_unchanged(self, encoder: LinkEncoder) -> None:
+        for sequence in (5, 9):
+            frame = numbered(2, sequence)
+            assert encoder.encode(frame, encoder.enter(frame), 0) is frame.data
+
+
+class TestPacker:
+    def test_full_datagrams_leave_and_the_rest_waits(self) -> None:
+        packer = Packer(100)
+        assert packer.add(b"a" * 60) == []
+        assert packer.add(b"b" * 40) == []
+        assert packer.add(b"c" * 1) == [b"a" * 60, b"b" * 40]
+        assert packer.flush() == [b"c"]
+        assert packer.flush() == []
+
+    def test_an_overlong_frame_goes_alone(self) -> None:
+        packer = Packer(100)
+        assert packer.add(b"a" * 200) == []
+        assert packer.add(b"b") == [b"a" * 200]
+
+
+def test_pacer_keeps_the_line_busy_but_its_buffer_short() -> None:
+    pacer, now_us, written = Pacer(baud=57600, ahead_us=20_000), 0, 0
+    while now_us < 10_000_000:
+        delay_us = pacer.delay_us(now_us)
+        if delay_us:
+            now_us += delay_us
+            continue
+        pacer.wrote(50, now_us)
+        written += 50
+        sent = now_us * 57600 // 10_000_000
+        assert written - sent <= 57600 * 20_000 // 10_000_000 + 51
+    assert written >= 57600
+    assert Pacer(57600, 20_000).delay_us(0) == 0

@@ -1,0 +1,92 @@
+"""MAVLink systems that encode numbered frames, and readers of their bytes."""
+
+from typing import Any
+
+from pymavlink.dialects.v20 import common as dialect
+
+from gateway.records import Outgoing
+from gateway.wire.mavlink_splitter import Event, MavFrame, frame_of, message_id_of, split_datagram
+
+STATION = 190
+"""Component id of a ground station."""
+KEY = bytes(32)
+"""Signing key of a signed sender."""
+
+
+class Sender:
+    """A MAVLink system that numbers its frames.
+
+    Parameters
+    ----------
+    system, component : int
+        Ids in the frames; with component `STATION` its heartbeat is a ground station's.
+    signed : bool, optional
+        Sign the frames with `KEY`.
+    """
+
+    def __init__(self, system: int = 1, component: int = 1, *, signed: bool = False) -> None:
+        self.link = dialect.MAVLink(None, system, component)
+        self.is_station = component == STATION
+        if signed:
+            self.link.signing.secret_key = KEY
+            self.link.signing.link_id = 1
+            self.link.signing.timestamp = 1
+            self.link.signing.sign_outgoing = True
+
+    def pack(self, message: Any) -> bytes:
+        """Encode any message with the next sequence number."""
+        frame = bytes(message.pack(self.link))
+        self.link.seq = (self.link.seq + 1) % 256
+        return frame
+
+    def heartbeat(self) -> bytes:
+        kind = dialect.MAV_TYPE_GCS if self.is_station else dialect.MAV_TYPE_FIXED_WING
+        return self.pack(dialect.MAVLink_heartbeat_message(kind, 0, 0, 0, 4, 3))
+
+    def attitude(self, time_ms: int = 5) -> bytes:
+        return self.pack(dialect.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0))
+
+    def raw_imu(self) -> bytes:
+        return self.pack(dialect.MAVLink_raw_imu_message(5, 1, 2, 3, 4, 5, 6, 7, 8, 9))
+
+    def home(self) -> bytes:
+        quaternion = [1, 0, 0, 0]
+        return self.pack(
+            dialect.MAVLink_home_position_message(1, 2, 3, 0, 0, 0, quaternion, 0, 0, 0)
+        )
+
+    def command(self, system: int, component: int) -> bytes:
+        return self.pack(
+            dialect.MAVLink_command_long_message(system, component, 512, 0, 1, 0, 0, 0, 0, 0, 0)
+        )
+
+    def ack(self) -> bytes:
+        return self.pack(dialect.MAVLink_command_ack_message(512, 0))
+
+
+def outgoing(frame: bytes, client_id: int | None = None) -> Outgoing:
+    """Return a frame of ours as the vehicle returns it."""
+    return Outgoing(frame, message_id_of(frame), client_id)
+
+
+def frames_of(events: list[Event]) -> list[bytes]:
+    """Return the bytes of the frames among a splitter's events."""
+    return [event.data for event in events if isinstance(event, MavFrame)]
+
+
+def frames_in(data: bytes) -> list[bytes]:
+    """Split a datagram; return the bytes of its frames."""
+    return frames_of(split_datagram(data))
+
+
+def numbered(system: int, sequence: int, message: Any = None) -> MavFrame:
+    """Return a frame of a system with a sequence number; by default a heartbeat."""
+    link = dialect.MAVLink(None, system, 1)
+    link.seq = sequence
+    message = message or dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
+    return frame_of(bytes(message.pack(link)))
+
+
+def raw_frame(message_id: int, data: bytes) -> MavFrame:
+    """Return a frame with arbitrary bytes, for queues that never look into them."""
+    return MavFrame(data, b"", message_id, (1, 1), (0, 0), 0, False)
