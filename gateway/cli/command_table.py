@@ -43,6 +43,10 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "fleet": CommandEntry(
         "live.fleet", "Show the vehicles of many sites here, through a Zenoh router."
     ),
+    "setup": CommandEntry(
+        "live.first_start",
+        "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
+    ),
     "calibrate": CommandEntry(
         "live.calibrate",
         "Calibrate an aircraft's sensors and save the result with its residuals.",

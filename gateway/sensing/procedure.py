@@ -34,6 +34,9 @@ SIDES: Final = (
     *("chips up", "chips down"),
 )
 """How the board lies when +x, -x, +y, -y, +z, -z reads gravity."""
+FIELD_SIDES: Final = 24
+FIELD_SPREAD: Final = 0.7
+"""Least to greatest extent of readings on the axes; soft iron stretches them by some 20 %."""
 SIDE_SHARE: Final = 0.8
 """Share of gravity that one axis must carry: 37 deg of tilt."""
 
@@ -101,6 +104,25 @@ def missing_sides(samples: Sequence[NodeSamples]) -> list[str]:
         if abs(mean[axis]) > SIDE_SHARE * STANDARD_GRAVITY_MPS2:
             seen.add(2 * axis + int(mean[axis] < 0.0))
     return [name for number, name in enumerate(SIDES) if number not in seen]
+
+
+def field_sides(samples: NodeSamples) -> int:
+    """Count the sides, of `FIELD_SIDES`, from which the magnetometer has seen the field.
+
+    Hard iron is not known yet, so directions are taken from the middle of the readings. It is found
+    only once the readings spread alike on all axes; until then fewer sides count.
+    """
+    if len(samples.mag) == 0:
+        return 0
+    low, high = samples.mag.min(axis=0), samples.mag.max(axis=0)
+    direction = samples.mag - 0.5 * (low + high)
+    # Each face of a cube around the middle, in four.
+    axis = np.abs(direction).argmax(axis=1)
+    others = np.take_along_axis(direction, (axis[:, np.newaxis] + [0, 1, 2]) % 3, axis=1) > 0.0
+    sides = len(np.unique(axis * 8 + others @ [4, 2, 1]))
+    extent = high - low
+    spread = extent.min() / extent.max() if extent.max() > 0.0 else 0.0
+    return int(sides * min(1.0, spread / FIELD_SPREAD))
 
 
 def is_still(samples: NodeSamples) -> bool:

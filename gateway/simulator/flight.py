@@ -34,7 +34,7 @@ from gateway.simulator.sensors import (
     errors_of,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S, Trajectory
+from gateway.simulator.trajectory import FLIGHT_S, SensorMotion, Trajectory
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, MAG_LSB_PER_GAUSS
 
 SampleRecord = ImuRaw | BaroRaw | GpsFix
@@ -58,19 +58,26 @@ class SimulatedAircraft:
         0 for the first aircraft; the next ones have the next ids, other gusts and another home.
     start_unix_us : int
         UTC at the start of the simulation.
+    motion : SensorMotion, optional
+        What it does; by default the planned flight.
     """
 
     def __init__(
-        self, settings: SimulatorSettings, index: int = 0, start_unix_us: int = START_UNIX_US
+        self,
+        settings: SimulatorSettings,
+        index: int = 0,
+        start_unix_us: int = START_UNIX_US,
+        motion: SensorMotion | None = None,
     ) -> None:
         home_lat_deg = settings.home_lat_deg - index * NEIGHBOUR_DEG
         settings = msgspec.structs.replace(settings, home_lat_deg=home_lat_deg)
         self.vehicle_id = settings.vehicle_id + index
         self.trajectory = Trajectory(settings, generator(settings, self.vehicle_id, Chance.GUSTS))
-        self.imu = ImuSampler(settings, self.trajectory, self.vehicle_id)
-        self.baro = BaroSampler(settings, self.trajectory, self.vehicle_id)
+        motion = motion or self.trajectory
+        self.imu = ImuSampler(settings, motion, self.vehicle_id)
+        self.baro = BaroSampler(settings, motion, self.vehicle_id)
         gps_chance = generator(settings, self.vehicle_id, Chance.GPS)
-        self.gps = GpsSampler(settings, self.trajectory, gps_chance, start_unix_us)
+        self.gps = GpsSampler(settings, motion, gps_chance, start_unix_us)
         self.gps_clock = DeviceClock(GPS_BOOT_US, -settings.clock_skew_ppm)
 
     @property

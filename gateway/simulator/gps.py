@@ -11,7 +11,7 @@ from gateway.records import GpsFixType
 from gateway.simulator.noise import FloatArray, Wander, White
 from gateway.simulator.sensors import BoolArray, IntArray
 from gateway.simulator.simulator_settings import GpsOutages, SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S, Trajectory
+from gateway.simulator.trajectory import FLIGHT_S, SensorMotion
 
 GPS_RATE_HZ: Final = 5
 EPOCH_US: Final = 1_000_000 // GPS_RATE_HZ
@@ -87,7 +87,7 @@ class GpsSampler:
     Parameters
     ----------
     settings : SimulatorSettings
-    trajectory : Trajectory
+    trajectory : SensorMotion
     rng : numpy.random.Generator
     start_unix_us : int
         UTC at the start of the simulation.
@@ -96,7 +96,7 @@ class GpsSampler:
     def __init__(
         self,
         settings: SimulatorSettings,
-        trajectory: Trajectory,
+        trajectory: SensorMotion,
         rng: np.random.Generator,
         start_unix_us: int,
     ) -> None:

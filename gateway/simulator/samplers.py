@@ -30,7 +30,7 @@ from gateway.simulator.sensors import (
     Mpu6050,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import Trajectory, Truth
+from gateway.simulator.trajectory import SensorMotion, Truth
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
@@ -137,7 +137,7 @@ class ImuSampler:
     """Read MPU6050 and HMC5883L along a trajectory at the node's rate."""
 
     def __init__(
-        self, settings: SimulatorSettings, trajectory: Trajectory, vehicle_id: int
+        self, settings: SimulatorSettings, trajectory: SensorMotion, vehicle_id: int
     ) -> None:
         self.clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
         self.inertial = Mpu6050(settings, generator(settings, vehicle_id, Chance.IMU))
@@ -193,7 +193,7 @@ class BaroSampler:
     """Read the BMP180 along a trajectory; it is on the IMU node."""
 
     def __init__(
-        self, settings: SimulatorSettings, trajectory: Trajectory, vehicle_id: int
+        self, settings: SimulatorSettings, trajectory: SensorMotion, vehicle_id: int
     ) -> None:
         clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
         self.barometer = Bmp180(settings, generator(settings, vehicle_id, Chance.BARO))

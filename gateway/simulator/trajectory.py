@@ -17,7 +17,7 @@ does not rotate here, and is flat around home (a few centimetres at one kilometr
 
 import math
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +129,16 @@ class Truth:
     """Shape (N,), mean motion through the air, gusts left out."""
 
 
+class SensorMotion(Protocol):
+    """What moves the simulated sensors."""
+
+    def truth_at(self, time_s: FloatArray) -> Truth:
+        """Return the true state at any times."""
+
+    def attitude_at(self, time_s: FloatArray) -> FloatArray:
+        """Return `q_nb` alone, shape (N, 4)."""
+
+
 class Trajectory:
     """One planned flight, repeated for ever.
 
@@ -175,7 +185,7 @@ class Trajectory:
         t = np.asarray(time_s, dtype=np.float64)
         phase = t % FLIGHT_S
         pos, accel, angles = self._pos(phase), self._accel(phase), self._angles(phase)
-        q_nb = _quaternions(angles)
+        q_nb = euler_quaternions(angles)
         force_n = accel - (0.0, 0.0, STANDARD_GRAVITY_MPS2)
         home = self._settings
         ellipsoid_m = home.home_alt_m + home.geoid_separation_m
@@ -189,14 +199,14 @@ class Trajectory:
             vel_n_mps=self._vel(phase),
             accel_n_mps2=accel,
             q_nb=q_nb,
-            rate_b_radps=_body_rates(angles, self._angle_rates(phase)),
+            rate_b_radps=body_rates(angles, self._angle_rates(phase)),
             accel_b_mps2=rotate_inverse(q_nb, force_n),
             airspeed_mps=self._airspeed(phase),
         )
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
         """Return `q_nb` alone, shape (N, 4), at times as in `truth_at`."""
-        return _quaternions(self._angles(time_s % FLIGHT_S))
+        return euler_quaternions(self._angles(time_s % FLIGHT_S))
 
     def _close(self, gusts: FloatArray) -> FloatArray:
         """Find leg durations that end the flight at home and in time, by Gauss-Newton steps.
@@ -329,7 +339,7 @@ def _attitude(commands: _Commands) -> FloatArray:
     return np.column_stack([yaw_pitch_roll[:, 2], yaw_pitch_roll[:, 1], yaw])
 
 
-def _quaternions(angles: FloatArray) -> FloatArray:
+def euler_quaternions(angles: FloatArray) -> FloatArray:
     """Build `q_nb` from roll, pitch and yaw; unlike SciPy's, its sign never jumps."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(0.5 * angles.T), np.sin(0.5 * angles.T)
     return np.column_stack(
@@ -342,7 +352,7 @@ def _quaternions(angles: FloatArray) -> FloatArray:
     )
 
 
-def _body_rates(angles: FloatArray, rates: FloatArray) -> FloatArray:
+def body_rates(angles: FloatArray, rates: FloatArray) -> FloatArray:
     """Turn Euler angle rates into the body rate: the exact derivative of the quaternion."""
     roll, pitch, _ = angles.T
     roll_rate, pitch_rate, yaw_rate = rates.T

@@ -4,16 +4,18 @@ from scipy.spatial.transform import Rotation
 
 from gateway.records import ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import Correction, NodeCalibration
-from gateway.sensing.procedure import SIDES as SIDE_NAMES
 from gateway.sensing.procedure import (
+    FIELD_SIDES,
     calibrate_accelerometer,
     calibrate_gyro,
     calibrate_level,
     calibrate_magnetometer,
     calibrate_mounting,
+    field_sides,
     is_still,
     missing_sides,
 )
+from gateway.sensing.procedure import SIDES as SIDE_NAMES
 from gateway.sensing.solvers import CalibrationError, NodeSamples, node_samples
 
 G = 9.80665
@@ -133,3 +135,22 @@ def test_magnetometer_from_raw_records() -> None:
     after = calibrate_magnetometer(samples, NodeCalibration())
     assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)
     assert after.mag_residual_ut < 0.1
+
+
+def test_field_sides_count_directions_about_the_hard_iron() -> None:
+    rng = np.random.default_rng(1)
+    all_sides = rng.normal(size=(4000, 3))
+    all_sides *= 45.0 / np.linalg.norm(all_sides, axis=1)[:, None]
+    iron = np.array([40.0, -25.0, 10.0])
+
+    def seen(field: np.ndarray) -> int:
+        none = np.empty((0, 3))
+        return field_sides(NodeSamples(np.empty(0), none, none, np.empty(0), field, np.empty(0)))
+
+    assert seen(np.empty((0, 3))) == 0
+    assert seen(np.tile(iron, (50, 1))) <= 1
+    assert seen(all_sides + iron) == FIELD_SIDES
+    flat = all_sides * [1.0, 1.0, 0.05]
+    assert seen(flat + iron) < FIELD_SIDES // 4
+    half = all_sides[all_sides[:, 0] > 0.0]
+    assert seen(half + iron) < 0.8 * FIELD_SIDES

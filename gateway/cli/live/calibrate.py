@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Protocol
 
 import msgspec
 import typer
 from rich import box
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.table import Table
 
 from gateway.cli.support.errors import refuse
@@ -36,12 +36,14 @@ from gateway.recordings.reading import open_rows
 from gateway.records import GpsFix, ImuRaw
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.procedure import (
+    FIELD_SIDES,
     SIDES,
     calibrate_accelerometer,
     calibrate_gyro,
     calibrate_level,
     calibrate_magnetometer,
     calibrate_mounting,
+    field_sides,
     is_still,
     missing_sides,
 )
@@ -53,7 +55,12 @@ PATIENCE_S: Final = 10.0
 """Without a sample for so long, give up."""
 POSE_S: Final = 3.0
 REST_S: Final = 5.0
-MAG_S: Final = 45.0
+MAG_S: Final = 15.0
+MAG_LIMIT_S: Final = 120.0
+"""The compass is turned for at least and at most this long."""
+SIDES_EVERY_S: Final = 0.5
+MAG_SIDES: Final = 20
+"""Of `FIELD_SIDES`: enough to end the turning."""
 MAX_TRIES: Final = 24
 MOVING_MPS: Final = 1.0
 """GPS speed that is not rest; a receiver at rest reports up to 0.3 m/s."""
@@ -73,8 +80,13 @@ class Step(StrEnum):
     LEVEL = "level"
 
 
-Capture = Callable[[float], NodeSamples]
-"""Waits for a number of seconds of samples."""
+class Capture(Protocol):
+    """Waits for samples."""
+
+    def __call__(self, seconds: float, *, turned: bool = False) -> NodeSamples:
+        """Return samples of so many seconds, or until the compass was turned to most sides."""
+
+
 Solve = Callable[[Step, NodeCalibration], NodeCalibration]
 Save = Callable[[NodeCalibration], None]
 
@@ -129,12 +141,12 @@ def calibrate(
     else:
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
-        capture = _capture_from(serial, vehicle)
-        solve = lambda step, known: _live_step(step, capture, known, field_ut)  # noqa: E731
-    _show(old, _each(chosen, solve, old, save))
+        capture = capture_from(serial, vehicle)
+        solve = lambda step, known: live_step(step, capture, known, field_ut)  # noqa: E731
+    _show(old, calibrate_each(chosen, solve, old, save))
 
 
-def _each(
+def calibrate_each(
     steps: list[Step], solve: Solve, calibration: NodeCalibration, save: Save
 ) -> NodeCalibration:
     """Run the steps; each is saved when it is done, so aborting loses only the present one.
@@ -158,9 +170,10 @@ def _each(
     return calibration
 
 
-def _live_step(
+def live_step(
     step: Step, capture: Capture, calibration: NodeCalibration, field_ut: float | None
 ) -> NodeCalibration:
+    """Ask for the poses of a step, and solve it; raises CalibrationError with advice."""
     match step:
         case Step.GYRO:
             _ask("Lay the aircraft down and do not touch it.")
@@ -169,10 +182,11 @@ def _live_step(
             return calibrate_accelerometer(_six_sides(capture), calibration)
         case Step.MAG:
             _ask(
-                f"Away from iron, turn the aircraft slowly about all its axes for {MAG_S:.0f} s, "
-                "upside down too."
+                "Away from iron, turn the aircraft slowly about all its axes, upside down too, "
+                "until most sides were seen."
             )
-            return calibrate_magnetometer(capture(MAG_S), calibration, field_ut)
+            samples = capture(MAG_S, turned=True)
+            return calibrate_magnetometer(samples, calibration, field_ut)
         case Step.MOUNTING:
             _ask("Set the aircraft level, as it flies.")
             level = capture(POSE_S)
@@ -247,51 +261,70 @@ def _speed_mps(fix: GpsFix) -> float:
     return math.hypot(north, east) if fix.fix_ok else 0.0
 
 
-def _capture_from(serial: SerialSettings, vehicle: int) -> Capture:
+def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
+    """Return a capture from the receiver's port; ends the command if that cannot be opened."""
     try:
         # Nobody shall lay an aircraft on its sides for a port that is not there.
         device = asyncio.run(find_receiver(serial))
     except PortNotFoundError as error:
         refuse(str(error))
     serial = msgspec.structs.replace(serial, port=device)
-    return lambda seconds: node_samples(asyncio.run(_Listening(serial, vehicle).listen(seconds)))
+
+    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
+        return asyncio.run(_Listening(serial, vehicle, turned).listen(seconds))
+
+    return capture
 
 
-@dataclass(slots=True)
 class _Listening:
-    """Read the receiver until one aircraft's samples span a time."""
+    """Read the receiver until one aircraft's samples span a time, and cover most sides if asked."""
 
-    serial: SerialSettings
-    vehicle: int
-
-    async def listen(self, seconds: float) -> list[ImuRaw]:
-        clock, link, raws = GatewayClock(), Link(), list[ImuRaw]()
-        done = asyncio.Event()
-        bar = Progress(
-            TextColumn("listening"), BarColumn(), TextColumn("{task.completed:.0f} s"),
+    def __init__(self, serial: SerialSettings, vehicle: int, turned: bool) -> None:
+        self._serial, self._vehicle, self._turned = serial, vehicle, turned
+        self._raws: list[ImuRaw] = []
+        self._shown_s = 0.0
+        label = "sides of the field seen" if turned else "listening"
+        unit = f"{{task.completed:.0f}} of {FIELD_SIDES}" if turned else "{task.completed:.0f} s"
+        self._bar = Progress(
+            TextColumn(label), BarColumn(), TextColumn(unit),
             console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
         )  # fmt: skip
-        task = bar.add_task("", total=seconds)
+
+    async def listen(self, seconds: float) -> NodeSamples:
+        clock, link, done = GatewayClock(), Link(), asyncio.Event()
+        task = self._bar.add_task("", total=FIELD_SIDES if self._turned else seconds)
 
         def on_bytes(data: bytes, now_us: int) -> None:
             for record in link.feed(data, now_us):
-                if isinstance(record, ImuRaw) and record.node.vehicle_id == self.vehicle:
-                    raws.append(record)
-            span_s = (raws[-1].time_us - raws[0].time_us) / US_PER_S if raws else 0.0
-            bar.update(task, completed=min(span_s, seconds), refresh=True)
-            if span_s > seconds:
+                if isinstance(record, ImuRaw) and record.node.vehicle_id == self._vehicle:
+                    self._raws.append(record)
+            if self._is_done(seconds, task):
                 done.set()
 
-        port = SerialPort(self.serial, on_bytes, lambda _: None, lambda _: None, clock)
+        port = SerialPort(self._serial, on_bytes, lambda _: None, lambda _: None, clock)
         port.start()
+        limit_s = MAG_LIMIT_S if self._turned else seconds
         try:
-            with bar:
-                await asyncio.wait_for(done.wait(), seconds + PATIENCE_S)
+            with self._bar:
+                await asyncio.wait_for(done.wait(), limit_s + PATIENCE_S)
         except TimeoutError:
-            refuse(f"no samples of vehicle {self.vehicle}: is it on, and the port right?")
+            refuse(f"no samples of vehicle {self._vehicle}: is it on, and the port right?")
         finally:
             port.close()
-        return raws
+        return node_samples(self._raws)
+
+    def _is_done(self, seconds: float, task: TaskID) -> bool:
+        raws = self._raws
+        span_s = (raws[-1].time_us - raws[0].time_us) / US_PER_S if raws else 0.0
+        if not self._turned:
+            self._bar.update(task, completed=min(span_s, seconds), refresh=True)
+            return span_s > seconds
+        if span_s < self._shown_s + SIDES_EVERY_S:
+            return False
+        self._shown_s = span_s
+        sides = field_sides(node_samples(raws))
+        self._bar.update(task, completed=sides, refresh=True)
+        return span_s > MAG_LIMIT_S or (span_s > seconds and sides >= MAG_SIDES)
 
 
 def _ask(text: str) -> None:

@@ -24,20 +24,20 @@ BIAS = np.array([0.2, -0.1, 0.3])
 
 
 class Link:
-    """Each capture lies on the next side; the first lies level. Turned is only the longest."""
+    """Each capture lies on the next side; the first lies level."""
 
     def __init__(self) -> None:
         self.captures = 0
         self.breaks_at = 1000
 
-    def __call__(self, seconds: float) -> NodeSamples:
+    def __call__(self, seconds: float, *, turned: bool = False) -> NodeSamples:
         rng = np.random.default_rng(self.captures)
         side = SIDES[self.captures % 6]
         self.captures += 1
         if self.captures > self.breaks_at:
             raise KeyboardInterrupt
         n = round(seconds * 100)
-        field = rng.normal(size=(n, 3)) if seconds > 30.0 else np.tile([0.3, 0.1, 0.9], (n, 1))
+        field = rng.normal(size=(n, 3)) if turned else np.tile([0.3, 0.1, 0.9], (n, 1))
         return NodeSamples(
             time_s=np.arange(n) / 100,
             accel=side + BIAS + rng.normal(0, 0.02, (n, 3)),
@@ -55,7 +55,7 @@ def link() -> Link:
 
 @pytest.fixture
 def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Link) -> Path:
-    monkeypatch.setattr(calibrate, "_capture_from", lambda serial, vehicle: link)
+    monkeypatch.setattr(calibrate, "capture_from", lambda serial, vehicle: link)
     path = tmp_path / "gateway.toml"
     path.write_text(f'aircraft_folder = "{tmp_path}"\n')
     return path
@@ -109,7 +109,7 @@ def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch
             np.zeros(300, np.bool_),
         )
 
-    monkeypatch.setattr(calibrate, "_capture_from", lambda serial, vehicle: moving)
+    monkeypatch.setattr(calibrate, "capture_from", lambda serial, vehicle: moving)
     output = run(config, "gyro")
     assert "still" in output
     assert "nothing changed" in output

@@ -1,0 +1,346 @@
+"""`mavgate setup`: a guided first start, on the real receiver or on the simulated one."""
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Final, NoReturn
+
+import typer
+from msgspec.structs import replace
+from rich.progress import BarColumn, Progress, TextColumn
+
+from gateway.cli.live.calibrate import (
+    Capture,
+    Step,
+    calibrate_each,
+    capture_from,
+    live_step,
+)
+from gateway.cli.support.errors import refuse
+from gateway.cli.support.settings_options import ConfigOption, read_aircraft, read_settings
+from gateway.cli.support.terminal import console_of, table_of
+from gateway.clock import GatewayClock, unix_time_us
+from gateway.config import GatewaySettings, save_aircraft
+from gateway.live.pty_port import PtyPort
+from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
+from gateway.records import GpsFix, LinkReport, NodeStatus
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.solvers import NodeSamples
+from gateway.simulator.flight import SimulatedAircraft
+from gateway.simulator.node import nodes_of
+from gateway.simulator.receiver import SimulatedReceiver
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.workbench import Workbench
+from gateway.wire.link import Link
+
+LOOK_S: Final = 5.0
+"""After opening: a bootloader takes up to 2 s, and every board reports once a second."""
+GPS_WAIT_S: Final = 60.0
+POLL_S: Final = 0.2
+NOISY_PERCENT: Final = 30
+LOSSY_PERCENT: Final = 5.0
+FEW_LOST: Final = 3
+"""So many may be chance in so short a time."""
+WEAK_SATELLITES: Final = 6
+SENSORS: Final = {1: "IMU", 2: "compass", 4: "barometer", 8: "GPS"}
+"""Bits of a node's report."""
+STEPS: Final = (Step.GYRO, Step.LEVEL, Step.MAG)
+
+console = console_of()
+
+
+@dataclass
+class Observed:
+    """What was received within a time."""
+
+    report: LinkReport
+    statuses: dict[tuple[int, int], NodeStatus] = field(default_factory=dict)
+    """The newest report of each node, by vehicle and node id."""
+    fixes: dict[int, GpsFix] = field(default_factory=dict)
+    """The newest fix of each vehicle."""
+
+    def vehicles(self) -> list[int]:
+        """List the ids of the aircraft that were heard."""
+        return sorted({link.node.vehicle_id for link in self.report.nodes})
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command of this file."""
+    app.command("setup")(setup)
+
+
+def setup(
+    *,
+    vehicle: Annotated[
+        int | None, typer.Option("--vehicle", min=1, max=31, help="Its id, if several are heard.")
+    ] = None,
+    port: Annotated[
+        str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
+    ] = None,
+    simulated: Annotated[
+        bool, typer.Option("--simulated", help="Try it on the simulated receiver; saves nothing.")
+    ] = False,
+    config: ConfigOption = None,
+) -> None:
+    """Guide through the first start: receiver, sensors, radio, GPS, calibration.
+
+    Each calibration is saved when it is done. The gateway must not run meanwhile: the receiver's
+    port is read by one program at a time.
+    """
+    settings = read_settings(config)
+    serial = settings.serial if port is None else replace(settings.serial, port=port)
+    if not simulated:
+        _guide(settings, serial, vehicle, save=True)
+        return
+    with simulated_receiver(settings.simulator) as (path, bench):
+        serial = replace(serial, port=path)
+        _guide(settings, serial, vehicle, save=False, on_turn=bench.turn)
+
+
+def _guide(
+    settings: GatewaySettings,
+    serial: SerialSettings,
+    vehicle: int | None,
+    *,
+    save: bool,
+    on_turn: Callable[[], None] = lambda: None,
+) -> None:
+    """Run the steps of the first start."""
+    logging.getLogger(SerialPort.__module__).setLevel(logging.WARNING)
+    serial = _find(serial)
+    seen = asyncio.run(_observe(serial, lambda _: False, LOOK_S))
+    _check_receiver(seen, serial)
+    number = _choose(seen, vehicle)
+    _check_nodes(seen, number)
+    _check_gps(serial, number)
+    _calibrate(settings, serial, number, save=save, on_turn=on_turn)
+    _head("Done")
+    console.print("Start the gateway with `mavgate run`, and a ground station on UDP port 14550.")
+    console.print("A step that failed can be repeated: `mavgate calibrate gyro`, `level` or `mag`.")
+    console.print("For the accelerometer, `mavgate calibrate accel` asks for all six sides.")
+
+
+def _find(serial: SerialSettings) -> SerialSettings:
+    _head("1 of 5: receiver")
+    try:
+        device = asyncio.run(find_receiver(serial))
+    except PortNotFoundError as error:
+        _stop(
+            str(error),
+            "Connect the receiver by USB. A new board gets its program by `mavgate flash receiver`",
+            "`mavgate doctor` checks whether this user may open the port",
+            "A gateway that runs (`mavgate status`) has to be stopped first",
+        )
+    return replace(serial, port=device)
+
+
+def _check_receiver(seen: Observed, serial: SerialSettings) -> None:
+    report, receiver = seen.report, seen.report.receiver
+    if receiver is None and not report.nodes:
+        sent = "bytes that are no frames" if report.bytes_received else "nothing"
+        _stop(
+            f"{serial.port} sends {sent}",
+            f"`mavgate flash --show --port {serial.port}` reads which program is on the board",
+            f"The receiver's line has {serial.baud} baud in these settings (serial.baud)",
+        )
+    if receiver is None:
+        _hint(f"{serial.port}: no report of the receiver in {LOOK_S:.0f} s")
+        return
+    _good(f"{serial.port}, channel {receiver.channel}, noise {receiver.noise_percent} %")
+    if receiver.noise_percent > NOISY_PERCENT:
+        _hint(
+            "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all boards "
+            "with another --channel (76 and above lie beyond Wi-Fi)"
+        )
+
+
+def _choose(seen: Observed, vehicle: int | None) -> int:
+    _head("2 of 5: boards, sensors and radio")
+    heard = seen.vehicles()
+    if not heard:
+        _stop(
+            "no aircraft is heard",
+            "Is it powered? A node whose LED flashes once every 2 s gets no answer: channel, rate "
+            "and address must be the receiver's, compare them by `mavgate flash --show`",
+            "Three flashes: its radio module does not answer: check its wiring and 3.3 V supply",
+        )
+    if vehicle is not None and vehicle not in heard:
+        _stop(f"vehicle {vehicle} is not heard, but {', '.join(map(str, heard))}")
+    if vehicle is None and len(heard) > 1:
+        _stop(f"several aircraft are heard: {', '.join(map(str, heard))}; choose with --vehicle")
+    return heard[0] if vehicle is None else vehicle
+
+
+def _check_nodes(seen: Observed, vehicle: int) -> None:
+    """Print the boards of the aircraft, and what is wrong with them."""
+    table = table_of(
+        "node", "firmware", "sensors", "missing", "payloads/s", "lost %", "supply V", left=4
+    )
+    hints = []
+    for link in seen.report.nodes:
+        if link.node.vehicle_id != vehicle:
+            continue
+        node = link.node.node_id
+        status = seen.statuses.get((vehicle, node))
+        share = 100.0 * link.lost / max(link.received + link.lost, 1)
+        if status is None:
+            table.add_row(str(node), "no report", "", "", f"{link.rate_hz:.0f}", f"{share:.1f}", "")
+            continue
+        failed = _sensors(status.sensors_failed)
+        version = "{}.{}".format(*status.firmware_version)
+        volts = f"{status.supply_mv / 1000:.2f}" if status.supply_mv else ""
+        found = _sensors(status.sensors_present & ~status.sensors_failed)
+        table.add_row(
+            str(node), version, found, failed, f"{link.rate_hz:.0f}", f"{share:.1f}", volts
+        )
+        if failed:
+            hints.append(f"Node {node}: {failed} missing or failed: check its wiring and supply")
+        if share > LOSSY_PERCENT and link.lost > FEW_LOST:
+            hints.append(
+                f"Node {node}: {share:.0f} % of the payloads are lost: upright antennas, 10 uF "
+                "across the radio's supply, or `--rate 250` on all boards for range"
+            )
+    console.print(table)
+    for hint in hints:
+        _hint(hint)
+    if not hints:
+        _good("all boards report all their sensors")
+
+
+def _sensors(bits: int) -> str:
+    return ", ".join(name for bit, name in SENSORS.items() if bits & bit)
+
+
+def _check_gps(serial: SerialSettings, vehicle: int) -> None:
+    _head("3 of 5: GPS")
+    seen = asyncio.run(_observe(serial, lambda seen: _has_fix(seen, vehicle), GPS_WAIT_S))
+    fix = seen.fixes.get(vehicle)
+    if fix is None:
+        _hint("no GPS node is heard: position will be missing; see step 2")
+    elif not _has_fix(seen, vehicle):
+        _hint(
+            f"no fix within {GPS_WAIT_S:.0f} s, {fix.satellites} satellites: go outdoors; a module "
+            "that was never used takes up to 15 min the first time"
+        )
+    else:
+        text = f"fix with {fix.satellites} satellites, accuracy {fix.h_acc_m:.1f} m"
+        _good(text) if fix.satellites >= WEAK_SATELLITES else _hint(f"{text}: wait for more")
+
+
+def _has_fix(seen: Observed, vehicle: int) -> bool:
+    return vehicle in seen.fixes and seen.fixes[vehicle].fix_ok
+
+
+def _calibrate(
+    settings: GatewaySettings,
+    serial: SerialSettings,
+    vehicle: int,
+    *,
+    save: bool,
+    on_turn: Callable[[], None],
+) -> None:
+    _head("4 of 5: calibration of gyroscope, level and compass")
+    aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
+    listen = capture_from(serial, vehicle)
+
+    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
+        if turned:
+            on_turn()
+        return listen(seconds, turned=turned)
+
+    saved: list[Path] = []
+
+    def keep(calibration: NodeCalibration) -> None:
+        if save:
+            changed = replace(aircraft, calibration=calibration)
+            saved.append(save_aircraft(settings, vehicle, changed))
+
+    source: Capture = capture
+    calibrate_each(
+        [*STEPS],
+        lambda step, known: live_step(step, source, known, None),
+        aircraft.calibration,
+        keep,
+    )
+    _head("5 of 5: saved")
+    if saved:
+        _good(str(saved[-1]))
+    else:
+        _hint("nothing was saved" + ("" if save else ", since the receiver is simulated"))
+
+
+async def _observe(
+    serial: SerialSettings, is_done: Callable[[Observed], bool], limit_s: float
+) -> Observed:
+    """Read the receiver until something holds, at most for a time; shows progress."""
+    clock, link = GatewayClock(), Link()
+    seen = Observed(link.report(0, connected=False, port=serial.port))
+
+    def on_bytes(data: bytes, now_us: int) -> None:
+        for record in link.feed(data, now_us):
+            if isinstance(record, NodeStatus):
+                seen.statuses[record.node.vehicle_id, record.node.node_id] = record
+            elif isinstance(record, GpsFix):
+                seen.fixes[record.node.vehicle_id] = record
+
+    bar = Progress(
+        TextColumn("listening"), BarColumn(), TextColumn("{task.completed:.0f} s"),
+        console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
+    )  # fmt: skip
+    task = bar.add_task("", total=limit_s)
+    port = SerialPort(serial, on_bytes, lambda _: None, lambda _: None, clock)
+    port.start()
+    began_us = clock()
+    try:
+        with bar:
+            while (past_s := (clock() - began_us) / 1e6) < limit_s and not is_done(seen):
+                bar.update(task, completed=past_s, refresh=True)
+                await asyncio.sleep(POLL_S)
+        seen.report = link.report(clock(), connected=port.connected, port=serial.port)
+    finally:
+        port.close()
+    return seen
+
+
+@contextmanager
+def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
+    """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
+    bench = Workbench(settings)
+    # The flight's dropouts have no place on a workbench.
+    settings = replace(settings, gps_outages_s=())
+    aircraft = SimulatedAircraft(settings, start_unix_us=unix_time_us(), motion=bench)
+    receiver = SimulatedReceiver(settings, nodes_of(aircraft, settings))
+    # In a thread with a loop of its own, since a person is asked in between.
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever, daemon=True)
+    port = PtyPort(receiver.frames())
+    thread.start()
+    loop.call_soon_threadsafe(port.start)
+    try:
+        yield port.path, bench
+    finally:
+        loop.call_soon_threadsafe(port.close)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+
+
+def _head(text: str) -> None:
+    console.print(f"\n{text}", style="bold")
+
+
+def _good(text: str) -> None:
+    console.print(f"good  {text}", style="green")
+
+
+def _hint(text: str) -> None:
+    console.print(f"note  {text}", style="yellow")
+
+
+def _stop(text: str, *hints: str) -> NoReturn:
+    """End the command with what is wrong, and what to do."""
+    refuse("\n".join([text, *(f"- {hint}" for hint in hints)]))

@@ -1,0 +1,99 @@
+"""`mavgate setup`: the guidance on the simulated receiver, and when something is missing."""
+
+import os
+import tty
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from gateway.cli.app import app
+from gateway.cli.live import calibrate, first_start
+from gateway.config import load, load_aircraft
+from gateway.simulator.simulator_settings import SimulatorSettings
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(first_start, "LOOK_S", 1.5)
+    monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
+    monkeypatch.setattr(calibrate, "REST_S", 4.0)
+    monkeypatch.setattr(calibrate, "POSE_S", 3.5)
+    monkeypatch.setattr(calibrate, "MAG_S", 5.0)
+
+
+def setup(*words: str) -> Result:
+    return CliRunner().invoke(app, ["setup", *words], input="\n" * 10)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calibrate, "MAG_SIDES", 16)
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    done = setup("--simulated", "--config", str(config))
+    assert done.exit_code == 0, done.output
+    for text in ("channel 76", "IMU, compass, barometer", "gyro: done", "level: done", "mag: done"):
+        assert text in done.output
+    assert load_aircraft(load(config)) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("quick")
+def test_calibration_of_a_receiver_at_a_port_is_saved(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(first_start, "STEPS", (calibrate.Step.GYRO,))
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    with first_start.simulated_receiver(SimulatorSettings(vehicle_id=3)) as (path, _):
+        wrong = setup("--port", path, "--vehicle", "4", "--config", str(config))
+        done = setup("--port", path, "--config", str(config))
+    assert wrong.exit_code == 2
+    assert "vehicle 4 is not heard, but 3" in wrong.output
+    assert done.exit_code == 0, done.output
+    assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, str]]:
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    yield master, os.ttyname(slave)
+    os.close(master)
+    os.close(slave)
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [(b"", "sends nothing"), (b"\x01\x02\x00" * 9, "sends bytes that are no frames")],
+    ids=["nothing", "garbage"],
+)
+def test_port_that_is_no_receiver_is_named_with_what_to_do(
+    terminal: tuple[int, str], sent: bytes, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    master, path = terminal
+    monkeypatch.setattr(first_start, "LOOK_S", 0.3)
+    before = first_start.SerialPort.start
+
+    def start(port: first_start.SerialPort) -> None:
+        before(port)
+        os.write(master, sent)
+
+    monkeypatch.setattr(first_start.SerialPort, "start", start)
+    done = setup("--port", path)
+    assert done.exit_code == 2
+    assert f"{path} {said}" in done.output
+    assert f"mavgate flash --show --port {path}" in done.output
+
+
+def test_missing_port_ends_with_what_to_do(tmp_path: Path) -> None:
+    done = setup("--port", str(tmp_path / "none"))
+    assert done.exit_code == 2
+    assert "mavgate flash receiver" in done.output
