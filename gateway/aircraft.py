@@ -44,20 +44,20 @@ from gateway.sensing.recalibration import (
     remove_tilt,
 )
 from gateway.settings import Settings
-from gateway.vehicle.actions import Action as VehicleAction
 from gateway.vehicle.actions import (
+    WARNING,
     CalibrationKind,
     CalibrationMeasured,
     RecordingRequest,
     SavePlaces,
     SaveSettings,
     SettingsChange,
+    StatusText,
 )
-from gateway.vehicle.home import Home, Place
-from gateway.vehicle.signing import SigningClock
-from gateway.vehicle.stamp_book import StampBook
-from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.events import WARNING, StatusText
+from gateway.vehicle.actions import Action as VehicleAction
+from gateway.vehicle.location import Home, Place
+from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.signing import SigningClock, StampBook
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 

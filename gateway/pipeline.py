@@ -27,12 +27,11 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.home import Place
-from gateway.vehicle.reader import BAD_SIGNATURE
-from gateway.vehicle.signing import SigningClock
-from gateway.vehicle.stamp_book import StampBook, Stamps
-from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.events import StatusText
+from gateway.vehicle.actions import StatusText
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.requests import BAD_SIGNATURE
+from gateway.vehicle.signing import SigningClock, StampBook, Stamps
 from gateway.wire.gps_time import GpsTime
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import FrameSigner

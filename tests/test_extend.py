@@ -30,7 +30,7 @@ from gateway.recordings.table import encode_head
 from gateway.records import ImuRaw, Incoming, NavState
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES
+from gateway.vehicle.telemetry.streams import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"

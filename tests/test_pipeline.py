@@ -22,7 +22,7 @@ from gateway.records import (
     Outgoing,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.home import Place
+from gateway.vehicle.location import Place
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads

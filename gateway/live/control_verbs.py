@@ -22,7 +22,7 @@ from gateway.recordings.index import (
 from gateway.recordings.join import parse_moment
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE
 from gateway.status import RecorderStatus, Snapshot
-from gateway.vehicle.home import Place
+from gateway.vehicle.location import Place
 
 
 class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -51,9 +51,16 @@ from gateway.records import (
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import RecordingRequest, Request, SavePlaces, SaveSettings
-from gateway.vehicle.home import Place
-from gateway.vehicle.telemetry.events import INFO, WARNING, StatusText
+from gateway.vehicle.actions import (
+    INFO,
+    WARNING,
+    RecordingRequest,
+    Request,
+    SavePlaces,
+    SaveSettings,
+    StatusText,
+)
+from gateway.vehicle.location import Place
 from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from typing import Final
 from gateway.live.worker import begin_worker
 from gateway.output import write_new
 from gateway.reasons import reason_of
-from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
+from gateway.vehicle.plan import StoredPlaces, decode_places, encode_places
 
 log = logging.getLogger(__name__)
 

@@ -33,7 +33,7 @@ from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings
-from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.services.parameters import ParameterTable
 
 LEAST_S: Final = 20.0
 """Shorter spans show only the convergence."""

@@ -82,7 +82,7 @@ from gateway.records import (
 from gateway.sensing.chain import SensorChain
 from gateway.sensing.imu_log import ImuLog, IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S
-from gateway.vehicle.telemetry.events import INFO, StatusText
+from gateway.vehicle.actions import INFO, StatusText
 
 LONGEST_SILENCE_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""

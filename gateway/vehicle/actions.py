@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Final
 
 import msgspec
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Outgoing, Vec3
 from gateway.settings import Settings
-from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.plan import StoredPlaces
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -32,6 +33,20 @@ class Request:
     def reply(self, message: Any) -> Reply:
         """Answer the client that asked."""
         return Reply(message, self.client_id)
+
+
+CRITICAL: Final = mavlink.MAV_SEVERITY_CRITICAL
+WARNING: Final = mavlink.MAV_SEVERITY_WARNING
+NOTICE: Final = mavlink.MAV_SEVERITY_NOTICE
+INFO: Final = mavlink.MAV_SEVERITY_INFO
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """A text and its severity."""
+
+    severity: int
+    text: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.vehicle.dialect import ProtocolVersion
+from gateway.vehicle.encoding import ProtocolVersion
 
 CAPABILITIES: Final = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT

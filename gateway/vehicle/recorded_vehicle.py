@@ -22,8 +22,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.actions import Answer, Reply, Request
-from gateway.vehicle.encoder import Encoder
-from gateway.vehicle.reader import RequestReader
+from gateway.vehicle.encoding import Encoder
+from gateway.vehicle.plan import MISSION, read_item
+from gateway.vehicle.requests import RequestReader
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -34,9 +35,8 @@ from gateway.vehicle.services.commands import (
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import HEARTBEAT, KEEPS_CLIENTS_US, NONE
-from gateway.vehicle.services.missions.mission import KINDS, MissionService, mission_ack
-from gateway.vehicle.services.missions.mission_items import MISSION, read_item
-from gateway.vehicle.services.parameters.parameter_service import (
+from gateway.vehicle.services.missions import KINDS, MissionService, mission_ack
+from gateway.vehicle.services.parameter_service import (
     BATCH,
     BATCH_INTERVAL_US,
     BY_NAME,

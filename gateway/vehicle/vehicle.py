@@ -18,34 +18,49 @@ from gateway.records import (
 from gateway.settings import Settings
 from gateway.units import US_PER_S
 from gateway.vehicle import identity
-from gateway.vehicle.actions import Action, Answer, Reply, Request, SettingsChange
-from gateway.vehicle.dialect import (
+from gateway.vehicle.actions import (
+    INFO,
+    NOTICE,
+    WARNING,
+    Action,
+    Answer,
+    Reply,
+    Request,
+    SettingsChange,
+    StatusText,
+)
+from gateway.vehicle.encoding import (
     MAVLINK_MSG_ID_COMPONENT_METADATA,
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
+    Encoder,
 )
-from gateway.vehicle.encoder import Encoder
-from gateway.vehicle.home import Place
-from gateway.vehicle.reader import RequestReader
-from gateway.vehicle.request_log import RequestLog
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.requests import RequestLog, RequestReader
 from gateway.vehicle.services.calibrator import Calibrator
-from gateway.vehicle.services.commands import ACCEPTED, FAILED, CommandService, read_command
+from gateway.vehicle.services.commands import (
+    ACCEPTED,
+    FAILED,
+    CommandService,
+    RecordingService,
+    read_command,
+)
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import IntervalService
-from gateway.vehicle.services.missions.places import PlaceService
 from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
-from gateway.vehicle.services.parameters.metadata import GENERAL_PATH, PARAMETER_PATH, Metadata
-from gateway.vehicle.services.parameters.parameter_service import PACKED_PATH, ParameterService
-from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.services.parameter_service import PACKED_PATH, ParameterService
+from gateway.vehicle.services.parameters import (
+    GENERAL_PATH,
+    PARAMETER_PATH,
+    Metadata,
+    ParameterTable,
+)
+from gateway.vehicle.services.places import PlaceService
 from gateway.vehicle.services.queries import QueryService
-from gateway.vehicle.services.recording import RecordingService
-from gateway.vehicle.signing import SigningClock, Verifier, key_from_passphrase
-from gateway.vehicle.stamp_book import StampBook
-from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.announcements import Announcements
-from gateway.vehicle.telemetry.events import INFO, NOTICE, WARNING, Announcer, StatusText
+from gateway.vehicle.signing import SigningClock, StampBook, Verifier, key_from_passphrase
+from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health
-from gateway.vehicle.telemetry.motion import IN_AIR
-from gateway.vehicle.telemetry.telemetry import Telemetry
+from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 OWN_SECTION: Final = "vehicle"

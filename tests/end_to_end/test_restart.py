@@ -17,7 +17,7 @@ from gateway.simulator.receiver import simulate
 from tests.end_to_end.processes import START_LIMIT_S, Client
 from tests.end_to_end.station import Station
 from tests.ports import free_port
-from tests.vehicle.services.missions.test_mission import (
+from tests.vehicle.services.test_missions import (
     MISSION,
     RALLY,
     content,

@@ -11,8 +11,8 @@ import pytest
 
 from gateway.live import place_files
 from gateway.live.place_files import PlaceFiles
-from gateway.vehicle.home import Place
-from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import StoredPlaces
 
 pytestmark = pytest.mark.io
 

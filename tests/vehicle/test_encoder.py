@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.encoder import Encoder
+from gateway.vehicle.encoding import Encoder
 from tests.vehicle.samples import decode
 
 

@@ -12,7 +12,7 @@ from msgspec.structs import fields, replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
-from gateway.vehicle.home import Place
+from gateway.vehicle.location import Place
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle

@@ -7,14 +7,14 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.actions import SavePlaces, SettingsChange
-from gateway.vehicle.home import Place
-from gateway.vehicle.stored import StoredPlaces
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import FIX, fix_at, texts
-from tests.vehicle.services.parameters.test_parameters import set_message, values
+from tests.vehicle.services.test_parameters import set_message, values
 
 NAMES = ("HOME_SOURCE", "HOME_LAT", "HOME_LON", "HOME_ALT")
 NONE, GPS, OPERATOR = 0.0, 1.0, 2.0

@@ -84,8 +84,9 @@ def test_unknown_messages_and_flags(station: GroundStation) -> None:
     assert station.vehicle.faults["malformed"] == 1
 
 
-def test_somebody_with_our_own_id_is_not_answered(station: GroundStation) -> None:
+def test_sender_with_our_own_system_and_component_is_not_answered(station: GroundStation) -> None:
     twin = GroundStation(station.vehicle, station.clock, system_id=1)
+    twin.mav.srcComponent = 1
     assert twin.send(mavlink.MAVLink_param_request_list_message(1, 1)) == []
 
 

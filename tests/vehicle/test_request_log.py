@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from gateway.vehicle.request_log import MAX_ENTRIES
+from gateway.vehicle.requests import MAX_ENTRIES
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.test_microservices import ftp
 

@@ -11,8 +11,8 @@ from gateway.vehicle.services.ftp import ACK, FtpError, Opcode
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.services.parameters.test_parameters import values
 from tests.vehicle.services.test_ftp import Ftp
+from tests.vehicle.services.test_parameters import values
 
 STATUSTEXT = mavlink.MAVLINK_MSG_ID_STATUSTEXT
 FRAMES_A_SECOND = 1000

@@ -8,11 +8,14 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.vehicle.signing import (
     EPOCH_2015_US,
     KEY_BYTES,
+    MAX_KEYS,
+    MAX_STREAMS,
+    RESERVE_TICKS,
     SigningClock,
+    StampBook,
     Verifier,
     key_from_passphrase,
 )
-from gateway.vehicle.stamp_book import MAX_KEYS, MAX_STREAMS, RESERVE_TICKS, StampBook
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

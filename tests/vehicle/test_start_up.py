@@ -7,8 +7,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.dialects.v20 import development
 
-from gateway.vehicle import dialect, identity
-from gateway.vehicle.encoder import Encoder
+from gateway.vehicle import encoding, identity
+from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import OWN_MESSAGES, GroundStation, kinds
@@ -114,7 +114,7 @@ def test_modes_are_as_the_development_dialect_has_them() -> None:
     parser = development.MAVLink(None)
     modes, mode = (
         parser.decode(bytearray(Encoder(1).encode(message).frame))
-        for message in (identity.available_modes(), identity.current_mode())
+        for message in (identity.available_modes(0), identity.current_mode(0))
     )
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0
@@ -124,14 +124,14 @@ def test_modes_are_as_the_development_dialect_has_them() -> None:
     ("kind", "fields"),
     [
         (
-            dialect.ProtocolVersion,
+            encoding.ProtocolVersion,
             (
                 "uint16_t version/uint16_t min_version/uint16_t max_version/"
                 "uint8_t spec_version_hash/\x08uint8_t library_version_hash/\x08"
             ),
         ),
         (
-            dialect.ComponentMetadata,
+            encoding.ComponentMetadata,
             "uint32_t time_boot_ms/uint32_t file_crc/char uri/\x64",
         ),
     ],

@@ -10,15 +10,14 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.actions import SavePlaces
-from gateway.vehicle.home import Place
-from gateway.vehicle.services.missions.mission_items import MAX_ITEMS, Item
-from gateway.vehicle.stored import StoredPlaces, decode_places, encode_places
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import MAX_ITEMS, Item, StoredPlaces, decode_places, encode_places
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import FIX, sample_at, state_at
-from tests.vehicle.services.missions.test_mission import content, download, item, upload
+from tests.vehicle.services.test_missions import content, download, item, upload
 
 NAN = math.nan
 ITEM = Item(3, 16, 1, (0.0, NAN, -math.inf, 0.1), 471_234_567, -87_654_321, 50.5)

@@ -6,9 +6,9 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
-from gateway.vehicle.home import Place
-from gateway.vehicle.stored import StoredPlaces
-from gateway.vehicle.telemetry.events import INFO
+from gateway.vehicle.actions import INFO
+from gateway.vehicle.location import Place
+from gateway.vehicle.plan import StoredPlaces
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock

@@ -15,7 +15,7 @@ from gateway.panel.state.instant import Instant, Spot
 from gateway.panel.state.status_texts import StatusTexts
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
-from gateway.vehicle.client_place import is_on_earth
+from gateway.vehicle.location import is_on_earth
 
 DEGE7: Final = 1e7
 MM: Final = 1e3

@@ -25,7 +25,14 @@ from numpy.typing import NDArray
 
 from gateway.records import ImuSample, Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
-from gateway.vehicle.actions import Answer, CalibrationKind, CalibrationMeasured, Reply
+from gateway.vehicle.actions import (
+    INFO,
+    Answer,
+    CalibrationKind,
+    CalibrationMeasured,
+    Reply,
+    StatusText,
+)
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -37,7 +44,7 @@ from gateway.vehicle.services.commands import (
     Outcome,
     whole,
 )
-from gateway.vehicle.telemetry.events import INFO, StatusText, chunks
+from gateway.vehicle.telemetry.announcements import chunks
 
 REST_US: Final = 3 * US_PER_S
 SIDE_US: Final = US_PER_S

@@ -27,7 +27,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import Answer, Reply, Request
-from gateway.vehicle.dialect import ControlStatus
+from gateway.vehicle.encoding import ControlStatus
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -22,8 +22,10 @@ from gateway.records import (
     Vec3,
 )
 from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
-from gateway.vehicle.home import Home, Place, distance_and_bearing, is_3d
-from gateway.vehicle.telemetry import fields
+from gateway.vehicle import encoding
+from gateway.vehicle.identity import CUSTOM_MODES
+from gateway.vehicle.location import Home, Place, distance_and_bearing, is_3d
+from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
 """Below this the direction of a GPS velocity is its noise."""
@@ -80,7 +82,7 @@ IMU_UPDATED: Final = ACCEL_UPDATED | GYRO_UPDATED | mavlink.HIGHRES_IMU_UPDATED_
 
 def boot_ms(time_us: int) -> int:
     """Turn the gateway clock into `time_boot_ms`, which wraps after 49.7 days."""
-    return (time_us // MS_US) & fields.UINT32_MAX
+    return (time_us // MS_US) & encoding.UINT32_MAX
 
 
 def attitude_quaternion(state: NavState) -> Any:
@@ -126,12 +128,12 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
         heading = to_euler(state.q_nb)[2]
     return mavlink.MAVLink_global_position_int_message(
         boot_ms(state.time_us),
-        fields.int32(state.lat_deg * DEGE7),
-        fields.int32(state.lon_deg * DEGE7),
-        fields.int32(state.alt_amsl_m * MM),
-        fields.int32((state.alt_amsl_m - reference_alt_m) * MM),
-        *(fields.int16(speed * CM) for speed in state.vel_n_mps),
-        fields.compass_cdeg(heading),
+        encoding.int32(state.lat_deg * DEGE7),
+        encoding.int32(state.lon_deg * DEGE7),
+        encoding.int32(state.alt_amsl_m * MM),
+        encoding.int32((state.alt_amsl_m - reference_alt_m) * MM),
+        *(encoding.int16(speed * CM) for speed in state.vel_n_mps),
+        encoding.compass_cdeg(heading),
     )
 
 
@@ -148,7 +150,7 @@ def vfr_hud(state: NavState) -> Any:
     return mavlink.MAVLink_vfr_hud_message(
         airspeed=speed,
         groundspeed=speed,
-        heading=fields.compass_deg(yaw) if math.isfinite(yaw) else 0,
+        heading=encoding.compass_deg(yaw) if math.isfinite(yaw) else 0,
         throttle=0,
         alt=state.alt_amsl_m,
         climb=-down,
@@ -295,13 +297,13 @@ def _milli_imu(sample: ImuSample, mag_b_ut: Vec3) -> tuple[int, ...]:
         (sample.gyro_b_radps, MILLI),
         (mag_b_ut, MILLI / UT_PER_GAUSS),
     )
-    return tuple(fields.int16(value * scale) for values, scale in scales for value in values)
+    return tuple(encoding.int16(value * scale) for values, scale in scales for value in values)
 
 
 def _temperature_cdegc(sample: ImuSample) -> int:
     """Return the temperature in 0.01 degrees; 0 means unknown, so 0 degrees is sent as 1."""
     temperature = sample.temperature_degc
-    return 0 if math.isnan(temperature) else fields.int16(temperature * CENTI) or 1
+    return 0 if math.isnan(temperature) else encoding.int16(temperature * CENTI) or 1
 
 
 def scaled_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
@@ -321,9 +323,9 @@ def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
 def gps_global_origin(origin: Place, time_us: int) -> Any:
     """Encode the origin of the local frame."""
     return mavlink.MAVLink_gps_global_origin_message(
-        fields.int32(origin.lat_deg * DEGE7),
-        fields.int32(origin.lon_deg * DEGE7),
-        fields.int32(origin.alt_amsl_m * MM),
+        encoding.int32(origin.lat_deg * DEGE7),
+        encoding.int32(origin.lon_deg * DEGE7),
+        encoding.int32(origin.alt_amsl_m * MM),
         time_us,
     )
 
@@ -334,7 +336,7 @@ def scaled_pressure(sample: BaroSample) -> Any:
         boot_ms(sample.time_us),
         sample.pressure_pa / PA_PER_HPA,
         NAN,
-        fields.int16(sample.temperature_degc * 100.0),
+        encoding.int16(sample.temperature_degc * 100.0),
     )
 
 
@@ -363,17 +365,17 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
         fix_type=FIX_TYPES[fix.fix_type] if fix.fix_ok else mavlink.GPS_FIX_TYPE_NO_FIX,
         lat=position.lat_dege7,
         lon=position.lon_dege7,
-        alt=fields.int32(position.alt_amsl_m * MM),
-        eph=fields.uint16(hdop * CENTI_DOP),
-        epv=fields.uint16(vdop * CENTI_DOP),
-        vel=fields.uint16(speed * CM) if is_3d(fix) else fields.UINT16_MAX,
-        cog=fields.compass_cdeg(math.atan2(east, north)) if moving else fields.UINT16_MAX,
-        satellites_visible=fields.uint8(fix.satellites),
-        alt_ellipsoid=fields.int32(position.alt_ellipsoid_m * MM),
-        h_acc=fields.uint32(fix.h_acc_m * MM),
-        v_acc=fields.uint32(fix.v_acc_m * MM),
-        vel_acc=fields.uint32(fix.speed_acc_mps * MM),
-        hdg_acc=fields.uint32(fix.course_acc_deg * DEGE5),
+        alt=encoding.int32(position.alt_amsl_m * MM),
+        eph=encoding.uint16(hdop * CENTI_DOP),
+        epv=encoding.uint16(vdop * CENTI_DOP),
+        vel=encoding.uint16(speed * CM) if is_3d(fix) else encoding.UINT16_MAX,
+        cog=encoding.compass_cdeg(math.atan2(east, north)) if moving else encoding.UINT16_MAX,
+        satellites_visible=encoding.uint8(fix.satellites),
+        alt_ellipsoid=encoding.int32(position.alt_ellipsoid_m * MM),
+        h_acc=encoding.uint32(fix.h_acc_m * MM),
+        v_acc=encoding.uint32(fix.v_acc_m * MM),
+        vel_acc=encoding.uint32(fix.speed_acc_mps * MM),
+        hdg_acc=encoding.uint32(fix.course_acc_deg * DEGE5),
     )
 
 
@@ -392,12 +394,12 @@ def gps_absent(now_us: int, located: GpsFix | None = None) -> Any:
         fix_type=mavlink.GPS_FIX_TYPE_NO_GPS,
         lat=0 if located is None else located.lat_dege7,
         lon=0 if located is None else located.lon_dege7,
-        alt=0 if located is None else fields.int32(located.alt_amsl_m * MM),
-        eph=fields.UINT16_MAX,
-        epv=fields.UINT16_MAX,
-        vel=fields.UINT16_MAX,
-        cog=fields.UINT16_MAX,
-        satellites_visible=fields.UINT8_MAX,
+        alt=0 if located is None else encoding.int32(located.alt_amsl_m * MM),
+        eph=encoding.UINT16_MAX,
+        epv=encoding.UINT16_MAX,
+        vel=encoding.UINT16_MAX,
+        cog=encoding.UINT16_MAX,
+        satellites_visible=encoding.UINT8_MAX,
     )
 
 
@@ -418,9 +420,9 @@ def estimator_status(state: NavState) -> Any:
 def home_position(home: Home) -> Any:
     """Encode home; its local position, the slope and the approach are not known."""
     return mavlink.MAVLink_home_position_message(
-        fields.int32(home.place.lat_deg * DEGE7),
-        fields.int32(home.place.lon_deg * DEGE7),
-        fields.int32(home.place.alt_amsl_m * MM),
+        encoding.int32(home.place.lat_deg * DEGE7),
+        encoding.int32(home.place.lon_deg * DEGE7),
+        encoding.int32(home.place.alt_amsl_m * MM),
         0.0,
         0.0,
         0.0,
@@ -433,3 +435,89 @@ def home_position(home: Home) -> Any:
 def system_time(now_us: int, unix_us: int | None) -> Any:
     """Encode the clocks; the Unix time is 0 until a GPS fix provides it."""
     return mavlink.MAVLink_system_time_message(unix_us or 0, boot_ms(now_us))
+
+
+FAILURES: Final = (
+    (GPS, mavlink.HL_FAILURE_FLAG_GPS),
+    (PRESSURE, mavlink.HL_FAILURE_FLAG_ABSOLUTE_PRESSURE),
+    (ACCEL, mavlink.HL_FAILURE_FLAG_3D_ACCEL),
+    (GYRO, mavlink.HL_FAILURE_FLAG_3D_GYRO),
+    (MAG, mavlink.HL_FAILURE_FLAG_3D_MAG),
+)
+HALF_DEGREES: Final = 2.0
+FIFTHS: Final = 5.0
+"""Of a metre a second."""
+TENTHS: Final = 10.0
+INT8_MAX: Final = 127
+UNKNOWN_PERCENT: Final = -1
+
+
+def high_latency2(
+    kind: int,
+    autopilot: int,
+    state: NavState | None,
+    fix: GpsFix | None,
+    health: Health,
+    now_us: int,
+) -> Any:
+    """Encode the state of the vehicle in 42 bytes.
+
+    A position has no "unknown" in this message: it is 0, 0 before the first fix, and the GPS
+    failure flag is set. Nothing measures wind, airspeed or throttle.
+
+    Parameters
+    ----------
+    kind : int
+        A MAV_TYPE.
+    autopilot : int
+        A MAV_AUTOPILOT.
+    state : NavState, optional
+        The newest.
+    fix : GpsFix, optional
+        The newest.
+    health : Health
+        State of the sensors.
+    now_us : int
+        Gateway clock.
+
+    Returns
+    -------
+    MAVLink_message
+    """
+    failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
+    if fix is None or not is_3d(fix):
+        failures |= mavlink.HL_FAILURE_FLAG_GPS
+    known = state is not None and has_position(state)
+    north, east, down = state.vel_n_mps if state is not None else (NAN, NAN, NAN)
+    yaw_deg = math.degrees(to_euler(state.q_nb)[2]) if state is not None else NAN
+    speed = encoding.uint8(math.hypot(north, east) * FIFTHS, unknown=0)
+    return mavlink.MAVLink_high_latency2_message(
+        timestamp=boot_ms(now_us),
+        type=kind,
+        autopilot=autopilot,
+        # The upper half of PX4's, as PX4 sends it.
+        custom_mode=CUSTOM_MODES[autopilot] >> 16,
+        latitude=encoding.int32(state.lat_deg * DEGE7) if state is not None and known else 0,
+        longitude=encoding.int32(state.lon_deg * DEGE7) if state is not None and known else 0,
+        altitude=encoding.int16(state.alt_amsl_m) if state is not None and known else 0,
+        target_altitude=0,
+        heading=encoding.uint8(yaw_deg % 360.0 / HALF_DEGREES, unknown=0),
+        target_heading=0,
+        target_distance=0,
+        throttle=0,
+        airspeed=speed,
+        airspeed_sp=0,
+        groundspeed=speed,
+        windspeed=0,
+        wind_heading=0,
+        eph=encoding.uint8(fix.h_acc_m * TENTHS if fix is not None else NAN),
+        epv=encoding.uint8(fix.v_acc_m * TENTHS if fix is not None else NAN),
+        temperature_air=0,
+        climb_rate=encoding.whole(-down * TENTHS, -INT8_MAX, INT8_MAX, 0),
+        battery=UNKNOWN_PERCENT,
+        wp_num=0,
+        failure_flags=failures,
+        custom0=0,
+        custom1=0,
+        custom2=0,
+    )

@@ -1,7 +1,20 @@
-"""The telemetry of a vehicle, each message at its own rate.
+"""The telemetry of a vehicle, each message at its own rate; and whether the vehicle is in the air.
 
 Every message has one builder, which works from the newest records; the streams and the answer to
 a request for a single message share it.
+
+The landed state is judged from the motion alone:
+
+| state     | becomes   | when                            |
+| --------- | --------- | ------------------------------- |
+| undefined | on ground | slow and low, for `HOLD_US`     |
+| undefined | in air    | fast or high, for `HOLD_US`     |
+| on ground | in air    | fast or high, for `HOLD_US`     |
+| in air    | on ground | slow and low, for `LANDING_US`  |
+
+Fast is above the take-off speed; high is above the take-off height over the first good fix (not
+over home, which may be set anywhere). Slow and low are below half of either, so that a hover, a
+stall turn or a touch-and-go does not flip the state.
 """
 
 import math
@@ -17,19 +30,79 @@ from gateway.records import (
     BaroSample,
     GpsFix,
     ImuSample,
+    NavFlags,
     NavState,
     NodeStatus,
     Vec3,
 )
-from gateway.vehicle.home import Home, Place, is_good_enough, place_of
+from gateway.units import US_PER_S
 from gateway.vehicle.identity import AUTOPILOTS, CUSTOM_MODES
+from gateway.vehicle.location import Home, Place, is_good_enough, place_of
 from gateway.vehicle.telemetry import messages
-from gateway.vehicle.telemetry.added_messages import ADDED_MESSAGES, NewestRecords
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
-from gateway.vehicle.telemetry.high_latency import high_latency2
-from gateway.vehicle.telemetry.motion import IN_AIR, Motion
-from gateway.vehicle.telemetry.streams import OFF, Pace, Stream, interval_us
+from gateway.vehicle.telemetry.messages import high_latency2
+from gateway.vehicle.telemetry.streams import (
+    ADDED_MESSAGES,
+    OFF,
+    NewestRecords,
+    Pace,
+    Stream,
+    interval_us,
+)
 from gateway.vehicle.vehicle_settings import VehicleSettings
+
+UNDEFINED: Final[int] = mavlink.MAV_LANDED_STATE_UNDEFINED
+ON_GROUND: Final[int] = mavlink.MAV_LANDED_STATE_ON_GROUND
+IN_AIR: Final[int] = mavlink.MAV_LANDED_STATE_IN_AIR
+
+HOLD_US: Final = 2 * US_PER_S
+LANDING_US: Final = 5 * US_PER_S
+SLOW: Final = 0.5
+"""Share of the take-off limits below which the vehicle has come down."""
+
+
+class Motion:
+    """The landed state of one vehicle."""
+
+    def __init__(self, takeoff_speed_mps: float, takeoff_height_m: float) -> None:
+        self.takeoff_speed_mps = takeoff_speed_mps
+        self.takeoff_height_m = takeoff_height_m
+        self.landed_state: int = UNDEFINED
+        self._leaning = UNDEFINED
+        self._since_us = 0
+
+    def update(self, state: NavState, ground_alt_m: float) -> None:
+        """Update the landed state from one navigation state.
+
+        Parameters
+        ----------
+        state : NavState
+            The estimate; without a valid velocity nothing changes.
+        ground_alt_m : float
+            Height of the ground above mean sea level, NaN while it is not known.
+        """
+        leaning = self._lean(state, ground_alt_m)
+        if leaning != self._leaning:
+            self._leaning, self._since_us = leaning, state.time_us
+        if leaning in (UNDEFINED, self.landed_state):
+            return
+        hold_us = LANDING_US if self.landed_state == IN_AIR else HOLD_US
+        if state.time_us - self._since_us >= hold_us:
+            self.landed_state = leaning
+
+    def _lean(self, state: NavState, ground_alt_m: float) -> int:
+        if not state.flags & NavFlags.VELOCITY_VALID:
+            return UNDEFINED
+        north, east, _ = state.vel_n_mps
+        speed = math.hypot(north, east) / self.takeoff_speed_mps
+        height = 0.0
+        if state.flags & NavFlags.ALTITUDE_VALID and not math.isnan(ground_alt_m):
+            height = (state.alt_amsl_m - ground_alt_m) / self.takeoff_height_m
+        most = max(speed, height)
+        if most > 1.0:
+            return IN_AIR
+        return ON_GROUND if most < SLOW else UNDEFINED
+
 
 STATE_MESSAGES: Final = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,

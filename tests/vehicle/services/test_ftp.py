@@ -12,11 +12,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32, decode_packet
-from gateway.vehicle.services.parameters.metadata import Metadata
-from gateway.vehicle.services.parameters.parameters import ParameterTable
+from gateway.vehicle.services.parameters import Metadata, ParameterTable
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.services.parameters.test_parameters import values
+from tests.vehicle.services.test_parameters import values
 
 
 class Ftp:

@@ -7,12 +7,12 @@ from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.generator.mavcrc import x25crc
 
 from gateway.records import Incoming, Outgoing
-from gateway.vehicle.dialect import ControlStatus
+from gateway.vehicle.encoding import ControlStatus
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation, kinds
-from tests.vehicle.services.parameters.test_parameters import set_message
+from tests.vehicle.services.test_parameters import set_message
 
 REQUEST_CONTROL = 32100
 ACCEPTED, DENIED, FAILED = 0, 2, 4

@@ -5,7 +5,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.actions import RecordingRequest
-from gateway.vehicle.services.recording import MAX_WAITING, PATIENCE_US
+from gateway.vehicle.services.commands import MAX_WAITING, PATIENCE_US
 from tests.vehicle.ground_station import GroundStation
 
 ACCEPTED, NOT_NOW, FAILED, IN_PROGRESS = 0, 1, 4, 5

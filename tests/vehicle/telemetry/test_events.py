@@ -1,6 +1,7 @@
 import pytest
 
-from gateway.vehicle.telemetry.events import BUCKET, HOLD_US, INFO, WARNING, Announcer, StatusText
+from gateway.vehicle.actions import INFO, WARNING, StatusText
+from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
 
 GOOD, BAD = StatusText(INFO, "good"), StatusText(WARNING, "bad")
 

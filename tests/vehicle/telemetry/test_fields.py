@@ -2,14 +2,14 @@ import math
 
 import pytest
 
-from gateway.vehicle.telemetry import fields
+from gateway.vehicle import encoding
 
 UNKNOWN = [
-    (fields.uint8, 255, 0, 254),
-    (fields.uint16, 65535, 0, 65534),
-    (fields.int16, 0, -32768, 32767),
-    (fields.int32, 0, -(2**31), 2**31 - 1),
-    (fields.uint32, 0, 0, 2**32 - 1),
+    (encoding.uint8, 255, 0, 254),
+    (encoding.uint16, 65535, 0, 65534),
+    (encoding.int16, 0, -32768, 32767),
+    (encoding.int32, 0, -(2**31), 2**31 - 1),
+    (encoding.uint32, 0, 0, 2**32 - 1),
 ]
 
 
@@ -23,7 +23,7 @@ def test_ends_and_unknown(fit: object, unknown: int, low: int, high: int) -> Non
 
 
 def test_a_field_without_a_mark_uses_its_whole_range() -> None:
-    assert fields.uint16(1e9, unknown=0) == 65535
+    assert encoding.uint16(1e9, unknown=0) == 65535
 
 
 @pytest.mark.parametrize(
@@ -31,9 +31,9 @@ def test_a_field_without_a_mark_uses_its_whole_range() -> None:
     [(0.0, 0, 0), (-0.001, 0, 0), (359.999, 0, 0), (-90.0, 27000, 270), (180.0, 18000, 180)],
 )
 def test_compass(deg: float, cdeg: int, whole: int) -> None:
-    assert fields.compass_cdeg(math.radians(deg)) == cdeg
-    assert fields.compass_deg(math.radians(deg)) == whole
+    assert encoding.compass_cdeg(math.radians(deg)) == cdeg
+    assert encoding.compass_deg(math.radians(deg)) == whole
 
 
 def test_unknown_compass() -> None:
-    assert fields.compass_cdeg(math.nan) == 65535
+    assert encoding.compass_cdeg(math.nan) == 65535

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import GpsFix, NavState
 from gateway.vehicle.telemetry.health import Health
-from gateway.vehicle.telemetry.high_latency import high_latency2
+from gateway.vehicle.telemetry.messages import high_latency2
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import BARO, FIX, NOTHING, SAMPLE, STATE
 

@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from gateway.records import NavFlags
-from gateway.vehicle.telemetry.motion import IN_AIR, ON_GROUND, UNDEFINED, Motion
+from gateway.vehicle.telemetry.telemetry import IN_AIR, ON_GROUND, UNDEFINED, Motion
 from tests.vehicle.samples import STATE, state_at
 
 

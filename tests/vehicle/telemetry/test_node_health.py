@@ -7,8 +7,9 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus, PipeCounters, ReceiverStatus
-from gateway.vehicle.telemetry.events import HOLD_US, INFO, WARNING
-from gateway.vehicle.telemetry.node_health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
+from gateway.vehicle.actions import INFO, WARNING
+from gateway.vehicle.telemetry.announcements import HOLD_US
+from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.samples import decode

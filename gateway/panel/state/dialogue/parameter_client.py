@@ -16,7 +16,7 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
-from gateway.vehicle.services.parameters.parameters import INTEGER_CODES, decode_value
+from gateway.vehicle.services.parameters import INTEGER_CODES, decode_value
 
 QUIET_US: Final = US_PER_S
 MISSING_AT_ONCE: Final = 20

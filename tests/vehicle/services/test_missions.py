@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.home import Place, distance_and_bearing
-from gateway.vehicle.services.missions.mission_items import MAX_ITEMS
+from gateway.vehicle.location import Place, distance_and_bearing
+from gateway.vehicle.plan import MAX_ITEMS
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.samples import STATE
 

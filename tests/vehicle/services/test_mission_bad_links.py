@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.services.missions.test_mission import ACCEPTED, count, item
+from tests.vehicle.services.test_missions import ACCEPTED, count, item
 
 STEP_S = 0.05
 COUNTED_TO = 5

@@ -23,7 +23,7 @@ from gateway.vehicle.services.commands import (
     Outcome,
     whole,
 )
-from gateway.vehicle.services.parameters.parameters import (
+from gateway.vehicle.services.parameters import (
     Parameter,
     ParameterTable,
     decode_value,

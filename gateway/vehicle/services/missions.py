@@ -46,7 +46,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import Answer, Reply, Request
-from gateway.vehicle.services.missions.mission_items import (
+from gateway.vehicle.plan import (
     ACCEPTED,
     FENCE,
     MAX_ITEMS,

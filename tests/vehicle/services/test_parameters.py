@@ -12,8 +12,7 @@ from gateway.records import RECORDED_ONLY
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, fields_of, setting
 from gateway.vehicle.actions import SaveSettings, SettingsChange
-from gateway.vehicle.services.parameters.parameter_names import parameter_name
-from gateway.vehicle.services.parameters.parameters import ParameterTable, decode_value
+from gateway.vehicle.services.parameters import ParameterTable, decode_value, parameter_name
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.test_start_up import load_parameters

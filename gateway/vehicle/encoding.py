@@ -1,0 +1,235 @@
+"""Messages to MAVLink 2 frames: field values, messages that pymavlink lacks, and the encoder.
+
+A MAVLink integer field often reserves its greatest value for "unknown". The functions for fields
+take the value to send in that case, and saturate one below it, so that a too large value is never
+read as "not known".
+
+Two messages of the standard and one of its development dialect are missing in pymavlink. Clients
+request them all the same; PROTOCOL_VERSION decides whether QGroundControl uses MAVLink 2. Each is
+laid out as the generator does it: larger fields first, and a CRC seeded by the definition.
+"""
+
+import math
+import struct
+from typing import Any, ClassVar, Final
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import Outgoing
+
+INT16_MAX: Final = 2**15 - 1
+INT32_MAX: Final = 2**31 - 1
+UINT8_MAX: Final = 2**8 - 1
+UINT16_MAX: Final = 2**16 - 1
+UINT32_MAX: Final = 2**32 - 1
+FLOAT32_MAX: Final = 3.402_823_4e38
+
+
+def whole(value: float, low: int, high: int, unknown: int) -> int:
+    """Round to an integer field.
+
+    Parameters
+    ----------
+    value : float
+        In the field's unit; NaN is not known, an infinity is saturated.
+    low, high : int
+        Ends of the field, `unknown` excluded.
+    unknown : int
+        What the message definition specifies for an unknown value.
+
+    Returns
+    -------
+    int
+    """
+    if math.isnan(value):
+        return unknown
+    if value <= low:
+        return low
+    if value >= high:
+        return high
+    return round(value)
+
+
+def uint8(value: float, unknown: int = UINT8_MAX) -> int:
+    """Fit an unsigned byte whose 255 may mean unknown."""
+    return whole(value, 0, UINT8_MAX - (unknown == UINT8_MAX), unknown)
+
+
+def uint16(value: float, unknown: int = UINT16_MAX) -> int:
+    """Fit an unsigned 16-bit field whose 65535 may mean unknown."""
+    return whole(value, 0, UINT16_MAX - (unknown == UINT16_MAX), unknown)
+
+
+def int16(value: float) -> int:
+    """Fit a signed 16-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT16_MAX - 1, INT16_MAX, 0)
+
+
+def int32(value: float) -> int:
+    """Fit a signed 32-bit field, which has no value for unknown; it gets 0."""
+    return whole(value, -INT32_MAX - 1, INT32_MAX, 0)
+
+
+def uint32(value: float) -> int:
+    """Fit an unsigned 32-bit field; as an extension field its 0 means unknown."""
+    return whole(value, 0, UINT32_MAX, 0)
+
+
+def compass_cdeg(angle_rad: float) -> int:
+    """Turn an angle from north into 0 to 35999 hundredths of a degree, 65535 if not known."""
+    if not math.isfinite(angle_rad):
+        return UINT16_MAX
+    return round(math.degrees(angle_rad) * 100.0) % 36000
+
+
+def compass_deg(angle_rad: float) -> int:
+    """Turn an angle from north into 0 to 359 whole degrees; an unknown angle must not come here."""
+    return round(math.degrees(angle_rad)) % 360
+
+
+MAVLINK_MSG_ID_PROTOCOL_VERSION: Final = 300
+MAVLINK_MSG_ID_COMPONENT_METADATA: Final = 397
+MAVLINK_MSG_ID_CONTROL_STATUS: Final = 512
+
+_Base: Any = mavlink.MAVLink_message
+
+
+class _Extra(_Base):  # type: ignore[misc]
+    """A message packed from its fields in wire order."""
+
+    id: ClassVar[int]
+    msgname: ClassVar[str]
+    crc_extra: ClassVar[int]
+    unpacker: ClassVar[struct.Struct]
+    fieldnames: ClassVar[list[str]] = []
+    fieldtypes: ClassVar[list[str]] = []
+
+    def __init__(self, *wire_values: Any) -> None:
+        super().__init__(self.id, self.msgname)
+        self.wire_values = wire_values
+
+    def pack(self, mav: Any, force_mavlink1: bool = False) -> bytes:
+        """Build the frame; these ids do not fit MAVLink 1."""
+        payload = self.unpacker.pack(*self.wire_values)
+        frame: bytes = self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1)
+        return frame
+
+
+class ProtocolVersion(_Extra):
+    """PROTOCOL_VERSION: version, min_version, max_version, and two library hashes."""
+
+    id = MAVLINK_MSG_ID_PROTOCOL_VERSION
+    msgname = "PROTOCOL_VERSION"
+    crc_extra = 217
+    unpacker = struct.Struct("<HHH8s8s")
+
+
+class ComponentMetadata(_Extra):
+    """COMPONENT_METADATA: time_boot_ms, file_crc, uri."""
+
+    id = MAVLINK_MSG_ID_COMPONENT_METADATA
+    msgname = "COMPONENT_METADATA"
+    crc_extra = 182
+    unpacker = struct.Struct("<II100s")
+
+
+class ControlStatus(_Extra):
+    """CONTROL_STATUS: flags, gcs_main, gcs_secondary."""
+
+    id = MAVLINK_MSG_ID_CONTROL_STATUS
+    msgname = "CONTROL_STATUS"
+    crc_extra = 21
+    unpacker = struct.Struct("<BB10s")
+
+
+AUTOPILOT_COMPONENT: Final = 1
+"""MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
+
+_START: Final = b"\xfd"
+_HEAD: Final = struct.Struct("<BBBBBBHB")
+"""Length, two flag bytes, sequence, system, component, message id in three bytes."""
+_INTEGER_LIMITS: Final = {
+    "int8_t": (-(2**7), 2**7 - 1),
+    "int16_t": (-(2**15), 2**15 - 1),
+    "int32_t": (-(2**31), 2**31 - 1),
+    "int64_t": (-(2**63), 2**63 - 1),
+    "uint8_t": (0, 2**8 - 1),
+    "uint16_t": (0, 2**16 - 1),
+    "uint32_t": (0, 2**32 - 1),
+    "uint64_t": (0, 2**64 - 1),
+}
+
+
+class Encoder:
+    """Frames of one system id; one sequence for all its messages."""
+
+    def __init__(self, system_id: int) -> None:
+        """Start the sequence."""
+        self.system_id = system_id
+        self._sequence = 0
+
+    def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
+        """Build the MAVLink 2 frame of one message.
+
+        Parameters
+        ----------
+        message : MAVLink_message
+            Any message of the dialect. A number beyond its field's range is saturated, so that no
+            measurement can stop the telemetry.
+        client_id : int, optional
+            The one client it answers.
+
+        Returns
+        -------
+        Outgoing
+        """
+        # Not message.id: HIGHRES_IMU and others have a field of that name.
+        message_id = message.get_msgId()
+        # pymavlink packs the payload; header and checksum would take it six times as long as here.
+        message._pack = self._frame  # noqa: SLF001
+        try:
+            frame = message.pack(message_id)
+        except (struct.error, OverflowError):
+            _saturate(message)
+            frame = message.pack(message_id)
+        self._sequence = (self._sequence + 1) % 256
+        return Outgoing(frame, message_id, client_id)
+
+    def _frame(
+        self, message_id: int, crc_extra: int, payload: bytes, *, force_mavlink1: bool
+    ) -> bytes:
+        """Put header and checksum around a payload; `force_mavlink1` is pymavlink's own."""
+        del force_mavlink1
+        body = payload.rstrip(b"\0") or payload[:1]
+        content = _HEAD.pack(
+            len(body),
+            0,
+            0,
+            self._sequence,
+            self.system_id,
+            AUTOPILOT_COMPONENT,
+            message_id & 0xFFFF,
+            message_id >> 16,
+        )
+        content += body
+        crc = mcrf4xx(content + crc_extra.to_bytes())
+        return _START + content + crc.to_bytes(2, "little")
+
+
+def _saturate(message: Any) -> None:
+    for name, kind in zip(message.fieldnames, message.fieldtypes, strict=True):
+        value = getattr(message, name)
+        if isinstance(value, list | tuple):
+            setattr(message, name, [_fit(item, kind) for item in value])
+        elif isinstance(value, int | float):
+            setattr(message, name, _fit(value, kind))
+
+
+def _fit(value: float, kind: str) -> float:
+    if kind in _INTEGER_LIMITS:
+        low, high = _INTEGER_LIMITS[kind]
+        return 0 if math.isnan(value) else int(max(low, min(high, value)))
+    if math.isfinite(value) and kind == "float":
+        return max(-FLOAT32_MAX, min(FLOAT32_MAX, value))
+    return value

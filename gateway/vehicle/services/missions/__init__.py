@@ -1,1 +1,0 @@
-"""Missions, fences, rally points, home and the marked location."""

@@ -1,1 +1,0 @@
-"""The settings as MAVLink parameters."""

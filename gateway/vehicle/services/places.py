@@ -1,0 +1,372 @@
+"""Home, the marked location, and the plan, as ground stations set them and as they are kept.
+
+The newest mark is valid, whoever set it: the current item of an uploaded mission, the first rally
+point, a region of interest, a home set by command, or the command line.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import NAN, GpsFix, NavState
+from gateway.settings import Settings
+from gateway.vehicle import encoding
+from gateway.vehicle.actions import INFO, Answer, Reply, SavePlaces, StatusText
+from gateway.vehicle.location import (
+    GLOBAL_FRAMES,
+    Home,
+    HomeParameters,
+    Place,
+    distance_and_bearing,
+    height_amsl_m,
+    is_3d,
+    is_on_earth,
+    place_of,
+)
+from gateway.vehicle.plan import FENCE, KINDS, MISSION, RALLY, Item, StoredPlaces
+from gateway.vehicle.services.commands import (
+    ACCEPTED,
+    DENIED,
+    NOT_NOW,
+    Command,
+    CommandService,
+    Outcome,
+    whole,
+)
+from gateway.vehicle.services.missions import MissionService
+from gateway.vehicle.telemetry.messages import has_position
+from gateway.vehicle.telemetry.telemetry import Telemetry
+
+
+class Mark:
+    """The marked location of one vehicle."""
+
+    def __init__(self) -> None:
+        self.place: Place | None = None
+        self.of: int | None = None
+        """Kind of the stored items that it follows; None if it was put by itself."""
+
+    def put(self, place: Place | None) -> None:
+        """Mark a place, or none.
+
+        Raises
+        ------
+        ValueError
+            If it is no place on earth; its height may be NaN.
+        """
+        if place is not None and not is_on_earth(place.lat_deg, place.lon_deg):
+            raise ValueError(f"no place on earth: {place.lat_deg}, {place.lon_deg}")
+        self.place, self.of = place, None
+
+    def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
+        """Mark the first place among stored items; without one, clear a mark that they had set.
+
+        Parameters
+        ----------
+        kind : int
+            MAV_MISSION_TYPE of the items.
+        items : tuple of Item
+            From the current one on.
+        home_alt_m : float
+            Height of home above mean sea level, NaN while there is none.
+        """
+        places = (item.place(home_alt_m) for item in items)
+        place = next((place for place in places if place is not None), None)
+        if place is not None:
+            self.place, self.of = place, kind
+        elif self.of == kind:
+            self.put(None)
+
+    def way(self, state: NavState) -> tuple[float, float] | None:
+        """Measure distance and bearing from the vehicle to the mark.
+
+        Parameters
+        ----------
+        state : NavState
+            Where the vehicle is.
+
+        Returns
+        -------
+        tuple of 2 floats, or None
+            Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
+            None without a mark or a position.
+        """
+        if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
+            return None
+        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        return distance_and_bearing(here, self.place)
+
+    def nav_controller_output(self, state: NavState | None) -> Any:
+        """Encode distance and bearing to the mark; None without a mark or a position.
+
+        The desired heading is the bearing; bearings are -180 to 180, as autopilots send them.
+        Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed error
+        is 0, since none is desired; clients print it as an integer, so NaN would fail.
+        """
+        way = None if state is None else self.way(state)
+        if state is None or self.place is None or way is None:
+            return None
+        distance_m, bearing_rad = way
+        bearing_deg = (encoding.compass_deg(bearing_rad) + 180) % 360 - 180
+        return mavlink.MAVLink_nav_controller_output_message(
+            nav_roll=NAN,
+            nav_pitch=NAN,
+            nav_bearing=bearing_deg,
+            target_bearing=bearing_deg,
+            wp_dist=encoding.uint16(distance_m, unknown=0),
+            alt_error=self.place.alt_amsl_m - state.alt_amsl_m,
+            aspd_error=0.0,
+            xtrack_error=NAN,
+        )
+
+
+NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
+"""The parameters' keys, and the parts of a place that they are."""
+
+
+class HomeService:
+    """Set and forget home, and decide which home is kept over a restart.
+
+    A home that the GPS measured is measured again at every start, which may be at another field;
+    one that an operator set is kept. A command keeps it at once, a parameter when the parameters
+    are stored.
+    """
+
+    def __init__(self, telemetry: Telemetry) -> None:
+        self.kept: Place | None = None
+        self._telemetry = telemetry
+        self._entered: set[str] = set()
+        """Numbers that were set while there was no home."""
+
+    @property
+    def home(self) -> Home | None:
+        """The present home."""
+        return self._telemetry.home
+
+    def put(self, place: Place, now_us: int) -> list[Answer]:
+        """Set home for an operator, and send HOME_POSITION."""
+        self._entered.clear()
+        return [Reply(m) for m in self._telemetry.set_home(Home(place, now_us, "operator"))]
+
+    def restore(self, place: Place) -> None:
+        """Start with the home that was kept."""
+        self.kept = place
+        self._telemetry.set_home(Home(place, 0, "operator"))
+
+    def keep(self) -> None:
+        """Keep the present home over a restart if an operator set it; else keep none."""
+        home = self.home
+        self.kept = home.place if home is not None and home.source == "operator" else None
+
+    def parameters(self) -> HomeParameters:
+        """Return home as parameters."""
+        home = self.home
+        if home is None:
+            return HomeParameters()
+        numbers = {key: getattr(home.place, part) for key, part in NUMBERS.items()}
+        return HomeParameters(source=home.source, **numbers)
+
+    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
+        """Apply the change of one parameter.
+
+        Parameters
+        ----------
+        settings : HomeParameters
+            With the change in it.
+        key : str
+            What changed.
+        now_us : int
+            Gateway clock.
+
+        Returns
+        -------
+        list of Answer
+
+        Raises
+        ------
+        ValueError
+            If there is no such home to name a source of.
+        """
+        value: Any = getattr(settings, key)
+        if key == "source":
+            return self._change_source(value, now_us)
+        part, home = NUMBERS[key], self.home
+        if home is not None:
+            if _same(value, getattr(home.place, part)):
+                # A parameter is less precise than home; a list that is written back must not round
+                # it.
+                return []
+            return self.put(replace(home.place, **{part: value}), now_us)
+        self._entered.add(key)
+        if self._entered < set(NUMBERS):
+            return []
+        return self.put(Place(*(getattr(settings, each) for each in NUMBERS)), now_us)
+
+    def _change_source(self, source: str, now_us: int) -> list[Answer]:
+        home = self.home
+        if source == "none":
+            self._entered.clear()
+            self._telemetry.forget_home()
+            return []
+        if home is None or (source, home.source) == ("gps", "operator"):
+            raise ValueError("there is no such home")
+        return [] if source == home.source else self.put(home.place, now_us)
+
+
+def _same(a: float, b: float) -> bool:
+    return bool(np.float32(a) == np.float32(b))
+
+
+Say = Callable[[StatusText, int], list[Any]]
+
+USE_CURRENT: Final = 1
+"""First parameter of MAV_CMD_DO_SET_HOME."""
+
+
+class PlaceService:
+    """Set home, set and clear the mark, and store them and the missions.
+
+    Parameters
+    ----------
+    vehicle_id : int
+        Id in the radio payloads.
+    telemetry : Telemetry
+        Knows where the vehicle is, and sends home and the way to the mark.
+    say : callable
+        Announces an event to all.
+    stored : StoredPlaces
+        The places kept from the last run.
+    """
+
+    def __init__(
+        self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlaces
+    ) -> None:
+        self._vehicle_id = vehicle_id
+        self.mark = Mark()
+        self.mark.place, self.mark.of = stored.mark, stored.mark_of
+        self.home = HomeService(telemetry)
+        if stored.home is not None:
+            self.home.restore(stored.home)
+        self._home_untold = stored.home is not None
+        self.missions = MissionService(self._on_items, self._explain)
+        self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
+        self.missions.current = stored.current
+        self._telemetry = telemetry
+        self._say = say
+        telemetry.add(
+            mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
+            lambda _: self.mark.nav_controller_output(telemetry.state),
+        )
+        telemetry.add(
+            mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, lambda _: self.missions.mission_current()
+        )
+
+    def register(self, commands: CommandService) -> None:
+        """Register the commands that are carried out here."""
+        commands.register(mavlink.MAV_CMD_DO_SET_HOME, self._set_home)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI, self._set_roi)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, self._set_roi_location)
+        commands.register(mavlink.MAV_CMD_DO_SET_ROI_NONE, self._clear_roi)
+        commands.register(mavlink.MAV_CMD_DO_SET_MISSION_CURRENT, self._set_mission_current)
+
+    def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
+        """Announce once how far a kept home is: it may be that of another field."""
+        home = self.home.kept
+        if home is None or not self._home_untold or not is_3d(fix):
+            return []
+        self._home_untold = False
+        distance_m, _ = distance_and_bearing(place_of(fix), home)
+        text = f"Stored home is used, {distance_m:.0f} m from here"
+        return self._explain(text, now_us)
+
+    def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
+        """Mark a place, or none, and announce it."""
+        self.mark.put(place)
+        text = "Mark cleared"
+        if place is not None:
+            text = f"Marked {place.lat_deg:.6f}, {place.lon_deg:.6f}"
+        return [self._save(), *self._explain(text, now_us)]
+
+    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
+        """Apply the change of a parameter of home; ValueError refuses it."""
+        return self.home.change(settings, key, now_us)
+
+    def store(self) -> list[Answer]:
+        """Keep the home that was set by parameters."""
+        self.home.keep()
+        return [self._save()]
+
+    def _save(self) -> SavePlaces:
+        items = self.missions.items
+        stored = StoredPlaces(
+            home=self.home.kept,
+            mark=self.mark.place,
+            mark_of=self.mark.of,
+            current=self.missions.current,
+            mission=items[MISSION],
+            fence=items[FENCE],
+            rally=items[RALLY],
+        )
+        return SavePlaces(self._vehicle_id, stored)
+
+    @property
+    def _home_alt_m(self) -> float:
+        home = self._telemetry.home
+        return home.place.alt_amsl_m if home else NAN
+
+    def _explain(self, text: str, now_us: int) -> list[Answer]:
+        return [Reply(message) for message in self._say(StatusText(INFO, text), now_us)]
+
+    def _on_items(self, kind: int, _now_us: int) -> list[Answer]:
+        if kind != FENCE:
+            first = self.missions.current if kind == MISSION else 0
+            self.mark.follow(kind, self.missions.items[kind][first:], self._home_alt_m)
+        return [self._save()]
+
+    def _place(self, command: Command) -> Place | None:
+        """Read the position of a command; None if it is invalid."""
+        if command.frame not in GLOBAL_FRAMES:
+            return None
+        if not is_on_earth(command.lat_deg, command.lon_deg):
+            return None
+        height = height_amsl_m(command.height_m, command.frame, self._home_alt_m)
+        return Place(command.lat_deg, command.lon_deg, height)
+
+    def _set_home(self, command: Command, now_us: int) -> Outcome:
+        if whole(command.params[0]) == USE_CURRENT:
+            state = self._telemetry.state
+            if state is None or not has_position(state):
+                return NOT_NOW, []
+            place: Place | None = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        else:
+            place = self._place(command)
+        if place is None or not math.isfinite(place.alt_amsl_m):
+            return DENIED, []
+        announced = self.home.put(place, now_us)
+        self.home.keep()
+        self.mark.put(place)
+        said = self._explain("Home set by a ground station", now_us)
+        return ACCEPTED, [*announced, *said, self._save()]
+
+    def _set_roi(self, command: Command, now_us: int) -> Outcome:
+        mode = whole(command.params[0])
+        if mode == mavlink.MAV_ROI_NONE:
+            return self._clear_roi(command, now_us)
+        if mode != mavlink.MAV_ROI_LOCATION:
+            return DENIED, []
+        return self._set_roi_location(command, now_us)
+
+    def _set_roi_location(self, command: Command, now_us: int) -> Outcome:
+        place = self._place(command)
+        return (DENIED, []) if place is None else (ACCEPTED, self.put_mark(place, now_us))
+
+    def _clear_roi(self, _command: Command, now_us: int) -> Outcome:
+        return ACCEPTED, self.put_mark(None, now_us)
+
+    def _set_mission_current(self, command: Command, now_us: int) -> Outcome:
+        answers = self.missions.set_current(whole(command.params[0]), now_us)
+        return (DENIED, []) if answers is None else (ACCEPTED, answers)
