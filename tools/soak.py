@@ -99,7 +99,7 @@ class Listener(asyncio.DatagramProtocol):
         while len(data) >= 12:
             message_id = int.from_bytes(data[7:10], "little")
             if message_id == mavlink.MAVLINK_MSG_ID_STATUSTEXT:
-                text = data[11 : 10 + data[1]].partition(b"\0")[0].decode()
+                text = data[11 : min(10 + data[1], 61)].partition(b"\0")[0].decode()
                 self.texts.append(f"{now_s:8.1f} {text}")
             self.note(message_id, now_s)
             data = data[12 + data[1] :]
