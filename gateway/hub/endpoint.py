@@ -109,7 +109,7 @@ LISTENING: Final = frozenset(
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
 COMMON_OPTIONS: Final = frozenset(
-    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor"}
+    {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
 )
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
@@ -175,6 +175,8 @@ class Endpoint:
     """Bytes a second that the link carries; telemetry is thinned to fit. 0 for any number."""
     trusted: bool | None = None
     """Whether its clients may change state; None: loopback and configured peers except fleets."""
+    mavlink: int = 0
+    """Version of all frames sent there; 0 for 2, or for 1 to a client that has only sent 1."""
     monitor: bool = False
     """Send all traffic, addressed frames included, and ignore everything received."""
     origins: frozenset[str] = frozenset()
@@ -211,7 +213,8 @@ def parse_endpoint(url: str) -> Endpoint:
     url : str
         As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
         separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
-        `wait` (milliseconds), `budget` (bytes a second), `trusted` and `monitor` (yes or no), and
+        `wait` (milliseconds), `budget` (bytes a second), `trusted` and `monitor` (yes or no),
+        `mavlink` (1 or 2), and
         of some kinds `origins` (separated by commas) or `path`.
 
     Returns
@@ -244,6 +247,7 @@ def parse_endpoint(url: str) -> Endpoint:
             budget=_budget(kind, port, options.get("budget")),
             trusted=yes_or_no("trusted", options.get("trusted")),
             monitor=yes_or_no("monitor", options.get("monitor")) or False,
+            mavlink=number_from(options.get("mavlink", "0"), "mavlink", 0, 2),
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
             config=options.get("config", ""),

@@ -14,7 +14,8 @@ same count share one copy, which is signed too if its vehicle signs. Frames of o
 never changed; a filter on those does show as loss.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
-see `bandwidth.py`. A client whose endpoint has `monitor=yes` gets every frame.
+see `bandwidth.py`. A client whose endpoint has `monitor=yes` gets every frame. One that knows only
+MAVLink 1 gets the messages that this version can carry, without extensions and signatures.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -33,7 +34,8 @@ from gateway.hub.stats import ClientCounters
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import MavFrame
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from gateway.wire.mavlink_version1 import base_size, to_mavlink1
 
 SEQUENCE_MASK: Final = 0xFF
 SLACK_SHIFT: Final = 2
@@ -67,11 +69,54 @@ class Recipient(Protocol):
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
 
+    @property
+    def is_mavlink1(self) -> bool:
+        """Whether it knows only MAVLink 1."""
+
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
         """Handle a failed `write` whose frame will still be counted as sent."""
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame now or queue it; never block, never raise."""
+
+
+class Mavlink1Client:
+    """A client that is sent MAVLink 1 frames.
+
+    Parameters
+    ----------
+    client : Recipient
+        Its transport.
+    """
+
+    is_direct = False
+    is_mavlink1 = True
+
+    def __init__(self, client: Recipient) -> None:
+        self.client_id = client.client_id
+        self.counters = client.counters
+        self.write = client.write
+        self._client = client
+
+    @property
+    def endpoint(self) -> Endpoint:
+        """The present options."""
+        return self._client.endpoint
+
+    def recover_uncounted(self, data: bytes, error: OSError) -> None:
+        """Pass a failed `write` on; never called, since it is not direct."""
+        self._client.recover_uncounted(data, error)
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Send one frame, unless MAVLink 1 cannot carry it."""
+        data = to_mavlink1(frame.data)
+        if data is not None:
+            self._client.transmit(frame if data is frame.data else frame_of(data))
+
+
+def recipient_of(client: Recipient) -> Recipient:
+    """Return a client with the conversion that it needs."""
+    return Mavlink1Client(client) if client.is_mavlink1 else client
 
 
 @dataclass(slots=True)
@@ -113,10 +158,19 @@ class _Subscription:
     bandwidth: Bandwidth | None
     answered: int = 0
     """Bytes of answers since the bandwidth was planned last."""
+    recipient: Recipient = field(init=False)
+    """The client with the conversion that it needs."""
     requested: dict[tuple[int, int], int] = field(default_factory=dict)
     """Requested intervals by system and message."""
     gaps: dict[Origin, _Gap] = field(default_factory=dict)
     limits: dict[bytes, _RateLimit] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.recipient = recipient_of(self.client)
+
+    def carries(self, frame: MavFrame) -> bool:
+        """Return whether the client's version of MAVLink has the message."""
+        return not self.recipient.is_mavlink1 or base_size(frame.message_id) is not None
 
     def gap_of(self, origin: Origin) -> _Gap:
         gap = self.gaps.get(origin)
@@ -139,6 +193,8 @@ class _Subscription:
     def interval_us(self, frame: MavFrame, *, is_ours: bool) -> int:
         """Return the least time between two frames; the settings bound a client's request."""
         endpoint, message_id = self.client.endpoint, frame.message_id
+        if not self.carries(frame):
+            return NO_MESSAGES
         if endpoint.monitor:
             return 0
         if not endpoint.passes(message_id):
@@ -336,6 +392,10 @@ class Fanout:
                 subscription.bandwidth = _bandwidth(client.endpoint)
             self._changed()
 
+    def change_version(self) -> None:
+        """Apply a changed MAVLink version of a client."""
+        self._changed()
+
     def set_interval(self, request: ClientInterval) -> None:
         """Apply a requested message interval; that of a client that has gone is ignored."""
         if subscription := self._subscriptions.get(request.client_id):
@@ -369,11 +429,12 @@ class Fanout:
         # A copy: a client that breaks at this frame removes itself.
         for client_id, subscription in tuple(self._subscriptions.items()):
             gap = subscription.gap_of(frame.origin)
-            if client_id in client_ids or subscription.client.endpoint.monitor:
+            wanted = client_id in client_ids or subscription.client.endpoint.monitor
+            if wanted and subscription.carries(frame):
                 subscription.answered += len(frame.data)
                 number = sequence - gap.skipped & SEQUENCE_MASK
                 copy = self._signer.sequence_and_sign(frame, number, now_us)
-                subscription.client.transmit(copy)
+                subscription.recipient.transmit(copy)
             else:
                 gap.skip()
 
@@ -382,7 +443,7 @@ class Fanout:
         for client_id in client_ids:
             if subscription := self._subscriptions.get(client_id):
                 subscription.answered += len(frame.data)
-                subscription.client.transmit(frame)
+                subscription.recipient.transmit(frame)
         for monitor in self._monitors:
             if monitor.client_id not in client_ids and monitor.client_id != source_id:
                 monitor.transmit(frame)
@@ -403,7 +464,7 @@ class Fanout:
             interval_us = subscription.interval_us(frame, is_ours=False)
             if subscription.client.client_id != source_id and interval_us != NO_MESSAGES:
                 limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
-                targets.append((subscription.client, limit))
+                targets.append((subscription.recipient, limit))
         return Route(frame.message_id, targets, path, rejects, on_foreign)
 
     def align(self, client_ids: Sequence[int]) -> None:
@@ -444,7 +505,9 @@ class Fanout:
         self.cache.clear()
         subscriptions = self._subscriptions.values()
         self.cache.is_metered = any(each.bandwidth for each in subscriptions)
-        self._monitors = [each.client for each in subscriptions if each.client.endpoint.monitor]
+        for each in subscriptions:
+            each.recipient = recipient_of(each.client)
+        self._monitors = [each.recipient for each in subscriptions if each.client.endpoint.monitor]
 
     def _make_own_route(self, frame: MavFrame) -> OwnRoute:
         if len(self.cache.own) >= MAX_KINDS:
@@ -457,7 +520,7 @@ class Fanout:
                 route.closed.append(gap)
                 continue
             limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
-            route.targets.append((subscription.client, gap, limit))
+            route.targets.append((subscription.recipient, gap, limit))
         self.cache.own[frame.key] = route
         return route
 

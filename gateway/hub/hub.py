@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from gateway.hub.endpoint import Endpoint, parse_endpoint
-from gateway.hub.fanout import Fanout, Route
+from gateway.hub.fanout import Fanout, Route, recipient_of
 from gateway.hub.limits import TokenBucket
 from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.round_trip import RoundTrip
@@ -402,7 +402,9 @@ class Hub:
                 passing = [each for each in greeting if client.endpoint.passes(each.message_id)]
                 for before, each in zip(range(len(passing), 0, -1), passing, strict=True):
                     number = sequence - before & 0xFF
-                    client.transmit(self.signer.sequence_and_sign(each, number, now_us))
+                    recipient_of(client).transmit(
+                        self.signer.sequence_and_sign(each, number, now_us)
+                    )
 
     def _tick(self) -> None:
         # First, so that the next tick follows whatever happens below.
@@ -459,4 +461,4 @@ class Hub:
         for client in asked:
             for frame in requests:
                 if client.endpoint.passes(frame.message_id):
-                    client.transmit(frame)
+                    recipient_of(client).transmit(frame)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
-from gateway.hub.fanout import Fanout
+from gateway.hub.fanout import Fanout, recipient_of
 from gateway.hub.limits import RequestQueue
 from gateway.hub.own_vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.hub.round_trip import RoundTrip, is_of_gateway
@@ -143,6 +143,8 @@ class Router:
 
     def deliver(self, client: Client, frame: MavFrame, now_us: int) -> None:
         """Route one frame received from a client for which there is no cached route."""
+        if client.update_version(frame, now_us):
+            self._fanout.change_version()
         origin = frame.origin
         if self._rejects is not None and self._rejects(frame.data, now_us):
             return
@@ -284,4 +286,4 @@ class Router:
             answer = self._round_trip.answer(frame, systems[0], now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
-                client.transmit(answer)
+                recipient_of(client).transmit(answer)

@@ -28,6 +28,7 @@ class Sink:
     """A client that keeps the frames that it is sent, with their times."""
 
     is_direct = False
+    is_mavlink1 = False
 
     def __init__(self, client_id: int, url: str) -> None:
         self.client_id = client_id

@@ -19,6 +19,7 @@ class Peer:
     """A client that keeps the frames that it is sent."""
 
     is_direct = False
+    is_mavlink1 = False
 
     def __init__(self, fanout: Fanout, client_id: int, options: str = "") -> None:
         self.sent: list[MavFrame] = []

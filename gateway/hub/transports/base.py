@@ -18,7 +18,7 @@ from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
 from gateway.reasons import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import Event, MavFrame, SplitFault
+from gateway.wire.mavlink_splitter import START_V2, Event, MavFrame, SplitFault
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +28,8 @@ UNTRUSTED_READ_RATE: Final = 64_000
 """Bytes a second read from all untrusted clients together: at most 5000 frames, a tenth of a
 processor. The rest waits with the sender, or is lost in the kernel."""
 UNTRUSTED_READ_BURST: Final = 256_000
+VERSION_PROBE_US: Final = 5 * US_PER_S
+"""Several heartbeats of the client."""
 RETRY_US: Final = US_PER_S
 """Between attempts to reopen a socket."""
 
@@ -115,6 +117,10 @@ class Client:
     heard_us: int | None = None
     round_trip_us: int | None = None
     counters: ClientCounters = field(default_factory=ClientCounters)
+    version1_since_us: int | None = None
+    """When it began to send MAVLink 1."""
+    sends_version2: bool = False
+    _only_version1: bool = False
     routes: dict[bytes, Route] = field(default_factory=dict)
     """Cached routes of frames from here."""
     write: Write = field(default=not_open)
@@ -174,6 +180,30 @@ class Client:
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
         return False
+
+    @property
+    def is_mavlink1(self) -> bool:
+        """Whether it is sent MAVLink 1: by its options, or because it sends nothing else."""
+        if self.endpoint.mavlink:
+            return self.endpoint.mavlink == 1
+        return self._only_version1
+
+    def update_version(self, frame: MavFrame, now_us: int) -> bool:
+        """Note the version of a frame from it; return whether it is sent another one from now on.
+
+        Programs that know both versions begin with 1, and change to 2 when they receive 2: so 2 is
+        sent for `VERSION_PROBE_US` to a client that sends 1.
+        """
+        if self.sends_version2:
+            return False
+        before = self.is_mavlink1
+        if frame.data[0] == START_V2:
+            self.sends_version2, self._only_version1 = True, False
+        elif self.version1_since_us is None:
+            self.version1_since_us = now_us
+        else:
+            self._only_version1 = now_us - self.version1_since_us >= VERSION_PROBE_US
+        return self.is_mavlink1 != before
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
         """Handle a failed `write` whose frame will still be counted as sent."""
