@@ -1,0 +1,55 @@
+"""The table of all texts and warnings in docs/troubleshooting.md, and the tool that writes it."""
+
+import tomllib
+from pathlib import Path
+
+from tools.make_troubleshooting import EXPLANATIONS, PAGE, ROOT, Sources, explained, page_of
+
+PACKAGE = """
+PREFIX: Final = "Mark: "
+
+def emit(text):
+    return StatusText(INFO, text)
+
+class Radio:
+    def poll(self, is_bad, row):
+        text = "radio lost" if is_bad else f"radio {self.name} is back"
+        emit(text)
+        emit(PREFIX + row.text)
+        log.warning("%s: no answer after %d s", self.name, 3)
+        log.info("not listed")
+"""
+
+
+def test_page_contains_every_message_with_cause_and_remedy() -> None:
+    page, wrong = page_of(ROOT / "gateway", tomllib.loads(EXPLANATIONS.read_text()))
+    assert wrong == [], "explain it in docs/troubleshooting.toml"
+    assert PAGE.read_text() == page, "run python -m tools.make_troubleshooting"
+
+
+def test_tool_finds_messages_behind_parameters_conditions_and_constants(tmp_path: Path) -> None:
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "radio.py").write_text(PACKAGE)
+    found = {(each.kind, each.pattern) for each in Sources(folder).messages()}
+    assert found == {
+        ("text", "radio lost"),
+        ("text", "radio … is back"),
+        ("text", "Mark: …"),
+        ("log", "…: no answer after … s"),
+    }
+
+
+def test_tool_reports_unexplained_messages_and_unused_explanations(tmp_path: Path) -> None:
+    folder = tmp_path / "package"
+    folder.mkdir()
+    (folder / "radio.py").write_text(PACKAGE)
+    entries = [
+        {"match": "radio", "cause": "a", "remedy": "b"},
+        {"match": "Mark", "cause": "a", "remedy": "b"},
+        {"match": "gone", "cause": "a", "remedy": "b"},
+    ]
+    _, wrong = explained(Sources(folder).messages(), entries)
+    assert len(wrong) == 2
+    assert "no answer after" in wrong[0]
+    assert "'gone'" in wrong[1]

@@ -1,0 +1,300 @@
+"""Write docs/troubleshooting.md: every text and warning of mavgate with its cause and remedy.
+
+usage: python -m tools.make_troubleshooting [--check]
+
+The messages come from the source code: each `StatusText`, and each call of a logger at WARNING or
+above. Causes and remedies come from docs/troubleshooting.toml, where the first entry whose `match`
+is part of a message explains it. The command fails while a message has no explanation, or an entry
+explains nothing; with `--check` also if the page is not up to date.
+"""
+
+import ast
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+PAGE: Final = ROOT / "docs" / "troubleshooting.md"
+EXPLANATIONS: Final = ROOT / "docs" / "troubleshooting.toml"
+LOG_LEVELS: Final = frozenset({"warning", "error", "critical", "exception"})
+TEXT_CALLS: Final = {"StatusText": 1, "MAVLink_statustext_message": 1, "News": 1}
+"""Constructors of texts for ground stations, and the position of the text."""
+HOLE: Final = "…"
+"""Stands for a value that is known only at run time."""
+MAX_DEPTH: Final = 4
+"""Calls that are followed back from a parameter to its value."""
+LEAST_LETTERS: Final = 4
+"""A pattern with fewer letters is not a message of its own: its values are looked for."""
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@dataclass(frozen=True, order=True, slots=True)
+class Message:
+    """A message that mavgate can emit."""
+
+    kind: str
+    """`text` for ground stations, or `log`."""
+    pattern: str
+    """Its wording, with `…` for values."""
+    source: str
+    """File and line."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Call:
+    call: ast.Call
+    caller: Function | None
+    package: str
+
+
+class Sources:
+    """The syntax trees of a package.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the package.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._trees = {path: ast.parse(path.read_text()) for path in sorted(folder.rglob("*.py"))}
+        self._trees_by_package = [
+            (path.relative_to(folder).parts[0], tree) for path, tree in self._trees.items()
+        ]
+
+    def messages(self) -> list[Message]:
+        """Return all messages, in the order of their wording."""
+        found: set[Message] = set()
+        for path, tree in self._trees.items():
+            package = path.relative_to(self._folder).parts[0]
+            for call, function in _calls(tree, None):
+                if (text := _text_of(call)) is None:
+                    continue
+                kind, expression = text
+                source = f"{path.relative_to(self._folder.parent)}:{call.lineno}"
+                for pattern in self._patterns(expression, function, package, 0):
+                    found.add(Message(kind, _tidied(pattern), source))
+        return sorted(found)
+
+    @cached_property
+    def _calls_by_name(self) -> dict[tuple[str, str], list["_Call"]]:
+        """Calls by package and name of the called function."""
+        found: dict[tuple[str, str], list[_Call]] = {}
+        for package, tree in self._trees_by_package:
+            for call, function in _calls(tree, None):
+                key = (package, _name_of(call.func))
+                found.setdefault(key, []).append(_Call(call, function, package))
+        return found
+
+    @cached_property
+    def _constants(self) -> dict[str, str]:
+        """Texts of module level, by name."""
+        found = {}
+        for tree in self._trees.values():
+            for node in tree.body:
+                target = node.target if isinstance(node, ast.AnnAssign) else None
+                value = getattr(node, "value", None)
+                if isinstance(target, ast.Name) and isinstance(value, ast.Constant):
+                    found[target.id] = value.value
+        return {name: value for name, value in found.items() if isinstance(value, str)}
+
+    def _patterns(
+        self, node: ast.expr, function: Function | None, package: str, depth: int
+    ) -> list[str]:
+        """Return the wordings that an expression may have."""
+        match node:
+            case ast.Constant(value=str(text)):
+                return [text]
+            case ast.IfExp():
+                return self._patterns(node.body, function, package, depth) + self._patterns(
+                    node.orelse, function, package, depth
+                )
+            case ast.JoinedStr():
+                return self._joined(node.values, function, package, depth)
+            case ast.BinOp(op=ast.Add()):
+                return self._joined([node.left, node.right], function, package, depth)
+            case (
+                ast.Subscript(value=inner)
+                | ast.Call(func=ast.Attribute(value=inner, attr="encode"))
+            ):
+                return self._patterns(inner, function, package, depth)
+            case ast.Name(id=name):
+                return self._named(name, function, package, depth) or [HOLE]
+            case _:
+                return [HOLE]
+
+    def _joined(
+        self, parts: list[ast.expr], function: Function | None, package: str, depth: int
+    ) -> list[str]:
+        found = [""]
+        literal = "".join(str(part.value) for part in parts if isinstance(part, ast.Constant))
+        for part in parts:
+            values = [HOLE]
+            if isinstance(part, ast.Constant):
+                values = [str(part.value)]
+            elif isinstance(part, ast.BinOp | ast.JoinedStr):
+                values = self._patterns(part, function, package, depth)
+            else:
+                inner = part.value if isinstance(part, ast.FormattedValue) else part
+                if isinstance(inner, ast.Name) and inner.id in self._constants:
+                    values = [self._constants[inner.id]]
+                elif len(re.findall(r"[A-Za-z]", literal)) < LEAST_LETTERS:
+                    values = self._patterns(inner, function, package, depth)
+            found = [before + value for before in found for value in values]
+        return found
+
+    def _named(self, name: str, function: Function | None, package: str, depth: int) -> list[str]:
+        if name in self._constants:
+            return [self._constants[name]]
+        if function is None or depth >= MAX_DEPTH:
+            return []
+        assigned = [
+            pattern
+            for node in ast.walk(function)
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
+            for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
+            if isinstance(target, ast.Name) and target.id == name
+            for pattern in self._patterns(node.value, function, package, depth)
+        ]
+        return assigned or self._passed(name, function, package, depth)
+
+    def _passed(self, name: str, function: Function, package: str, depth: int) -> list[str]:
+        """Return the values of a parameter in all calls of its function."""
+        arguments = [argument.arg for argument in function.args.args]
+        if name not in arguments:
+            return []
+        position = arguments.index(name) - (arguments[0] == "self")
+        found = []
+        for one in self._calls_by_name.get((package, function.name), []):
+            given = [word.value for word in one.call.keywords if word.arg == name]
+            given += one.call.args[position : position + 1]
+            for value in given[:1]:
+                if one.caller is not function:
+                    found += self._patterns(value, one.caller, package, depth + 1)
+        return found
+
+
+def _calls(node: ast.AST, function: Function | None) -> Iterator[tuple[ast.Call, Function | None]]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Call):
+            yield child, function
+        inner = child if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
+        yield from _calls(child, inner)
+
+
+def _name_of(function: ast.expr) -> str:
+    return getattr(function, "id", getattr(function, "attr", ""))
+
+
+def _text_of(call: ast.Call) -> tuple[str, ast.expr] | None:
+    """Return the kind and the wording of a call that emits a message."""
+    name = _name_of(call.func)
+    owner = getattr(call.func, "value", None)
+    if name in LOG_LEVELS and isinstance(owner, ast.Name) and owner.id == "log" and call.args:
+        first = call.args[0]
+        if isinstance(first, ast.Constant) and first.value == "%s" and len(call.args) > 1:
+            first = call.args[1]
+        return "log", first
+    at = TEXT_CALLS.get(name)
+    return None if at is None or len(call.args) <= at else ("text", call.args[at])
+
+
+def _tidied(pattern: str) -> str:
+    text = re.sub(r"%[-#0-9.]*[sdrfx]", HOLE, pattern)
+    return re.sub(f"{HOLE}+", HOLE, " ".join(text.split()))
+
+
+def _is_dynamic(message: Message) -> bool:
+    """Return whether the wording of a message is not in the call that emits it."""
+    return len(re.findall(r"[A-Za-z]", message.pattern)) < LEAST_LETTERS
+
+
+def with_dynamic(
+    messages: list[Message], dynamic: list[dict[str, Any]]
+) -> tuple[list[Message], list[str]]:
+    """Replace messages without a wording of their own by those that are listed for their file."""
+    files = {entry["file"]: entry for entry in dynamic}
+    known = [message for message in messages if not _is_dynamic(message)]
+    found = {
+        message.source.partition(":")[0]: message.source
+        for message in messages
+        if _is_dynamic(message)
+    }
+    wrong = [
+        f"no dynamic entry for {source}" for file, source in found.items() if file not in files
+    ]
+    wrong += [f"no dynamic message in {file}" for file in files if file not in found]
+    known += [
+        Message(entry["kind"], text, entry["file"])
+        for entry in dynamic
+        for text in entry.get("texts", [])
+    ]
+    return sorted(known), wrong
+
+
+def explained(messages: list[Message], entries: list[dict[str, str]]) -> tuple[str, list[str]]:
+    """Return the tables of the page, and what is missing or superfluous."""
+    wrong: list[str] = []
+    rows: dict[str, list[str]] = {"text": [], "log": []}
+    used: set[int] = set()
+    shown: set[tuple[str, str]] = set()
+    for message in messages:
+        if (message.kind, message.pattern) in shown:
+            continue
+        shown.add((message.kind, message.pattern))
+        number = next(
+            (at for at, entry in enumerate(entries) if entry["match"] in message.pattern), None
+        )
+        if number is None:
+            wrong.append(f"no explanation of {message.pattern!r} ({message.source})")
+            continue
+        used.add(number)
+        entry = entries[number]
+        cells = (f"`{message.pattern}`", entry["cause"], entry["remedy"])
+        rows[message.kind].append(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+        )
+    wrong += [
+        f"nothing matches {entry['match']!r}" for at, entry in enumerate(entries) if at not in used
+    ]
+    head = "| message | cause | remedy |\n| --- | --- | --- |\n"
+    texts, logs = ("\n".join(rows[kind]) for kind in ("text", "log"))
+    page = (
+        "## Texts in the ground station\n\n"
+        f"`{HOLE}` stands for a value. A text that says again, back or OK reports the end of a "
+        f"problem.\n\n{head}{texts}\n\n"
+        f"## Warnings in the log\n\n{head}{logs}\n"
+    )
+    return page, wrong
+
+
+def page_of(folder: Path, explanations: dict[str, Any]) -> tuple[str, list[str]]:
+    """Return the whole page, and what is missing or superfluous."""
+    messages, wrong = with_dynamic(Sources(folder).messages(), explanations["dynamic"])
+    tables, unexplained = explained(messages, explanations["message"])
+    wrong += unexplained
+    note = "<!-- Written by `python -m tools.make_troubleshooting`; edit troubleshooting.toml. -->"
+    return f"{note}\n\n{explanations['intro'].strip()}\n\n{tables}", wrong
+
+
+def main() -> None:
+    """Write the page, or check it."""
+    page, wrong = page_of(ROOT / "gateway", tomllib.loads(EXPLANATIONS.read_text()))
+    if "--check" not in sys.argv:
+        PAGE.write_text(page)
+    elif PAGE.read_text() != page:
+        wrong.append(f"{PAGE.name} is not up to date: run python -m tools.make_troubleshooting")
+    for line in wrong:
+        print(line)
+    sys.exit(bool(wrong))
+
+
+if __name__ == "__main__":
+    main()
