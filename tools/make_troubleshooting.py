@@ -4,8 +4,8 @@ usage: python -m tools.make_troubleshooting [--check]
 
 The messages come from the source code: each `StatusText`, and each call of a logger at WARNING or
 above. Causes and remedies come from docs/troubleshooting.toml, where the first entry whose `match`
-is part of a message explains it. The command fails while a message has no explanation, or an entry
-explains nothing; with `--check` also if the page is not up to date.
+is part of a message explains it. The command fails while a message has no explanation; with
+`--check` also if the page is not up to date.
 """
 
 import ast
@@ -22,7 +22,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "troubleshooting.md"
 EXPLANATIONS: Final = ROOT / "docs" / "troubleshooting.toml"
 LOG_LEVELS: Final = frozenset({"warning", "error", "critical", "exception"})
-TEXT_CALLS: Final = {"StatusText": 1, "MAVLink_statustext_message": 1, "News": 1}
+TEXT_CALLS: Final = {"StatusText": 1, "MAVLink_statustext_message": 1, "ClientAlert": 1}
 """Constructors of texts for ground stations, and the position of the text."""
 HOLE: Final = "…"
 """Stands for a value that is known only at run time."""
@@ -216,54 +216,30 @@ def _is_dynamic(message: Message) -> bool:
     return len(re.findall(r"[A-Za-z]", message.pattern)) < LEAST_LETTERS
 
 
-def with_dynamic(
-    messages: list[Message], dynamic: list[dict[str, Any]]
-) -> tuple[list[Message], list[str]]:
-    """Replace messages without a wording of their own by those that are listed for their file."""
-    files = {entry["file"]: entry for entry in dynamic}
-    known = [message for message in messages if not _is_dynamic(message)]
-    found = {
-        message.source.partition(":")[0]: message.source
-        for message in messages
-        if _is_dynamic(message)
-    }
-    wrong = [
-        f"no dynamic entry for {source}" for file, source in found.items() if file not in files
-    ]
-    wrong += [f"no dynamic message in {file}" for file in files if file not in found]
-    known += [
-        Message(entry["kind"], text, entry["file"])
-        for entry in dynamic
-        for text in entry.get("texts", [])
-    ]
-    return sorted(known), wrong
+def with_dynamic(messages: list[Message], dynamic: list[dict[str, str]]) -> list[Message]:
+    """Replace messages without a wording in their call by those that are listed."""
+    found = [message for message in messages if not _is_dynamic(message)]
+    listed = [Message(entry["kind"], entry["text"], "several") for entry in dynamic]
+    return sorted(found + listed)
 
 
 def explained(messages: list[Message], entries: list[dict[str, str]]) -> tuple[str, list[str]]:
-    """Return the tables of the page, and what is missing or superfluous."""
+    """Return the tables of the page, and the messages without an explanation."""
     wrong: list[str] = []
     rows: dict[str, list[str]] = {"text": [], "log": []}
-    used: set[int] = set()
     shown: set[tuple[str, str]] = set()
     for message in messages:
         if (message.kind, message.pattern) in shown:
             continue
         shown.add((message.kind, message.pattern))
-        number = next(
-            (at for at, entry in enumerate(entries) if entry["match"] in message.pattern), None
-        )
-        if number is None:
+        entry = next((each for each in entries if each["match"] in message.pattern), None)
+        if entry is None:
             wrong.append(f"no explanation of {message.pattern!r} ({message.source})")
             continue
-        used.add(number)
-        entry = entries[number]
         cells = (f"`{message.pattern}`", entry["cause"], entry["remedy"])
         rows[message.kind].append(
             "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
         )
-    wrong += [
-        f"nothing matches {entry['match']!r}" for at, entry in enumerate(entries) if at not in used
-    ]
     head = "| message | cause | remedy |\n| --- | --- | --- |\n"
     texts, logs = ("\n".join(rows[kind]) for kind in ("text", "log"))
     page = (
@@ -276,10 +252,9 @@ def explained(messages: list[Message], entries: list[dict[str, str]]) -> tuple[s
 
 
 def page_of(folder: Path, explanations: dict[str, Any]) -> tuple[str, list[str]]:
-    """Return the whole page, and what is missing or superfluous."""
-    messages, wrong = with_dynamic(Sources(folder).messages(), explanations["dynamic"])
-    tables, unexplained = explained(messages, explanations["message"])
-    wrong += unexplained
+    """Return the whole page, and the messages without an explanation."""
+    messages = with_dynamic(Sources(folder).messages(), explanations["dynamic"])
+    tables, wrong = explained(messages, explanations["message"])
     note = "<!-- Written by `python -m tools.make_troubleshooting`; edit troubleshooting.toml. -->"
     return f"{note}\n\n{explanations['intro'].strip()}\n\n{tables}", wrong
 
