@@ -77,7 +77,7 @@ PURE_FOLDERS = {"panel/state", "season/statistics"}
 PURE_FILES = {
     f"recordings/{name}.py"
     for name in (
-        *("columns", "table", "tlog", "tlog_scan", "answers", "join", "play"),
+        *("columns", "table", "tlog", "tlog_scan", "answers", "join", "moment", "play"),
         *("formats/csv", "formats/maps", "formats/mavlink"),
     )
 }

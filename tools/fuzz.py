@@ -35,7 +35,7 @@ from gateway.live.control_verbs import AircraftVerbs, Named, Text, To
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import COLUMNS, TableRow
 from gateway.recordings.formats.ulog import TOPICS
-from gateway.recordings.join import parse_moment
+from gateway.recordings.moment import parse_moment
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, Incoming, NodeId

@@ -19,7 +19,7 @@ from gateway.recordings.index import (
     find_recording,
     list_recordings,
 )
-from gateway.recordings.join import parse_moment
+from gateway.recordings.moment import parse_moment
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE
 from gateway.status import RecorderStatus, Snapshot
 from gateway.vehicle.location import Place

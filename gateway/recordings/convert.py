@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.files import NO_RECORDING, FileKind, FlightError, kind_of
 from gateway.recordings.formats.maps import (
     VehicleTrack,
     to_geojson,
@@ -18,10 +18,9 @@ from gateway.recordings.formats.maps import (
     tracks_of_table,
 )
 from gateway.recordings.fuse import RecordedFusion
-from gateway.recordings.join import NOTHING_WITHIN, Limits, joined_tables, place_in, trimmed
+from gateway.recordings.join import NOTHING_WITHIN, Limits, joined_tables, trimmed
+from gateway.recordings.moment import place_in
 from gateway.recordings.reading import (
-    NO_RECORDING,
-    FlightError,
     ReadOptions,
     RecordedTable,
     aircraft_of,

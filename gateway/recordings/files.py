@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from pathlib import Path
 from tempfile import NamedTemporaryFile, gettempdir
-from typing import IO, Any, BinaryIO, Final, cast
+from typing import IO, Any, BinaryIO, Final, Literal, cast
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -58,6 +58,16 @@ GZIP_MAGIC: Final = b"\x1f\x8b"
 
 Progress = Callable[[int], None]
 """Called with how many more bytes were read."""
+
+
+Position = Literal["causal", "interpolated"]
+SettingsChoice = Literal["recorded", "current"]
+
+NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
+
+
+class FlightError(Exception):
+    """A file without the data that a command needs; the text says what and where."""
 
 
 class FileKind(StrEnum):

@@ -42,10 +42,16 @@ from gateway.recordings.columns import (
     has_group,
     write_lines,
 )
-from gateway.recordings.files import FileKind, encoding_of, kind_of, read_chunks, read_ends
+from gateway.recordings.files import (
+    FileKind,
+    FlightError,
+    encoding_of,
+    kind_of,
+    read_chunks,
+    read_ends,
+)
 from gateway.recordings.join import joined_tables
 from gateway.recordings.reading import (
-    FlightError,
     ReadOptions,
     RecordedTable,
     aircraft_of,

@@ -13,7 +13,9 @@ from typing import Final
 from gateway.recordings.answers import FIRST_GROUND_STATION, LogAnswers, is_station
 from gateway.recordings.files import (
     MAX_UNPACKED,
+    NO_RECORDING,
     FileKind,
+    FlightError,
     Layout,
     Progress,
     TlogSource,
@@ -26,7 +28,7 @@ from gateway.recordings.files import (
 from gateway.recordings.fuse import RecordedFusion, end_of
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.reading import NO_RECORDING, FlightError, ReadOptions
+from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
 
 READ_SIZE: Final = 1 << 20

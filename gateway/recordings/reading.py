@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.resources import files
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -23,7 +23,10 @@ from gateway.recordings.files import (
     OTHER_FORMATS,
     PARQUET,
     FileKind,
+    FlightError,
+    Position,
     Progress,
+    SettingsChoice,
     encoding_of,
     kind_of,
     open_tlog,
@@ -47,16 +50,6 @@ from gateway.recordings.tlog import ORDER_US, TlogRecord
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import counted
-
-Position = Literal["causal", "interpolated"]
-SettingsChoice = Literal["recorded", "current"]
-
-NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
-
-
-class FlightError(Exception):
-    """A file without the data that a command needs; the text says what and where."""
-
 
 TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
 """The map for logs whose columns are time_s, ax, gx and so on."""

@@ -34,7 +34,9 @@ from gateway.recordings.columns import (
 )
 from gateway.recordings.files import (
     HEAD_BYTES,
+    NO_RECORDING,
     FileKind,
+    FlightError,
     Layout,
     Progress,
     file_layout,
@@ -45,7 +47,6 @@ from gateway.recordings.files import (
     read_blocks,
     read_ends,
 )
-from gateway.recordings.reading import NO_RECORDING, FlightError
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
 from gateway.recordings.tlog import DAY_US, Batch, TlogIndex, TlogScanner, payload_of
 from gateway.recordings.tlog_scan import IntArray

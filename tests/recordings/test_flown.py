@@ -9,8 +9,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import row_to_line
+from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import FlightError, ReadOptions
+from gateway.recordings.reading import ReadOptions
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
 from tests.recordings.frames import START_US, make_records, make_tlog

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from gateway.recordings.columns import COLUMNS
+from gateway.recordings.files import FlightError
 from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import FlightError, RecordedTable
+from gateway.recordings.reading import RecordedTable
 from gateway.recordings.table import TableBlock, TableHeader, TableMark
 
 SECOND_US = 1_000_000

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.recordings.join import Moment, parse_moment, place_in
+from gateway.recordings.moment import Moment, parse_moment, place_in
 
 DAY_US = 86_400_000_000
 

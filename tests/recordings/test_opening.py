@@ -12,8 +12,9 @@ from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.columns import row_to_line
+from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
-from gateway.recordings.reading import FlightError, ReadOptions, header_for
+from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.table import encode_head, encode_header
 from gateway.recordings.tlog import TlogRecord
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog

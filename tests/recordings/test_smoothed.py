@@ -11,8 +11,9 @@ from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
 from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import RecordedFusion, smooth_blocks
-from gateway.recordings.reading import FlightError, ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions, open_rows
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))

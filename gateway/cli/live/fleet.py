@@ -21,7 +21,7 @@ from gateway.live.attachment import on_end_signals
 from gateway.live.control_socket import ControlError, request
 from gateway.live.detached_output import detached_output
 from gateway.recordings.index import NEWEST
-from gateway.recordings.join import civil_time
+from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted
 
 log = logging.getLogger(__name__)

@@ -25,7 +25,7 @@ from gateway.recordings.index import (
     list_recordings,
     rename_recording,
 )
-from gateway.recordings.join import civil_time
+from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:

@@ -32,6 +32,7 @@ from gateway.estimation.kernel_record import FloatArray, IntArray
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.columns import NAV, has_group
+from gateway.recordings.files import FlightError, SettingsChoice
 from gateway.recordings.fuse import (
     SETTLES,
     RowFusion,
@@ -42,13 +43,7 @@ from gateway.recordings.fuse import (
     with_smoothed_estimator,
 )
 from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import (
-    FlightError,
-    RecordedTable,
-    SettingsChoice,
-    header_for,
-    open_rows,
-)
+from gateway.recordings.reading import RecordedTable, header_for, open_rows
 from gateway.recordings.table import TableBlock
 from gateway.records import FusionState
 from gateway.units import US_PER_S, counted

@@ -24,9 +24,16 @@ from gateway.cli.support.recording_options import (
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import console_of, print_json, table_of
 from gateway.output import write_new
-from gateway.recordings.files import FileKind, Progress, kind_of, open_tlog, read_blocks
-from gateway.recordings.join import civil_time
-from gateway.recordings.reading import NO_RECORDING, FlightError
+from gateway.recordings.files import (
+    NO_RECORDING,
+    FileKind,
+    FlightError,
+    Progress,
+    kind_of,
+    open_tlog,
+    read_blocks,
+)
+from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import MENDED, FileInfo, VehicleInfo, describe
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
 from gateway.recordings.tlog import encode_record

@@ -50,6 +50,7 @@ from gateway.player import (
     endpoints_beyond,
     prepare,
 )
+from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import (
     AS_FAST_AS_POSSIBLE,
@@ -58,7 +59,6 @@ from gateway.recordings.play import (
     PlayState,
     check_speed,
 )
-from gateway.recordings.reading import FlightError
 from gateway.units import counted
 
 VIEW_INTERVAL_S: Final = 0.25

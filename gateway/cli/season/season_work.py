@@ -16,7 +16,8 @@ from gateway.cli.support.recording_options import read_column_map, refusing
 from gateway.cli.support.settings_options import read_options, read_settings
 from gateway.cli.support.terminal import console_of
 from gateway.printable import printable
-from gateway.recordings.reading import ReadOptions, SettingsChoice
+from gateway.recordings.files import SettingsChoice
+from gateway.recordings.reading import ReadOptions
 from gateway.season.batch.dask_executor import ClusterError, DaskCluster, has_dask
 from gateway.season.batch.flight_tasks import FlightResult, FlightTask, warm_up, without_secrets
 from gateway.season.batch.result_folder import ResultFolder

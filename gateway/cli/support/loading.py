@@ -18,10 +18,10 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import read_options
 from gateway.config import GatewaySettings
-from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.files import FileKind, FlightError, SettingsChoice, kind_of
 from gateway.recordings.fuse import aircraft_for, check_latency
 from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import FlightError, ReadOptions, SettingsChoice, is_table, open_rows
+from gateway.recordings.reading import ReadOptions, is_table, open_rows
 
 FlightArgument = Annotated[
     Path | None,

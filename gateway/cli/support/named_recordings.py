@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 from gateway.cli.support.asking import ask, is_running
 from gateway.cli.support.settings_options import read_settings
+from gateway.recordings.files import FlightError
 from gateway.recordings.index import RecordingError, find_recording
-from gateway.recordings.reading import FlightError
 
 if TYPE_CHECKING:
     from gateway.config import GatewaySettings

@@ -12,10 +12,9 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
 from gateway.reasons import reason_of
+from gateway.recordings.files import FlightError, Position, SettingsChoice
 from gateway.recordings.formats.csv import ColumnMap
-from gateway.recordings.formats.dataflash import SENSORS
-from gateway.recordings.join import Moment, parse_moment
-from gateway.recordings.reading import FlightError, Position, SettingsChoice
+from gateway.recordings.moment import Moment, parse_moment
 
 PANEL: Final = "Recordings"
 
@@ -71,6 +70,8 @@ def read_column_map(path: Path | None) -> ColumnMap | None:
 
 def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
     """Read --sensor; raises FlightError if one is invalid."""
+    from gateway.recordings.formats.dataflash import SENSORS
+
     found = []
     for text in texts or ():
         kind, _, number = text.partition("=")

@@ -21,9 +21,9 @@ from pymavlink.DFReader import DFReader_binary, DFReader_text
 
 from gateway.geometry.quaternion import from_euler
 from gateway.recordings.columns import Imported, RowBuilder, TableRow
-from gateway.recordings.files import ERASED, read_chunks, temporary_copy
+from gateway.recordings.files import ERASED, FlightError, read_chunks, temporary_copy
 from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US
-from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.columns import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
 from gateway.recordings.convert import FlightToWrite
-from gateway.recordings.files import is_packed, read_chunks, temporary_copy
-from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_blocks
+from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
+from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
 from gateway.recordings.table import (
     FORMAT_LINE,
     HEADER_PREFIX,

@@ -27,9 +27,9 @@ from pyulog.exceptions import ULogException
 
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, TableRow
-from gateway.recordings.files import read_chunks, temporary_copy
+from gateway.recordings.files import FlightError, read_chunks, temporary_copy
 from gateway.recordings.formats.mavlink import UNIX_YEAR_2000_US, UT_PER_GAUSS, VELOCITY_AGE_US
-from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, table_of_rows
+from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

@@ -17,10 +17,11 @@ from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.axis import Axis, SweepError, grid
 from gateway.analysis.tuning.contest import Trials, base_score, make_contest
+from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import aircraft_for, fused_lines
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import FlightError, ReadOptions, header_for, open_rows
+from gateway.recordings.reading import ReadOptions, header_for, open_rows
 from gateway.recordings.summary import describe
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user

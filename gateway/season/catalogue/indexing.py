@@ -12,8 +12,10 @@ from typing import Final
 from gateway.recordings.files import (
     CHUNK,
     GZIP,
+    NO_RECORDING,
     OTHER_FORMATS,
     FileKind,
+    FlightError,
     first_bytes,
     kind_of,
     open_recording,
@@ -22,7 +24,7 @@ from gateway.recordings.files import (
     read_chunks,
 )
 from gateway.recordings.index import as_text, recording_name
-from gateway.recordings.reading import NO_RECORDING, FlightError, ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions, open_rows
 from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
 from gateway.season.executors import Executor, WorkFailed
 from gateway.season.statistics.recording_tally import Flown, TableSkimmer, TlogTally, tally_rows

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.geometry.angle import wrap_180
-from gateway.recordings.join import civil_time
+from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import GroundDistance
 from gateway.recordings.tlog import DAY_US
 from gateway.season.statistics.track_shape import Place, simplified

@@ -19,7 +19,7 @@ from gateway.cli.support.named_recordings import files_of
 from gateway.config import GatewaySettings, load
 from gateway.player import PlayerDaemon
 from gateway.recordings.columns import row_to_line
-from gateway.recordings.reading import FlightError
+from gateway.recordings.files import FlightError
 from gateway.recordings.summary import END_BYTES, glance
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import TlogRecord

@@ -21,9 +21,10 @@ from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
+from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.opening import open_flights
-from gateway.recordings.reading import FlightError, ReadOptions, RecordedTable, open_rows
+from gateway.recordings.reading import ReadOptions, RecordedTable, open_rows
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.recordings.formats import flown

@@ -1,0 +1,73 @@
+"""Moments of a recording as text: `1:20`, `80`, `+10`, `2026-06-11T14:25:30Z`."""
+
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Final
+
+from gateway.units import US_PER_S
+
+MAX_TEXT: Final = 40
+_CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A moment of a recording; exactly one of the two is set."""
+
+    offset_s: float | None = None
+    """From the start, or from here if `relative`."""
+    relative: bool = False
+    time_us: int | None = None
+    """Civil time in µs since 1970."""
+
+
+def parse_moment(text: str) -> Moment:
+    """Read a moment.
+
+    Parameters
+    ----------
+    text : str
+        Seconds, `minutes:seconds` or `hours:minutes:seconds` from the start; with a sign, from
+        here; or a date and time in ISO 8601, in UTC unless it names a zone.
+
+    Returns
+    -------
+    Moment
+
+    Raises
+    ------
+    ValueError
+        If it is none of these.
+    """
+    if len(text) > MAX_TEXT:
+        raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")
+    if match := _CLOCK.fullmatch(text.strip()):
+        sign, first, second, seconds = match.groups()
+        hours, minutes = (first, second) if second is not None else ("0", first or "0")
+        offset_s = int(hours or 0) * 3600 + int(minutes) * 60 + float(seconds)
+        return Moment(-offset_s if sign == "-" else offset_s, relative=bool(sign))
+    try:
+        moment = datetime.fromisoformat(text.strip())
+    except ValueError as error:
+        raise ValueError(
+            f"{text!r} is no moment: write 80, 1:20, 1:02:03, +10, -0:30 or 2026-06-11T14:25:30Z"
+        ) from error
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return Moment(time_us=round(moment.timestamp() * US_PER_S))
+
+
+def civil_time(unix_us: float) -> datetime | None:
+    """Return a time in µs since 1970 as a moment in UTC; None beyond the calendar's years."""
+    try:
+        return datetime.fromtimestamp(unix_us / US_PER_S, UTC)
+    except (ValueError, OverflowError, OSError):
+        return None
+
+
+def place_in(moment: Moment, first_us: int) -> int:
+    """Convert a moment to a recording's own time, given that of its start."""
+    if moment.time_us is not None:
+        return moment.time_us
+    return first_us + round((moment.offset_s or 0.0) * US_PER_S)
