@@ -27,19 +27,7 @@ def check_output(
 ) -> None:
     """Check that a file may be written here, before the work for it.
 
-    Parameters
-    ----------
-    path : Path
-        The output file.
-    inputs : iterable of Path or None
-        The input files; None for those not given.
-    overwrite : bool
-        Whether an existing regular file may be replaced.
-
-    Raises
-    ------
-    OSError
-        FileExistsError if it exists and may not be replaced; otherwise the reason.
+    Raises OSError fileExistsError if it exists and may not be replaced; otherwise the reason.
     """
     try:
         there = path.lstat()
@@ -134,20 +122,7 @@ def write_new(
 def written_together(folder: Path) -> Iterator[Path]:
     """Have files written that belong together: all of them get into a folder, or none.
 
-    Parameters
-    ----------
-    folder : Path
-        Made where it is not there yet. Files of the same names in it are replaced.
-
-    Yields
-    ------
-    Path
-        An empty folder, on the same disk, to write the files into.
-
-    Raises
-    ------
-    OSError
-        As `check_output`, or if the disk fails.
+    Raises OSError as `check_output`, or if the disk fails.
     """
     is_new = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)

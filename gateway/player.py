@@ -74,21 +74,7 @@ def endpoints_beyond(settings: HubSettings) -> list[str]:
 class PlayerDaemon:
     """A player with its clients: sends frames of recordings, answers clients' requests.
 
-    Parameters
-    ----------
-    settings : GatewaySettings
-        The hub's.
-    flights : sequence of PlayedFlight
-        The flights to play.
-    plan : PlayPlan
-        How.
-    files : sequence of str
-        Names to show.
-
-    Raises
-    ------
-    ValueError
-        If recorded commands would leave this machine without the user's consent.
+    Raises ValueError if recorded commands would leave this machine without the user's consent.
     """
 
     def __init__(

@@ -60,18 +60,7 @@ class Judge:
 
 
 def make_judge(flight: Flight, keep: BoolArray) -> Judge:
-    """Split the fixes of a flight.
-
-    Parameters
-    ----------
-    flight : Flight
-    keep : ndarray of bool
-        Which of its fixes are fused; see `thin` and `withhold`.
-
-    Returns
-    -------
-    Judge
-    """
+    """Split the fixes of a flight."""
     return judge_of(*split(flight, keep))
 
 
@@ -81,22 +70,7 @@ def judge_of(fused: Flight, held: Flight) -> Judge:
 
 
 def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
-    """Score one track.
-
-    Parameters
-    ----------
-    track : FlightTrack
-        Fused from `judge.fused`.
-    judge : Judge
-
-    Returns
-    -------
-    dict of str to float
-        `north_m` and `east_m`, mean error against interpolated GPS as in the paper;
-        `interpolated_m`, its horizontal root mean square; `held_m`, the same against the fixes
-        that were not fused; `reference_m`, the same against the reference. NaN without data to
-        compare with.
-    """
+    """Score one track."""
     flight = judge.fused
     scored = flight.scored
     to_gps = position_error_m(track, judge.interpolated)[scored]
@@ -119,23 +93,7 @@ def blend_table(
     sensed: Sensed,
     interval_s: float,
 ) -> pd.DataFrame:
-    """Fuse a flight with every pair of weights, as in Table I.
-
-    Parameters
-    ----------
-    flight : Flight
-    fusion : FusionSettings
-        The paper's estimator is used, whatever is selected there.
-    sensed : Sensed
-        The flight's filtered samples.
-    interval_s : float
-        GPS is thinned to one fix in this many seconds; 0 for all.
-
-    Returns
-    -------
-    DataFrame
-        `alpha`, `beta`, and the columns of `score`; alpha varies slowest.
-    """
+    """Fuse a flight with every pair of weights, as in Table I."""
     judge = make_judge(flight, thin(flight, interval_s))
     rows = []
     for alpha, beta in itertools.product(WEIGHTS, repeat=2):

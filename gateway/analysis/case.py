@@ -65,20 +65,7 @@ def with_estimator(fusion: FusionSettings, name: str) -> FusionSettings:
 def make_case(
     flight: Flight, fusion: FusionSettings | None = None, *, smooth: bool = False
 ) -> Case:
-    """Fuse a flight with every estimator.
-
-    Parameters
-    ----------
-    flight : Flight
-    fusion : FusionSettings, optional
-        Instead of the flight's own.
-    smooth : bool
-        Add a track that is smoothed from both ends, if the clock never goes back.
-
-    Returns
-    -------
-    Case
-    """
+    """Fuse a flight with every estimator."""
     fusion = fusion or flight.fusion
     sensed = sense(flight, fusion.sensing)
     tracks = {name: fuse(flight, with_estimator(fusion, name), sensed) for name in ESTIMATORS}

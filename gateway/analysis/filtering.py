@@ -60,14 +60,7 @@ def apply(kind: Kind, settings: SensingSettings, rate_hz: float, x: FloatArray) 
 
 
 def compare(settings: SensingSettings, rate_hz: float) -> pd.DataFrame:
-    """Compare the filters' properties in a table.
-
-    Returns
-    -------
-    DataFrame
-        One row per filter: ripple of the pass band, gain at the cutoff and at three times the
-        cutoff, group delay at 0 Hz and its maximum, overshoot of a step, time per sample.
-    """
+    """Compare the filters' properties in a table."""
     return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
 
 

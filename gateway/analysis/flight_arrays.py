@@ -234,23 +234,7 @@ def flight_of_records(
     story: str,
     fusion: FusionSettings,
 ) -> Flight:
-    """Calibrate raw records into a flight.
-
-    Parameters
-    ----------
-    records : iterable of RawRecord or ImuCalibrated
-        One aircraft's, in the order of time.
-    calibration : NodeCalibration
-        Its IMU node's.
-    name, story : str
-        See `Flight`.
-    fusion : FusionSettings
-        See `Flight`.
-
-    Returns
-    -------
-    Flight
-    """
+    """Calibrate raw records into a flight."""
     chain = SensorChain(fusion.sensing, calibration)
     turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
     samples: list[ImuSample] = []
@@ -291,13 +275,7 @@ def flight_of_samples(
     story: str,
     fusion: FusionSettings,
 ) -> Flight:
-    """Convert calibrated samples to a flight.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two IMU samples.
-    """
+    """Convert calibrated samples to a flight."""
     if len(samples) < 2:
         raise ValueError(f"{name}: {len(samples)} IMU samples are no flight")
     return Flight(

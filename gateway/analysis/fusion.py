@@ -65,23 +65,7 @@ def sense(flight: Flight, settings: SensingSettings) -> Sensed:
 
 
 def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> FlightTrack:
-    """Fuse a flight with the estimator selected in the settings.
-
-    Parameters
-    ----------
-    flight : Flight
-        Its fixes and barometer samples enter at their arrival, before the IMU sample that is not
-        earlier.
-    settings : FusionSettings
-        Filters and estimator.
-    sensed : Sensed, optional
-        Result of `sense` for the same filters, to avoid computing it again.
-
-    Returns
-    -------
-    FlightTrack
-        One row per IMU sample.
-    """
+    """Fuse a flight with the estimator selected in the settings."""
     estimator = make_estimator(settings.estimation)
     if isinstance(estimator, KernelEstimator):
         return _fuse_at_once(flight, estimator)
@@ -109,22 +93,7 @@ def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> Flo
 
 
 def fuse_smoothed(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
-    """Smooth a flight from both ends, over the Kalman filter.
-
-    Parameters
-    ----------
-    flight : Flight
-        Its clock does not go back.
-    settings : FusionSettings
-        Filter settings.
-
-    Returns
-    -------
-    track : FlightTrack
-        One row per IMU sample.
-    latency_s : float
-        The GPS latency that was used; see `smooth`.
-    """
+    """Smooth a flight from both ends, over the Kalman filter."""
     estimation = msgspec.structs.replace(settings.estimation, estimator="eskf")
     estimator = make_estimator(estimation)
     if not isinstance(estimator, KernelEstimator):

@@ -62,12 +62,7 @@ def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
 
 
 def thin(flight: Flight, interval_s: float) -> BoolArray:
-    """Choose fixes at least an interval apart; unusable ones are all kept.
-
-    Returns
-    -------
-    ndarray of bool, one for each of `flight.fixes`
-    """
+    """Choose fixes at least an interval apart; unusable ones are all kept."""
     keep = np.ones(len(flight.fixes), np.bool_)
     last_us: int | None = None
     # Half a fix interval of tolerance: arrival jitters.
@@ -83,12 +78,7 @@ def thin(flight: Flight, interval_s: float) -> BoolArray:
 
 
 def withhold(flight: Flight, every: int) -> BoolArray:
-    """Choose all fixes but every n-th usable one.
-
-    Returns
-    -------
-    ndarray of bool, one for each of `flight.fixes`
-    """
+    """Choose all fixes but every n-th usable one."""
     usable = np.array(
         [is_usable(fix, flight.fusion.estimation.reference) for fix in flight.fixes], np.bool_
     )

@@ -18,17 +18,7 @@ HOLD_OUT: Final = 5
 
 
 def summarise(case: Case) -> dict[str, float]:
-    """Summarise a flight.
-
-    Parameters
-    ----------
-    case : Case
-
-    Returns
-    -------
-    dict of str to float
-        By name with unit; NaN if unknown.
-    """
+    """Summarise a flight."""
     flight, track = case.flight, case.track
     fixes = fixes_of(flight)
     gap_s = np.diff(fixes.arrival_us) / US_PER_S

@@ -56,20 +56,7 @@ class PilotFigures:
 
 
 def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> PilotFigures:
-    """Summarise one flight.
-
-    Parameters
-    ----------
-    flight : Flight
-    track : FlightTrack
-        As it was fused, at the times of the flight's samples.
-    frame : LocalFrame
-        Metres about the first fix.
-
-    Returns
-    -------
-    PilotFigures
-    """
+    """Summarise one flight."""
     seconds = flight.time_s
     place = frame.place(track.lat_deg, track.lon_deg)
     height_m = np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan)

@@ -22,22 +22,7 @@ def cores() -> int:
 
 @contextmanager
 def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[Pool]:
-    """Open a pool of forked processes.
-
-    Parameters
-    ----------
-    count : int
-        Number of processes.
-    begin : callable
-        Called first in each of them.
-    *arguments : object
-        For it; in a forked process they need not be picklable.
-
-    Yields
-    ------
-    Pool
-        Open it before a thread is started, such as that of a progress bar.
-    """
+    """Open a pool of forked processes."""
     with no_warning_of_threads():
         pool = multiprocessing.get_context(START).Pool(count, _begin, (begin, *arguments))
     with pool:
@@ -45,21 +30,7 @@ def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[
 
 
 def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connection:
-    """Call a function in a background process, which sends what it makes.
-
-    Parameters
-    ----------
-    work : callable
-        Called there with the argument and with what it sends by. That process ends when nobody
-        can receive any more, also if this one is killed.
-    argument : object
-        In a forked process it need not be picklable.
-
-    Returns
-    -------
-    Connection
-        What the other process sends; its end is that of the process.
-    """
+    """Call a function in a background process, which sends what it makes."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
     process = multiprocessing.Process(
         target=_begin, args=(_send, work, argument, sender, receiver), daemon=True

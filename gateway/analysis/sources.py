@@ -49,22 +49,7 @@ def simulated_flight(
     fusion: FusionSettings | None = None,
     duration_s: float = FLIGHT_S,
 ) -> Flight:
-    """Fly the built-in flight.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings, optional
-        The simulator's; its GPS latency becomes that of the fusion.
-    fusion : FusionSettings, optional
-        All other settings of the fusion.
-    duration_s : float
-        Length to fly.
-
-    Returns
-    -------
-    Flight
-        With exact truth as its reference.
-    """
+    """Fly the built-in flight."""
     settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
     aircraft = SimulatedAircraft(settings)
     flight = flight_of_records(
@@ -122,26 +107,7 @@ def flight_of_blocks(
 ) -> Flight:
     """Build a flight from a recording.
 
-    Parameters
-    ----------
-    blocks : iterable of TableBlock
-        In the order of time.
-    calibration : NodeCalibration
-        Of the IMU node, for rows that hold counts.
-    fusion : FusionSettings
-        The settings that belong to the flight.
-    name, story : str
-        See `Flight`.
-
-    Returns
-    -------
-    Flight
-        With the states that were recorded, if there are any.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two IMU samples.
+    Raises ValueError if there are fewer than two IMU samples.
     """
     pieces = [_arrays_of(block.cells, calibration) for block in blocks if len(block)]
     if sum(len(piece.time_us) for piece in pieces) < 2:
@@ -238,22 +204,7 @@ def _track_of_cells(states: FloatArray) -> FlightTrack:
 def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
     """Take the states of a recording as a flight's reference.
 
-    Parameters
-    ----------
-    flight : Flight
-    blocks : iterable of TableBlock
-        On the clock of the flight, in the order of time.
-    name : str
-        Name of the reference.
-
-    Returns
-    -------
-    Flight
-
-    Raises
-    ------
-    ValueError
-        If the recording holds no state.
+    Raises ValueError if the recording holds no state.
     """
     states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
     if not sum(map(len, states)):

@@ -35,17 +35,7 @@ class _Table:
 
 
 class Part:
-    """Bytes by the ending of their file's name, buffered until they are written to the disk.
-
-    Parameters
-    ----------
-    session : str
-        Name of the recording.
-    number : int
-        Which part of it, from 1.
-    offset_us : int
-        Civil time of gateway time zero, for as long as the part is written.
-    """
+    """Bytes by the ending of their file's name, buffered until they are written to the disk."""
 
     def __init__(self, session: str, number: int, offset_us: int) -> None:
         self.session = session
@@ -77,15 +67,7 @@ class Part:
         return vehicle_id in self._tables
 
     def prepare_table(self, header: TableHeader, state: FusionState | None = None) -> None:
-        """Set the head of an aircraft's table.
-
-        Parameters
-        ----------
-        header : TableHeader
-            Of this part; the recording's name is put in when the table begins.
-        state : FusionState, optional
-            State of the fusion before the first row, if it has any.
-        """
+        """Set the head of an aircraft's table."""
         self._tables[header.vehicle_id] = _Table(header, state)
 
     def add_flight(
@@ -181,18 +163,5 @@ class RecordingBudget:
         self._trusted.pop(client_id, None)
 
     def takes(self, client_id: int, size: int, now_us: int) -> bool:
-        """Return whether a frame from a client, or to it alone, is recorded.
-
-        Parameters
-        ----------
-        client_id : int
-        size : int
-            Of the frame in bytes.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        bool
-        """
+        """Return whether a frame from a client, or to it alone, is recorded."""
         return self._trusted.get(client_id, self._strangers).draw(size, now_us)

@@ -63,18 +63,7 @@ def reason_of(error: OSError) -> str:
 
 
 class PartFiles:
-    """Append to the files of one part, opening each with its first bytes.
-
-    Parameters
-    ----------
-    folder : Path
-        Created if it does not exist.
-    session : str
-        Name of the recording; a number is added if the first part finds it taken, also with its
-        first bytes: another gateway may record in the same folder.
-    part : int
-        From 1.
-    """
+    """Append to the files of one part, opening each with its first bytes."""
 
     def __init__(self, folder: Path, session: str, part: int) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -86,22 +75,7 @@ class PartFiles:
         self._has_new_names = False
 
     def write(self, pieces: Mapping[str, bytes]) -> DiskState:
-        """Append to files, without waiting for the physical disk.
-
-        Parameters
-        ----------
-        pieces : mapping of str to bytes
-            What to append, by the ending of the file's name: `.tlog`, `_v1.csv`.
-
-        Returns
-        -------
-        DiskState
-
-        Raises
-        ------
-        OSError
-            If the disk refuses it, or a file was removed meanwhile.
-        """
+        """Append to files, without waiting for the physical disk."""
         for ending, data in pieces.items():
             if ending not in self._files:
                 self._open(ending)
@@ -120,13 +94,7 @@ class PartFiles:
         return partial(_sync, tuple(self._files.values()), folder)
 
     def rename(self, to_name: str) -> None:
-        """Rename the recording between two writes, also before the first; the folder is not synced.
-
-        Raises
-        ------
-        RecordingError
-            If the name is taken or invalid.
-        """
+        """Rename the recording between two writes, also before the first; the folder is not synced."""
         if self.session in {recording.name for recording in list_recordings(self._folder)}:
             move_recording(self._folder, self.session, to_name)
         else:
@@ -134,13 +102,7 @@ class PartFiles:
         self.session = to_name
 
     def close(self, pieces: Mapping[str, bytes]) -> None:
-        """Append the last bytes, sync, close all files, and remove empty ones.
-
-        Raises
-        ------
-        OSError
-            If the disk refuses something; all files are closed then, too.
-        """
+        """Append the last bytes, sync, close all files, and remove empty ones."""
         try:
             self.write(pieces)
         finally:
@@ -212,13 +174,7 @@ NEW: Final = ".new"
 
 
 class Restamper:
-    """Shift the times of files, one after the other.
-
-    Parameters
-    ----------
-    free_floor : int
-        Bytes of the disk that a copy must leave free.
-    """
+    """Shift the times of files, one after the other."""
 
     def __init__(self, free_floor: int) -> None:
         self._free_floor = free_floor

@@ -26,15 +26,7 @@ RETRY_S: Final = 10.0
 
 
 class PlaceFiles:
-    """The files of all aircraft.
-
-    Parameters
-    ----------
-    folder : Path
-        Created when it is needed.
-    report : callable
-        Called with the vehicle id and why its places cannot be stored, or None when they can again.
-    """
+    """The files of all aircraft."""
 
     def __init__(self, folder: Path, report: Callable[[int, str | None], None]) -> None:
         self.failures = 0

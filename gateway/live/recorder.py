@@ -168,10 +168,7 @@ class Recorder:
     async def save(self, name: str) -> None:
         """Rename the present or last session.
 
-        Raises
-        ------
-        RecordingError
-            If there is none, or the name is taken or invalid.
+        Raises RecordingError if there is none, or the name is taken or invalid.
         """
         if not self._session.name:
             raise RecordingError("nothing was recorded since the gateway started")

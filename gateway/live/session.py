@@ -146,13 +146,7 @@ def part_stem(session: str, part: int) -> str:
 
 
 class Session:
-    """Decide when files are opened and closed.
-
-    Parameters
-    ----------
-    settings : RecordingSettings
-        Mode and limits.
-    """
+    """Decide when files are opened and closed."""
 
     def __init__(self, settings: RecordingSettings) -> None:
         self._settings = settings
@@ -214,26 +208,7 @@ class Session:
     def poll(
         self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False
     ) -> list[SessionAction]:
-        """Return the actions that are due.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-        unix_us : int
-            Civil time, for the name of a new session.
-        part_bytes : int
-            Size of the largest file that is open.
-        free_bytes : int
-            Space left on the disk; 0 if unknown.
-        jumped : bool
-            Whether civil time has turned out to differ from that of the open files.
-
-        Returns
-        -------
-        list of SessionAction
-            To be carried out in this order.
-        """
+        """Return the actions that are due."""
         match self.state:
             case SessionState.IDLE if self.wanted:
                 self.name, self.part = session_name(unix_us), 0

@@ -22,13 +22,7 @@ Kept = Mapping[int, dict[str, dict[str, int]]]
 
 
 class StampFile:
-    """The file of all aircraft.
-
-    Parameters
-    ----------
-    folder : Path
-        Created when it is needed.
-    """
+    """The file of all aircraft."""
 
     def __init__(self, folder: Path) -> None:
         self._file = folder / NAME

@@ -11,20 +11,7 @@ Result = TypeVar("Result")
 
 
 def begin_worker(name: str, most: int = 1) -> ThreadPoolExecutor:
-    """Start a thread at once: when its first job comes, the loop would wait for it.
-
-    Parameters
-    ----------
-    name : str
-        Prefix of the thread's name.
-    most : int
-        Threads there may be; another starts where a job comes and all are busy.
-
-    Returns
-    -------
-    ThreadPoolExecutor
-        With one thread.
-    """
+    """Start a thread at once: when its first job comes, the loop would wait for it."""
     worker = ThreadPoolExecutor(most, name)
     worker.submit(int)
     return worker
@@ -36,14 +23,6 @@ async def done_by(
     *args: Parameters.args,
     **kwargs: Parameters.kwargs,
 ) -> Result:
-    """Return a job's result; the job is done even if the task that waits for it is cancelled.
-
-    Parameters
-    ----------
-    worker : ThreadPoolExecutor
-        Whose thread does it, behind its earlier jobs.
-    job : callable
-        Called with the other arguments.
-    """
+    """Return a job's result; the job is done even if the task that waits for it is cancelled."""
     job_alone = partial(job, *args, **kwargs)
     return await asyncio.shield(asyncio.get_running_loop().run_in_executor(worker, job_alone))

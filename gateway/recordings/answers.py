@@ -62,15 +62,7 @@ _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
 
 def is_station(origin: int, stations: Set[int]) -> bool:
-    """Return whether a sender (system << 8 | component) is a ground station.
-
-    Parameters
-    ----------
-    origin : int
-        The sender.
-    stations : set of int
-        Senders whose heartbeats say so.
-    """
+    """Return whether a sender (system << 8 | component) is a ground station."""
     return origin >> 8 >= FIRST_GROUND_STATION or origin in stations
 
 
@@ -86,22 +78,7 @@ def is_command(frame: bytes, stations: Set[int]) -> bool:
 
 
 def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
-    """Find the records that are neither from a station nor requests to a vehicle.
-
-    Parameters
-    ----------
-    batch : Batch
-        Records of a tlog.
-    begin : int
-        First of them to look at.
-    stations : set of int
-        Senders whose heartbeats said that they are ground stations.
-
-    Returns
-    -------
-    ndarray of int
-        Their numbers in the batch.
-    """
+    """Find the records that are neither from a station nor requests to a vehicle."""
     origins = batch.origins[begin:]
     kept = (origins >> 8 < FIRST_GROUND_STATION) & ~np.isin(origins, list(stations))
     for i in np.flatnonzero(kept & np.isin(batch.message_ids[begin:], _LOOKED_AT)).tolist():
@@ -190,15 +167,7 @@ class LogAnswers:
         self._kept = 0
 
     def note(self, batch: Batch, stations: Set[int]) -> None:
-        """Take in the next records.
-
-        Parameters
-        ----------
-        batch : Batch
-            Records of a tlog, in their order.
-        stations : set of int
-            Senders (system << 8 | component) that are ground stations, as far as it is known.
-        """
+        """Take in the next records."""
         systems = batch.origins >> 8
         pairs = np.unique(systems << 32 | batch.message_ids)
         self._seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}

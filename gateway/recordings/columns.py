@@ -143,15 +143,7 @@ def cells_of(row: TableRow) -> tuple[Cell, ...]:
 
 
 def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
-    """Make a row of the numbers of its cells, in the order of `COLUMNS`.
-
-    Parameters
-    ----------
-    cells : sequence of float
-        NaN for an empty one; as `settle` leaves them.
-    vehicle_id : int
-        Of the aircraft.
-    """
+    """Make a row of the numbers of its cells, in the order of `COLUMNS`."""
     time_us = int(cells[0])
     has_raw, has_si = (not math.isnan(cells[group.start]) for group in (RAW, SI))
     flags = _imu_flags(int(cells[3])) if has_raw or has_si else ImuFlags(0)
@@ -460,22 +452,7 @@ def read_lines(text: bytes, width: int) -> FloatArray | None:
 
 
 def read_cells(line: bytes, width: int, places: Sequence[int] | None) -> list[float]:
-    """Read one line as Python reads numbers.
-
-    Parameters
-    ----------
-    line : bytes
-        Without its end.
-    width : int
-        Cells that it should have.
-    places : sequence of int, optional
-        Which of them are wanted; -1 for one that is not there. By default all.
-
-    Raises
-    ------
-    ValueError
-        If it has other cells, or a wanted one is no number.
-    """
+    """Read one line as Python reads numbers."""
     texts = line.decode().split(",")
     if len(texts) != width:
         raise ValueError(f"{counted(len(texts), 'cell')} where there should be {width}")

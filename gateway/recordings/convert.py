@@ -36,27 +36,7 @@ from gateway.recordings.tlog import Stamper, TlogRecord, encode_record
 class FlightToWrite:
     """Recordings that become one file: as MAVLink or as rows, whichever its format needs.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Tlogs, or tables of one aircraft.
-    options : ReadOptions
-        How to read and fuse.
-    limits : tuple of Moment or None
-        First and last moment.
-    title : str
-        Name of the flight in the file.
-    fuse : bool
-        Fuse tables again instead of using their recorded states.
-    smooth : bool
-        Smooth them from both ends.
-    message : str, optional
-        Name of the MAVLink message to write, if the format holds only one type.
-
-    Raises
-    ------
-    OSError
-        If a file cannot be read.
+    Raises OSError if a file cannot be read.
     """
 
     def __init__(
@@ -155,22 +135,7 @@ LACKS: Final[dict[str, Lacks]] = {}
 
 
 def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
-    """Add a format that `mavgate convert` can write.
-
-    Parameters
-    ----------
-    ending : str
-        Of the file's name, with its dot.
-    write : callable
-        Yields the file's bytes piece by piece.
-    lacks : Lacks
-        What the format cannot hold of a recording; the command tells the user.
-
-    Raises
-    ------
-    ValueError
-        If the ending is taken.
-    """
+    """Add a format that `mavgate convert` can write."""
     if ending in WRITERS:
         raise ValueError(f"files that end in {ending} are written already")
     WRITERS[ending], LACKS[ending] = write, lacks

@@ -150,20 +150,7 @@ def is_packed(path: Path) -> bool:
 
 @contextmanager
 def open_unpacked(path: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
-    """Open a file, gzipped or not, to read it to its end.
-
-    Yields
-    ------
-    file : BinaryIO
-        Gives its bytes unpacked.
-    raw : BinaryIO
-        The file on the disk.
-
-    Raises
-    ------
-    OSError
-        As `open_descriptor`, or if it is a damaged gzip file.
-    """
+    """Open a file, gzipped or not, to read it to its end."""
     with _readable(path), open_recording(path) as raw:
         packed = raw.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC)
         yield (cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if packed else raw), raw
@@ -175,14 +162,7 @@ def open_recording(path: Path) -> io.BufferedReader:
 
 
 def open_descriptor(path: Path) -> int:
-    """Open a file to read it, if it has an end.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read, or is a pipe or a device: they may have no end, and give their bytes
-        only once.
-    """
+    """Open a file to read it, if it has an end."""
     # A pipe that nobody writes to would wait here.
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     mode = os.fstat(descriptor).st_mode
@@ -248,20 +228,7 @@ def read_chunks(
 
 @contextmanager
 def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
-    """Have a file's content in a temporary one, which nobody cuts while it is read.
-
-    Parameters
-    ----------
-    path : Path
-        The file, for an error.
-    content : iterable of bytes
-        Its bytes, unpacked.
-
-    Raises
-    ------
-    OSError
-        If there is no room for it.
-    """
+    """Have a file's content in a temporary one, which nobody cuts while it is read."""
     copy = NamedTemporaryFile(prefix="mavgate-")  # noqa: SIM115
     try:
         for data in content:
@@ -279,15 +246,7 @@ def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
 
 
 def read_ends(path: Path) -> tuple[bytes, bytes]:
-    """Read the lines of a text file up to its first row, and some of the last.
-
-    Returns
-    -------
-    head : bytes
-        The lines up to and including the first that is not a comment.
-    tail : bytes
-        The last lines, the first of them whole.
-    """
+    """Read the lines of a text file up to its first row, and some of the last."""
     head = tail = b""
     with open_unpacked(path) as (file, raw):
         while line := file.readline(MAX_LINE):
@@ -337,13 +296,7 @@ _TIMES: Final = {
 
 
 class FrameClock:
-    """The time of each frame, counted from the first one.
-
-    Parameters
-    ----------
-    by_size : bool
-        Space frames by their size: no message holds a time.
-    """
+    """The time of each frame, counted from the first one."""
 
     def __init__(self, *, by_size: bool = False) -> None:
         self._by_size = by_size

@@ -34,24 +34,7 @@ IMU: Final = slice(1, BARO)
 def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     """Read a recording as a flight to be sent again.
 
-    Parameters
-    ----------
-    files : list of Path
-        Parts of one recording, a tlog, another program's CSV, or any format with a reader.
-    options : ReadOptions
-        Column map, vehicle, settings.
-
-    Returns
-    -------
-    RecordedFlight
-        Calibrated samples in body axes, so it needs no calibration.
-
-    Raises
-    ------
-    FlightError
-        If there is no flight in it.
-    OSError
-        If it cannot be read at all.
+    Raises FlightError if there is no flight in it; OSError if it cannot be read at all.
     """
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)

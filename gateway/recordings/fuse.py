@@ -95,15 +95,7 @@ LONGEST_SILENCE_US: Final = 1_000_000
 
 
 class Replay:
-    """Feed rows to a pipeline as if they arrived now.
-
-    Parameters
-    ----------
-    pipeline : Pipeline
-        Fresh, with the settings to fuse with.
-    follow : bool
-        Whether to change settings where they were changed in flight.
-    """
+    """Feed rows to a pipeline as if they arrived now."""
 
     def __init__(self, pipeline: Pipeline, *, follow: bool = True) -> None:
         self._pipeline = pipeline
@@ -116,18 +108,7 @@ class Replay:
     def take(
         self, row: TableRow | TableHeader | TableMark | FusionState | NodeStatus
     ) -> Iterator[tuple[int, Action]]:
-        """Process one row, a change of settings, a mark, or a state to restore.
-
-        Parameters
-        ----------
-        row : TableRow, TableHeader, TableMark, FusionState or NodeStatus
-            The next of the file.
-
-        Yields
-        ------
-        tuple of int and Action
-            Time on the recorded gateway clock, and the pipeline's action.
-        """
+        """Process one row, a change of settings, a mark, or a state to restore."""
         if isinstance(row, TableHeader):
             if self._follow:
                 now_us = self._now_us or 0
@@ -230,15 +211,7 @@ def heard_of(cells: FloatArray, vehicle_id: int) -> list[tuple[int, BaroRaw | Gp
 
 
 class InterpolatedPosition:
-    """The paper's playback: straight lines between fixes instead of the fused position.
-
-    Parameters
-    ----------
-    fixes : iterable of GpsFix
-        Of one aircraft, in the order of their arrival; read only as far as the states go.
-    latency_s : float
-        How much earlier than its arrival a fix was valid.
-    """
+    """The paper's playback: straight lines between fixes instead of the fused position."""
 
     def __init__(self, fixes: Iterable[GpsFix], latency_s: float) -> None:
         self._latency_us = round(latency_s * US_PER_S)
@@ -459,17 +432,7 @@ def aircraft_for(
 
 
 def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) -> None:
-    """Add a remark where the motion of a recording speaks against the latency that is set.
-
-    Parameters
-    ----------
-    file : Path
-        For the remark.
-    table : RecordedTable
-        One of mavgate's own; its rows are read here, and kept for the next reader.
-    aircraft : AircraftSettings
-        What it is fused with; it is not changed, since the setting is the user's.
-    """
+    """Add a remark where the motion of a recording speaks against the latency that is set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     found = estimate_latency(_samples_of(table, aircraft))
     if found is not None and abs(found.latency_s - set_s) > max(DOUBTFUL_S, 3.0 * found.std_s):
@@ -482,19 +445,7 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
 def note_smoothed_latency(
     file: Path, table: RecordedTable, aircraft: AircraftSettings, used_s: float
 ) -> AircraftSettings:
-    """Return the settings that a flight was smoothed with; a remark tells a latency not set.
-
-    Parameters
-    ----------
-    file : Path
-        For the remark.
-    table : RecordedTable
-        Its remarks are added to.
-    aircraft : AircraftSettings
-        What the flight was to be smoothed with.
-    used_s : float
-        The GPS latency that it was smoothed with; see `smooth_blocks`.
-    """
+    """Return the settings that a flight was smoothed with; a remark tells a latency not set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     if used_s == set_s:
         return aircraft
@@ -551,15 +502,7 @@ def with_reference(aircraft: AircraftSettings, **changes: object) -> AircraftSet
 
 
 class RowFusion:
-    """Put new states into rows.
-
-    Parameters
-    ----------
-    aircraft : Aircraft
-        Fresh, with the settings to fuse with.
-    follow : bool
-        Whether to change settings where they were changed in flight.
-    """
+    """Put new states into rows."""
 
     def __init__(self, aircraft: Aircraft, *, follow: bool) -> None:
         self._aircraft = aircraft
@@ -649,22 +592,7 @@ SETTLES: Final = "the state stored at the start is not used: {}; the estimator h
 
 
 class RecordedFusion:
-    """Flights in sequence, fused again.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        Anything that `open_rows` reads, of one aircraft.
-    options : ReadOptions
-        Settings, and how to read the files.
-    smooth : bool
-        Return smoothed states instead of those of the filter.
-
-    Raises
-    ------
-    FlightError
-        If there is no flight in a file, or they do not belong together.
-    """
+    """Flights in sequence, fused again."""
 
     def __init__(
         self, files: Sequence[Path], options: ReadOptions, *, smooth: bool = False

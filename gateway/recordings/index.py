@@ -36,23 +36,7 @@ class RecordingError(Exception):
 
 
 def check_name(name: str) -> str:
-    """Check the name under which a user saves a session.
-
-    Parameters
-    ----------
-    name : str
-        Letters, digits, space, dot, hyphen and underscore; begins with a letter or digit.
-
-    Returns
-    -------
-    str
-        The same.
-
-    Raises
-    ------
-    ValueError
-        If the name is not allowed for a file, or has another meaning.
-    """
+    """Check the name under which a user saves a session."""
     if name == NEWEST:
         raise ValueError(f"{name!r} is no name for a recording: it always means the newest")
     sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
@@ -124,10 +108,7 @@ def list_recordings(folder: Path) -> list[Recording]:
 def find_recording(folder: Path, name: str) -> Recording:
     """Find one recording by name; `last` is the newest, unless one has that name.
 
-    Raises
-    ------
-    RecordingError
-        If there is none.
+    Raises RecordingError if there is none.
     """
     recordings = list_recordings(folder)
     for recording in recordings:
@@ -165,10 +146,7 @@ def rename_recording(folder: Path, name: str, to_name: str) -> Recording:
 def move_recording(folder: Path, name: str, to_name: str) -> Recording:
     """Rename a recording, also while it is being written; never overwrites.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such recording, or the new name is taken or invalid.
+    Raises RecordingError if there is no such recording, or the new name is taken or invalid.
     """
     recording = find_recording(folder, name)
     check_free(folder, to_name)
@@ -180,10 +158,7 @@ def move_recording(folder: Path, name: str, to_name: str) -> Recording:
 def delete_recording(folder: Path, name: str) -> Recording:
     """Delete the files of a recording and return what they were.
 
-    Raises
-    ------
-    RecordingError
-        If there is no such recording.
+    Raises RecordingError if there is no such recording.
     """
     recording = find_recording(folder, name)
     for path in recording.files:

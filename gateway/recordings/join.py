@@ -33,11 +33,8 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     Parts of one recording share a clock; other recordings are put in their place by civil time.
     Where two overlap, the later one is taken from the end of the earlier one on.
 
-    Raises
-    ------
-    FlightError
-        If they are of several aircraft; while the rows are read, if one begins before the one
-        that it is given behind.
+    Raises FlightError if they are of several aircraft; while the rows are read, if one begins
+    before the one that it is given behind.
     """
     vehicles = sorted({table.header.vehicle_id for table in tables})
     if len(vehicles) > 1:
@@ -76,13 +73,7 @@ def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
 
 
 def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us: float) -> bool:
-    """Return whether a recording begins at the end of the one before, as far as that is known.
-
-    Raises
-    ------
-    FlightError
-        If it begins before that one has begun.
-    """
+    """Return whether a recording begins at the end of the one before, as far as that is known."""
     if shift_us is None:
         return True
     if begin_us < begun_us:
@@ -128,13 +119,7 @@ def _moved(comment: TableComment, shift_us: int) -> TableComment:
 
 
 def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
-    """Cut a table at its begin and end, each a moment or None.
-
-    Raises
-    ------
-    FlightError
-        While the rows are read, if none is between them.
-    """
+    """Cut a table at its begin and end, each a moment or None."""
     begin, end = limits
     zero_us = table.header.unix_us_at_zero or 0
 

@@ -25,20 +25,7 @@ class Moment:
 def parse_moment(text: str) -> Moment:
     """Read a moment.
 
-    Parameters
-    ----------
-    text : str
-        Seconds, `minutes:seconds` or `hours:minutes:seconds` from the start; with a sign, from
-        here; or a date and time in ISO 8601, in UTC unless it names a zone.
-
-    Returns
-    -------
-    Moment
-
-    Raises
-    ------
-    ValueError
-        If it is none of these.
+    Raises ValueError if it is none of these.
     """
     if len(text) > MAX_TEXT:
         raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")

@@ -118,22 +118,7 @@ PIECE: Final = 8
 
 
 class FusedTlog:
-    """Generate frames on demand, and keep them on disk for seeking back.
-
-    Parameters
-    ----------
-    frames : iterator of TlogRecord
-        The frames to play, in the order of their times.
-    last_us : int, optional
-        Time of its end, if known beforehand.
-    answers : LogAnswers, optional
-        Collects answers from the frames.
-
-    Raises
-    ------
-    OSError
-        If there is no room for temporary files.
-    """
+    """Generate frames on demand, and keep them on disk for seeking back."""
 
     def __init__(
         self,
@@ -243,21 +228,8 @@ def open_flights(
 ) -> list[OpenFlight]:
     """Index the tlogs, and begin to fuse other files; the parts of a recording together.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Anything that `mavgate play` takes.
-    options : ReadOptions
-        How to fuse.
-    opened : ExitStack
-        Closes the files.
-
-    Raises
-    ------
-    FlightError
-        If there is nothing to play in one of them.
-    OSError
-        If one cannot be read.
+    Raises FlightError if there is nothing to play in one of them; OSError if one cannot be
+    read.
     """
     flights = []
     for parts in parts_together(files):
@@ -286,18 +258,7 @@ def open_flights(
 def lay_out(
     flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool
 ) -> list[PlayedFlight]:
-    """Give each vehicle its own system id, and recordings of different days the same start.
-
-    Parameters
-    ----------
-    flights : sequence of OpenFlight
-        At least one.
-    wished : sequence of int
-        System ids for the first vehicles of the recordings, as many as are given; the other
-        vehicles of a recording get the following ids.
-    with_commands : bool
-        Play messages of stations and other requests to a vehicle too.
-    """
+    """Give each vehicle its own system id, and recordings of different days the same start."""
     begin_us, end_us = flights[0].first_us, flights[0].last_us
     used: set[int] = set()
     played = []

@@ -124,10 +124,7 @@ class Track:
     def take(self) -> bytes:
         """Return the next frame and move on.
 
-        Raises
-        ------
-        ValueError
-            At the end.
+        Raises ValueError at the end.
         """
         record = self._next
         if record is None:
@@ -219,10 +216,7 @@ class PlayState(StrEnum):
 def check_speed(speed: float) -> float:
     """Check a speed: 0.1 to 100, or infinite.
 
-    Raises
-    ------
-    ValueError
-        If it is outside.
+    Raises ValueError if it is outside.
     """
     if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
         raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")

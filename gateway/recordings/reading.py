@@ -111,23 +111,7 @@ READERS: Final[dict[str, Read]] = {}
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
-    """Add a format that every command that takes a flight can read.
-
-    Parameters
-    ----------
-    name : str
-        Of the format, for people.
-    knows : callable
-        Whether a file that begins with these bytes (some hundred) is of the format.
-    read : callable
-        Opens a file; see `table_of_rows` for samples that are calibrated already. Raises
-        FlightError if there is no flight in it.
-
-    Raises
-    ------
-    ValueError
-        If a format of that name is read already.
-    """
+    """Add a format that every command that takes a flight can read."""
     if name in READERS:
         raise ValueError(f"{name} files are read already")
     OTHER_FORMATS[name], READERS[name] = knows, read
@@ -164,24 +148,8 @@ def is_table(path: Path) -> bool:
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     """Open any file that holds a flight as a table.
 
-    Parameters
-    ----------
-    path : Path
-        A table, another program's CSV, or an autopilot's tlog.
-    options : ReadOptions
-        Column map, vehicle, settings.
-
-    Returns
-    -------
-    RecordedTable
-        The head is complete, the rows come as they are read.
-
-    Raises
-    ------
-    FlightError
-        If it holds no flight that can be read.
-    OSError
-        If it cannot be read at all.
+    Raises FlightError if it holds no flight that can be read; OSError if it cannot be read at
+    all.
     """
     match kind_of(path):
         case FileKind.TABLE:
@@ -195,20 +163,7 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
 
 
 def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
-    """Return the header that a table needs to be fused again.
-
-    Parameters
-    ----------
-    aircraft : AircraftSettings
-        Those that the flight is fused with; the signing passphrase stays out of the file.
-    vehicle_id : int
-        The aircraft of the table.
-
-    Returns
-    -------
-    TableHeader
-        Version, settings and calibration; the rest is the recorder's to fill in.
-    """
+    """Return the header that a table needs to be fused again."""
     sections: dict[str, Any] = msgspec.to_builtins(aircraft)
     sections["vehicle"].pop("signing_passphrase")
     calibration = sections.pop("calibration")
@@ -221,23 +176,7 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 
 
 def settings_of(header: TableHeader) -> AircraftSettings:
-    """Return the settings with which a table was recorded.
-
-    Parameters
-    ----------
-    header : TableHeader
-        Of the table.
-
-    Returns
-    -------
-    AircraftSettings
-        Absent sections keep their defaults.
-
-    Raises
-    ------
-    msgspec.ValidationError
-        If another version wrote them, with settings that this one does not have.
-    """
+    """Return the settings with which a table was recorded."""
     sections = {**header.settings, "calibration": header.calibration}
     return msgspec.convert(sections, AircraftSettings)
 
@@ -386,23 +325,7 @@ def table_of_rows(
     vehicle_id: int = 1,
     unix_us_at_zero: int | None = None,
 ) -> RecordedTable:
-    """Give rows of another program the head of a table, with the current settings.
-
-    Parameters
-    ----------
-    rows : iterator of TableRow
-        Their values count as calibrated.
-    options : ReadOptions
-        Holds the current settings.
-    vehicle_id : int
-        Of the aircraft.
-    unix_us_at_zero : int, optional
-        Civil time at the rows' zero, if it is known.
-
-    Returns
-    -------
-    RecordedTable
-    """
+    """Give rows of another program the head of a table, with the current settings."""
     header = _header_of_today(options, vehicle_id, unix_us_at_zero)
     blocks = (block_of(some) for some in iter(lambda: [*islice(rows, ROWS)], []))
     return RecordedTable(header, blocks)

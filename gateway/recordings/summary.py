@@ -380,13 +380,7 @@ class Glance(msgspec.Struct, frozen=True):
 
 
 def glance(files: Sequence[Path]) -> Glance:
-    """Look at a recording.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        All files of it; one that cannot be read, or is empty, is ignored.
-    """
+    """Look at a recording."""
     times_us: list[int] = []
     vehicles: set[int] = set()
     for file in files:

@@ -173,15 +173,7 @@ class Batch:
 
 
 class TlogScanner:
-    """Decode any chunks of a tlog into batches of records; never raises on data.
-
-    Parameters
-    ----------
-    offset : int
-        Where in the file the first chunk begins; a record must begin there.
-    strict : bool
-        Check every checksum, so that a frame with a wrong one counts as damage.
-    """
+    """Decode any chunks of a tlog into batches of records; never raises on data."""
 
     def __init__(self, offset: int = 0, *, strict: bool = False) -> None:
         self._offset = offset
@@ -239,20 +231,7 @@ class TlogScanner:
         )  # fmt: skip
 
     def _mend(self, times: IntArray, following: bytes) -> int:
-        """Give records whose time is damaged, which no checksum shows, that of the one before.
-
-        Parameters
-        ----------
-        times : ndarray, shape (n,)
-            In µs; changed in place.
-        following : bytes
-            The time of the record behind, if there is one and it is in step.
-
-        Returns
-        -------
-        int
-            How many were changed.
-        """
+        """Give records whose time is damaged, which no checksum shows, that of the one before."""
         # A time begins with a zero, or it is none.
         is_known = self._in_step and len(following) == TIME_SIZE and following[0] == 0
         next_us = int.from_bytes(following, "big") if is_known else int(times[-1])
@@ -505,21 +484,7 @@ _SYSTEM_AT_V1: Final = 3
 
 
 def readdress(frame: bytes, system_id: int) -> bytes:
-    """Return a frame as if another system had sent it.
-
-    Parameters
-    ----------
-    frame : bytes
-        A complete frame. Its signature is removed, since it would be invalid; a frame of an
-        unknown message is returned unchanged, since its checksum cannot be computed.
-    system_id : int
-        1 to 255.
-
-    Returns
-    -------
-    bytes
-        The frame with the checksum that fits.
-    """
+    """Return a frame as if another system had sent it."""
     extra = CRC_EXTRA.get(message_id_of(frame))
     if extra is None:
         return frame

@@ -65,13 +65,7 @@ class ThisProcess:
 
 
 class LocalProcesses:
-    """Processes of this machine.
-
-    Parameters
-    ----------
-    jobs : int or None
-        How many; None for one a core.
-    """
+    """Processes of this machine."""
 
     def __init__(self, jobs: int | None) -> None:
         self._jobs = jobs or cores()

@@ -96,19 +96,7 @@ class NodeSamples:
 
 
 def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None) -> NodeSamples:
-    """Scale raw records without correcting them.
-
-    Parameters
-    ----------
-    records : sequence of ImuRaw
-        Of one node, in their order.
-    moving : sequence of bool, optional
-        Of each record, whether the node moves according to GPS; by default unknown.
-
-    Returns
-    -------
-    NodeSamples
-    """
+    """Scale raw records without correcting them."""
     fields = [
         (r.time_us * 1e-6, field)
         for r in records
@@ -240,25 +228,7 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
 
 
 def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
-    """Find how the node is mounted from two poses of the aircraft.
-
-    Parameters
-    ----------
-    level : tuple of 3 floats
-        Mean specific force in sensor axes while the aircraft stood level.
-    nose_up : tuple of 3 floats
-        The same with the nose raised, by 15 to 90 deg.
-
-    Returns
-    -------
-    Matrix3
-        Rows of the rotation from sensor axes to body FRD.
-
-    Raises
-    ------
-    CalibrationError
-        If the two are too much alike.
-    """
+    """Find how the node is mounted from two poses of the aircraft."""
     up = np.array(level) / np.linalg.norm(level)
     raised = np.array(nose_up) / np.linalg.norm(nose_up)
     if _angle_deg(up, raised) < MIN_TILT_DEG:

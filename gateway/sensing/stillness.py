@@ -34,18 +34,7 @@ NOT_STILL: Final = "the node did not lie still: lay it down and do not touch it"
 
 
 def still_windows(samples: NodeSamples) -> list[slice]:
-    """Find the spans of a log in which the node lay still.
-
-    Parameters
-    ----------
-    samples : NodeSamples
-        Times growing.
-
-    Returns
-    -------
-    list of slice
-        Windows of `STILL_S` over `time_s`, in order, not overlapping.
-    """
+    """Find the spans of a log in which the node lay still."""
     time_s = samples.time_s
     if len(time_s) == 0:
         return []
@@ -55,17 +44,7 @@ def still_windows(samples: NodeSamples) -> list[slice]:
 
 
 def rest_spans(samples: NodeSamples) -> list[slice]:
-    """Find the spans in which the node lay still and did not turn either.
-
-    Parameters
-    ----------
-    samples : NodeSamples
-
-    Returns
-    -------
-    list of slice
-        Spans of `REST_WINDOWS` windows or more, in order.
-    """
+    """Find the spans in which the node lay still and did not turn either."""
     spans = []
     for run in _runs(still_windows(samples)):
         for begin in range(0, len(run) - REST_WINDOWS + 1, REST_WINDOWS):

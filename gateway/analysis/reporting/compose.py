@@ -33,19 +33,7 @@ has no data for is left out."""
 
 
 def make_report(case: Case, other: Case | None = None) -> Report:
-    """Build the report of one flight.
-
-    Parameters
-    ----------
-    case : Case
-    other : Case, optional
-        Another flight, or the same with other settings, to compare it with.
-
-    Returns
-    -------
-    Report
-        Its figures are not drawn yet.
-    """
+    """Build the report of one flight."""
     compared = [comparison(case, other)] if other is not None else []
     sections = compared + [section for build in SECTIONS if (section := build(case)) is not None]
     return Report(

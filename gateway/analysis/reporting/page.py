@@ -112,23 +112,7 @@ def write_report(
     on_picture: Callable[[], None] = lambda: None,
     jobs: int | None = None,
 ) -> Path:
-    """Write the page, its figures as SVG and PNG, and its tables as CSV.
-
-    Parameters
-    ----------
-    report : Report
-    folder : Path
-        Created if it does not exist.
-    on_picture : callable
-        Called after each figure, for a progress bar without a thread.
-    jobs : int, optional
-        Processes that draw; one per core by default.
-
-    Returns
-    -------
-    Path
-        The page.
-    """
+    """Write the page, its figures as SVG and PNG, and its tables as CSV."""
     with written_together(folder) as fresh:
         for section in report.sections:
             for table in section.tables:

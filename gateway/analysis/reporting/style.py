@@ -90,26 +90,7 @@ def styled() -> Iterator[None]:
 def panels(
     width_in: float, rows: int, row_height_in: float, *, columns: int = 1, share_x: bool = True
 ) -> tuple[Figure, list[Axes]]:
-    """Create a figure of panels one below the other, or side by side if there is room.
-
-    Parameters
-    ----------
-    width_in : float
-        `WIDE_IN` or `NARROW_IN`.
-    rows : int
-        Panels below each other on a wide page.
-    row_height_in : float
-        Height of one row.
-    columns : int
-        Panels side by side on a wide page; on a narrow one they go below each other.
-    share_x : bool
-        Whether all have the same x axis.
-
-    Returns
-    -------
-    Figure, list of Axes
-        The panels row by row.
-    """
+    """Create a figure of panels one below the other, or side by side if there is room."""
     if width_in < WIDE_IN:
         rows, columns = rows * columns, 1
     figure = Figure(figsize=(width_in, rows * row_height_in))

@@ -39,13 +39,7 @@ class Axis:
 
 
 def full_key(name: str) -> str:
-    """Find a setting by its path, the end of its path, or the paper's name.
-
-    Raises
-    ------
-    SweepError
-        If there is none, or more than one.
-    """
+    """Find a setting by its path, the end of its path, or the paper's name."""
     name = SHORT.get(name, name)
     found = [key for key in _leaves(FusionSettings, "") if key == name or key.endswith(f".{name}")]
     if not found:
@@ -58,10 +52,7 @@ def full_key(name: str) -> str:
 def parse_axis(name: str, text: str) -> Axis:
     """Read an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
 
-    Raises
-    ------
-    SweepError
-        If the text is neither, or a value is not allowed.
+    Raises SweepError if the text is neither, or a value is not allowed.
     """
     key = full_key(name)
     parts = text.split(":")
@@ -87,10 +78,7 @@ def parse_axis(name: str, text: str) -> Axis:
 def grid(axes: Sequence[Axis]) -> list[Values]:
     """List every point of a grid; the first axis varies slowest.
 
-    Raises
-    ------
-    SweepError
-        If there are too many.
+    Raises SweepError if there are too many.
     """
     size = math.prod(len(axis.values) for axis in axes)
     if size > LARGEST_GRID:
@@ -99,13 +87,7 @@ def grid(axes: Sequence[Axis]) -> list[Values]:
 
 
 def with_value(settings: Any, key: str, value: Value) -> Any:
-    """Return settings with one value changed.
-
-    Raises
-    ------
-    SweepError
-        If the value is not allowed there; the text names the key.
-    """
+    """Return settings with one value changed."""
     name, _, rest = key.partition(".")
     if rest:
         return msgspec.structs.replace(

@@ -66,26 +66,7 @@ def make_contest(
 ) -> Contest:
     """Prepare a sweep.
 
-    Parameters
-    ----------
-    flight : Flight
-    fusion : FusionSettings
-        All settings that are not varied. If those of one estimator are varied, it is selected.
-    keys : sequence of str
-        Settings to vary.
-    hold_out : int
-        Every n-th fix is withheld from the fusion; 0 for none.
-    interval_s : float
-        If not 0, fuse only one fix in this many seconds, and withhold all others.
-
-    Returns
-    -------
-    Contest
-
-    Raises
-    ------
-    SweepError
-        If the keys belong to several estimators.
+    Raises SweepError if the keys belong to several estimators.
     """
     fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
@@ -134,13 +115,7 @@ def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
 
 
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
-    """Return trials as a table, the best first.
-
-    Raises
-    ------
-    SweepError
-        If no trial has a score of this metric.
-    """
+    """Return trials as a table, the best first."""
     rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]
     table = pd.DataFrame(rows)
     column = COLUMN_OF[metric]
@@ -204,29 +179,7 @@ def optimise(
     generations: int,
     on_generation: Callable[[float], None] = lambda _: None,
 ) -> Values:
-    """Search between the least and greatest value of each axis by differential evolution.
-
-    Parameters
-    ----------
-    axes : sequence of Axis
-        Numbers only.
-    evaluate : callable
-        Scores many points at once, smaller is better; NaN is worst.
-    generations : int
-        How long to search.
-    on_generation : callable
-        Called with the best score after each generation.
-
-    Returns
-    -------
-    tuple of float
-        The best point.
-
-    Raises
-    ------
-    SweepError
-        If an axis is no range of numbers.
-    """
+    """Search between the least and greatest value of each axis by differential evolution."""
     bounds = []
     for axis in axes:
         numbers = [v for v in axis.values if isinstance(v, int | float)]

@@ -16,20 +16,7 @@ _trials: Trials | None = None
 
 @contextmanager
 def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
-    """Open a pool of processes.
-
-    Parameters
-    ----------
-    contest : Contest
-        The data shared by all trials.
-    jobs : int, optional
-        Number of processes; one per core by default.
-
-    Yields
-    ------
-    callable
-        Runs many trials, and yields the index and scores of each as it is done.
-    """
+    """Open a pool of processes."""
     trials = Trials(contest)
     trials.warm_up()
     count = jobs or cores()

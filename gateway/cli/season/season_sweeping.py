@@ -38,26 +38,7 @@ def run_season_sweep(
     options: SweepOptions,
     kept: Path | None = None,
 ) -> list[FlightResult]:
-    """Score every point on every flight, show what is best for all, and write it.
-
-    Parameters
-    ----------
-    work : SeasonWork
-        The flights, and who works on them.
-    read : ReadOptions
-        How they are read.
-    settings : GatewaySettings
-        What the best values are put into.
-    options : SweepOptions
-        What is varied, and how it is judged.
-    kept : Path, optional
-        Folder where each flight's scores are kept.
-
-    Returns
-    -------
-    list of FlightResult
-        With those that failed.
-    """
+    """Score every point on every flight, show what is best for all, and write it."""
     with refusing():
         if kept is not None:
             kept.mkdir(parents=True, exist_ok=True)

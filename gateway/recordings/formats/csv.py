@@ -71,17 +71,7 @@ class ColumnMap(Settings, frozen=True):
 
 
 class CsvReader:
-    """Turn the lines of another program's CSV into rows.
-
-    Parameters
-    ----------
-    column_map : ColumnMap
-        What its columns mean.
-    vehicle_id : int
-        Vehicle id of the rows.
-    lenient : bool
-        Whether the file may lack mapped columns, except those needed to fuse it.
-    """
+    """Turn the lines of another program's CSV into rows."""
 
     def __init__(
         self, column_map: ColumnMap, vehicle_id: int = 1, *, lenient: bool = False
@@ -101,23 +91,7 @@ class CsvReader:
         """Lines that could not be read, or whose time is not between those beside them."""
 
     def rows(self, lines: Iterable[str]) -> Iterator[TableRow]:
-        """Read a whole file.
-
-        Parameters
-        ----------
-        lines : iterable of str
-            Its lines; those that begin with `#` are left out, and lines of text before the names
-            of the columns are counted. Values are separated by commas, semicolons or tabs.
-
-        Yields
-        ------
-        TableRow
-
-        Raises
-        ------
-        ValueError
-            If the file lacks a column that it must have.
-        """
+        """Read a whole file."""
         kept = (line for line in lines if not line.startswith("#"))
         head = [*islice(kept, MAX_HEAD_LINES)]
         delimiter, names, begin = self._find_names(head)
@@ -150,20 +124,7 @@ class CsvReader:
                 self.faults += 1
 
     def _find_names(self, head: Sequence[str]) -> tuple[str, list[str], int]:
-        """Find the line with the names of the columns.
-
-        Returns
-        -------
-        delimiter : str
-        names : list of str
-        begin : int
-            Number of the line behind it.
-
-        Raises
-        ------
-        ValueError
-            If no line has all names; it states the ones that the likeliest line lacks.
-        """
+        """Find the line with the names of the columns."""
         best: tuple[int, int, str, list[str]] | None = None
         for number, line in enumerate(head):
             for delimiter in DELIMITERS if line.strip() else ():

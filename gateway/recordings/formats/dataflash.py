@@ -92,15 +92,7 @@ def _own_us(name: str, message: Message) -> int:
 
 
 class ArdupilotReader:
-    """Turn the messages of one log into records.
-
-    Parameters
-    ----------
-    vehicle_id : int
-        Vehicle id of the records.
-    sensors : mapping of str to int
-        Which sensor to take of each of `SENSORS`, counted from 0; by default the first.
-    """
+    """Turn the messages of one log into records."""
 
     def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
         self.dropped = 0
@@ -136,19 +128,7 @@ class ArdupilotReader:
         return {*self._handlers, *KINDS}
 
     def feed(self, name: str, message: Message) -> list[Imported]:
-        """Take the next message.
-
-        Parameters
-        ----------
-        name : str
-            Of its format.
-        message : Message
-
-        Returns
-        -------
-        list of Imported
-            What it holds, in the order of time; nothing for most messages.
-        """
+        """Take the next message."""
         kind = KINDS.get(name, name)
         if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
             return []

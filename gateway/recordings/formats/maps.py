@@ -73,20 +73,7 @@ LAST_US: Final = 253_402_300_799 * US_PER_S
 
 
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and places.
-
-    Parameters
-    ----------
-    name : str
-        Name of the flight on the map.
-    vehicles : iterable of VehicleTrack
-        Each with its points in the order of their times.
-
-    Yields
-    ------
-    str
-        Pieces of the file.
-    """
+    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and places."""
     yield (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
@@ -203,20 +190,7 @@ HALF_TURN_DEG = 180.0
 
 
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight: a line per vehicle with `coordTimes`, its home, marks and events as points.
-
-    Parameters
-    ----------
-    name : str
-        Name of the flight on the map.
-    vehicles : iterable of VehicleTrack
-        Each with its points in the order of their times.
-
-    Yields
-    ------
-    str
-        Pieces of the file.
-    """
+    """Write a flight: a line per vehicle with `coordTimes`, its home, marks and events as points."""
     yield f'{{"type":"FeatureCollection","name":{json.dumps(name)},"features":['
     separator = "\n"
     for vehicle in vehicles:
@@ -350,20 +324,7 @@ class _Drawn:
 
 
 def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:
-    """Collect the tracks of the vehicles of a tlog.
-
-    Parameters
-    ----------
-    records : iterable of TlogRecord
-        In the order of their times.
-    system_id : int or None
-        The one vehicle to take; all by default.
-
-    Returns
-    -------
-    list of VehicleTrack
-        Of those that reported a position, by their ids.
-    """
+    """Collect the tracks of the vehicles of a tlog."""
     drawn: dict[int, _Drawn] = {}
     stations: set[int] = set()
     for record in records:
@@ -415,15 +376,7 @@ def _take_text(one: _Drawn, frame: bytes, time_us: int) -> None:
 
 
 def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[VehicleTrack]:
-    """Collect the track of a table's aircraft: fused, or its fixes if it has no states.
-
-    Parameters
-    ----------
-    table : RecordedTable
-        Its rows are used up.
-    aircraft : AircraftSettings
-        Settings of the fix that sets home if the table has no home.
-    """
+    """Collect the track of a table's aircraft: fused, or its fixes if it has no states."""
     zero_us = table.header.unix_us_at_zero or 0
     one = _Drawn(VehicleTrack(f"aircraft {table.header.vehicle_id}"))
     has_home = False

@@ -44,18 +44,7 @@ LENGTH_AT: Final = 1
 
 @cache
 def layout_of(kind: Any) -> np.dtype[np.void]:
-    """Return a message's fields as they lie in its payload.
-
-    Parameters
-    ----------
-    kind : type
-        pymavlink's class of the message.
-
-    Returns
-    -------
-    dtype
-        A field of it by each name; texts are bytes up to their first NUL at the latest.
-    """
+    """Return a message's fields as they lie in its payload."""
     fields = []
     for name, code, length in zip(
         kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
@@ -281,13 +270,7 @@ _HEAD: Final = slice(0, 4)
 
 
 class AutopilotReader:
-    """Turn one vehicle's messages into rows of a table.
-
-    Parameters
-    ----------
-    system_id : int or None
-        Whose; the first system that sends an IMU message by default.
-    """
+    """Turn one vehicle's messages into rows of a table."""
 
     def __init__(self, system_id: int | None = None) -> None:
         self.system_id = system_id
@@ -470,22 +453,7 @@ def _on_clock(
     newest_us: IntArray,
     sampled_us: IntArray,
 ) -> IntArray:
-    """Give each message its time since zero.
-
-    Parameters
-    ----------
-    streams : ndarray, shape (n,)
-        0 for the IMU, or of `_STREAMS`.
-    own_us : ndarray, shape (n,)
-        By the vehicle; 0 where it tells none, less for a message that has no time.
-    recorded_us : ndarray, shape (n,)
-    zero_us : ndarray, shape (2,)
-        The vehicle's time at zero, and that of the recording.
-    newest_us : ndarray, shape (4,)
-        The newest time of each stream, which is changed.
-    sampled_us : ndarray, shape (1,)
-        When the newest IMU sample was recorded, which is changed.
-    """
+    """Give each message its time since zero."""
     found = np.empty_like(own_us)
     for i in range(len(own_us)):
         stream = streams[i]

@@ -197,21 +197,7 @@ class FoxgloveView:
         }
 
     def feed(self, system_id: int, component_id: int, message: Any, time_us: int) -> list[Shown]:
-        """Take the next message of a vehicle.
-
-        Parameters
-        ----------
-        system_id, component_id : int
-            Its sender; the panels show messages of the autopilot.
-        message : MAVLink_message
-            Decoded.
-        time_us : int
-            When it was recorded, µs since 1970.
-
-        Returns
-        -------
-        list of Shown
-        """
+        """Take the next message of a vehicle."""
         handler = self._handlers.get(message.msgname)
         if handler is None or component_id != AUTOPILOT:
             return []

@@ -73,20 +73,7 @@ Row = Mapping[str, Any]
 
 
 class Px4Log:
-    """The topics of one log.
-
-    Parameters
-    ----------
-    topics : mapping of str to mapping of str to ndarray
-        Arrays of one length by field, by topic; `timestamp` among them.
-    vehicle_id : int
-        Vehicle id of the records.
-
-    Raises
-    ------
-    ValueError
-        If there is no IMU in it.
-    """
+    """The topics of one log."""
 
     def __init__(self, topics: Mapping[str, Topic], vehicle_id: int) -> None:
         self.dropped = 0

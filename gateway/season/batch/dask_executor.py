@@ -34,15 +34,8 @@ def has_dask() -> bool:
 class DaskCluster:
     """Workers of a Dask cluster.
 
-    Parameters
-    ----------
-    address : str
-        Of its scheduler: tcp://HOST:8786.
-
-    Raises
-    ------
-    ClusterError
-        If there is none, it has no worker, or its workers run another version of mavgate.
+    Raises ClusterError if there is none, it has no worker, or its workers run another version
+    of mavgate.
     """
 
     def __init__(self, address: str) -> None:

@@ -81,17 +81,7 @@ class FlightTask(Protocol):
     def do(self, files: list[Path], name: str) -> Worked:
         """Do it.
 
-        Parameters
-        ----------
-        files : list of Path
-            The recording's.
-        name : str
-            What it is called, for what is written.
-
-        Raises
-        ------
-        FlightError, OSError, ValueError
-            If there is no flight in it.
+        Raises FlightError, OSError, ValueError if there is no flight in it.
         """
         ...
 
@@ -234,19 +224,7 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
 
 
 def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[FlightResult, Files]:
-    """Do a task on one recording; whatever is wrong with it stands in the result.
-
-    Parameters
-    ----------
-    task : FlightTask
-    known : tuple
-        The recording, its stamp, its key, and the name for what is written.
-
-    Raises
-    ------
-    StorageError, OSError
-        If the recording cannot be had at the moment.
-    """
+    """Do a task on one recording; whatever is wrong with it stands in the result."""
     item, stamp, key, name = known
     result = FlightResult(
         place=as_text(item.place), digest=stamp, key=key, task=task.name, version=__version__

@@ -22,15 +22,7 @@ PARTIAL: Final = ".partial"
 class ResultFolder:
     """Results of many recordings.
 
-    Parameters
-    ----------
-    folder : Path
-        Made if it is not there.
-
-    Raises
-    ------
-    OSError
-        If it cannot be written.
+    Raises OSError if it cannot be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -41,10 +33,7 @@ class ResultFolder:
     def held(self) -> Iterator[None]:
         """Keep other runs out, and remove what was left half written: by a killed one, or by this.
 
-        Raises
-        ------
-        OSError
-            If another run is at work in it.
+        Raises OSError if another run is at work in it.
         """
         descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:

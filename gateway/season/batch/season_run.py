@@ -28,25 +28,7 @@ def run_season(
     folder: ResultFolder | None,
     tell: Tell,
 ) -> list[FlightResult]:
-    """Do a task on every recording that it is not done on yet.
-
-    Parameters
-    ----------
-    task : FlightTask
-    items : sequence of BatchItem
-    executor : Executor
-        Does the work.
-    folder : ResultFolder or None
-        Where results are kept, and found again; None to keep nothing.
-    tell : callable
-        For a progress bar.
-
-    Returns
-    -------
-    list of FlightResult
-        One an item, in their order. What failed for a reason that may pass, such as a machine that
-        died, is not kept and will be tried again.
-    """
+    """Do a task on every recording that it is not done on yet."""
     found: list[FlightResult | None] = [None] * len(items)
     todo: list[tuple[BatchItem, str, str, str]] = []
     numbers: list[int] = []

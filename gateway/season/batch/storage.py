@@ -86,18 +86,7 @@ def has_fsspec() -> bool:
 def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem]:
     """Find the recordings that are meant.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Files, folders, and URLs of either, with `*` too. The parts of one recording become one
-        item; where there are tables of a recording, its tlogs are left out.
-    each_file : bool
-        Let every file be an item of its own.
-
-    Raises
-    ------
-    StorageError
-        If there is nothing of a name, or its storage cannot be reached.
+    Raises StorageError if there is nothing of a name, or its storage cannot be reached.
     """
     places = list(dict.fromkeys(place for name in names for place in _places(name)))
     if each_file:
@@ -132,18 +121,7 @@ def digest_of_files(paths: Sequence[Path]) -> str:
 
 @contextmanager
 def local_files(item: BatchItem) -> Iterator[list[Path]]:
-    """Have the files of a recording on this machine's disk.
-
-    Yields
-    ------
-    list of Path
-        Those that came from elsewhere are gone afterwards.
-
-    Raises
-    ------
-    StorageError
-        If one cannot be fetched.
-    """
+    """Have the files of a recording on this machine's disk."""
     if not any(part.data is not None or is_url(part.place) for part in item.parts):
         yield [Path(part.place) for part in item.parts]
         return

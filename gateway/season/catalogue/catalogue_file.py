@@ -86,18 +86,7 @@ class CataloguedFile:
 
 
 class Catalogue:
-    """The catalogue, open to be changed.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the recordings.
-
-    Raises
-    ------
-    CatalogueError
-        If the file cannot be made or is of another program.
-    """
+    """The catalogue, open to be changed."""
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CATALOGUE_NAME
@@ -175,22 +164,7 @@ class Catalogue:
 def find_flights(folder: Path, where: str = "") -> list[Row]:
     """Ask a catalogue.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the recordings.
-    where : str
-        What stands behind WHERE in SQL, in the names of `COLUMNS`; all flights by default.
-
-    Returns
-    -------
-    list of dict
-        The columns of each flight, by time.
-
-    Raises
-    ------
-    CatalogueError
-        If there is no catalogue, or the condition is none.
+    Raises CatalogueError if there is no catalogue, or the condition is none.
     """
     with _asked(folder) as db:
         rows = _select(db, ", ".join(COLUMNS), where)

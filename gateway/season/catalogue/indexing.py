@@ -61,25 +61,7 @@ def index_folder(
 ) -> IndexReport:
     """Bring the catalogue of a folder up to date.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the recordings; those in folders below it belong to it.
-    options : ReadOptions
-        How other programs' files are read.
-    executor : Executor
-        Reads them.
-    on_progress : callable
-        Called with how many files were read, and of how many.
-
-    Returns
-    -------
-    IndexReport
-
-    Raises
-    ------
-    CatalogueError
-        If the catalogue cannot be written.
+    Raises CatalogueError if the catalogue cannot be written.
     """
     catalogue = Catalogue(folder)
     try:

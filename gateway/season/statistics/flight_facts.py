@@ -106,13 +106,7 @@ class FlightTally:
         self._fixed.append(fixed)
 
     def facts(self, end_us: int | None) -> FlightFacts:
-        """Sum up, with all that depends on positions and fixes alone.
-
-        Parameters
-        ----------
-        end_us : int or None
-            Time of the recording's last record.
-        """
+        """Sum up, with all that depends on positions and fixes alone."""
         outages, lost_s = self._outages(end_us)
         known = FlightFacts(gps_outages=outages, gps_lost=lost_s, faults=self.faults)
         if not self.points:

@@ -73,17 +73,7 @@ class Versus:
 
 
 def group_of(vehicle: int | None, began: str | None, digest: str) -> str:
-    """Name the aircraft and day of a flight, which share weather and the state of the sensors.
-
-    Parameters
-    ----------
-    vehicle : int or None
-        System id.
-    began : str or None
-        Begin as the catalogue writes it; a flight without one is a group of its own.
-    digest : str
-        Of its file.
-    """
+    """Name the aircraft and day of a flight, which share weather and the state of the sensors."""
     return f"{vehicle} {began[:10] if began else digest}"
 
 

@@ -102,15 +102,7 @@ class _Run:
 
 
 class Calibrator:
-    """At most one calibration at a time.
-
-    Parameters
-    ----------
-    vehicle_id : int
-        Whose sensors they are.
-    in_flight : callable
-        Whether it flies.
-    """
+    """At most one calibration at a time."""
 
     def __init__(self, vehicle_id: int, in_flight: Callable[[], bool]) -> None:
         self._vehicle_id = vehicle_id

@@ -20,17 +20,7 @@ COLOURS: Final = (style.BLUE, style.RED)
 
 
 def comparison(a: Case, b: Case) -> Section:
-    """Build the section.
-
-    Parameters
-    ----------
-    a, b : Case
-        Two flights, or the same one fused with other settings.
-
-    Returns
-    -------
-    Section
-    """
+    """Build the section."""
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
     what = "the same flight with other settings" if same else b.flight.name
     lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."

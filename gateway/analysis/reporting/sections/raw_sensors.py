@@ -77,13 +77,7 @@ def timing(case: Case) -> Section | None:
 
 
 def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
-    """Measure jitter and loss.
-
-    Returns
-    -------
-    DataFrame
-        One row.
-    """
+    """Measure jitter and loss."""
     interval_us = np.diff(node_time_us) % NODE_WRAP_US
     nominal_us = float(np.median(interval_us))
     missing = missing_samples(node_time_us)
