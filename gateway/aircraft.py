@@ -7,7 +7,6 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import astuple, dataclass
-from typing import Final
 
 import msgspec
 import numpy as np
@@ -34,19 +33,13 @@ from gateway.records import (
     Outgoing,
     RawRecord,
 )
+from gateway.sensing.calibrating import corrected_by
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.sensing.imu_log import ImuLog
-from gateway.sensing.recalibration import (
-    remove_accel_error,
-    remove_gyro_error,
-    remove_mag_error,
-    remove_tilt,
-)
 from gateway.settings import Settings
 from gateway.vehicle.actions import (
     WARNING,
-    CalibrationKind,
     CalibrationMeasured,
     RecordingRequest,
     SavePlaces,
@@ -72,13 +65,6 @@ class SettingsChanged:
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
 Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
 """Frames to send, clients' rates, and records for a recording, in the order of its fusion."""
-
-ABSORB: Final = {
-    CalibrationKind.GYRO: remove_gyro_error,
-    CalibrationKind.ACCEL: remove_accel_error,
-    CalibrationKind.LEVEL: remove_tilt,
-    CalibrationKind.MAG: remove_mag_error,
-}
 
 
 class AircraftSettings(Settings, frozen=True):
@@ -271,9 +257,9 @@ class Aircraft:
         return self.perform([*self.vehicle.say(text, now_us), *answers], now_us)
 
     def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
-        """Correct the calibration by a measured error, unless it is too large for a sensor."""
+        """Join the calibration with a measured one, unless no sensor has such errors."""
         try:
-            fresh = ABSORB[measured.kind](self.settings.calibration, measured.error_b)
+            fresh = corrected_by(self.settings.calibration, measured.correction)
             calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
         except ValueError as error:
             text = StatusText(WARNING, f"Calibration refused: {error}")

@@ -27,7 +27,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "wire": FOUNDATION,
     "sensing": FOUNDATION,
     "estimation": FOUNDATION,
-    "vehicle": FOUNDATION,
+    "vehicle": FOUNDATION | {"sensing"},
     "clock": set(),
     "printable": set(),
     "reasons": set(),

@@ -23,6 +23,7 @@ from gateway.records import (
     Outgoing,
     RawRecord,
 )
+from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured, SettingsChange
@@ -257,7 +258,11 @@ def test_a_calibration_that_cannot_be_is_refused(key: str, value: Any, words: st
 def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
     aircraft = Aircraft(1, AircraftSettings())
     fly(aircraft)
-    measured = CalibrationMeasured(1, CalibrationKind.MAG, (5000.0, 0.0, 0.0))
+    measured = CalibrationMeasured(
+        1,
+        CalibrationKind.MAG,
+        msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0)),
+    )
     told = aircraft.perform([measured], 0)
     assert b"Calibration refused" in told[0].frame
     assert all(isinstance(action, Outgoing) for action in told)

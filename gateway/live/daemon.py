@@ -4,6 +4,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -23,6 +24,7 @@ from gateway.config import (
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
+from gateway.live.imu_tap import ImuTap
 from gateway.live.loop_lag import LoopLag
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
@@ -48,6 +50,7 @@ from gateway.records import (
     NodeStatus,
     Outgoing,
 )
+from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
@@ -151,6 +154,11 @@ class Daemon:
         RecorderVerbs(self._recorder).register(control)
         AircraftVerbs(self._mark).register(control)
         HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(control)
+        self._imu = ImuTap(
+            lambda vehicle_id: self._pipeline.find(vehicle_id).settings.calibration,
+            self._calibrate,
+        )
+        self._imu.register(control)
         return control
 
     def start(self) -> None:
@@ -378,6 +386,8 @@ class Daemon:
         match action:
             case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
                 self._recorder.flight(action)
+                if isinstance(action, FusedSample):
+                    self._imu.add(action)
             case ClientInterval():
                 self._hub.set_interval(action)
             case SaveSettings():
@@ -388,6 +398,16 @@ class Daemon:
                 (self._recorder.record if action.start else self._recorder.stop)()
             case SettingsChanged():
                 self._recorder.settings_changed(action.vehicle_id)
+
+    def _calibrate(self, vehicle_id: int, calibration: NodeCalibration) -> None:
+        """Use a calibration from now on, and write it to the aircraft's file."""
+        aircraft = self._pipeline.find(vehicle_id)
+        if aircraft.vehicle.in_flight:
+            raise ControlError(f"aircraft {vehicle_id} is in flight")
+        changed = msgspec.structs.replace(aircraft.settings, calibration=calibration)
+        self._perform(self._pipeline.change(vehicle_id, changed, self.now_us()))
+        saved = self._files.submit(save_aircraft, self._settings, vehicle_id, aircraft.settings)
+        saved.add_done_callback(_report_saved)
 
     def _save(self, save: SaveSettings) -> None:
         """Write an aircraft's settings to its file, and report the outcome."""
@@ -417,3 +437,10 @@ class Daemon:
     def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
         now_us = self.now_us()
         self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))
+
+
+def _report_saved(saving: Future[Path]) -> None:
+    try:
+        log.info("calibration saved to %s", saving.result())
+    except OSError as error:
+        log.warning("the calibration cannot be saved: %s", reason_of(error))

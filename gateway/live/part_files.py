@@ -94,7 +94,7 @@ class PartFiles:
         return partial(_sync, tuple(self._files.values()), folder)
 
     def rename(self, to_name: str) -> None:
-        """Rename the recording between two writes, also before the first; the folder is not synced."""
+        """Rename the recording between two writes; the folder is not synced."""
         if self.session in {recording.name for recording in list_recordings(self._folder)}:
             move_recording(self._folder, self.session, to_name)
         else:

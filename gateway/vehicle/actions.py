@@ -7,7 +7,8 @@ from typing import Any, Final
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.records import ClientInterval, Outgoing, Vec3
+from gateway.records import ClientInterval, Outgoing
+from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings
 from gateway.vehicle.plan import StoredPlaces
 
@@ -97,14 +98,12 @@ class CalibrationKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationMeasured:
-    """A remaining error of the calibrated samples, which the calibration then removes."""
+    """A calibration of the calibrated samples, which the aircraft's own is then joined with."""
 
     vehicle_id: int
     kind: CalibrationKind
-    error_b: Vec3
-    """In body FRD, to be subtracted from calibrated samples: gyroscope bias in rad/s,
-    accelerometer bias in m/s2, hard iron in uT; for LEVEL the roll, pitch and yaw in rad by
-    which the mounting is off."""
+    correction: NodeCalibration
+    """In body axes; see `gateway.sensing.calibrating.corrected_by`."""
 
 
 Action = (

@@ -37,7 +37,7 @@ from gateway.vehicle.encoding import (
 from gateway.vehicle.location import Place
 from gateway.vehicle.plan import StoredPlaces
 from gateway.vehicle.requests import RequestLog, RequestReader
-from gateway.vehicle.services.calibrator import Calibrator
+from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW, Calibrator
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     FAILED,
@@ -161,7 +161,9 @@ class Vehicle:
                 PACKED_PATH: self._parameters.packed,
             }
         )
-        self._calibrator = Calibrator(self.system_id, lambda: self.in_flight)
+        self._calibrator = Calibrator(
+            self.system_id, lambda: self.in_flight, lambda: self.telemetry.state
+        )
         self._recording = RecordingService(self._explain)
         self._control = OperatorControl(
             self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
@@ -182,6 +184,7 @@ class Vehicle:
         commands = CommandService(self._intervals, self._build, self._knows, self._explain)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
+        commands.register(FIXED_MAG_CAL_YAW, self._calibrator.start_by_yaw)
         self.places.register(commands)
         self._recording.register(commands)
         commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)

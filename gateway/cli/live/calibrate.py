@@ -2,7 +2,8 @@
 
 import asyncio
 import math
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -11,9 +12,10 @@ from typing import Annotated, Final, Protocol
 import msgspec
 import typer
 from rich import box
-from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
+from gateway.cli.support.asking import ask, is_running
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import refusing
@@ -26,6 +28,7 @@ from gateway.cli.support.settings_options import (
 from gateway.cli.support.terminal import console_of
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
+from gateway.live.imu_tap import raw_of
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialPort,
@@ -33,11 +36,11 @@ from gateway.live.serial_port import (
     find_receiver,
 )
 from gateway.recordings.reading import open_rows
-from gateway.records import GpsFix, ImuRaw
-from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.procedure import (
+from gateway.records import GpsFix, ImuRaw, RawRecord
+from gateway.sensing.calibrating import (
     FIELD_SIDES,
-    SIDES,
+    CalibrationError,
+    NodeSamples,
     calibrate_accelerometer,
     calibrate_gyro,
     calibrate_level,
@@ -45,12 +48,15 @@ from gateway.sensing.procedure import (
     calibrate_mounting,
     field_sides,
     is_still,
-    missing_sides,
+    node_samples,
+    sides_of,
 )
-from gateway.sensing.solvers import CalibrationError, NodeSamples, node_samples
+from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
 from gateway.wire.link import Link
 
+POLL_S: Final = 0.5
+"""Interval of the requests to a running gateway."""
 PATIENCE_S: Final = 10.0
 """Without a sample for so long, give up."""
 POSE_S: Final = 3.0
@@ -68,6 +74,13 @@ MOVING_US: Final = 3 * US_PER_S
 """A movement by GPS counts for this long."""
 
 console = console_of()
+
+
+SIDES: Final = (
+    *("x arrow up", "x arrow down", "y arrow up", "y arrow down"),
+    *("chips up", "chips down"),
+)
+"""How the board lies when +x, -x, +y, -y, +z, -z reads gravity."""
 
 
 class Step(StrEnum):
@@ -120,16 +133,25 @@ def calibrate(
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
-    Each step is saved when it is done. The gateway must not run meanwhile: the receiver's port is
-    read by one program at a time.
+    Each step is saved when it is done. A running gateway gives the samples and uses the result at
+    once; without one, or with --port, the receiver is read.
     """
     settings = read_settings(config)
     aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
     chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
     old = aircraft.calibration
+    is_live = log is None and port is None and config is None and is_running()
+    if is_live:
+        found = ask("imu.calibration", {"vehicle_id": vehicle})
+        old = msgspec.convert(found, NodeCalibration)
 
     def save(calibration: NodeCalibration) -> None:
         if dry_run:
+            return
+        if is_live:
+            values = msgspec.to_builtins(calibration)
+            ask("imu.calibrate", {"vehicle_id": vehicle, "calibration": values})
+            console.print("the gateway uses it, and saves it")
             return
         changed = msgspec.structs.replace(aircraft, calibration=calibration)
         with refusing():
@@ -141,7 +163,7 @@ def calibrate(
     else:
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
-        capture = capture_from(serial, vehicle)
+        capture = _capture_live(vehicle) if is_live else capture_from(serial, vehicle)
         solve = lambda step, known: live_step(step, capture, known, field_ut)  # noqa: E731
     _show(old, calibrate_each(chosen, solve, old, save))
 
@@ -201,7 +223,7 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
     """Collect poses until the node was laid on all its sides."""
     held: list[NodeSamples] = []
     for _ in range(MAX_TRIES):
-        missing = missing_sides(held)
+        missing = _missing(held)
         if not missing:
             break
         done = len(SIDES) - len(missing)
@@ -212,10 +234,16 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
         samples = capture(POSE_S)
         if not is_still(samples):
             console.print("It moved; once more.")
-        elif missing_sides([*held, samples]) == missing:
+        elif _missing([*held, samples]) == missing:
             console.print("That side was done before, or it is too far from upright; once more.")
         held.append(samples)
     return held
+
+
+def _missing(samples: list[NodeSamples]) -> list[str]:
+    """Name the sides on which the node was not laid yet."""
+    seen = sides_of(samples)
+    return [name for number, name in enumerate(SIDES) if number not in seen]
 
 
 def _log_step(
@@ -271,60 +299,82 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     serial = msgspec.structs.replace(serial, port=device)
 
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
-        return asyncio.run(_Listening(serial, vehicle, turned).listen(seconds))
+        collecting = _Collecting(vehicle, seconds, turned=turned)
+        return asyncio.run(_listen(serial, vehicle, collecting))
 
     return capture
 
 
-class _Listening:
-    """Read the receiver until one aircraft's samples span a time, and cover most sides if asked."""
+class _Collecting:
+    """Collect one aircraft's samples over a time, until most sides were seen if asked."""
 
-    def __init__(self, serial: SerialSettings, vehicle: int, turned: bool) -> None:
-        self._serial, self._vehicle, self._turned = serial, vehicle, turned
-        self._raws: list[ImuRaw] = []
+    def __init__(self, vehicle: int, seconds: float, *, turned: bool) -> None:
+        self._vehicle, self._seconds, self._turned = vehicle, seconds, turned
+        self.raws: list[ImuRaw] = []
         self._shown_s = 0.0
         label = "sides of the field seen" if turned else "listening"
         unit = f"{{task.completed:.0f}} of {FIELD_SIDES}" if turned else "{task.completed:.0f} s"
-        self._bar = Progress(
+        self.bar = Progress(
             TextColumn(label), BarColumn(), TextColumn(unit),
             console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
         )  # fmt: skip
+        self._task = self.bar.add_task("", total=FIELD_SIDES if turned else seconds)
+        self.limit_s = MAG_LIMIT_S if turned else seconds
 
-    async def listen(self, seconds: float) -> NodeSamples:
-        clock, link, done = GatewayClock(), Link(), asyncio.Event()
-        task = self._bar.add_task("", total=FIELD_SIDES if self._turned else seconds)
-
-        def on_bytes(data: bytes, now_us: int) -> None:
-            for record in link.feed(data, now_us):
-                if isinstance(record, ImuRaw) and record.node.vehicle_id == self._vehicle:
-                    self._raws.append(record)
-            if self._is_done(seconds, task):
-                done.set()
-
-        port = SerialPort(self._serial, on_bytes, lambda _: None, lambda _: None, clock)
-        port.start()
-        limit_s = MAG_LIMIT_S if self._turned else seconds
-        try:
-            with self._bar:
-                await asyncio.wait_for(done.wait(), limit_s + PATIENCE_S)
-        except TimeoutError:
-            refuse(f"no samples of vehicle {self._vehicle}: is it on, and the port right?")
-        finally:
-            port.close()
-        return node_samples(self._raws)
-
-    def _is_done(self, seconds: float, task: TaskID) -> bool:
-        raws = self._raws
+    def add(self, records: Iterable[RawRecord]) -> bool:
+        """Take the next records; return whether they are enough."""
+        raws, seconds = self.raws, self._seconds
+        raws += [r for r in records if isinstance(r, ImuRaw) and r.node.vehicle_id == self._vehicle]
         span_s = (raws[-1].time_us - raws[0].time_us) / US_PER_S if raws else 0.0
         if not self._turned:
-            self._bar.update(task, completed=min(span_s, seconds), refresh=True)
+            self.bar.update(self._task, completed=min(span_s, seconds), refresh=True)
             return span_s > seconds
         if span_s < self._shown_s + SIDES_EVERY_S:
             return False
         self._shown_s = span_s
         sides = field_sides(node_samples(raws))
-        self._bar.update(task, completed=sides, refresh=True)
+        self.bar.update(self._task, completed=sides, refresh=True)
         return span_s > MAG_LIMIT_S or (span_s > seconds and sides >= MAG_SIDES)
+
+
+async def _listen(serial: SerialSettings, vehicle: int, collecting: _Collecting) -> NodeSamples:
+    """Read the receiver until the samples are enough."""
+    clock, link, done = GatewayClock(), Link(), asyncio.Event()
+
+    def on_bytes(data: bytes, now_us: int) -> None:
+        if collecting.add(link.feed(data, now_us)):
+            done.set()
+
+    port = SerialPort(serial, on_bytes, lambda _: None, lambda _: None, clock)
+    port.start()
+    try:
+        with collecting.bar:
+            await asyncio.wait_for(done.wait(), collecting.limit_s + PATIENCE_S)
+    except TimeoutError:
+        refuse(f"no samples of vehicle {vehicle}: is it on, and the port right?")
+    finally:
+        port.close()
+    return node_samples(collecting.raws)
+
+
+def _capture_live(vehicle: int) -> Capture:
+    """Take the samples of the running gateway."""
+
+    def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
+        collecting, idle_s = _Collecting(vehicle, seconds, turned=turned), 0.0
+        ask("imu.samples", {"vehicle_id": vehicle})
+        with collecting.bar:
+            is_done = False
+            while not is_done:
+                time.sleep(POLL_S)
+                found = ask("imu.samples", {"vehicle_id": vehicle})
+                idle_s = 0.0 if found else idle_s + POLL_S
+                if idle_s > PATIENCE_S:
+                    refuse(f"no samples of vehicle {vehicle}: is it on?")
+                is_done = collecting.add(raw_of(tuple(values), vehicle) for values in found)
+        return node_samples(collecting.raws)
+
+    return capture
 
 
 def _ask(text: str) -> None:

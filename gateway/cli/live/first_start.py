@@ -28,8 +28,8 @@ from gateway.config import GatewaySettings, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.records import GpsFix, LinkReport, NodeStatus
+from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.solvers import NodeSamples
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver

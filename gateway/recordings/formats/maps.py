@@ -190,7 +190,7 @@ HALF_TURN_DEG = 180.0
 
 
 def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight: a line per vehicle with `coordTimes`, its home, marks and events as points."""
+    """Write a flight: a line per vehicle with `coordTimes`; home, marks and events as points."""
     yield f'{{"type":"FeatureCollection","name":{json.dumps(name)},"features":['
     separator = "\n"
     for vehicle in vehicles:

@@ -1,15 +1,15 @@
-"""Calibration on command: measure the remaining error of the calibrated samples.
+"""Calibration on command, of the samples as they are calibrated now.
 
-| command            | what the operator does                   | what is measured                |
-| ------------------ | ---------------------------------------- | ------------------------------- |
-| param1 = 1, gyro   | leave it at rest, 3 s                    | mean rate: the bias             |
-| param5 = 2, level  | leave it level and at rest, 3 s          | roll and pitch of the mounting  |
-| param5 = 4, accel  | leave it level and at rest, 3 s          | mean less gravity: the bias     |
-| param5 = 1, accel  | rest it on each of its six sides in turn | middle of the extremes, by axis |
-| param2 = 1, mag    | turn it about all axes, up to a minute   | centre of the sphere            |
+| command                     | what the operator does                | what is solved       |
+| --------------------------- | ------------------------------------- | -------------------- |
+| PREFLIGHT_CALIBRATION 1 = 1 | leave it at rest, 3 s                 | gyroscope bias       |
+| PREFLIGHT_CALIBRATION 5 = 2 | leave it level and at rest, 3 s       | tilt of the mounting |
+| PREFLIGHT_CALIBRATION 5 = 4 | leave it level and at rest, 3 s       | accelerometer bias   |
+| PREFLIGHT_CALIBRATION 5 = 1 | rest it on each of its six sides      | the same, and scale  |
+| PREFLIGHT_CALIBRATION 2 = 1 | turn it about all axes, up to 1 min   | hard and soft iron   |
+| FIXED_MAG_CAL_YAW           | leave it at rest at a heading, 3 s    | hard iron            |
 
-None is done in flight, where nothing is at rest. An error larger than any intact sensor of the
-kind has is refused: then the aircraft moved.
+`gateway.sensing.calibrating` solves them. None is done in flight, where nothing is at rest.
 
 Progress goes out as COMMAND_ACK (in progress) and as the `[cal]` texts that ground stations read;
 the result is an action, because the calibration belongs to another stage.
@@ -18,13 +18,29 @@ the result is an action, because the calibration belongs to another stage.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gateway.records import ImuSample, Vec3
-from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.geometry.geomagnetism import magnetic_field, year_of
+from gateway.records import ImuSample, NavFlags, NavState, Vec3
+from gateway.sensing.calibrating import (
+    IN_BODY_AXES,
+    CalibrationError,
+    MoreNeeded,
+    NodeSamples,
+    calibrate_accelerometer,
+    calibrate_accelerometer_level,
+    calibrate_gyro,
+    calibrate_level,
+    calibrate_magnetometer_by_yaw,
+    sides_of,
+    solve_magnetometer,
+    still_windows,
+    with_magnetometer,
+)
+from gateway.sensing.calibration import NodeCalibration
+from gateway.units import US_PER_S
 from gateway.vehicle.actions import (
     INFO,
     Answer,
@@ -46,37 +62,16 @@ from gateway.vehicle.services.commands import (
 )
 from gateway.vehicle.telemetry.announcements import chunks
 
+FIXED_MAG_CAL_YAW: Final = 42006
+"""MAV_CMD_FIXED_MAG_CAL_YAW, of the dialect ardupilotmega."""
 REST_US: Final = 3 * US_PER_S
 SIDE_US: Final = US_PER_S
 MAG_MIN_US: Final = 10 * US_PER_S
 TIMEOUT_US: Final = 60 * US_PER_S
 SIX_SIDES_TIMEOUT_US: Final = 180 * US_PER_S
-
-MAX_REST_GYRO_RADPS: Final = 0.05
-"""Standard deviation; hand-held trembling is above, an idling engine may be too."""
-MAX_REST_ACCEL_MPS2: Final = 0.5
-MAX_FIELD_DRIFT_UTPS: Final = 0.2
-"""A steady turn is as quiet as a rest, but the field turns: 0.6 deg/s at mid latitudes."""
-MIN_FIELD_SAMPLES: Final = 20
-MOST: Final = {
-    CalibrationKind.GYRO: (20.0 * RAD_PER_DEG, "it turned"),
-    CalibrationKind.ACCEL: (2.0, "it was moved or not level"),
-    CalibrationKind.LEVEL: (30.0 * RAD_PER_DEG, "it was not level"),
-    CalibrationKind.MAG: (200.0, "iron or a current is near"),
-}
-"""Greatest error along an axis, and the likely cause of a greater one. The first two are the
-limits of the MPU6050's data sheet, doubled for the accelerometer because of soldering."""
-FIELD_UT: Final = (15.0, 100.0)
-"""Strength of the Earth's field, a scale that is off by a third included."""
-MAX_FIELD_RESIDUAL: Final = 0.1
-"""Deviation of the field's strength, as a share of it."""
-SIDE_SHARE: Final = 0.9
-"""Share of gravity that one axis must carry for the aircraft to lie on that side."""
-MIN_SPREAD: Final = 1.2
-"""Least spread of the field along each axis, in radii of the sphere: 2 is all round."""
 MAG_SAMPLES: Final = 2000
-MIN_MAG_SAMPLES: Final = 100
 FIT_EVERY: Final = 50
+MOVED: Final = "it was moved"
 
 SIDES: Final = ("back", "front", "left", "right", "up", "down")
 """Which side lies below when +x, -x, +y, -y, +z, -z reads plus one gravity; level is "down"."""
@@ -88,25 +83,68 @@ class _Run:
     command: Command
     began_us: int
     six_sides: bool = False
-    window_us: int | None = None
+    simple: bool = False
+    yaw_rad: float | None = None
+    times_us: list[int] = field(default_factory=list)
     gyro: list[Vec3] = field(default_factory=list)
     accel: list[Vec3] = field(default_factory=list)
     mag: list[Vec3] = field(default_factory=list)
     mag_times_us: list[int] = field(default_factory=list)
-    sides: dict[int, Vec3] = field(default_factory=dict)
+    poses: list[NodeSamples] = field(default_factory=list)
+    """Of each side that it lay on."""
     progress: int = 0
 
     @property
     def deadline_us(self) -> int:
         return self.began_us + (SIX_SIDES_TIMEOUT_US if self.six_sides else TIMEOUT_US)
 
+    def take(self, sample: ImuSample) -> int:
+        """Collect a sample; return how long they span."""
+        self.times_us.append(sample.time_us)
+        self.gyro.append(sample.gyro_b_radps)
+        self.accel.append(sample.accel_b_mps2)
+        if sample.mag_b_ut is not None and len(self.mag) < MAG_SAMPLES:
+            self.mag.append(sample.mag_b_ut)
+            self.mag_times_us.append(sample.time_us)
+        return sample.time_us - self.times_us[0]
+
+    def samples(self) -> NodeSamples:
+        """Return what was collected, in body axes, and collect anew."""
+        found = NodeSamples(
+            time_s=np.array(self.times_us) / US_PER_S,
+            accel=np.array(self.accel),
+            gyro=np.array(self.gyro),
+            mag_time_s=np.array(self.mag_times_us) / US_PER_S,
+            mag=np.array(self.mag, float).reshape(-1, 3),
+            moving=np.zeros(len(self.times_us), np.bool_),
+        )
+        for collected in (self.times_us, self.accel, self.gyro, self.mag, self.mag_times_us):
+            collected.clear()
+        return found
+
 
 class Calibrator:
-    """At most one calibration at a time."""
+    """At most one calibration at a time.
 
-    def __init__(self, vehicle_id: int, in_flight: Callable[[], bool]) -> None:
+    Parameters
+    ----------
+    vehicle_id : int
+        Whose sensors they are.
+    in_flight : callable
+        Whether it flies.
+    state : callable
+        The newest estimate, if there is any: where the field of the Earth is looked up.
+    """
+
+    def __init__(
+        self,
+        vehicle_id: int,
+        in_flight: Callable[[], bool],
+        state: Callable[[], NavState | None] = lambda: None,
+    ) -> None:
         self._vehicle_id = vehicle_id
         self._in_flight = in_flight
+        self._state = state
         self._run: _Run | None = None
 
     @property
@@ -116,27 +154,37 @@ class Calibrator:
 
     def start(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_CALIBRATION; all zero cancels."""
-        gyro, mag = whole(command.params[0]), whole(command.params[1])
-        accel = whole(command.extra[0])
-        asked = {
-            (1, 0, 0): (CalibrationKind.GYRO, False),
-            (0, 1, 0): (CalibrationKind.MAG, False),
-            (0, 0, 1): (CalibrationKind.ACCEL, True),
-            (0, 0, 2): (CalibrationKind.LEVEL, False),
-            (0, 0, 4): (CalibrationKind.ACCEL, False),
-        }.get((gyro, mag, accel))
-        if asked is None:
+        asked = (whole(command.params[0]), whole(command.params[1]), whole(command.extra[0]))
+        run = {
+            (1, 0, 0): _Run(CalibrationKind.GYRO, command, now_us),
+            (0, 1, 0): _Run(CalibrationKind.MAG, command, now_us),
+            (0, 0, 1): _Run(CalibrationKind.ACCEL, command, now_us, six_sides=True),
+            (0, 0, 2): _Run(CalibrationKind.LEVEL, command, now_us),
+            (0, 0, 4): _Run(CalibrationKind.ACCEL, command, now_us, simple=True),
+        }.get(asked)
+        if run is None:
             values = (*command.params, *command.extra, command.height_m)
             nothing = not any(whole(value) for value in values)
             return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
+        return self._begin(run)
+
+    def start_by_yaw(self, command: Command, now_us: int) -> Outcome:
+        """Carry out MAV_CMD_FIXED_MAG_CAL_YAW: parameter 1 is the heading in deg."""
+        yaw_deg = command.params[0]
+        if not math.isfinite(yaw_deg):
+            return UNSUPPORTED, []
+        yaw_rad = math.radians(yaw_deg)
+        return self._begin(_Run(CalibrationKind.MAG, command, now_us, yaw_rad=yaw_rad))
+
+    def _begin(self, run: _Run) -> Outcome:
         if self._in_flight():
             return DENIED, _text("calibration failed: in flight")
-        kind, six_sides = asked
-        if self._run is not None:
-            again = (self._run.kind, self._run.six_sides) == asked
+        if (old := self._run) is not None:
+            same = (old.kind, old.six_sides, old.simple, old.yaw_rad)
+            again = same == (run.kind, run.six_sides, run.simple, run.yaw_rad)
             return (IN_PROGRESS if again else NOT_NOW), []
-        self._run = _Run(kind, command, now_us, six_sides)
-        return IN_PROGRESS, _text(f"calibration started: 2 {kind}")
+        self._run = run
+        return IN_PROGRESS, _text(f"calibration started: 2 {run.kind}")
 
     def on_sample(self, sample: ImuSample) -> list[Answer]:
         """Take in one calibrated sample while a calibration is under way."""
@@ -145,20 +193,14 @@ class Calibrator:
             return []
         if self._in_flight():
             return self._fail("in flight")
-        if run.kind is CalibrationKind.MAG:
-            return self._on_mag(run, sample)
-        if sample.mag_b_ut is not None and not run.six_sides:
-            run.mag.append(sample.mag_b_ut)
-            run.mag_times_us.append(sample.time_us)
-        if run.window_us is None:
-            run.window_us = sample.time_us
-        run.gyro.append(sample.gyro_b_radps)
-        run.accel.append(sample.accel_b_mps2)
-        length_us = SIDE_US if run.six_sides else REST_US
-        passed_us = sample.time_us - run.window_us
-        if passed_us >= length_us:
-            return self._on_window(run)
-        return [] if run.six_sides else self._announce(run, 100 * passed_us // length_us)
+        passed_us = run.take(sample)
+        if run.kind is CalibrationKind.MAG and run.yaw_rad is None:
+            return self._on_mag(run, passed_us) if sample.mag_b_ut is not None else []
+        if run.six_sides:
+            return self._on_side(run) if passed_us > SIDE_US else []
+        if passed_us <= REST_US:
+            return self._announce(run, min(99, 100 * passed_us // REST_US))
+        return self._solve(run, run.samples())
 
     def poll(self, now_us: int) -> list[Answer]:
         """End a calibration that takes too long."""
@@ -170,58 +212,56 @@ class Calibrator:
         """Return when to give up."""
         return self._run.deadline_us if self._run else None
 
-    def _on_window(self, run: _Run) -> list[Answer]:
-        gyro, accel = np.array(run.gyro), np.array(run.accel)
-        run.gyro.clear()
-        run.accel.clear()
-        run.window_us = None
-        at_rest = (
-            float(gyro.std(axis=0).max()) < MAX_REST_GYRO_RADPS
-            and float(accel.std(axis=0).max()) < MAX_REST_ACCEL_MPS2
-        )
-        if run.six_sides:
-            return self._on_side(run, accel.mean(axis=0)) if at_rest else []
-        if not at_rest or _field_turns(run):
-            return self._fail("it was moved")
+    def _solve(self, run: _Run, samples: NodeSamples) -> list[Answer]:
+        try:
+            return self._done(run, self._correction(run, samples))
+        except CalibrationError as error:
+            return self._fail(str(error) if still_windows(samples) else MOVED)
+
+    def _correction(self, run: _Run, samples: NodeSamples) -> NodeCalibration:
         if run.kind is CalibrationKind.GYRO:
-            return self._done(run, _vector(gyro.mean(axis=0)))
-        mean = _vector(accel.mean(axis=0))
+            return calibrate_gyro(samples, IN_BODY_AXES)
         if run.kind is CalibrationKind.LEVEL:
-            return self._done(run, _tilt(mean))
-        return self._done(run, (mean[0], mean[1], mean[2] + STANDARD_GRAVITY_MPS2))
+            return calibrate_level(samples, IN_BODY_AXES)
+        if run.simple:
+            return calibrate_accelerometer_level(samples, IN_BODY_AXES)
+        if run.yaw_rad is None:
+            return calibrate_accelerometer(run.poses, IN_BODY_AXES)
+        lat_deg, lon_deg = run.command.lat_deg, run.command.lon_deg
+        state = self._state()
+        if (
+            not (lat_deg or lon_deg)
+            and state is not None
+            and NavFlags.POSITION_VALID in state.flags
+        ):
+            lat_deg, lon_deg = state.lat_deg, state.lon_deg
+        if not (lat_deg or lon_deg):
+            raise CalibrationError("no position: wait for GPS, or give latitude and longitude")
+        there = magnetic_field(lat_deg, lon_deg, 0.0, year_of(None))
+        return calibrate_magnetometer_by_yaw(samples, IN_BODY_AXES, run.yaw_rad, there)
 
-    def _on_side(self, run: _Run, mean: NDArray[np.float64]) -> list[Answer]:
-        axis = int(np.abs(mean).argmax())
-        if abs(float(mean[axis])) < SIDE_SHARE * STANDARD_GRAVITY_MPS2:
+    def _on_side(self, run: _Run) -> list[Answer]:
+        samples, before = run.samples(), sides_of(run.poses)
+        new = sides_of([samples]) - before
+        if not new:
             return []
-        side = 2 * axis + (float(mean[axis]) < 0.0)
-        if side in run.sides:
-            return []
-        run.sides[side] = _vector(mean)
-        if len(run.sides) == len(SIDES):
-            low = [run.sides[2 * n + 1][n] for n in range(3)]
-            high = [run.sides[2 * n][n] for n in range(3)]
-            x, y, z = (0.5 * (a + b) for a, b in zip(low, high, strict=True))
-            return self._done(run, (x, y, z))
-        texts = _text(f"{SIDES[side]} side done, rotate to a different side")
-        return texts + self._announce(run, 100 * len(run.sides) // len(SIDES))
+        run.poses.append(samples)
+        if len(before) + 1 == len(SIDES):
+            return self._solve(run, samples)
+        texts = _text(f"{SIDES[new.pop()]} side done, rotate to a different side")
+        return texts + self._announce(run, 100 * (len(before) + 1) // len(SIDES))
 
-    def _on_mag(self, run: _Run, sample: ImuSample) -> list[Answer]:
-        if sample.mag_b_ut is None:
-            return []
-        if len(run.mag) < MAG_SAMPLES:
-            run.mag.append(sample.mag_b_ut)
-        passed_us = sample.time_us - run.began_us
-        enough = len(run.mag) >= MIN_MAG_SAMPLES and len(run.mag) % FIT_EVERY == 0
-        if not enough or passed_us < MAG_MIN_US:
+    def _on_mag(self, run: _Run, passed_us: int) -> list[Answer]:
+        if passed_us < MAG_MIN_US or len(run.mag) % FIT_EVERY:
             return self._announce(run, min(90, 100 * passed_us // TIMEOUT_US))
-        points = np.array(run.mag)
-        centre, radius = fit_sphere(points)
-        if not math.isfinite(radius) or np.ptp(points, axis=0).min() < MIN_SPREAD * radius:
-            return self._fail("turn it about all axes") if len(run.mag) >= MAG_SAMPLES else []
-        residual = float(np.std(np.linalg.norm(points - centre, axis=1)))
-        is_earths = FIELD_UT[0] <= radius <= FIELD_UT[1] and residual <= MAX_FIELD_RESIDUAL * radius
-        return self._done(run, centre) if is_earths else self._fail(MOST[run.kind][1])
+        try:
+            fit = solve_magnetometer(np.array(run.mag))
+            return self._done(run, with_magnetometer(IN_BODY_AXES, fit))
+        except MoreNeeded:
+            is_full = len(run.mag) >= MAG_SAMPLES
+            return self._fail("turn it about all axes") if is_full else []
+        except CalibrationError as error:
+            return self._fail(str(error))
 
     def _announce(self, run: _Run, percent: int) -> list[Answer]:
         step = percent // 10 * 10
@@ -230,12 +270,9 @@ class Calibrator:
         run.progress = step
         return [run.command.ack(IN_PROGRESS, step), *_text(f"progress <{step}>")]
 
-    def _done(self, run: _Run, error_b: Vec3) -> list[Answer]:
-        most, why = MOST[run.kind]
-        if max(map(abs, error_b)) > most:
-            return self._fail(why)
+    def _done(self, run: _Run, correction: NodeCalibration) -> list[Answer]:
         self._run = None
-        measured = CalibrationMeasured(self._vehicle_id, run.kind, error_b)
+        measured = CalibrationMeasured(self._vehicle_id, run.kind, correction)
         return [measured, run.command.ack(ACCEPTED), *_text(f"calibration done: {run.kind}")]
 
     def _fail(self, why: str) -> list[Answer]:
@@ -246,46 +283,6 @@ class Calibrator:
     def _cancel(self) -> list[Answer]:
         run, self._run = self._run, None
         return _text("calibration cancelled") if run else []
-
-
-def fit_sphere(points: NDArray[np.float64]) -> tuple[Vec3, float]:
-    """Fit a sphere by linear least squares: `|p|^2 = 2 c.p + (r^2 - |c|^2)`.
-
-    Parameters
-    ----------
-    points : ndarray, shape (n, 3)
-        At least four.
-
-    Returns
-    -------
-    centre : tuple of 3 floats
-    radius : float
-        NaN where the points lie on no sphere.
-    """
-    system = np.column_stack((2.0 * points, np.ones(len(points))))
-    solution = np.linalg.lstsq(system, (points**2).sum(axis=1), rcond=None)[0]
-    centre = solution[:3]
-    square = float(solution[3] + centre @ centre)
-    return _vector(centre), math.sqrt(square) if square > 0.0 else math.nan
-
-
-def _field_turns(run: _Run) -> bool:
-    """Return whether the field turned during rest; False without a magnetometer."""
-    if len(run.mag) < MIN_FIELD_SAMPLES:
-        return False
-    times_s = (np.array(run.mag_times_us) - run.mag_times_us[0]) / US_PER_S
-    slope = np.polyfit(times_s, np.array(run.mag), 1)[0]
-    return float(np.linalg.norm(slope)) > MAX_FIELD_DRIFT_UTPS
-
-
-def _tilt(mean_b_mps2: Vec3) -> Vec3:
-    x, y, z = mean_b_mps2
-    return (math.atan2(-y, -z), math.atan2(x, math.hypot(y, z)), 0.0)
-
-
-def _vector(values: Any) -> Vec3:
-    x, y, z = (float(value) for value in values)
-    return (x, y, z)
 
 
 def _text(text: str) -> list[Answer]:

@@ -12,7 +12,7 @@ from gateway.config import load, load_aircraft
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
-from gateway.sensing.solvers import NodeSamples
+from gateway.sensing.calibrating import NodeSamples
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.estimation.samples import fix

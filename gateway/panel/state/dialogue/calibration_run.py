@@ -19,8 +19,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.dialogue.sphere_cover import CELLS, seen_cells
 from gateway.records import NAN
+from gateway.sensing.calibrating import fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
-from gateway.vehicle.services.calibrator import fit_sphere
 
 FloatArray = NDArray[np.float64]
 

@@ -1,0 +1,512 @@
+"""The calibration solver: from samples of poses and turns to a node's calibration."""
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gateway.geometry.geomagnetism import MagneticField
+from gateway.geometry.quaternion import from_euler, rotate_inverse
+from gateway.geometry.rotation import Matrix3
+from gateway.records import ImuFlags, ImuRaw, NodeId
+from gateway.sensing.calibrating import (
+    FIELD_SIDES,
+    IN_BODY_AXES,
+    MAX_GYRO_BIAS_RADPS,
+    STILL_ACCEL_MPS2,
+    STILL_GYRO_RADPS,
+    CalibrationError,
+    NodeSamples,
+    calibrate_accelerometer,
+    calibrate_gyro,
+    calibrate_level,
+    calibrate_magnetometer,
+    calibrate_magnetometer_by_yaw,
+    calibrate_mounting,
+    corrected_by,
+    distinct_poses,
+    field_sides,
+    gyro_at_rest,
+    is_still,
+    node_samples,
+    remove_tilt,
+    rest_spans,
+    sides_of,
+    solve_accelerometer,
+    solve_magnetometer,
+    solve_mounting,
+    solve_rest,
+    still_windows,
+)
+from gateway.sensing.calibration import FACE_UP, IDENTITY3, Correction, NodeCalibration
+
+G = 9.80665
+SIDES = G * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1.0]])
+
+
+def sphere(rng: np.random.Generator, count: int, radius: float) -> np.ndarray:
+    points = rng.normal(size=(count, 3))
+    return radius * points / np.linalg.norm(points, axis=1)[:, None]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_six_sides_give_bias_and_scale(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    bias, scale = rng.normal(0, 0.3, 3), 1.0 + rng.normal(0, 0.02, 3)
+    fit = solve_accelerometer(SIDES / scale + bias)
+    np.testing.assert_allclose(fit.bias, bias, atol=1e-6)
+    np.testing.assert_allclose(np.diag(fit.matrix), scale, atol=1e-7)
+    assert fit.residual < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_many_poses_give_the_skew_too(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    skew = rng.normal(0, 0.01, (3, 3))
+    matrix = np.eye(3) + 0.5 * (skew + skew.T)
+    bias = rng.normal(0, 0.3, 3)
+    poses = np.vstack([SIDES, sphere(rng, 12, G)])
+    fit = solve_accelerometer(poses @ np.linalg.inv(matrix).T + bias)
+    np.testing.assert_allclose(fit.matrix, matrix, atol=1e-6)
+    np.testing.assert_allclose(fit.bias, bias, atol=1e-5)
+
+
+@pytest.mark.parametrize("poses", [SIDES[:5], np.vstack([SIDES[:4], SIDES[:4]])])
+def test_missing_sides_are_refused(poses: np.ndarray) -> None:
+    with pytest.raises(CalibrationError, match="side"):
+        solve_accelerometer(poses)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_magnetometer_ellipsoid(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    spread = 0.1 * rng.normal(size=(3, 3))
+    soft = np.eye(3) + 0.5 * (spread + spread.T)
+    hard = rng.normal(0, 20.0, 3)
+    raw = sphere(rng, 600, 45.0) @ np.linalg.inv(soft).T + hard + rng.normal(0, 0.2, (600, 3))
+    fit = solve_magnetometer(raw, 45.0)
+    np.testing.assert_allclose(fit.bias, hard, atol=0.2)
+    np.testing.assert_allclose(fit.matrix, soft, atol=0.01)
+    assert fit.residual == pytest.approx(0.2, rel=0.2)
+
+
+def test_magnetometer_without_known_strength_keeps_the_mean() -> None:
+    raw = sphere(np.random.default_rng(1), 300, 50.0) + 10.0
+    fit = solve_magnetometer(raw)
+    assert np.linalg.norm((raw - fit.bias) @ np.array(fit.matrix), axis=1).mean() == pytest.approx(
+        50.0, rel=1e-3
+    )
+
+
+def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
+    angle = np.linspace(0, 6.28, 300)
+    flat = np.column_stack([40 * np.cos(angle), 40 * np.sin(angle), np.full(300, 20.0)])
+    with pytest.raises(CalibrationError, match="turn the aircraft"):
+        solve_magnetometer(flat)
+    with pytest.raises(CalibrationError, match="10 samples"):
+        solve_magnetometer(flat[:10])
+    with pytest.raises(CalibrationError, match="1 sample where"):
+        solve_magnetometer(flat[:1])
+
+
+@pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_mounting_from_level_and_nose_up(seed: int, pitch_deg: float) -> None:
+    mounting = Rotation.random(random_state=seed).as_matrix()
+    pitch = np.radians(pitch_deg)
+    level_s = mounting.T @ np.array([0.0, 0.0, -G])
+    raised_s = mounting.T @ np.array([G * np.sin(pitch), 0.0, -G * np.cos(pitch)])
+    found = solve_mounting(tuple(level_s), tuple(raised_s))
+    np.testing.assert_allclose(found, mounting, atol=1e-9)
+
+
+def test_face_up_board_is_the_default_mounting() -> None:
+    np.testing.assert_allclose(solve_mounting((0, 0, G), (5.0, 0, 8.0)), FACE_UP, atol=1e-12)
+
+
+def test_nose_that_was_not_raised_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="nose"):
+        solve_mounting((0, 0, G), (0.1, 0, G))
+
+
+def test_rest() -> None:
+    fit = solve_rest(np.random.default_rng(2).normal((0.01, -0.02, 0.03), 0.001, (500, 3)))
+    assert fit.mean == pytest.approx((0.01, -0.02, 0.03), abs=2e-4)
+    assert fit.residual == pytest.approx(0.001, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("poses", "told"),
+    [
+        (SIDES + np.array([0.0, 2.1, 0.0]), "bias 2.10 m/s2"),
+        (1.2 * SIDES, "scale error"),
+        (SIDES * [[0.93], [1.0], [1.0], [1.0], [1.0], [1.0]] - [[0], [3], [0], [0], [0], [0]], ""),
+    ],
+)
+def test_an_accelerometer_that_no_sensor_can_be_is_refused(poses: np.ndarray, told: str) -> None:
+    with pytest.raises(CalibrationError, match=f"{told}.*still"):
+        solve_accelerometer(poses)
+
+
+@pytest.mark.parametrize(
+    ("field", "told"),
+    [
+        (sphere(np.random.default_rng(1), 300, 45.0) + np.array([0, 0, 201]), "hard iron 201"),
+        (sphere(np.random.default_rng(1), 300, 45.0) * [1.0, 2.1, 1.0], "soft iron"),
+        (sphere(np.random.default_rng(1), 300, 120.0), "a field of 120 uT"),
+        (
+            sphere(np.random.default_rng(1), 300, 45.0)
+            * (1.0 + 0.2 * np.random.default_rng(2).normal(size=(300, 1))),
+            "residual",
+        ),
+    ],
+)
+def test_a_field_that_is_not_the_earths_is_refused(field: np.ndarray, told: str) -> None:
+    with pytest.raises(CalibrationError, match=f"{told}.*iron"):
+        solve_magnetometer(field)
+
+
+BIAS = np.array([0.2, -0.1, 0.3])
+
+
+def pose(force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0.02) -> NodeSamples:
+    """Five seconds in one pose, as a node would read them."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0, 5, 0.01)
+    n = len(time_s)
+    return NodeSamples(
+        time_s=time_s,
+        accel=force + BIAS + rng.normal(0, shaking, (n, 3)),
+        gyro=rate + rng.normal(0, 0.1 * shaking, (n, 3)),
+        mag_time_s=np.empty(0),
+        mag=np.empty((0, 3)),
+        moving=np.zeros(n, np.bool_),
+    )
+
+
+def test_gyro_bias_at_rest() -> None:
+    after = calibrate_gyro(pose(SIDES[4], rate=0.05), NodeCalibration())
+    assert after.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
+    assert 0.001 < after.gyro_residual_radps < 0.003
+
+
+def test_gyro_that_is_moved_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="still"):
+        calibrate_gyro(pose(SIDES[4], shaking=3.0), NodeCalibration())
+
+
+def test_six_poses_one_by_one() -> None:
+    held = [pose(side, k) for k, side in enumerate(SIDES)]
+    assert sides_of([]) == set()
+    assert sides_of([held[0], held[0]]) == {0}
+    assert sides_of(held[1:]) == {1, 2, 3, 4, 5}
+    assert sides_of(held) == set(range(6))
+    after = calibrate_accelerometer(held, NodeCalibration())
+    assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
+    assert after.accel_residual_mps2 < 0.01
+
+
+def test_six_poses_in_one_log() -> None:
+    parts = [pose(side, k) for k, side in enumerate(SIDES)]
+    whole = NodeSamples(
+        time_s=np.arange(len(parts) * 500) * 0.01,
+        accel=np.vstack([p.accel for p in parts]),
+        gyro=np.vstack([p.gyro for p in parts]),
+        mag_time_s=np.empty(0),
+        mag=np.empty((0, 3)),
+        moving=np.zeros(len(parts) * 500, np.bool_),
+    )
+    after = calibrate_accelerometer([whole], NodeCalibration())
+    assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
+
+
+def test_a_tilted_pose_is_no_side() -> None:
+    half = np.sin(np.pi / 4)
+    assert sides_of([pose(G * np.array([half, half, 0.0]))]) == set()
+
+
+def test_a_pose_that_moved_does_not_count() -> None:
+    shaken = pose(SIDES[0], shaking=3.0)
+    assert not is_still(shaken)
+    assert sides_of([shaken, pose(SIDES[1])]) == {1}
+    with pytest.raises(CalibrationError, match="1 pose where 6 are needed"):
+        calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
+
+
+def test_mounting_turns_the_magnetometer_along() -> None:
+    mounting = Rotation.from_euler("zyx", [90, 10, 180], degrees=True).as_matrix()
+    level = pose(mounting.T @ [0, 0, -G])
+    raised = pose(mounting.T @ [G * np.sin(0.8), 0, -G * np.cos(0.8)], 1)
+    before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
+    after = calibrate_mounting(level, raised, before)
+    np.testing.assert_allclose(after.mounting, mounting, atol=2e-3)
+    np.testing.assert_allclose(after.mag_mounting, after.mounting, atol=1e-12)
+
+
+@pytest.mark.parametrize("tilt_deg", [(3.0, -2.0), (-5.0, 4.0), (0.0, 0.0)])
+def test_level_takes_a_small_tilt_out(tilt_deg: tuple[float, float]) -> None:
+    before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
+    tilt = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix()
+    force_s = np.linalg.solve(np.array(before.mounting), tilt.T @ [0, 0, -G])
+    after = calibrate_level(pose(force_s), before)
+    level = Correction(after.mounting, after.accel_matrix, after.accel_bias_mps2)
+    assert level.apply(tuple(force_s + BIAS)) == pytest.approx((0, 0, -G), abs=0.02)
+
+
+def test_magnetometer_from_raw_records() -> None:
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(400, 3))
+    counts = np.rint(500 * points / np.linalg.norm(points, axis=1)[:, None] + [80, -40, 20])
+    raws = [
+        ImuRaw(
+            time_us=10_000 * k,
+            node=NodeId(1, 0),
+            node_time_us=0,
+            accel_raw=(0, 0, 4096),
+            gyro_raw=(0, 0, 0),
+            mag_raw=tuple(int(c) for c in row),
+            temperature_raw=0,
+            accel_range_g=8,
+            gyro_range_dps=1000,
+            mag_lsb_per_gauss=1000,
+            flags=ImuFlags.MAG_NEW if k % 2 == 0 else ImuFlags(0),
+        )
+        for k, row in enumerate(counts.tolist())
+    ]
+    samples = node_samples(raws)
+    assert samples.mag.shape == (200, 3)
+    np.testing.assert_allclose(samples.mag_time_s[:3], [0.0, 0.02, 0.04])
+    assert not samples.moving.any()
+    assert samples.accel[0] == pytest.approx((0, 0, G))
+    after = calibrate_magnetometer(samples, NodeCalibration())
+    assert after.mag_hard_iron_ut == pytest.approx((8.0, -4.0, 2.0), abs=0.05)
+    assert after.mag_residual_ut < 0.1
+
+
+BIAS = np.array([0.02, -0.03, 0.01])
+
+
+def lying(
+    seconds: float,
+    turn_degps: float = 0.0,
+    *,
+    mag_hz: float = 75.0,
+    gyro_noise: float = 0.002,
+    accel_noise: float = 0.04,
+    bias: np.ndarray = BIAS,
+    seed: int = 0,
+) -> NodeSamples:
+    """A board face up, turning about the vertical, in the field of mid latitudes."""
+    rng = np.random.default_rng(seed)
+    time_s = np.arange(0.0, seconds, 0.01)
+    mag_time_s = np.arange(0.0, seconds if mag_hz else 0.0, 1.0 / (mag_hz or 1.0))
+    heading = np.radians(turn_degps) * mag_time_s
+    field = np.column_stack([20 * np.cos(heading), -20 * np.sin(heading), 0 * heading + 40.0])
+    n = len(time_s)
+    return NodeSamples(
+        time_s=time_s,
+        accel=SIDES[4] + rng.normal(0, accel_noise, (n, 3)),
+        gyro=bias + np.array([0, 0, np.radians(turn_degps)]) + rng.normal(0, gyro_noise, (n, 3)),
+        mag_time_s=mag_time_s,
+        mag=field + rng.normal(0, 0.5, field.shape) + [10.0, -5.0, 3.0],
+        moving=np.zeros(n, np.bool_),
+    )
+
+
+def joined(*parts: NodeSamples) -> NodeSamples:
+    begins = np.cumsum([0.0, *(part.time_s[-1] + 0.01 for part in parts)])
+    return NodeSamples(
+        time_s=np.concatenate([p.time_s + t for p, t in zip(parts, begins, strict=False)]),
+        accel=np.vstack([p.accel for p in parts]),
+        gyro=np.vstack([p.gyro for p in parts]),
+        mag_time_s=np.concatenate([p.mag_time_s + t for p, t in zip(parts, begins, strict=False)]),
+        mag=np.vstack([p.mag for p in parts]),
+        moving=np.concatenate([p.moving for p in parts]),
+    )
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("mag_hz", [0.0, 15.0, 75.0])
+def test_the_bias_of_a_rest(seed: int, mag_hz: float) -> None:
+    gyro = gyro_at_rest(lying(10.0, mag_hz=mag_hz, seed=seed))
+    assert gyro.mean(axis=0) == pytest.approx(BIAS, abs=2e-4)
+
+
+@pytest.mark.parametrize("turn_degps", [-2.8, 2.8, 1.0])
+def test_a_steady_turn_is_no_rest(turn_degps: float) -> None:
+    turn = lying(20.0, turn_degps)
+    assert len(still_windows(turn)) >= 19, "as quiet as on a table"
+    with pytest.raises(CalibrationError, match="3 s of rest"):
+        gyro_at_rest(turn)
+
+
+def test_the_rest_of_a_log_is_found_among_its_turns() -> None:
+    log = joined(lying(20.0, 2.8), lying(8.0, seed=1), lying(30.0, -2.8))
+    after = calibrate_gyro(log, NodeCalibration())
+    assert after.gyro_bias_radps == pytest.approx(tuple(BIAS), abs=5e-4)
+    assert after.gyro_residual_radps < 0.003
+
+
+def test_without_a_magnetometer_contradicting_rests_are_refused() -> None:
+    log = joined(lying(8.0, mag_hz=0.0), lying(8.0, 2.8, mag_hz=0.0))
+    with pytest.raises(CalibrationError, match=r"2.8 deg/s apart.*turned steadily"):
+        gyro_at_rest(log)
+
+
+def test_what_gps_sees_moving_is_no_rest() -> None:
+    flown = lying(10.0, 2.8, mag_hz=0.0)
+    assert rest_spans(flown)
+    flown.moving[:] = True
+    assert still_windows(flown) == []
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_still"),
+    [
+        ({"gyro_noise": 0.8 * STILL_GYRO_RADPS}, True),
+        ({"gyro_noise": 1.2 * STILL_GYRO_RADPS}, False),
+        ({"accel_noise": 0.8 * STILL_ACCEL_MPS2}, True),
+        ({"accel_noise": 1.2 * STILL_ACCEL_MPS2}, False),
+        ({"bias": np.array([0.95 * MAX_GYRO_BIAS_RADPS, 0, 0])}, True),
+        ({"bias": np.array([1.05 * MAX_GYRO_BIAS_RADPS, 0, 0])}, False),
+    ],
+)
+def test_the_limits_of_stillness(shape: dict[str, float], is_still: bool) -> None:
+    assert bool(still_windows(lying(5.0, **shape))) == is_still
+
+
+@pytest.mark.parametrize(("limit", "most"), [(STILL_GYRO_RADPS, 0.03), (STILL_ACCEL_MPS2, 0.5)])
+def test_a_hand_that_trembles_is_not_still(limit: float, most: float) -> None:
+    """About 2 deg/s and a twentieth of gravity: no table trembles so."""
+    assert limit < most
+
+
+@pytest.mark.parametrize(("scale", "is_still"), [(1.0, True), (1.14, True), (1.17, False)])
+def test_a_banked_turn_weighs_too_much(scale: float, is_still: bool) -> None:
+    turn = lying(5.0, mag_hz=0.0)
+    turn.accel[:] *= scale
+    assert bool(still_windows(turn)) == is_still
+
+
+def test_a_rest_takes_three_seconds() -> None:
+    assert rest_spans(lying(2.9)) == []
+    assert rest_spans(lying(3.5)) != []
+
+
+def test_still_windows_and_poses_of_a_log() -> None:
+    rng = np.random.default_rng(3)
+    time_s = np.arange(0, 40, 0.01)
+    side = SIDES[(time_s // 6).astype(int) % 6]
+    turning = (time_s % 6) > 4
+    n = len(time_s)
+    samples = NodeSamples(
+        time_s,
+        accel=side + rng.normal(0, np.where(turning, 3.0, 0.02)[:, None], (n, 3)),
+        gyro=rng.normal(0, np.where(turning, 1.0, 0.002)[:, None], (n, 3)),
+        mag_time_s=np.empty(0),
+        mag=np.empty((0, 3)),
+        moving=np.zeros(n, np.bool_),
+    )
+    windows = still_windows(samples)
+    assert 20 <= len(windows) <= 28
+    poses = distinct_poses(samples.accel, windows)
+    assert len(poses) == 6
+    np.testing.assert_allclose(np.sort(poses[:, 0]), np.sort(SIDES[:, 0]), atol=0.05)
+
+
+CALIBRATION = NodeCalibration(
+    mounting=((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    accel_bias_mps2=(0.1, -0.2, 0.3),
+    accel_matrix=((1.1, 0.02, 0.0), (0.0, 0.9, 0.01), (0.0, 0.0, 1.05)),
+    gyro_bias_radps=(0.01, 0.02, 0.03),
+    mag_hard_iron_ut=(5.0, 6.0, 7.0),
+    mag_soft_iron=((1.0, 0.1, 0.0), (0.1, 1.2, 0.0), (0.0, 0.0, 0.8)),
+)
+ERROR = (0.25, -0.5, 0.125)
+
+
+def corrections(cal: NodeCalibration) -> dict[str, Correction]:
+    return {
+        "accel": Correction(cal.mounting, cal.accel_matrix, cal.accel_bias_mps2),
+        "gyro": Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps),
+        "mag": Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut),
+    }
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+
+    def near_identity() -> Matrix3:
+        rows = (np.eye(3) + 0.05 * rng.normal(size=(3, 3))).tolist()
+        return tuple(map(tuple, rows))  # type: ignore[return-value]
+
+    correction = msgspec.structs.replace(
+        IN_BODY_AXES,
+        mounting=tuple(map(tuple, Rotation.random(random_state=seed).as_matrix().tolist())),
+        accel_bias_mps2=ERROR,
+        accel_matrix=near_identity(),
+        gyro_bias_radps=ERROR,
+        mag_hard_iron_ut=ERROR,
+        mag_soft_iron=near_identity(),
+        mag_residual_ut=0.5,
+    )
+    joined = corrected_by(CALIBRATION, correction)
+    raw = tuple(rng.normal(size=3).tolist())
+    for sensor, both in corrections(joined).items():
+        first = corrections(CALIBRATION)[sensor].apply(raw)
+        assert both.apply(raw) == pytest.approx(corrections(correction)[sensor].apply(first))
+    assert joined.mag_residual_ut == 0.5
+
+
+def test_correction_of_one_sensor_leaves_the_others_to_the_last_bit() -> None:
+    joined = corrected_by(CALIBRATION, msgspec.structs.replace(IN_BODY_AXES, gyro_bias_radps=ERROR))
+    changed = {n for n in joined.__struct_fields__ if getattr(joined, n) != getattr(CALIBRATION, n)}
+    assert changed == {"gyro_bias_radps"}
+
+
+@pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 215.0])
+def test_hard_iron_by_a_known_heading(yaw_deg: float) -> None:
+    field = MagneticField(math.radians(3.0), math.radians(64.0), 48.0)
+    q_nb = from_euler(0.1, -0.2, math.radians(yaw_deg))
+    north = 48.0 * math.cos(math.radians(64.0)) * np.array([math.cos(0.05236), math.sin(0.05236)])
+    field_b = rotate_inverse(q_nb, (*north, 48.0 * math.sin(math.radians(64.0))))
+    samples = pose(np.array(rotate_inverse(q_nb, (0.0, 0.0, -G))) - BIAS)
+    iron = np.array([9.0, 8.0, 7.0])
+    samples = replace(samples, mag_time_s=samples.time_s, mag=np.tile(field_b, (500, 1)) + iron)
+    found = calibrate_magnetometer_by_yaw(samples, IN_BODY_AXES, math.radians(yaw_deg), field)
+    assert found.mag_hard_iron_ut == pytest.approx((9.0, 8.0, 7.0), abs=0.05)
+
+
+def test_what_seemed_tilted_is_level() -> None:
+    level = (0.0, 0.0, -9.80665)
+    tilt = (0.1, -0.05, 0.0)
+    seen = rotate_inverse(from_euler(*tilt), level)
+    raw = np.array(CALIBRATION.mounting).T @ np.array(seen)
+    turned = remove_tilt(CALIBRATION, tilt)
+    assert np.array(turned.mounting) @ raw == pytest.approx(np.array(level), abs=1e-12)
+    assert np.array(turned.mag_mounting) @ np.array(turned.mag_mounting).T == pytest.approx(
+        np.eye(3), abs=1e-12
+    )
+
+
+def test_field_sides_count_directions_about_the_hard_iron() -> None:
+    rng = np.random.default_rng(1)
+    all_sides = rng.normal(size=(4000, 3))
+    all_sides *= 45.0 / np.linalg.norm(all_sides, axis=1)[:, None]
+    iron = np.array([40.0, -25.0, 10.0])
+
+    def seen(field: np.ndarray) -> int:
+        none = np.empty((0, 3))
+        return field_sides(NodeSamples(np.empty(0), none, none, np.empty(0), field, np.empty(0)))
+
+    assert seen(np.empty((0, 3))) == 0
+    assert seen(np.tile(iron, (50, 1))) <= 1
+    assert seen(all_sides + iron) == FIELD_SIDES
+    flat = all_sides * [1.0, 1.0, 0.05]
+    assert seen(flat + iron) < FIELD_SIDES // 4
+    half = all_sides[all_sides[:, 0] > 0.0]
+    assert seen(half + iron) < 0.8 * FIELD_SIDES
