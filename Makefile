@@ -1,24 +1,28 @@
 # make demo   the gateway on its built-in simulated receiver, until interrupted
 # make test   every test, the firmware's included
+# make kernels  the compiled kernels, if their sources have changed
 # make lint   formatting, lint and types
 # make firmware   the ready-made images of `mavgate flash`; make deb builds them too
 # make deb    a Debian package with the service, in dist/
 # make fuzz   odd input to all that reads any, with new values, for five minutes
 # make lock   write the lock files anew from pyproject.toml
 
-.PHONY: demo test lint deb fuzz lock firmware clean
+.PHONY: demo kernels test lint deb fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck avrdude arduino-core-avr
 
-demo: .venv/.run
+demo: kernels
 	.venv/bin/mavgate demo
+
+kernels: .venv/.run
+	@.venv/bin/python -m tools.build_kernels
 
 # Tests that need the AVR tool chain or a browser skip, and say so, where it could not be installed.
 # A third of their time they wait, so there are three workers for two cores; and they start hundreds of
 # processes, which shall not each compile all sources anew.
 test: export PYTHONDONTWRITEBYTECODE =
-test: .venv/.dev
+test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
 	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder
@@ -36,6 +40,10 @@ lock: .venv/.dev
 	$(COMPILE) --extra panel --output-file requirements.lock pyproject.toml
 	$(COMPILE) --all-extras --constraint requirements.lock $(HEADLESS) \
 		--output-file requirements-dev.lock pyproject.toml
+	$(LINKER) --output-file requirements-linker.lock
+
+LINKER = .venv/bin/uv pip compile --quiet --upgrade --universal --no-header --no-emit-index-url \
+	--no-emit-find-links --group linker
 
 COMPILE = .venv/bin/uv pip compile --quiet --upgrade --universal --no-header \
 	--no-emit-index-url --no-emit-find-links --group build

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway import __version__
-from gateway.compiled.entry_point import NotCompiledError
 from gateway.estimation.columns import NAV_COLUMNS, imu_rows, nav_row, nav_state
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
@@ -236,25 +235,14 @@ class Aircraft:
         list of Action
         """
         actions: list[Action] = []
-        refusals: list[Action] = []
         for action in wanted:
             if isinstance(action, SettingsChange):
-                try:
-                    actions += self._change(action.section, action.settings)
-                except NotCompiledError:
-                    refusals += self._refuse(action.section, now_us)
+                actions += self._change(action.section, action.settings)
             elif isinstance(action, CalibrationMeasured):
                 actions += self._recalibrate(action, now_us)
             else:
                 actions.append(action)
-        # Last, behind the value that the client asked for.
-        return actions + refusals
-
-    def _refuse(self, section: str, now_us: int) -> list[Action]:
-        """Send the values that remain, because the chosen estimator is not there yet."""
-        text = StatusText(WARNING, "Estimator is being compiled: try later")
-        answers = self.vehicle.take_settings(section, getattr(self.settings, section))
-        return self.perform([*self.vehicle.say(text, now_us), *answers], now_us)
+        return actions
 
     def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
         """Join the calibration with a measured one, unless no sensor has such errors."""

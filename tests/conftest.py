@@ -23,21 +23,10 @@ USERS_OWN = (
 ROOT = Path(__file__).resolve().parent.parent
 
 
-_COMPILING: list[subprocess.Popen[bytes]] = []
-
-
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the estimators beside the first tests: each worker would compile its own."""
-    if session.config.getoption("numprocesses", None):
-        for name in ("eskf", "complementary"):
-            words = [sys.executable, "-m", "tests.compile_ahead", name]
-            _COMPILING.append(subprocess.Popen(words, cwd=ROOT))
-
-
-def pytest_sessionfinish() -> None:
-    for process in _COMPILING:
-        process.kill()
-        process.wait()
+    """Compile the kernels if their sources have changed, before the workers start."""
+    if not hasattr(session.config, "workerinput"):
+        subprocess.run([sys.executable, "-m", "tools.build_kernels"], cwd=ROOT, check=True)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -1,39 +1,30 @@
-"""Machine code: the same results as Python, kept for what it was made of, and loaded alone."""
+"""The library of compiled kernels: the results of Python, current with its sources, no compiler."""
 
-import importlib
-import importlib.util
-import logging
-import os
-import shutil
+import ast
+import json
 import subprocess
 import sys
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+import tomllib
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import pytest
 
-from gateway.compiled import address_of, array_at, compiled, compiled_with, digest_of
-from gateway.compiled.compiler import compile_dispatcher, compile_entry
+from gateway.compiled import address_of, array_at, compiled, compiled_with, entry_point
 from gateway.compiled.entry_point import (
+    BUILD_COMMAND,
+    ENTRY_POINTS,
+    ROOT,
     EntryPoint,
-    NotCompiledError,
-    dispatched,
-    nothing_compiled,
+    changed_source,
+    load_entry_points,
+    open_library,
+    stamp_in,
+    stamp_of,
 )
-from gateway.compiled.machine_code import (
-    ONCE,
-    OTHERS_KEPT,
-    MachineCode,
-    compiling,
-    keep_code,
-    kept_code,
-)
-from gateway.estimation.complementary.complementary_kernels import KERNELS
+from tools.build_kernels import KERNEL_MODULES, build_library, compiled_again, is_current
+
+pytestmark = pytest.mark.io
 
 FLOAT = np.dtype(np.float64)
 FACTOR = 3.0
@@ -47,7 +38,7 @@ def scaled(x: float) -> float:
 def scale(values: int, count: int, offset: float) -> None:
     numbers = array_at(values, (count,), FLOAT)
     for k in range(count):
-        numbers[k] = scaled(numbers[k]) + offset
+        numbers[k] = scaled(numbers[k]) / offset + offset
 
 
 def allocate(count: int) -> None:
@@ -55,314 +46,152 @@ def allocate(count: int) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    return tmp_path
+def scaling() -> EntryPoint[[int, int, float]]:
+    """An entry point that the installed library lacks."""
+    point = EntryPoint(scale)
+    ENTRY_POINTS.remove(point)
+    return point
 
 
-def kept_in(folder: Path) -> list[Path]:
-    return list(folder.glob("*.code"))
-
-
-def use(entry: Callable[[int, int, float], None]) -> list[float]:
+def use(function: EntryPoint[[int, int, float]], offset: float = 0.25) -> list[float]:
     numbers = np.array([1.0, 2.5])
-    entry(address_of(numbers), 2, 0.25)
+    function(address_of(numbers), 2, offset)
     return numbers.tolist()
 
 
-@pytest.mark.io
-def test_an_entry_point_does_what_its_function_does_and_is_kept(folder: Path) -> None:
-    assert use(scale) == [3.25, 7.75]
-    first = EntryPoint(scale)
-    assert not first.is_kept
-    assert use(first) == [3.25, 7.75]
-    assert first.is_kept
-    assert use(EntryPoint(scale)) == [3.25, 7.75]
-    assert len(kept_in(folder)) == 1
+def test_machine_code_gives_the_results_of_python(
+    scaling: EntryPoint[[int, int, float]], tmp_path: Path
+) -> None:
+    build_library(path := tmp_path / "kernels.so", [scaling])
+    scaling.load(path)
+    assert use(scaling) == use(scale) == [12.25, 30.25]
+    assert use(scaling, 0.0) == [np.inf, np.inf], "Python would raise"
+    assert [*tmp_path.iterdir()] == [path]
 
 
-@pytest.mark.io
-def test_a_running_gateway_compiles_nothing(folder: Path) -> None:
-    with nothing_compiled():
-        with pytest.raises(NotCompiledError):
-            use(EntryPoint(scale))
-        with pytest.raises(NotCompiledError):
-            dispatched(scale)(0, 0, 0.0)
-    assert not kept_in(folder)
-    use(EntryPoint(scale))
-    with nothing_compiled():
-        assert use(EntryPoint(scale)) == [3.25, 7.75], "what is kept is loaded"
+def test_an_experiment_compiles_patched_constants_until_its_end(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    flight = entry_point_of_quaternions()
+    before = from_euler(flight)
+    monkeypatch.setattr("gateway.geometry.quaternion.from_euler", compiled(lambda *_: (7.0,) * 4))
+    assert from_euler(flight) == before
+    with compiled_again([flight]):
+        assert from_euler(flight) == [7.0] * 4
+    assert from_euler(flight) == before
 
 
-@pytest.mark.io
+def entry_point_of_quaternions() -> EntryPoint[[int, int, int]]:
+    from gateway.geometry.quaternion import _from_euler_array
+
+    return _from_euler_array
+
+
+def from_euler(point: EntryPoint[[int, int, int]]) -> list[float]:
+    angles, found = np.array([0.1, 0.2, 0.3]), np.empty(4)
+    point(1, address_of(angles), address_of(found))
+    return found.tolist()
+
+
+def test_a_kernel_may_not_allocate(tmp_path: Path) -> None:
+    point = EntryPoint(allocate)
+    ENTRY_POINTS.remove(point)
+    with pytest.raises(TypeError, match="allocates"):
+        build_library(tmp_path / "kernels.so", [point])
+
+
+def test_the_installed_library_is_current_and_complete() -> None:
+    assert is_current()
+    load_entry_points()
+
+
 @pytest.mark.parametrize(
-    "damage", [lambda data: b"", lambda data: data[:-1], lambda data: data[:-50] + bytes(50)]
-)
-def test_damaged_code_is_made_anew(folder: Path, damage: Callable[[bytes], bytes]) -> None:
-    use(EntryPoint(scale))
-    [file] = kept_in(folder)
-    sound = file.read_bytes()
-    file.write_bytes(damage(sound))
-    assert not EntryPoint(scale).is_kept
-    assert use(EntryPoint(scale)) == [3.25, 7.75]
-    assert EntryPoint(scale).is_kept
-
-
-@pytest.mark.io
-def test_code_of_an_earlier_source_goes(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use(EntryPoint(scale))
-    monkeypatch.setitem(globals(), "FACTOR", 5.0)
-    assert not EntryPoint(scale).is_kept
-    # The compiler of this process has bound the constant already.
-    monkeypatch.setitem(globals(), "scaled", compiled(lambda x: 5.0 * x))
-    assert use(EntryPoint(scale)) == [5.25, 12.75]
-    assert len(kept_in(folder)) == 1
-
-
-@pytest.mark.io
-def test_installations_leave_each_other_their_code(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def run_by(installation: str) -> None:
-        monkeypatch.setattr("gateway.compiled.machine_code._made_for", lambda: installation)
-
-    def keep(digest: str, time_s: int) -> None:
-        before = kept_in(folder)
-        keep_code("f", digest, MachineCode(digest.encode(), None))
-        [new] = set(kept_in(folder)).difference(before)
-        os.utime(new, (time_s, time_s))
-
-    run_by("Debian's")
-    keep("first source", 1)
-    run_by("another")
-    assert kept_code("f", "first source") is None
-    keep("first source", 2)
-    keep("second source", 3)
-    assert kept_code("f", "first source") is None
-    run_by("Debian's")
-    assert kept_code("f", "first source") == MachineCode(b"first source", None)
-    for time_s in range(4, 9):
-        run_by(f"one of {time_s}")
-        keep("second source", time_s)
-    assert len(kept_in(folder)) == 1 + OTHERS_KEPT
-    run_by("one of 5")
-    assert kept_code("f", "second source") is not None
-    run_by("Debian's")
-    assert kept_code("f", "first source") is None
-
-
-@pytest.mark.io
-def test_that_something_is_compiled_is_told_once(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr("numba.config.CACHE_DIR", str(folder))
-    monkeypatch.setattr("gateway.compiled.machine_code._HAS_TOLD", told := bytearray(1))
-    path = folder / "raced.py"
-    path.write_text(SOURCE)
-    with caplog.at_level(logging.INFO):
-        use(EntryPoint(scale))
-        assert caplog.messages == [ONCE]
-        process(path)(NEAR)
-        assert caplog.messages == [ONCE]
-        told[0] = 0
-        use(EntryPoint(scale))
-        process(path)(NEAR)
-        assert caplog.messages == [ONCE], "what is kept is not compiled"
-        process(path)(FAR)
-        assert caplog.messages == [ONCE, ONCE]
-
-
-@pytest.mark.io
-def test_where_nothing_can_be_kept_it_works_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "file").touch()
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file"))
-    entry = EntryPoint(scale)
-    assert use(entry) == [3.25, 7.75]
-    assert not entry.is_kept
-
-
-@pytest.mark.io
-def test_what_another_process_compiles_is_waited_for(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A thread stands for the process: a lock of files keeps them apart as well."""
-    code, name, digest = compile_entry(compiled(scale)), f"{__name__}.scale", digest_of(scale)
-
-    def fail(_: object) -> None:
-        raise AssertionError("compiled twice")
-
-    monkeypatch.setattr("gateway.compiled.compiler.compile_entry", fail)
-    with ThreadPoolExecutor() as pool:
-        with compiling(name):
-            found = pool.submit(EntryPoint(scale).code)
-            keep_code(name, digest, code)
-        assert found.result() == code
-
-
-@pytest.mark.io
-def test_an_entry_point_may_not_allocate(folder: Path) -> None:
-    with pytest.raises(TypeError, match="allocate"):
-        EntryPoint(allocate)(3)
-    assert not kept_in(folder)
-
-
-@pytest.mark.io
-@pytest.mark.skipif(shutil.which("cc") is None, reason="there is no linker")
-def test_what_is_kept_is_loaded_without_numba_and_llvm() -> None:
-    for entry in KERNELS.live:
-        entry.prepare()
-    tell = (
-        "import sys; from gateway.estimation.select import EstimationSettings, make_estimator;"
-        "make_estimator(EstimationSettings(estimator='complementary'));"
-        "print({'numba', 'llvmlite'} & {*sys.modules})"
-    )
-    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
-    assert other.stdout == "set()\n"
-
-
-@pytest.mark.io
-@pytest.mark.parametrize("linker", [None, "/bin/false"])
-def test_what_cannot_be_linked_is_loaded_by_llvm(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, linker: str | None
-) -> None:
-    monkeypatch.setattr("shutil.which", lambda _: linker)
-    assert compile_entry(compiled(scale)).shared is None
-    assert use(EntryPoint(scale)) == [3.25, 7.75]
-    assert use(EntryPoint(scale)) == [3.25, 7.75]
-
-
-@pytest.mark.io
-def test_what_the_system_does_not_load_is_loaded_by_llvm(folder: Path) -> None:
-    use(EntryPoint(scale))
-    kept = compile_entry(compiled(scale))
-    name, digest = f"{__name__}.scale", digest_of(scale)
-    keep_code(name, digest, kept._replace(shared=b"no library"))
-    assert use(EntryPoint(scale)) == [3.25, 7.75]
-
-
-@pytest.mark.io
-def test_every_process_takes_the_code_for_made_of_the_same() -> None:
-    tell = (
-        "from gateway.estimation.complementary.complementary_kernels import KERNELS;"
-        "from gateway.compiled import digest_of; print(digest_of(KERNELS.imus.__wrapped__))"
-    )
-    other = subprocess.run([sys.executable, "-c", tell], check=True, capture_output=True, text=True)
-    entry: Any = KERNELS.imus
-    assert other.stdout.strip() == digest_of(entry.__wrapped__)
-
-
-CALLED = """
-from gateway.compiled import compiled
-
-FACTOR = {factor}
-{comment}
-@compiled
-def inner():
-    return {inner}
-"""
-CALLING = """
-import called
-from gateway.compiled import compiled
-from called import inner
-
-@compiled
-def outer():
-    return called.FACTOR * middle()
-
-@compiled
-def middle():
-    return inner()
-"""
-
-
-@pytest.mark.io
-@pytest.mark.parametrize(
-    ("factor", "inner", "comment", "same"),
+    ("source", "current"),
     [
-        (2, "100", "", False),
-        (1, "3 + 4 * five()", "", False),
-        (1, "100", "\n\n# The next function.", True),
+        ("x = 3.0\ndef f():\n    return 2 * x\n", True),
+        ('"""Text."""\nx = 3.0  # m\n\n\ndef f():\n    """More."""\n    return 2 * x\n', True),
+        ("x = 3.0\ndef f():\n    return 3 * x\n", False),
+        ("x = 3.5\ndef f():\n    return 2 * x\n", False),
+        ("x = 3.0\ndef f(:\n", False),
+        (None, False),
     ],
 )
-def test_what_it_calls_has_changed(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    factor: int,
-    inner: str,
-    comment: str,
-    same: bool,
+def test_only_a_change_of_code_makes_a_library_stale(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str | None, current: bool
 ) -> None:
-    """Machine code holds the constants and functions of other files, too."""
-    monkeypatch.syspath_prepend(tmp_path)
-    # Python itself takes a file of the same size and second for unchanged.
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    (tmp_path / "calling.py").write_text(CALLING)
-    digests = []
-    for parts in ((1, "100", ""), (factor, inner, comment)):
-        text = CALLED.format(factor=parts[0], inner=parts[1], comment=parts[2])
-        (tmp_path / "called.py").write_text(text)
-        for name in ("called", "calling"):
-            monkeypatch.delitem(sys.modules, name, raising=False)
-        importlib.invalidate_caches()
-        digests.append(digest_of(importlib.import_module("calling").outer))
-    assert (digests[0] == digests[1]) == same
+    monkeypatch.setattr(entry_point, "ROOT", tmp_path)
+    file = tmp_path / "kernel.py"
+    file.write_text("x = 3.0\ndef f():\n    return 2 * x\n")
+    stamp = stamp_of(file)
+    if source is None:
+        file.unlink()
+    else:
+        file.write_text(source)
+    assert changed_source(stamp) == (None if current else "kernel.py")
 
 
-def test_the_copies_of_a_template_are_made_of_their_own() -> None:
+def test_a_library_names_what_it_was_compiled_from(
+    scaling: EntryPoint[[int, int, float]], tmp_path: Path
+) -> None:
+    build_library(path := tmp_path / "kernels.so", [scaling], stamp='gateway/units.py 1 2\n"\\\0x')
+    assert stamp_in(open_library(path)) == 'gateway/units.py 1 2\n"\\'
+    assert changed_source(stamp_in(open_library(path))) == "gateway/units.py"
+
+
+@pytest.mark.parametrize("content", [None, b"", b"no library"])
+def test_without_a_library_the_error_names_the_command_that_builds_it(
+    tmp_path: Path, content: bytes | None
+) -> None:
+    path = tmp_path / "kernels.so"
+    if content is not None:
+        path.write_bytes(content)
+    code = (
+        "import sys; from pathlib import Path; import gateway.compiled.entry_point as e;"
+        f"e.LIBRARY = Path({str(path)!r}); sys.argv[1:] = ['demo', '--no-panel'];"
+        "from gateway.cli.__main__ import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    [line] = done.stderr.splitlines()
+    assert line.startswith(f"{path}: the library of compiled kernels ")
+    assert f"`{BUILD_COMMAND}`" in line
+
+
+def test_no_compiler_is_needed_at_run_time() -> None:
+    code = (
+        "import sys; sys.modules |= dict.fromkeys(['numba', 'llvmlite', 'ziglang']);"
+        "from gateway.compiled.entry_point import load_entry_points;"
+        f"import {', '.join(KERNEL_MODULES)}; load_entry_points();"
+        "from gateway.estimation.select import *;"
+        "[make_estimator(EstimationSettings(estimator=name)) for name in ESTIMATORS]"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_all_entry_points_are_built_of_what_a_wheel_is_built_with() -> None:
+    code = (
+        f"import json, sys, {', '.join(KERNEL_MODULES)};"
+        "print(json.dumps({n: getattr(m, '__file__', None) for n, m in sys.modules.items()}))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
+    files: dict[str, str | None] = json.loads(done.stdout)
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        required = tomllib.load(file)["build-system"]["requires"]
+    for path in (ROOT / "gateway").rglob("*.py"):
+        names = {
+            node.id for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Name)
+        }
+        if "EntryPoint" in names and path.parent.name != "compiled":
+            assert str(path) in files.values(), f"{path} is missing in KERNEL_MODULES"
+    packages = {
+        name.partition(".")[0] for name, file in files.items() if "site-packages" in str(file)
+    }
+    for package in packages - {"gateway", "typing_extensions", "_distutils_hack"}:
+        if not package.startswith("__editable__"):
+            assert any(one.startswith(package) for one in required), package
+
+
+def test_the_copies_of_a_template_use_their_own_values() -> None:
     one, two = (compiled_with(scaled, {"FACTOR": f}, f"by_{f}") for f in (1.0, 2.0))
     assert [one(7.0), two(7.0), scaled(7.0)] == [7.0, 14.0, 21.0]
-    assert len({digest_of(f) for f in (one, two, scaled)}) == 3
-
-
-SOURCE = """
-from gateway.compiled import compiled
-
-@compiled
-def read(record):
-    return record.x
-"""
-NEAR = np.zeros(1, [("x", "f8"), ("y", "f8")])[0]
-FAR = np.zeros(1, [("y", "f8"), ("x", "f8")])[0]
-
-
-def process(path: Path) -> Any:
-    """The function as another process would have it: nothing compiled, the same files."""
-    spec = importlib.util.spec_from_file_location("raced", path)
-    assert spec
-    assert spec.loader
-    module: ModuleType = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return compile_dispatcher(module.read)
-
-
-@pytest.mark.io
-def test_two_processes_compile_for_different_types_at_once(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Where no lock can be had. Both read the index before either has written; the first to name
-    its file is the last to write it.
-    """
-    monkeypatch.setattr("gateway.compiled.compiler.compiling", lambda _: nullcontext())
-    # Numba has read the environment before.
-    monkeypatch.setattr("numba.config.CACHE_DIR", str(folder))
-    path = folder / "raced.py"
-    path.write_text(SOURCE)
-    NEAR["x"], FAR["x"] = 1.0, 2.0
-    first, second = process(path), process(path)
-    files, others = first._cache._cache_file, second._cache._cache_file
-    write = files._save_data
-
-    def late(name: str, data: object) -> None:
-        others._load_index = dict
-        assert second(FAR) == 2.0
-        write(name, data)
-
-    files._save_data = late
-    assert first(NEAR) == 1.0
-    assert list(folder.rglob("*.nbc"))
-    after = process(path)
-    assert after(FAR) == 2.0
-    assert after(NEAR) == 1.0
-    assert after.stats.cache_hits[after.signatures[0]] == 1
+    assert {f.__qualname__ for f in (one, two)} == {"scaled_by_1.0", "scaled_by_2.0"}

@@ -6,10 +6,8 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway import aircraft
 from gateway.aircraft import Action, AircraftSettings
-from gateway.compiled.entry_point import NotCompiledError
-from gateway.estimation.select import ESTIMATORS, EstimationSettings
+from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
 from gateway.records import (
     BaroRaw,
@@ -258,29 +256,6 @@ def test_requests_that_are_not_carried_out_are_counted(pipeline: Pipeline) -> No
     station.signing.secret_key, station.signing.sign_outgoing = bytes(32), True
     pipeline.handle(Incoming(7, bytes(change.pack(station)), trusted=True), 0)
     assert (pipeline.refused, pipeline.forged) == (3, 1)
-
-
-def test_an_estimator_that_is_not_compiled_yet_is_refused(
-    pipeline: Pipeline, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tracker = Tracker()
-    pipeline.feed(tracker.frame(0, LEVEL), 5_000)
-
-    def not_there(_: object) -> None:
-        raise NotCompiledError("eskf")
-
-    monkeypatch.setattr(aircraft, "make_estimator", not_there)
-    change = mavlink.MAVLink_param_set_message(1, 1, b"EST_ESTIMATOR", 1.0, 9)
-    frame = bytes(change.pack(mavlink.MAVLink(None, 255, 190)))
-    actions = pipeline.handle(Incoming(7, frame, trusted=True), 6_000)
-    kept = float(list(ESTIMATORS).index("paper"))
-    assert named(actions, "PARAM_VALUE")[-1].param_value == kept, "the newest value holds"
-    assert [m.text for m in named(actions, "STATUSTEXT")] == [
-        "Estimator is being compiled: try later"
-    ]
-    assert pipeline.aircraft[1].settings.estimation.estimator == "paper"
-    later = pipeline.feed(tracker.frame(100_000, LEVEL), 105_000)
-    assert named(later, "ATTITUDE_QUATERNION")
 
 
 def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipeline) -> None:

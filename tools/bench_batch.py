@@ -42,7 +42,7 @@ from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw
 from gateway.season.batch.dask_executor import DaskCluster
-from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, SweepTask, warm_up
+from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, SweepTask
 from gateway.season.batch.result_folder import ResultFolder
 from gateway.season.batch.season_run import LOOKING, run_season
 from gateway.season.batch.storage import items_of
@@ -201,7 +201,6 @@ Used = Callable[[], tuple[float, float]]
 def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
     """Have somebody who works, ready to; a cluster has two processes of one thread."""
     if by != "dask":
-        warm_up()
         yield LocalProcesses(1 if by == "serial" else WORKERS), _children
         return
     distributed: Any = import_module("distributed")
@@ -210,7 +209,7 @@ def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
         dashboard_address=None,
     ) as cluster:  # fmt: skip
         client = DaskCluster(cluster.scheduler_address)
-        # What a worker does once in its life: load the machine code.
+        # A worker imports the modules once in its life.
         dict(client.run(_ready, range(4 * WORKERS)))
 
         def used() -> tuple[float, float]:
@@ -224,7 +223,6 @@ def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
 
 
 def _ready(_: int) -> int:
-    warm_up()
     time.sleep(0.2)
     return os.getpid()
 

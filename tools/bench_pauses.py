@@ -7,16 +7,10 @@ by stations by UDP, TCP and WebSocket that ask for all there is. Printed are the
 its loop by the program's own doing, apart from what the machine takes: first until all aircraft are
 heard, then while telemetry flows. The baseline, beside it the whole time, is a loop whose turns are
 all alike.
-
-With an empty cache it is a first start: machine code comes while telemetry runs, and is told beside
-the turns.
-
-    NUMBA_CACHE_DIR=$(mktemp -d) python tools/bench_pauses.py --minutes 3
 """
 
 import argparse
 import asyncio
-import logging
 import os
 import socket
 import subprocess
@@ -34,8 +28,8 @@ from gateway.analysis.processes import begin_copy
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.cli.live.run import loop_comes_first
 from gateway.cli.support.made_ahead import made_ahead
-from gateway.cli.support.warm_up import Compilation, make_ready
 from gateway.clock import unix_time_us
+from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
 from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
@@ -79,27 +73,11 @@ def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySetting
     )
 
 
-class Marks(logging.Handler):
-    """Notes what a logger tells beside the turns of a loop."""
-
-    def __init__(self, watch: TurnWatch) -> None:
-        super().__init__()
-        self._watch = watch
-
-    def emit(self, record: logging.LogRecord) -> None:
-        """Note it."""
-        self._watch.mark(record.getMessage())
-
-
-async def fly(
-    settings: GatewaySettings, watch: TurnWatch, seconds: float, compiling: Compilation | None
-) -> None:
+async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> None:
     """Run the daemon as `mavgate demo` does."""
     line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
     daemon = Daemon(settings, calibrated_aircraft(settings), lambda: settings, line)
     watch.install()
-    if compiling is not None:
-        compiling.watch()
     with loop_comes_first(daemon.start):
         watch.restart()
         try:
@@ -117,18 +95,15 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
     """Fly, with stations beside it."""
     ports = free_ports(4)
     settings = settings_in(folder, options.vehicles, ports)
-    compiling = make_ready(settings.estimation.estimator)
+    load_entry_points()
     watch = TurnWatch()
-    warm_up = logging.getLogger(make_ready.__module__)
-    warm_up.setLevel(logging.DEBUG)
-    warm_up.addHandler(Marks(watch))
     visitors = subprocess.Popen(
         [sys.executable, Path(__file__).with_name("visitors.py"), *map(str, ports)],
         stderr=subprocess.DEVNULL,
     )
     try:
         with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
-            runner.run(fly(settings, watch, 60.0 * options.minutes, compiling))
+            runner.run(fly(settings, watch, 60.0 * options.minutes))
         if visitors.poll() is not None:
             raise SystemExit("the stations have died")
     finally:

@@ -29,5 +29,12 @@ fi
 echo "set-up: installing the packages of $lock (some minutes the first time)"
 # The lock lists every package: --no-deps keeps what it leaves out from coming in.
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r "$lock"
+if ! command -v cc >/dev/null; then
+    echo "set-up: installing a linker, since there is no C compiler"
+    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
+        -r requirements-linker.lock
+fi
 .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
     --no-build-isolation --editable .
+echo "set-up: compiling the kernels"
+.venv/bin/python -m tools.build_kernels

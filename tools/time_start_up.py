@@ -5,8 +5,7 @@
 
 Prints the CPU of `mavgate --help` and `status`, the best of five; then of `mavgate run` on a
 simulated receiver the seconds, the CPU and the memory from its call to its first datagram and to
-its first attitude, with compiled estimators and with an empty cache. The baselines are a Python
-that does nothing, and `mavlogdump.py --help`.
+its first attitude. The baselines are a Python that does nothing, and `mavlogdump.py --help`.
 
 Then it starts the demo and prints seconds of wall clock: the scripted QGroundControl over UDP and
 TCP, as MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last
@@ -60,7 +59,7 @@ def process_figures(pid: int) -> str:
     own, waited = (sum(map(int, text[k : k + 2])) / os.sysconf("SC_CLK_TCK") for k in (11, 13))
     status = Path(f"/proc/{pid}/status").read_text()
     resident_mb = int(re.findall(r"VmRSS:\s+(\d+)", status)[0]) / 1024
-    return f"CPU {own:.2f} s (and {waited:.2f} s of compilers), {resident_mb:.0f} MB"
+    return f"CPU {own:.2f} s (and {waited:.2f} s of children), {resident_mb:.0f} MB"
 
 
 def feed(master: int, frames: Iterable[TimedFrame], began_s: float) -> Iterator[float]:
@@ -75,14 +74,11 @@ def feed(master: int, frames: Iterable[TimedFrame], began_s: float) -> Iterator[
             os.write(master, frame.data)
 
 
-def time_run(folder: Path, cache: Path | None) -> None:
+def time_run(folder: Path) -> None:
     """Print how soon a gateway on a receiver that is there already sends, and what that took."""
     master, slave = os.openpty()
     tty.setraw(slave)
     frames = simulate(SimulatorSettings(gps_first_fix_s=0.5), START_UNIX_US).frames()
-    before = os.environ.get("NUMBA_CACHE_DIR")
-    if cache is not None:
-        os.environ["NUMBA_CACHE_DIR"] = str(cache)
     began_s = time.monotonic()
     gateway = Gateway(folder, "run", "--port", os.ttyname(slave), config=CONFIG)
     client = Client(gateway.port)
@@ -94,7 +90,7 @@ def time_run(folder: Path, cache: Path | None) -> None:
             names = {message.get_type() for message in client.receive()}
             while wanted and wanted[0] in names:
                 print(
-                    f"mavgate run, {'warm' if cache is None else 'cold'}, to {wanted.pop(0)}: "
+                    f"mavgate run to {wanted.pop(0)}: "
                     f"{time.monotonic() - began_s:.2f} s, {process_figures(gateway.process.pid)}"
                 )
             if not wanted:
@@ -104,9 +100,6 @@ def time_run(folder: Path, cache: Path | None) -> None:
         client.sock.close()
         os.close(master)
         os.close(slave)
-        os.environ.pop("NUMBA_CACHE_DIR", None)
-        if before is not None:
-            os.environ["NUMBA_CACHE_DIR"] = before
 
 
 def time_gateway(folder: Path) -> None:
@@ -121,8 +114,7 @@ def time_gateway(folder: Path) -> None:
         print(f"mavgate status: CPU {cpu_of(*mavgate, 'status'):.2f} s")
     finally:
         gateway.stop()
-    time_run(folder, None)
-    time_run(folder, folder / "empty")
+    time_run(folder)
 
 
 def connect(kind: int, port: int, version: int) -> Station:

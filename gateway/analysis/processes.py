@@ -1,4 +1,4 @@
-"""Forked processes, which share all that this one has computed and compiled."""
+"""Forked processes, which share all that this one has computed."""
 
 import gc
 import multiprocessing

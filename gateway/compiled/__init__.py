@@ -1,17 +1,16 @@
 """Numeric functions that machine code is compiled from; called from Python they run as Python.
 
-A function marked by `compiled` is in numba's nopython subset. The machine code of an entry point
-(see `entry_point`) contains all the functions that it calls. Compiled code is strict IEEE 754 and
-gives the same bits everywhere; Python gives the same to some units in the last place, because its
-powers and `hypot` are rounded otherwise.
+A function marked by `compiled` is in numba's nopython subset. `tools/build_kernels.py` compiles the
+entry points (see `entry_point`) and all functions that they call into one library. Compiled code is
+strict IEEE 754 and gives the same bits everywhere; Python gives the same except for some units in
+the last place, because its powers and `hypot` are rounded differently.
 """
 
 import ctypes
-import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, lru_cache
 from math import prod
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType
 from typing import Any, Final, TypeVar, cast
 
 import numpy as np
@@ -68,53 +67,6 @@ def compiled_with(template: Function, names: dict[str, object], mark: str) -> Fu
     copy.__qualname__, copy.__doc__ = f"{source.__qualname__}_{mark}", source.__doc__
     copy.__annotations__ = source.__annotations__
     return cast(Function, compiled(copy))
-
-
-def digest_of(function: Callable[..., object]) -> str:
-    """Return a digest of everything that the machine code of a function is compiled from.
-
-    It covers the bytecode of the function and of all compiled functions that it calls, directly or
-    not, and the global constants that these use. Comments and line numbers do not change it.
-    """
-    digest, found = hashlib.sha256(), [cast(FunctionType, function)]
-    for one in found:
-        for code in _codes(one.__code__):
-            constants = [c for c in code.co_consts if not isinstance(c, CodeType)]
-            digest.update(repr((code.co_name, code.co_code, constants, code.co_names)).encode())
-        for name, value in _globals_of(one):
-            if is_compiled(value):
-                value = cast(FunctionType, value)
-                if value not in found:
-                    found.append(value)
-                value = found.index(value)
-            digest.update(f"{name} {value}\n".encode())
-    return digest.hexdigest()
-
-
-def _codes(code: CodeType) -> Iterator[CodeType]:
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _codes(constant)
-
-
-def _globals_of(function: FunctionType) -> Iterator[tuple[str, object]]:
-    """Yield the global constants and compiled functions that a function uses."""
-    for code in _codes(function.__code__):
-        for name in code.co_names:
-            value = function.__globals__.get(name)
-            if isinstance(value, ModuleType):
-                yield from ((n, v) for n, v in _taken_from(value, code) if _is_fixed(v))
-            elif _is_fixed(value):
-                yield name, value
-
-
-def _taken_from(module: ModuleType, code: CodeType) -> Iterator[tuple[str, object]]:
-    yield from ((name, getattr(module, name, None)) for name in code.co_names)
-
-
-def _is_fixed(value: object) -> bool:
-    return isinstance(value, int | float | tuple | np.dtype) or is_compiled(value)
 
 
 def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:

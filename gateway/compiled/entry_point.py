@@ -1,157 +1,176 @@
-"""Functions that Python calls as machine code: directly by ctypes, or through numba."""
+"""Functions that Python calls as machine code, from one library that is built at installation.
 
+`tools/build_kernels.py` makes the library of all entry points. It contains digests of the sources
+that it was compiled from, which are compared when it is loaded.
+"""
+
+import ast
 import ctypes
-import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from functools import update_wrapper
+import hashlib
+from collections.abc import Callable
+from functools import cache, update_wrapper
 from inspect import signature
-from typing import Any, Final, Generic, ParamSpec, TypeVar
+from pathlib import Path
+from typing import Any, Final, Generic, ParamSpec
 
-from gateway.compiled import compiled, digest_of
-from gateway.compiled.machine_code import (
-    MachineCode,
-    compiling,
-    keep_code,
-    kept_code,
-    load_code,
-    tell_of_compiling,
-)
+from gateway.compiled import compiled
 
 Parameters = ParamSpec("Parameters")
-Result = TypeVar("Result")
 
-INTERPRETED: Final = os.environ.get("NUMBA_DISABLE_JIT", "0") != "0"
-"""Run everything as Python, for a debugger."""
+ROOT: Final = Path(__file__).resolve().parents[2]
+"""The folder that contains the package `gateway`."""
+LIBRARY: Final = Path(__file__).with_name("kernels.so")
+SOURCES_SYMBOL: Final = "mavgate_sources"
+"""A string in the library: the lines of `stamp_of` for each of its sources."""
+BUILD_COMMAND: Final = "make kernels"
 C_TYPES: Final[dict[Any, Any]] = {int: ctypes.c_int64, float: ctypes.c_double}
 
-
-_may_compile = True
-
-
-class NotCompiledError(ValueError):
-    """Machine code is not cached, and this process may not compile."""
+ENTRY_POINTS: Final[list["EntryPoint[...]"]] = []
+"""All entry points of the modules imported so far."""
 
 
-@contextmanager
-def nothing_compiled() -> Iterator[None]:
-    """Raise NotCompiledError where this process would compile: it takes seconds.
+class LibraryError(OSError):
+    """The library of compiled kernels is missing, or was compiled from other sources."""
 
-    For a running gateway, whose event loop would stop meanwhile, whichever thread compiles.
-    """
-    global _may_compile
-    before, _may_compile = _may_compile, False
-    try:
-        yield
-    finally:
-        _may_compile = before
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__()
+        self.filename = str(path)
+        self._text = (
+            f"the library of compiled kernels {reason}; build it by `{BUILD_COMMAND}` in the "
+            "source tree, or install mavgate again"
+        )
+
+    def __str__(self) -> str:
+        """Return the reason and the remedy."""
+        return self._text
 
 
 class EntryPoint(Generic[Parameters]):
-    """A function that is called as machine code, loaded from the cache or compiled at first call.
+    """A function that is called as machine code; use it as a decorator.
+
+    The function itself, which `__wrapped__` is, runs as Python.
 
     Parameters
     ----------
     function : callable
-        Takes `int` (addresses of arrays too) and `float`, and returns nothing; see
-        `compiler.compile_entry`.
+        At module level, in numba's nopython subset; takes `int` (addresses of arrays and records
+        too) and `float`, and returns nothing. It must not allocate. Its module must be listed in
+        `KERNEL_MODULES` of `tools/build_kernels.py`.
     """
 
     def __init__(self, function: Callable[Parameters, None]) -> None:
-        self._function = compiled(function)
-        self._name = f"{function.__module__}.{function.__qualname__}"
-        self._loaded: Callable[..., None] | None = function if INTERPRETED else None
-        update_wrapper(self, function)
+        self._loaded: Callable[..., None] | None = None
+        self.symbol = f"{function.__module__}.{function.__qualname__}"
+        update_wrapper(self, compiled(function))
+        ENTRY_POINTS.append(self)
 
     def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        """Call it."""
+        """Call it; raises LibraryError if the library cannot be used."""
         if self._loaded is None:
-            self._loaded = self._load(self.code())
-        self._loaded(*args, **kwargs)
+            self.load()
+        self._loaded(*args, **kwargs)  # type: ignore[misc]
 
-    def prepare(self) -> None:
-        """Load or compile it before it is called."""
-        self._loaded = self._loaded or self._load(self.code())
+    def load(self, path: Path | None = None) -> None:
+        """Load it before it is called.
 
-    def interpret(self) -> None:
-        """Run it as Python until `take`, unless it is loaded; that is much slower."""
-        self._loaded = self._loaded or self._run_as_python
-
-    def take(self, code: MachineCode) -> None:
-        """Load machine code that another process has got by `code`."""
-        self._loaded = self._load(code)
-
-    @property
-    def is_kept(self) -> bool:
-        """Whether its machine code is cached, or not needed."""
-        if INTERPRETED:
-            return True
-        return kept_code(self._name, digest_of(self._function)) is not None
-
-    def code(self) -> MachineCode:
-        """Read its machine code from the cache, or compile it and cache it.
+        Parameters
+        ----------
+        path : Path, optional
+            A library of other variants of the kernels, whose sources are not compared.
 
         Raises
         ------
-        NotCompiledError
-            If it is not there and `nothing_compiled` holds.
+        LibraryError
+            If the library is missing, was built from other sources, or lacks this function.
         """
-        name, digest = self._name, digest_of(self._function)
-        code = kept_code(name, digest)
-        if code is None:
-            if not _may_compile:
-                raise NotCompiledError(f"{name} is not compiled yet")
-            with compiling(name):
-                code = kept_code(name, digest) or self._compile(name, digest)
-        return code
+        library = open_checked_library() if path is None else open_library(path)
+        try:
+            loaded = library[self.symbol]
+        except AttributeError:
+            raise LibraryError(path or LIBRARY, f"lacks {self.symbol}") from None
+        loaded.argtypes = [C_TYPES[p.annotation] for p in self.parameters]
+        loaded.restype = None
+        self._loaded = loaded
 
-    def _compile(self, name: str, digest: str) -> MachineCode:
-        # Imported late, here and below: numba takes 60 MB.
-        from gateway.compiled.compiler import compile_entry
-
-        tell_of_compiling()
-        code = compile_entry(self._function)
-        keep_code(name, digest, code)
-        return code
-
-    def _load(self, code: MachineCode) -> Callable[..., None]:
-        parameters = signature(self._function).parameters.values()
-        prototype = ctypes.PYFUNCTYPE(None, *(C_TYPES[p.annotation] for p in parameters))
-        return prototype(load_code(code))
-
-    def _run_as_python(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> None:
-        # Python raises where machine code goes on with NaN. Then the rest of the call is left out:
-        # no number of a sensor may stop the telemetry.
-        with suppress(ArithmeticError, ValueError):
-            self._function(*args, **kwargs)
+    @property
+    def parameters(self) -> list[Any]:
+        """The parameters of the function, each of which is annotated as `int` or `float`."""
+        return [*signature(self.__wrapped__).parameters.values()]  # type: ignore[attr-defined]
 
 
-class _Dispatched(Generic[Parameters, Result]):
-    """A function that numba compiles at its first call."""
-
-    def __init__(self, function: Callable[Parameters, Result]) -> None:
-        self._function = compiled(function)
-        self._dispatcher: Callable[..., Result] | None = function if INTERPRETED else None
-        update_wrapper(self, function)
-
-    def __call__(self, *args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        if self._dispatcher is None:
-            if not _may_compile:
-                raise NotCompiledError(f"{self._function.__qualname__} is for recordings")
-            from gateway.compiled.compiler import compile_dispatcher
-
-            self._dispatcher = compile_dispatcher(self._function)
-        return self._dispatcher(*args, **kwargs)
+def load_entry_points() -> None:
+    """Load the entry points of all imported modules; raises LibraryError if that is impossible."""
+    for entry_point in ENTRY_POINTS:
+        entry_point.load()
 
 
-def dispatched(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Compile a function when Python calls it, for loops over whole recordings.
+def open_library(path: Path) -> ctypes.PyDLL:
+    """Open a library of kernels; raises LibraryError if there is none."""
+    try:
+        # PyDLL keeps the interpreter's lock: a live step is shorter than giving it up.
+        return ctypes.PyDLL(str(path))
+    except OSError as error:
+        reason = f"cannot be loaded ({error})" if path.exists() else "is missing"
+        raise LibraryError(path, reason) from error
 
-    Only Python can call the result; compiled code calls functions marked by `compiled`.
+
+@cache
+def open_checked_library() -> ctypes.PyDLL:
+    """Open the installed library, if it was compiled from the present sources."""
+    library = open_library(LIBRARY)
+    if changed := changed_source(stamp_in(library)):
+        raise LibraryError(LIBRARY, f"is older than {changed}")
+    return library
+
+
+def stamp_in(library: ctypes.PyDLL) -> str:
+    """Return the lines of `stamp_of` that a library contains."""
+    text = ctypes.c_char.in_dll(library, SOURCES_SYMBOL)
+    return ctypes.string_at(ctypes.addressof(text)).decode()
+
+
+def changed_source(stamp: str) -> str | None:
+    """Return the first source from which a library would be compiled differently today.
 
     Parameters
     ----------
-    function : callable
-        In numba's nopython subset; takes arrays and records as they are.
+    stamp : str
+        From `stamp_in`.
     """
-    return _Dispatched(function)
+    for line in stamp.splitlines():
+        name, content, code = line.split()
+        path = ROOT / name
+        source = path.read_bytes() if path.exists() else b""
+        # Comments and docstrings change no code; it takes long to leave them out.
+        if _digest(source) != content and code_digest(source) != code:
+            return name
+    return None
+
+
+def stamp_of(path: Path) -> str:
+    """Return a source's path relative to `ROOT`, and digests of its content and of its code."""
+    source = path.read_bytes()
+    return f"{path.relative_to(ROOT).as_posix()} {_digest(source)} {code_digest(source)}"
+
+
+def code_digest(source: bytes) -> str:
+    """Return a digest of Python code that comments, docstrings and layout do not change."""
+    try:
+        tree = ast.parse(source)
+    except SyntaxError:
+        return ""
+    for node in ast.walk(tree):
+        for block in ("body", "orelse", "finalbody"):
+            if isinstance(statements := getattr(node, block, None), list):
+                setattr(node, block, [s for s in statements if not _is_text(s)])
+    return _digest(ast.dump(tree).encode())
+
+
+def _is_text(statement: ast.AST) -> bool:
+    """Return whether a statement is only a string."""
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
+
+
+def _digest(data: bytes) -> str:
+    return hashlib.blake2b(data, digest_size=16).hexdigest()

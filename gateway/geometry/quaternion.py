@@ -1,14 +1,24 @@
 """Unit quaternions of attitude: Hamilton, scalar first, body FRD to NED.
 
-All functions take and return plain tuples of floats, so they cost the same inside a compiled
-kernel and in a per-sample call. Equation numbers are those of Arfakhsyad et al., "UAV Data-Driven
-Modeling Software with Integrated 9-Axis IMU-GPS Sensor Fusion and Data Filtering Algorithm".
+The functions take and return plain tuples of floats, so they cost the same inside a compiled
+kernel and in a per-sample call; those for arrays, at the end, are compiled loops. Equation numbers
+are those of Arfakhsyad et al., "UAV Data-Driven Modeling Software with Integrated 9-Axis IMU-GPS
+Sensor Fusion and Data Filtering Algorithm".
 """
 
 import math
+from typing import Final
 
-from gateway.compiled import compiled
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.compiled import address_of, array_at, compiled
+from gateway.compiled.entry_point import EntryPoint
 from gateway.records import Quat, Vec3
+
+FloatArray = NDArray[np.float64]
+
+_FLOAT: Final = np.dtype(np.float64)
 
 IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 
@@ -159,3 +169,69 @@ def to_euler(q: Quat) -> Vec3:
     pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return (roll, pitch, yaw)
+
+
+def from_euler_array(angles_rad: FloatArray) -> FloatArray:
+    """Apply `from_euler` to each row.
+
+    Parameters
+    ----------
+    angles_rad : ndarray, shape (n, 3)
+        Roll, pitch and yaw.
+
+    Returns
+    -------
+    ndarray, shape (n, 4)
+        Quaternions, scalar first.
+    """
+    angles = np.ascontiguousarray(angles_rad, np.float64)
+    found = np.empty((len(angles), 4))
+    _from_euler_array(len(angles), address_of(angles), address_of(found))
+    return found
+
+
+@EntryPoint
+def _from_euler_array(count: int, angles_at: int, found_at: int) -> None:
+    angles = array_at(angles_at, (count, 3), _FLOAT)
+    found = array_at(found_at, (count, 4), _FLOAT)
+    for i in range(count):
+        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = from_euler(
+            angles[i, 0], angles[i, 1], angles[i, 2]
+        )
+
+
+def integrate_rate(dt_s: FloatArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
+    """Integrate an attitude from the angular rate alone.
+
+    Parameters
+    ----------
+    dt_s : ndarray, shape (n,)
+        Interval that each sample stands for.
+    gyro_b_radps : ndarray, shape (n, 3)
+        Rate in body FRD.
+    q_nb : ndarray, shape (4,)
+        Attitude before the first sample.
+
+    Returns
+    -------
+    ndarray, shape (n, 4)
+        Attitude at the end of each interval.
+    """
+    found = np.empty((len(dt_s), 4))
+    inputs = [np.ascontiguousarray(part, np.float64) for part in (dt_s, gyro_b_radps, q_nb)]
+    _integrate_rate(len(found), *map(address_of, (*inputs, found)))
+    return found
+
+
+@EntryPoint
+def _integrate_rate(count: int, dt_at: int, gyro_at: int, begin_at: int, found_at: int) -> None:
+    dt_s = array_at(dt_at, (count,), _FLOAT)
+    gyro = array_at(gyro_at, (count, 3), _FLOAT)
+    begin = array_at(begin_at, (4,), _FLOAT)
+    found = array_at(found_at, (count, 4), _FLOAT)
+    q = (begin[0], begin[1], begin[2], begin[3])
+    for k in range(count):
+        dt = dt_s[k]
+        turn = from_rotation_vector((gyro[k, 0] * dt, gyro[k, 1] * dt, gyro[k, 2] * dt))
+        q = normalise(multiply(q, turn))
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = q

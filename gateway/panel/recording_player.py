@@ -23,9 +23,8 @@ from gateway.recordings.index import RecordingError, find_recording
 
 log = logging.getLogger(__name__)
 
-READY_S: Final = 600.0
-"""A table of hours is opened in some seconds; a first start compiles, for minutes on a busy PC.
-A player that fails is noticed when it ends."""
+READY_S: Final = 120.0
+"""A table of hours is opened in some seconds. A player that fails is noticed when it ends."""
 STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
 LEAP_S: Final = 0.5

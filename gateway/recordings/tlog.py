@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from gateway.recordings.tlog_scan import (
     COLUMNS,
+    KNOWN_IDS,
     LARGEST_RECORD,
     SMALLEST_RECORD,
     TIME_SIZE,
+    ExtraArray,
     IntArray,
-    crc_extra_table,
     lacks_end,
     scan,
 )
@@ -76,7 +77,17 @@ MAX_JUMPS: Final = 1000
 
 HEARTBEAT_ID: Final = 0
 
-_EXTRA: Final = crc_extra_table()
+
+def _crc_extra_table() -> ExtraArray:
+    """Lay the messages' checksum seeds out as an array by message id, -1 where unknown."""
+    table = np.full(KNOWN_IDS, -1, np.int16)
+    for message_id, extra in CRC_EXTRA.items():
+        if message_id < KNOWN_IDS:
+            table[message_id] = extra[0]
+    return table
+
+
+_EXTRA: Final = _crc_extra_table()
 
 
 def payload_of(frame: bytes, size: int) -> bytes:

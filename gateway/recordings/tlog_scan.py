@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from gateway.compiled import address_of, array_at, compiled
 from gateway.compiled.entry_point import EntryPoint
-from gateway.wire.mavlink_messages import CRC_EXTRA
 
 ByteArray = NDArray[np.uint8]
 IntArray = NDArray[np.int64]
@@ -38,8 +37,7 @@ LARGEST_RECORD: Final = 8 + 12 + 255 + 13
 COLUMNS: Final = 5
 """Start, size of the frame, time in µs, origin (system << 8 | component), message id."""
 
-_KNOWN_IDS: Final = 1 << 16
-_UNKNOWN: Final = -1
+KNOWN_IDS: Final = 1 << 16
 _YES: Final = 1
 _NO: Final = 0
 _WAIT: Final = -1
@@ -48,15 +46,6 @@ _FINAL, _STRICT, _IN_STEP = 1, 2, 4
 _BYTE: Final = np.dtype(np.uint8)
 _INT: Final = np.dtype(np.int64)
 _EXTRA: Final = np.dtype(np.int16)
-
-
-def crc_extra_table() -> ExtraArray:
-    """Lay the messages' checksum seeds out as an array by message id, -1 where unknown."""
-    table = np.full(_KNOWN_IDS, _UNKNOWN, np.int16)
-    for message_id, extra in CRC_EXTRA.items():
-        if message_id < _KNOWN_IDS:
-            table[message_id] = extra[0]
-    return table
 
 
 @compiled
@@ -167,7 +156,7 @@ def scan(
     in_step : bool
         Whether a record is known to begin at the first byte.
     extra : ndarray, shape (n,)
-        From `crc_extra_table`.
+        Checksum seeds by message id, -1 where unknown.
     records : ndarray, shape (COLUMNS, m)
         Filled; `m` at least `data.size // SMALLEST_RECORD + 1`.
     damage : ndarray, shape (2, m + 1)
@@ -191,7 +180,8 @@ def scan(
     return (at, count, damaged, bool(in_step_now))
 
 
-def scan_entry(
+@EntryPoint
+def scan_at(
     size: int,
     room: int,
     flags: int,
@@ -203,7 +193,7 @@ def scan_entry(
 ) -> None:
     """Do `scan` on arrays by their addresses; writes its result as four numbers."""
     data = array_at(data_at, (size,), _BYTE)
-    extra = array_at(extra_at, (_KNOWN_IDS,), _EXTRA)
+    extra = array_at(extra_at, (KNOWN_IDS,), _EXTRA)
     records = array_at(records_at, (COLUMNS, room), _INT)
     damage = array_at(damage_at, (2, room + 1), _INT)
     found = array_at(found_at, (4,), _INT)
@@ -254,6 +244,3 @@ def _walk(
         damage[0, damaged], damage[1, damaged] = bad_from, at
         damaged += 1
     return (at, count, damaged, in_step)
-
-
-scan_at: Final = EntryPoint(scan_entry)

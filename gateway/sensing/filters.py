@@ -12,8 +12,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.compiled import compiled
-from gateway.compiled.entry_point import dispatched
+from gateway.compiled import address_of, array_at, compiled
+from gateway.compiled.entry_point import EntryPoint
 from gateway.records import Vec3
 
 FloatArray = NDArray[np.float64]
@@ -27,6 +27,7 @@ FilterState = tuple[Delays, Vec3]
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
 """A wire: what it is designed for keeps no delays and needs no arithmetic."""
+_FLOAT: Final = np.dtype(np.float64)
 NO_DELAYS: Final[Delays] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 SLOWEST_HIGHPASS_HZ: Final = 1e-6
 """A time constant of 44 hours: a slower one makes no difference in any flight, while rounding
@@ -127,14 +128,16 @@ def step(c: Coefficients, z: Delays, x: Vec3) -> tuple[Vec3, Delays]:
     return ((y0, y1, y2), delays)
 
 
-@dispatched
-def run(c: Coefficients, z: Delays, x: FloatArray) -> tuple[FloatArray, Delays]:
-    """Pass an array of shape (n, 3) through the filter."""
-    y = np.empty_like(x)
-    for i in range(x.shape[0]):
+@EntryPoint
+def filter_rows(count: int, coefficients_at: int, delays_at: int, x_at: int, y_at: int) -> None:
+    """Pass an array of shape (count, 3) through the filter; the delays are changed."""
+    k, d = array_at(coefficients_at, (5,), _FLOAT), array_at(delays_at, (6,), _FLOAT)
+    x, y = array_at(x_at, (count, 3), _FLOAT), array_at(y_at, (count, 3), _FLOAT)
+    c, z = (k[0], k[1], k[2], k[3], k[4]), (d[0], d[1], d[2], d[3], d[4], d[5])
+    for i in range(count):
         out, z = step(c, z, (x[i, 0], x[i, 1], x[i, 2]))
         y[i, 0], y[i, 1], y[i, 2] = out
-    return (y, z)
+    d[0], d[1], d[2], d[3], d[4], d[5] = z
 
 
 def _last_input(c: Coefficients, z: Delays, y: Vec3) -> Vec3:
@@ -222,9 +225,16 @@ class VectorFilter:
         if self._coefficients is PASS_THROUGH:
             y, delays = x.copy(), NO_DELAYS
         else:
-            y, delays = run(self._coefficients, self._delays(x[0]), np.ascontiguousarray(x))
+            y, delays = self._filter(np.ascontiguousarray(x, np.float64))
         self.state = (delays, (float(y[-1, 0]), float(y[-1, 1]), float(y[-1, 2])))
         return y
+
+    def _filter(self, x: FloatArray) -> tuple[FloatArray, Delays]:
+        y, state = np.empty_like(x), np.array(self._delays(x[0]))
+        arrays = (np.array(self._coefficients), state, x, y)
+        filter_rows(len(x), *map(address_of, arrays))
+        a, b, c, d, e, f = state.tolist()
+        return y, (a, b, c, d, e, f)
 
     def _delays(self, first: Vec3 | FloatArray) -> Delays:
         if self.state is not None:

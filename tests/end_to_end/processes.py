@@ -17,9 +17,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from tests.ports import free_ports
 
-START_LIMIT_S = 600.0
-"""The first start after an upgrade compiles, on a busy machine for more than a minute; everything
-else takes a second."""
+START_LIMIT_S = 60.0
+"""A start takes a second, on a busy machine some more."""
 
 SO_RCVBUFFORCE = 33
 """Of Linux, for root alone: beyond the limit that others have."""

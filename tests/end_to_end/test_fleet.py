@@ -20,8 +20,6 @@ from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
 from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
 from mavsdk.asyncio.plugins.param import ParamAsync
 
-from gateway.cli.support.warm_up import make_ready
-from gateway.estimation.select import EstimationSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, until
 from tests.end_to_end.test_ground_stations import WAYPOINTS, answered
 from tests.ports import free_port, free_ports
@@ -83,10 +81,6 @@ def wrong_clock(tmp_path_factory: pytest.TempPathFactory) -> Path | None:
 def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) -> Iterator[Fleet]:
     folder = tmp_path_factory.mktemp("fleet")
     place = f"tcp/127.0.0.1:{free_port()}"
-    # Once for all: three sites that compile at the same time would take minutes.
-    compiling = make_ready(EstimationSettings().estimator)
-    while compiling is not None and compiling.take_one():
-        pass
     running: dict[str, Gateway] = {}
     ports = free_ports(3)
     words = [sys.executable, "-m", "gateway.cli", "fleet", "--listen", place, "--site", "field-*"]

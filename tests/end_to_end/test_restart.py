@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.cli.support.warm_up import make_ready
 from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
@@ -95,9 +94,6 @@ async def run(folder: Path, use: Callable[[int], Any], *beside: str) -> Any:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    compiling = make_ready("complementary")
-    while compiling is not None and compiling.take_one():
-        pass
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path
 

@@ -124,7 +124,6 @@ def test_a_filter_keeps_what_is_set_until_a_manoeuvre(flight: Flight, name: str)
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_python_finds_what_machine_code_does(name: str) -> None:
-    """Before everything is compiled, a filter flies as Python, turns and all."""
     flight = simulated_flight(21, calibrated=True)
     estimator = make_estimator(EstimationSettings(estimator=name, reference=flight.reference))
     assert isinstance(estimator, KernelEstimator)

@@ -153,7 +153,7 @@ def test_a_record_is_read_and_written_at_its_address(estimator: KernelEstimator)
 
 
 def test_python_gives_what_machine_code_does(estimator: KernelEstimator) -> None:
-    """Before everything is compiled, it flies as Python; the powers are rounded otherwise."""
+    """Python rounds powers differently."""
     items = events(8.0, 5)
     machine = as_rows(feed(estimator, items))
     functions = {k: getattr(estimator._kernels, k) for k in ("begin", "imus", "baro", "gps")}

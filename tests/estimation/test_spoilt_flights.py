@@ -31,7 +31,6 @@ from tools.spoil_flight import RECOVERY_S, SPOILS, applies, cut, departure, mid_
 pytestmark = pytest.mark.slow
 
 RUNS = {"eskf": run_eskf, "complementary": run_complementary}
-"""In this order, since another worker begins with `complementary`: each compiles one of them."""
 SEEDS = (21, 22)
 PLACE_M = 10.0
 

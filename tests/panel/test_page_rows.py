@@ -391,7 +391,7 @@ def _move_in_time(page: Page, row: object) -> None:
         page.keyboard.press("Space")
         expect(view.get_by_label("Play or pause")).to_have_text(icon)
     view.get_by_text("fused again beside it").click()
-    # The table is fused by a process that may have to compile first.
+    # The table is fused by another process.
     page.wait_for_function(
         "Object.values(mavgate.vehicles).filter((v) => v.origin === 'fused again').length === 2",
         timeout=START_LIMIT_MS,

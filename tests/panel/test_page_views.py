@@ -171,7 +171,6 @@ def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
     enough_us = desk.begun_us + (LEAST_S + 1.0) * US_PER_S
     desk.page.wait_for_function(f"mavgate.state.time_us > {enough_us}")
     card.get_by_role("button", name="Compare").click()
-    # It may have to compile.
     expect(rows.locator("td:first-child")).to_have_text(list(ESTIMATORS), timeout=START_LIMIT_MS)
     figures = rows.locator("td:nth-child(2)").all_inner_texts()
     assert all(re.fullmatch(r"\d+\.\d+ deg", figure) for figure in figures)

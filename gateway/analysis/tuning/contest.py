@@ -91,8 +91,8 @@ class Trials:
         self._contest = contest
         self._sensed: tuple[SensingSettings, Sensed] | None = None
 
-    def warm_up(self) -> None:
-        """Compile and filter the samples in advance, once for all processes."""
+    def prepare(self) -> None:
+        """Filter and fuse the samples in advance, once for all processes."""
         fusion, flight = self._contest.fusion, self._contest.judge.fused
         self._sensed = (fusion.sensing, sense(flight, fusion.sensing))
         fuse(flight, fusion, self._sensed[1])

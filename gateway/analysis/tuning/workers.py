@@ -18,7 +18,7 @@ _trials: Trials | None = None
 def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
     """Open a pool of processes."""
     trials = Trials(contest)
-    trials.warm_up()
+    trials.prepare()
     count = jobs or cores()
     if count == 1:
         yield lambda points: ((k, trials.run(values)) for k, values in enumerate(points))

@@ -35,8 +35,8 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_options,
 )
-from gateway.cli.support.warm_up import make_ready
 from gateway.clock import unix_time_us
+from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
 from gateway.live.daemon import Daemon
 from gateway.recordings.flown import open_flown
@@ -81,7 +81,7 @@ def demo(
         return with_endpoints(load_settings(config), endpoint)
 
     settings = or_refuse(read)
-    compiling = make_ready(settings.estimation.estimator)
+    load_entry_points()
     daemons: list[Daemon] = []
 
     def report(text: str) -> None:
@@ -113,7 +113,7 @@ def demo(
             return daemons[0]
 
         page = PanelProcess(config) if panel and is_installed() else None
-        asyncio.run(serve(daemon, plain=plain, panel=page, compiling=compiling))
+        asyncio.run(serve(daemon, plain=plain, panel=page))
 
 
 def recorded_line(

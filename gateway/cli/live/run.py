@@ -20,8 +20,7 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_aircraft,
 )
-from gateway.cli.support.warm_up import Compilation, make_ready
-from gateway.compiled.entry_point import nothing_compiled
+from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings
 from gateway.live.attachment import on_end_signals
 from gateway.live.daemon import Daemon
@@ -74,13 +73,9 @@ def run_gateway(
 
     settings = or_refuse(read)
     aircraft = read_aircraft(settings)
-    own = (one.estimation.estimator for one in aircraft.values())
-    compiling = make_ready(settings.estimation.estimator, *own)
+    load_entry_points()
     page = PanelProcess(config) if panel or settings.panel.enabled else None
-    work = serve(
-        lambda: Daemon(settings, aircraft, read), plain=plain, panel=page, compiling=compiling
-    )
-    asyncio.run(work)
+    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:
@@ -99,7 +94,6 @@ async def serve(
     *,
     plain: bool,
     panel: PanelProcess | None = None,
-    compiling: Compilation | None = None,
 ) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing its status.
 
@@ -114,8 +108,6 @@ async def serve(
         Log lines even on a terminal.
     panel : PanelProcess, optional
         The page in a browser, to be started and ended with the daemon.
-    compiling : Compilation, optional
-        From `make_ready`.
     """
     stopped = asyncio.Event()
     on_end_signals(stopped.set)
@@ -123,8 +115,6 @@ async def serve(
     daemon = daemon_of()
     if not sys.stdin.isatty():
         _reload_on_hangup(daemon)
-    if compiling is not None:
-        compiling.watch()
     with loop_comes_first(daemon.start):
         if panel is not None:
             panel.start(daemon.control_socket)
@@ -147,7 +137,7 @@ def loop_comes_first(start: Callable[[], None]) -> Iterator[None]:
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
-        with nothing_compiled(), detached_output():
+        with detached_output():
             start()
             # All that exists by now is there to stay, as the library of the metrics that the start
             # has loaded: a full garbage collection of it would stop telemetry for 0.1 s.

@@ -19,7 +19,7 @@ from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice
 from gateway.recordings.reading import ReadOptions
 from gateway.season.batch.dask_executor import ClusterError, DaskCluster, has_dask
-from gateway.season.batch.flight_tasks import FlightResult, FlightTask, warm_up, without_secrets
+from gateway.season.batch.flight_tasks import FlightResult, FlightTask, without_secrets
 from gateway.season.batch.result_folder import ResultFolder
 from gateway.season.batch.season_run import run_season
 from gateway.season.batch.storage import BatchItem, StorageError, has_fsspec, is_url, items_of
@@ -83,10 +83,6 @@ class SeasonWork:
     def executor(self) -> Iterator[Executor]:
         """Open the executor; a cluster that cannot be used ends the command."""
         if self.scheduler is None:
-            console = console_of(stderr=True)
-            # After an upgrade the compiler runs for a minute: once here, not in every process.
-            with console.status("making the estimators ready"):
-                warm_up()
             yield LocalProcesses(self.jobs)
             return
         if not has_dask():

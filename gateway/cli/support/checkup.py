@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.cli.support.errors import how_to_add
-from gateway.cli.support.warm_up import ENTRY_POINTS, is_kept
+from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
 from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.tls import valid_until_s
@@ -135,13 +135,14 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
         )
 
 
-def check_cache(_: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether compiled estimators are cached, and can be."""
-    if all(map(is_kept, ENTRY_POINTS)):
-        yield Diagnosis(Grade.GOOD, "estimators", "compiled")
-        return
-    text = "the next start compiles them, and they cost more computing for a minute"
-    yield Diagnosis(Grade.NOTE, "estimators", text)
+def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether the compiled kernels can be loaded."""
+    try:
+        load_entry_points()
+    except LibraryError as error:
+        yield Diagnosis(Grade.WRONG, "kernels", str(error))
+    else:
+        yield Diagnosis(Grade.GOOD, "kernels", "compiled")
 
 
 def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
@@ -263,7 +264,7 @@ CHECKS: Final[tuple[Check, ...]] = (
     check_ports,
     check_aircraft,
     check_disk,
-    check_cache,
+    check_kernels,
     check_clock,
     check_certificates,
     check_extras,

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from gateway.compiled.entry_point import dispatched
+from gateway.compiled import address_of, array_at, record_at
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.alignment.gps_latency import (
     KNOWN_STD_S,
     LatencyState,
@@ -16,12 +17,15 @@ from gateway.estimation.alignment.gps_latency import (
     latency_to_use,
     watch_latency,
 )
-from gateway.estimation.columns import ACCEL, GPS_USABLE, GPS_VEL, GYRO
+from gateway.estimation.columns import ACCEL, GPS_USABLE, GPS_VEL, GYRO, IMU_COLUMNS
 from gateway.estimation.history import remember
 from gateway.estimation.kernel import SampleLog
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, new_record
+from gateway.estimation.kernel_record import as_vec, layout, new_record
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise, rotate
 
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
+LATENCY_LAYOUT: Final = layout(LatencyState)
 LONGEST_STEP_S: Final = 0.5
 """A longer silence of the IMU is not integrated over."""
 
@@ -53,7 +57,9 @@ def estimate_latency(log: SampleLog) -> GpsLatency | None:
         return None
     s = new_record(LatencyState)
     begin_latency(s, 0.0)
-    watch_log(s, log.imu_time_us, log.imu, log.gps_time_us[told], vel[told])
+    parts = (log.imu_time_us, log.imu, log.gps_time_us[told], vel[told])
+    arrays = [np.ascontiguousarray(part) for part in parts]
+    watch_log(len(arrays[0]), len(arrays[2]), *map(address_of, (s, *arrays)))
     std_s = found_latency_std(s)
     return GpsLatency(max(float(s.found_latency_s), 0.0), std_s) if std_s < KNOWN_STD_S else None
 
@@ -77,11 +83,22 @@ def latency_of_flight(log: SampleLog, set_s: float) -> float:
     return set_s if found is None else latency_to_use(found.latency_s, set_s)
 
 
-@dispatched
+@EntryPoint
 def watch_log(
-    s: LatencyState, imu_time_us: IntArray, imu: FloatArray, gps_time_us: IntArray, vel: FloatArray
+    imu_count: int,
+    gps_count: int,
+    state: int,
+    imu_times_us: int,
+    imu_rows: int,
+    gps_times_us: int,
+    velocities: int,
 ) -> None:
     """Integrate the specific force in the gyroscope's frame, and watch every velocity."""
+    s = record_at(state, LATENCY_LAYOUT)
+    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
+    imu = array_at(imu_rows, (imu_count, IMU_COLUMNS), FLOAT)
+    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    vel = array_at(velocities, (gps_count, 3), FLOAT)
     q, fixes = (1.0, 0.0, 0.0, 0.0), 0
     base_us = imu_time_us[0]
     for i in range(imu_time_us.shape[0]):

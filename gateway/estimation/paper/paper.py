@@ -155,7 +155,7 @@ class PaperEstimator:
         rest: RestSettings,
     ) -> None:
         # Before a sample waits for it.
-        step_live.prepare()
+        step_live.load()
         self._settings = settings
         self._reference = reference
         self._rest = filled_record(RestGains, rest_gains(rest))

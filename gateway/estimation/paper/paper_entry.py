@@ -2,17 +2,11 @@
 
 from typing import Final
 
-import numpy as np
-
 from gateway.compiled import array_at, record_at
 from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.kernel_record import as_quat, as_vec, layout, write_quat, write_vec
-from gateway.estimation.paper.paper_kernels import Memory, step
-from gateway.estimation.rest import RestGains
+from gateway.estimation.kernel_record import as_quat, as_vec, write_quat, write_vec
+from gateway.estimation.paper.paper_kernels import FLOAT, MEMORY_LAYOUT, REST_LAYOUT, step
 
-MEMORY_LAYOUT: Final = layout(Memory)
-REST_LAYOUT: Final = layout(RestGains)
-FLOAT: Final = np.dtype(np.float64)
 MOTION_COLUMNS: Final = 19
 
 

@@ -9,11 +9,17 @@ from typing import Annotated, Final
 
 import numpy as np
 
-from gateway.compiled import compiled
-from gateway.compiled.entry_point import dispatched
+from gateway.compiled import address_of, array_at, compiled, record_at
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation import flagbits
 from gateway.estimation.history import SLOTS, recall, remember
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_vec, write_vec
+from gateway.estimation.kernel_record import (
+    FloatArray,
+    IntArray,
+    as_vec,
+    layout,
+    write_vec,
+)
 from gateway.estimation.rest import RestGains, RestState, begin_rest, watch_rest
 from gateway.estimation.sensor_faults import (
     HealthState,
@@ -76,6 +82,12 @@ class Memory(RestState, HealthState):
     ring_count: int
     past: Annotated[FloatArray, (6,)]
     """Scratch: the integrals as they were."""
+
+
+MEMORY_LAYOUT: Final = layout(Memory)
+REST_LAYOUT: Final = layout(RestGains)
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
 
 
 @compiled
@@ -310,7 +322,6 @@ def flags_of(
     return flags
 
 
-@dispatched
 def run(
     gains: tuple[float, float, float, float, float],
     rest: RestGains,
@@ -350,14 +361,69 @@ def run(
     ndarray, shape (n, OUT_COLUMNS)
         One row a sample.
     """
+    arrays = [np.ascontiguousarray(part) for part in (time_us, samples, fix_time_us, fixes)]
     out = np.empty((len(time_us), OUT_COLUMNS))
-    alpha_gyro, alpha_yaw, alpha, beta, latency_s = gains
+    places = [address_of(part) for part in (rest, memory, *arrays, out)]
+    run_at(*gains, int(at_fix), declination_rad, len(time_us), len(fix_time_us), *places)
+    return out
+
+
+@EntryPoint
+def run_at(
+    alpha_gyro: float,
+    alpha_yaw: float,
+    alpha: float,
+    beta: float,
+    latency_s: float,
+    at_fix: int,
+    declination_rad: float,
+    count: int,
+    fix_count: int,
+    rest_at: int,
+    memory_at: int,
+    times_us: int,
+    samples_at: int,
+    fix_times_us: int,
+    fixes_at: int,
+    out_at: int,
+) -> None:
+    """Do `run` on arrays by their addresses."""
+    rest, memory = record_at(rest_at, REST_LAYOUT), record_at(memory_at, MEMORY_LAYOUT)
+    time_us = array_at(times_us, (count,), INT)
+    samples = array_at(samples_at, (count, SAMPLE_COLUMNS), FLOAT)
+    fix_time_us = array_at(fix_times_us, (fix_count,), INT)
+    fixes = array_at(fixes_at, (fix_count, FIX_COLUMNS), FLOAT)
+    out = array_at(out_at, (count, OUT_COLUMNS), FLOAT)
+    _run(
+        alpha_gyro, alpha_yaw, alpha, beta, latency_s, at_fix != 0, declination_rad, rest, memory,
+        time_us, samples, fix_time_us, fixes, out,
+    )  # fmt: skip
+
+
+@compiled
+def _run(
+    alpha_gyro: float,
+    alpha_yaw: float,
+    alpha: float,
+    beta: float,
+    latency_s: float,
+    at_fix: bool,
+    declination_rad: float,
+    rest: RestGains,
+    memory: Memory,
+    time_us: IntArray,
+    samples: FloatArray,
+    fix_time_us: IntArray,
+    fixes: FloatArray,
+    out: FloatArray,
+) -> None:
+    """Do `run`."""
     q = (1.0, 0.0, 0.0, 0.0)
     place = vel = fix_place = fix_vel = (math.nan, math.nan, math.nan)
     now_us = mag_us = last_fix_us = NEVER
     k = 0
-    for i in range(len(time_us)):
-        while k < len(fix_time_us) and fix_time_us[k] <= time_us[i]:
+    for i in range(time_us.shape[0]):
+        while k < fix_time_us.shape[0] and fix_time_us[k] <= time_us[i]:
             fix_place, fix_vel = carry_forward(
                 memory, three(fixes, k, 0), three(fixes, k, 3), fix_time_us[k], now_us, latency_s
             )
@@ -385,4 +451,3 @@ def run(
                 mag_us = now_us
         flags = flags_of(time_us[i], now_us != NEVER, mag_us, declination_rad, last_fix_us, sound)
         write(out, i, q, place, vel, flags)
-    return out

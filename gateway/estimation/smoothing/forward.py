@@ -7,16 +7,19 @@ through, this is all that a smoother needs.
 """
 
 import math
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.compiled import compiled
-from gateway.compiled.entry_point import dispatched
+from gateway.compiled import address_of, array_at, compiled, record_at
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
     CLIPPED,
+    GPS_COLUMNS,
+    IMU_COLUMNS,
     NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
     NAV_FLAGS,
     NAV_POS_STD,
     NAV_VEL_STD,
@@ -41,13 +44,18 @@ from gateway.estimation.eskf.eskf_state import (
 )
 from gateway.estimation.eskf.iron import board_var, standing_field_var
 from gateway.estimation.flagbits import ATTITUDE_VALID, HEADING_VALID
-from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat
+from gateway.estimation.kernel_record import FloatArray, IntArray, as_quat, layout
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply
 
 BoolArray = NDArray[np.bool_]
 
 SHOWN: Final = 2
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
+BOOL: Final = np.dtype(np.bool_)
+STATE_LAYOUT: Final = layout(EskfState)
+GAINS_LAYOUT: Final = layout(EskfGains)
 
 take_earlier: Final = KERNELS.earlier
 
@@ -169,9 +177,8 @@ def move_copy(s: EskfState, p: EskfGains, time_us: int, row: FloatArray, F: Floa
         foresee(s, p, F)
 
 
-@dispatched
 def run_forward(
-    states: FloatArray,
+    states: NDArray[np.void],
     p: EskfGains,
     nodes: IntArray,
     imu_time_us: IntArray,
@@ -220,8 +227,87 @@ def run_forward(
     on_compass : ndarray, shape (m + 1,)
         Filled: `compass_share` there.
     """
-    s, copy = states[0], states[1]
+    log = (imu_time_us, imu, baro_time_us, baro_alt_m, gps_time_us, gps)
+    samples = [np.ascontiguousarray(part) for part in log]
+    arrays = (nodes, *samples, out, P, F, foreseen, d, anew, shown, doubt, on_compass)
     taken = np.zeros(2, np.int64)
+    counts = (len(nodes) - 1, len(imu_time_us), len(baro_time_us), len(gps_time_us))
+    forward(*counts, *map(address_of, (states, p, taken, *arrays)))
+
+
+@EntryPoint
+def forward(
+    node_count: int,
+    imu_count: int,
+    baro_count: int,
+    gps_count: int,
+    states_at: int,
+    gains: int,
+    taken_at: int,
+    nodes_at: int,
+    imu_times_us: int,
+    imu_rows: int,
+    baro_times_us: int,
+    baro_alts_m: int,
+    gps_times_us: int,
+    gps_rows: int,
+    out_at: int,
+    P_at: int,
+    F_at: int,
+    foreseen_at: int,
+    d_at: int,
+    anew_at: int,
+    shown_at: int,
+    doubt_at: int,
+    on_compass_at: int,
+) -> None:
+    """Do `run_forward` on arrays by their addresses."""
+    states, p = array_at(states_at, (2,), STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    nodes, taken = array_at(nodes_at, (node_count + 1,), INT), array_at(taken_at, (2,), INT)
+    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
+    imu = array_at(imu_rows, (imu_count, IMU_COLUMNS), FLOAT)
+    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
+    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
+    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    gps = array_at(gps_rows, (gps_count, GPS_COLUMNS), FLOAT)
+    out = array_at(out_at, (imu_count, NAV_COLUMNS), FLOAT)
+    P = array_at(P_at, (node_count, STATES, STATES), FLOAT)
+    F = array_at(F_at, (node_count, STATES, STATES), FLOAT)
+    foreseen = array_at(foreseen_at, (node_count, STATES, STATES), FLOAT)
+    d, anew = array_at(d_at, (node_count, STATES), FLOAT), array_at(anew_at, (imu_count,), BOOL)
+    shown = array_at(shown_at, (node_count, SHOWN), FLOAT)
+    doubt = array_at(doubt_at, (node_count + 1,), FLOAT)
+    on_compass = array_at(on_compass_at, (node_count + 1,), FLOAT)
+    _pass(
+        states, p, taken, nodes, imu_time_us, imu, baro_time_us, baro_alt_m, gps_time_us, gps,
+        out, P, F, foreseen, d, anew, shown, doubt, on_compass,
+    )  # fmt: skip
+
+
+@compiled
+def _pass(
+    states: Any,
+    p: EskfGains,
+    taken: IntArray,
+    nodes: IntArray,
+    imu_time_us: IntArray,
+    imu: FloatArray,
+    baro_time_us: IntArray,
+    baro_alt_m: FloatArray,
+    gps_time_us: IntArray,
+    gps: FloatArray,
+    out: FloatArray,
+    P: FloatArray,
+    F: FloatArray,
+    foreseen: FloatArray,
+    d: FloatArray,
+    anew: BoolArray,
+    shown: FloatArray,
+    doubt: FloatArray,
+    on_compass: FloatArray,
+) -> None:
+    """Do `run_forward`; `taken` counts the heights and the fixes that were used."""
+    s, copy = states[0], states[1]
     for k in range(nodes.shape[0] - 1):
         s.unaided_sq = max(s.unaided_sq, shown[k, 0])
         s.flies = max(s.flies, int(shown[k, 1]))

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.compiled.entry_point import dispatched
-from gateway.geometry.quaternion import from_euler
+from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import (
     BARO,
     COLUMNS,
@@ -31,6 +30,7 @@ from gateway.recordings.columns import (
     BoolArray,
     FloatArray,
 )
+from gateway.recordings.stream_clock import STREAMS, times_on_clock
 from gateway.recordings.tlog import Batch
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
 from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
@@ -189,7 +189,7 @@ def nav_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     return np.column_stack(
         [
             time_us,
-            _quaternions(np.column_stack(angles)),
+            from_euler_array(np.column_stack(angles)),
             *rates,
             _of_place(places, place_at, "lat", DEG_PER_DEGE7),
             _of_place(places, place_at, "lon", DEG_PER_DEGE7),
@@ -235,17 +235,6 @@ def _of_place(places: Fields, place_at: IntArray, name: str, scale: float) -> Fl
     return found
 
 
-@dispatched
-def _quaternions(angles: FloatArray) -> FloatArray:
-    """Apply `from_euler` to roll, pitch and yaw of shape (n, 3)."""
-    found = np.empty((len(angles), 4))
-    for i in range(len(angles)):
-        found[i, 0], found[i, 1], found[i, 2], found[i, 3] = from_euler(
-            angles[i, 0], angles[i, 1], angles[i, 2]
-        )
-    return found
-
-
 VELOCITY_AGE_US: Final = US_PER_S // 2
 """An older velocity down is not used."""
 
@@ -279,7 +268,7 @@ class AutopilotReader:
         self._rank = 0
         self._zero_us = np.zeros(2, np.int64)
         """What the vehicle's own time, and that of the recording, were at the rows' zero."""
-        self._newest_us = np.zeros(1 + len(_STREAMS), np.int64)
+        self._newest_us = np.zeros(STREAMS, np.int64)
         """Of each stream, on the rows' clock."""
         self._sampled_us = np.zeros(1, np.int64)
         """When the newest IMU sample was recorded, or what was first."""
@@ -361,7 +350,7 @@ class AutopilotReader:
         streams = np.zeros(len(message_ids), np.int64)
         for message_id, stream in _STREAMS.items():
             streams[message_ids == message_id] = stream
-        return _on_clock(
+        return times_on_clock(
             streams, own_us, recorded_us, self._zero_us, self._newest_us, self._sampled_us
         )
 
@@ -442,33 +431,3 @@ class AutopilotReader:
 
     def _holds(self, group: slice) -> bool:
         return len(self._open) > 0 and not np.isnan(self._open[0, group.start])
-
-
-@dispatched
-def _on_clock(
-    streams: IntArray,
-    own_us: IntArray,
-    recorded_us: IntArray,
-    zero_us: IntArray,
-    newest_us: IntArray,
-    sampled_us: IntArray,
-) -> IntArray:
-    """Give each message its time since zero."""
-    found = np.empty_like(own_us)
-    for i in range(len(own_us)):
-        stream = streams[i]
-        if own_us[i] >= 0:
-            told_us = recorded_us[i] if own_us[i] == 0 else own_us[i]
-            elapsed_us = told_us - zero_us[0]
-            if not 0 <= elapsed_us - newest_us[0] <= US_PER_S:
-                # Another clock than the IMU's, or a restart: use the time of recording.
-                if stream == 0:
-                    elapsed_us = recorded_us[i] - zero_us[1]
-                else:
-                    # The two clocks drift apart, so only since the newest sample.
-                    elapsed_us = newest_us[0] + max(recorded_us[i] - sampled_us[0], 0)
-            newest_us[stream] = max(newest_us[stream], elapsed_us)
-            if stream == 0:
-                sampled_us[0] = recorded_us[i]
-        found[i] = newest_us[stream]
-    return found

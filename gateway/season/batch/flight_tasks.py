@@ -11,7 +11,7 @@ import msgspec
 
 from gateway import __version__
 from gateway.analysis.case import Case, make_case
-from gateway.analysis.flight_arrays import Flight, FusionSettings, flight_of_records
+from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.fusion import fuse_states
 from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
@@ -23,10 +23,8 @@ from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.join import joined_tables
 from gateway.recordings.reading import ReadOptions, header_for, open_rows
 from gateway.recordings.summary import describe
-from gateway.records import ImuCalibrated, ImuFlags, NodeId
 from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
 from gateway.season.statistics.flight_facts import began_text
-from gateway.sensing.calibration import NodeCalibration
 
 HELD: Final = "held_m"
 """Errors at the withheld fixes, by estimator."""
@@ -296,16 +294,3 @@ def _figures(case: Case) -> dict[str, Any]:
     known = {name: value for name, value in summarise(case).items() if value == value}
     held = {name: withheld_error_m(case, name) for name in case.tracks}
     return {"summary": known, HELD: {name: m for name, m in held.items() if m == m}}
-
-
-def warm_up() -> None:
-    """Have the estimators' machine code in this process, and so in all that are forked from it."""
-    node = NodeId(1, 0)
-    records = [
-        ImuCalibrated(time_us, node, (0.0, 0.0, -9.81), (0.0, 0.0, 0.0), None, 20.0, ImuFlags(0))
-        for time_us in range(0, 30_000, 10_000)
-    ]
-    flight = flight_of_records(
-        records, NodeCalibration(), name="warm-up", story="", fusion=FusionSettings()
-    )
-    make_case(flight)

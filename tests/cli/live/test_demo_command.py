@@ -34,7 +34,6 @@ def settings_of_demo(
 
         monkeypatch.setattr(demo, "serve", serve)
         monkeypatch.setattr(demo, "Daemon", make_daemon)
-        monkeypatch.setattr(demo, "make_ready", lambda _: None)
         result = CliRunner().invoke(app, ["demo", "--config", str(file), "--no-panel", *options])
         assert result.exit_code == 0, result.output
         return found

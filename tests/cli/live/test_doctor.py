@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.support import checkup
 from gateway.cli.support.checkup import Diagnosis, Grade
+from gateway.compiled.entry_point import LibraryError
 from gateway.config import GatewaySettings
 from gateway.live import control_finder
 
@@ -140,12 +141,18 @@ def test_the_clock(
     assert one(checkup.check_clock, settings).grade is grade
 
 
-@pytest.mark.parametrize(("kept", "grade"), [(True, Grade.GOOD), (False, Grade.NOTE)])
-def test_compiled_estimators(
-    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, kept: bool, grade: Grade
+@pytest.mark.parametrize("missing", [False, True])
+def test_compiled_kernels(
+    settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, missing: bool
 ) -> None:
-    monkeypatch.setattr(checkup, "is_kept", lambda _: kept)
-    assert one(checkup.check_cache, settings).grade is grade
+    def load() -> None:
+        if missing:
+            raise LibraryError(Path("kernels.so"), "is missing")
+
+    monkeypatch.setattr(checkup, "load_entry_points", load)
+    found = one(checkup.check_kernels, settings)
+    assert found.grade is (Grade.WRONG if missing else Grade.GOOD)
+    assert ("make kernels" in found.text) == missing
 
 
 def test_missing_extras_are_named(

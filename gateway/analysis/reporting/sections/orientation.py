@@ -12,9 +12,8 @@ from gateway.analysis.flight_arrays import FloatArray, IntArray
 from gateway.analysis.metrics import euler_rad, rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
-from gateway.compiled.entry_point import dispatched
 from gateway.geometry.angle import wrap_180
-from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+from gateway.geometry.quaternion import integrate_rate
 from gateway.units import US_PER_S
 
 PAPER: Final = "paper"
@@ -86,7 +85,7 @@ def yaw_lines(case: Case) -> YawLines:
         judge, known = case.track, np.isfinite(case.track.q_nb).all(axis=1)
     start = int(np.argmax(known))
     gyro_q = np.full((len(flight.time_us), 4), np.nan)
-    gyro_q[start:] = integrate_rate(
+    gyro_q[start:] = _attitude_by_rate(
         flight.time_us[start:], flight.gyro_b_radps[start:], judge.q_nb[start]
     )
     reference_deg = continuous_yaw_deg(judge.q_nb)
@@ -125,38 +124,11 @@ def _yaw_table(lines: YawLines) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def integrate_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
-    """Integrate an attitude from the angular rate only.
-
-    Parameters
-    ----------
-    time_us : ndarray, shape (N,)
-        A step longer than `MAX_STEP_S` or back in time is left out.
-    gyro_b_radps : ndarray, shape (N, 3)
-        Rate in body FRD.
-    q_nb : ndarray, shape (4,)
-        Attitude at the first sample.
-
-    Returns
-    -------
-    ndarray, shape (N, 4)
-        Attitude at each sample.
-    """
+def _attitude_by_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatArray) -> FloatArray:
+    """Integrate the rate, except over steps that go back in time or exceed `MAX_STEP_S`."""
     dt_s = np.diff(time_us, prepend=time_us[:1]) / US_PER_S
     dt_s = np.where((dt_s > 0.0) & (dt_s <= MAX_STEP_S), dt_s, 0.0)
-    return _integrate(dt_s, np.nan_to_num(gyro_b_radps), np.array(q_nb, np.float64))
-
-
-@dispatched
-def _integrate(dt_s: FloatArray, gyro: FloatArray, begin: FloatArray) -> FloatArray:
-    out = np.empty((len(dt_s), 4))
-    q = (begin[0], begin[1], begin[2], begin[3])
-    for k in range(len(dt_s)):
-        dt = dt_s[k]
-        turn = from_rotation_vector((gyro[k, 0] * dt, gyro[k, 1] * dt, gyro[k, 2] * dt))
-        q = normalise(multiply(q, turn))
-        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = q
-    return out
+    return integrate_rate(dt_s, np.nan_to_num(gyro_b_radps), q_nb)
 
 
 def _draw_yaw(case: Case, lines: YawLines, width_in: float) -> Figure:

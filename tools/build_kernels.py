@@ -1,0 +1,229 @@
+"""Compile the kernels into one library, which the gateway loads without a compiler.
+
+    python -m tools.build_kernels [--force] [--output FILE [--architecture aarch64]]
+
+The C compiler of the system links the library or, where there is none, the one of the package
+`ziglang`, which can also link for another architecture and for older systems.
+"""
+
+import argparse
+import gc
+import importlib
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Final
+
+from gateway.compiled.entry_point import (
+    ENTRY_POINTS,
+    LIBRARY,
+    EntryPoint,
+    LibraryError,
+    changed_source,
+    open_library,
+    stamp_in,
+    stamp_of,
+)
+
+KERNEL_MODULES: Final = (
+    "gateway.estimation.alignment.latency_of_log",
+    "gateway.estimation.complementary.complementary_kernels",
+    "gateway.estimation.eskf.eskf_kernels",
+    "gateway.estimation.paper.paper_kernels",
+    "gateway.estimation.paper.paper_entry",
+    "gateway.estimation.smoothing.forward",
+    "gateway.recordings.stream_clock",
+    "gateway.recordings.tlog_scan",
+    "gateway.geometry.quaternion",
+    "gateway.sensing.filters",
+)
+"""The modules with entry points; to build a wheel, only numpy, msgspec and pygeomag are there."""
+ARCHITECTURES: Final = ("x86_64", "aarch64")
+OLDEST_GLIBC: Final = "2.17"
+"""The library of a wheel runs with this version of the C library and later ones."""
+NO_KERNELS: Final = ("gateway.compiled", "gateway.settings")
+"""Modules that all kernels import, but no constant from."""
+SHOW_S: Final = 0.2
+"""Interval of the progress on a terminal."""
+
+
+def main() -> None:
+    """Build the library of this source tree, unless it is current."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--force", action="store_true", help="build it even if it is current")
+    parser.add_argument("--output", type=Path, help="where to build it, for a package")
+    parser.add_argument(
+        "--architecture", choices=ARCHITECTURES, help="for a wheel, which runs on older systems too"
+    )
+    options = parser.parse_args()
+    if options.output or options.force or not is_current():
+        build_installed(options.output or LIBRARY, options.architecture)
+
+
+def is_current() -> bool:
+    """Return whether the library of this source tree was compiled from the present sources."""
+    try:
+        return changed_source(stamp_in(open_library(LIBRARY))) is None
+    except (LibraryError, ValueError):
+        return False
+
+
+def build_installed(path: Path, architecture: str | None = None) -> None:
+    """Build the library that the gateway loads; in a process that has imported nothing else.
+
+    Parameters
+    ----------
+    path : Path
+    architecture : str, optional
+        See `build_library`.
+    """
+    for name in KERNEL_MODULES:
+        importlib.import_module(name)
+    # All that was imported may define a constant or a type of a kernel.
+    names = [name for name in sys.modules if name.startswith("gateway.")]
+    files = {sys.modules[name].__file__ for name in names if not name.startswith(NO_KERNELS)}
+    stamp = "\n".join(sorted(stamp_of(Path(file)) for file in files if file))
+    build_library(path, ENTRY_POINTS, stamp=stamp, architecture=architecture, show=True)
+
+
+@contextmanager
+def compiled_again(entry_points: Sequence[EntryPoint[...]]) -> Iterator[None]:
+    """Let entry points run as they are now, with patched constants and functions of their modules.
+
+    For experiments: they are compiled when the context begins, and call the installed library
+    again when it ends.
+
+    Parameters
+    ----------
+    entry_points : sequence of EntryPoint
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "variant.so")
+        build_library(path, entry_points)
+        try:
+            for entry_point in entry_points:
+                entry_point.load(path)
+            yield
+        finally:
+            for entry_point in entry_points:
+                entry_point.load()
+
+
+def build_library(
+    path: Path,
+    entry_points: Sequence[EntryPoint[...]],
+    *,
+    stamp: str = "",
+    architecture: str | None = None,
+    show: bool = False,
+) -> None:
+    """Compile entry points, and all functions that they call, into a library.
+
+    Parameters
+    ----------
+    path : Path
+        Of the library; replaced atomically, so that a running process keeps the old one.
+    entry_points : sequence of EntryPoint
+    stamp : str
+        The value of `SOURCES_SYMBOL`.
+    architecture : str, optional
+        For a wheel: `x86_64` or `aarch64`. By default the library is for this machine alone.
+    show : bool
+        Print the progress.
+
+    Raises
+    ------
+    TypeError
+        If a function needs the run-time library of Python or numba, because it allocates.
+    """
+    # Imported late: without numba, the command can still find that the library is current.
+    from tools.kernel_compiler import compile_object
+
+    progress = _Progress(len(entry_points)) if show else None
+    was_enabled = gc.isenabled()
+    # The garbage collector would take a fifth of the time.
+    gc.disable()
+    try:
+        machine_code = compile_object(
+            entry_points, stamp, architecture, progress.step if progress else None
+        )
+    finally:
+        if was_enabled:
+            gc.enable()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".kernels-") as folder:
+        relocatable, library = Path(folder, "kernels.o"), Path(folder, "kernels.so")
+        relocatable.write_bytes(machine_code)
+        _link(relocatable, library, architecture)
+        library.replace(path)
+    if progress is not None:
+        progress.end(path)
+
+
+def _link(relocatable: Path, library: Path, architecture: str | None) -> None:
+    """Make a library of an object file."""
+    command = _linker(architecture)
+    options = ["-shared", "-nostartfiles", "-s", "-o", str(library), str(relocatable), "-lm"]
+    with tempfile.TemporaryDirectory() as cache:
+        environment = {**os.environ, "ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
+        done = subprocess.run(
+            [*command, *options], capture_output=True, text=True, check=False, env=environment
+        )
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(command)} cannot link {library.name}:\n{done.stderr}")
+
+
+def _linker(architecture: str | None) -> list[str]:
+    """Choose the command that links: for a wheel the one that supports older systems."""
+    if architecture is None and (compiler := shutil.which("cc")):
+        return [compiler]
+    if find_spec("ziglang") is None:
+        raise SystemExit(
+            "the kernels cannot be linked: install a C compiler or the Python package ziglang"
+        )
+    target = f"{architecture or platform.machine()}-linux-gnu.{OLDEST_GLIBC}"
+    return [sys.executable, "-m", "ziglang", "cc", "-target", target]
+
+
+class _Progress:
+    """Prints how many entry points are compiled."""
+
+    def __init__(self, total: int) -> None:
+        self._total = total
+        self._done = self._functions = 0
+        self._begin_s = self._shown_s = time.monotonic()
+        self._redraws = sys.stdout.isatty()
+
+    def step(self, what: str) -> None:
+        """Take note of a function that was compiled, or of an entry point with all it calls."""
+        self._functions += what == "function"
+        self._done += what == "entry point"
+        now_s = time.monotonic()
+        if self._redraws and now_s - self._shown_s > SHOW_S:
+            self._shown_s = now_s
+            print(f"\r{self._text()}", end="", flush=True)
+
+    def end(self, path: Path) -> None:
+        """Print the result."""
+        size = f"{path.stat().st_size / 1e3:.0f} kB"
+        begin = "\r" if self._redraws else ""
+        print(f"{begin}{self._text()}: {path.name}, {size}")
+
+    def _text(self) -> str:
+        elapsed_s = time.monotonic() - self._begin_s
+        return (
+            f"compiling kernels: {self._done} of {self._total} entry points, "
+            f"{self._functions} functions, {elapsed_s:.0f} s"
+        )
+
+
+if __name__ == "__main__":
+    main()
