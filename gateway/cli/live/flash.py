@@ -141,8 +141,8 @@ def _address(text: str | None) -> int | None:
 def _list() -> None:
     """List the serial ports and the bootloader behind each USB adapter."""
     found = list_serial_ports()
-    if not found:
-        refuse("this machine has no serial port: connect a board by USB")
+    if not any(port.usb_id for port in found):
+        refuse("no USB adapter is connected: connect a board by USB, then list again")
     table = table_of("device", "USB id", "adapter", "bootloader", left=4)
     for port in found:
         answer = _bootloader_text(port.device) if port.usb_id else "not asked"

@@ -234,9 +234,15 @@ class FtpService:
         return packet.session, handler(request, packet)
 
     def _open(self, request: Request, packet: Packet) -> tuple[int, bytes]:
+        """Open a session, under the number of the request if that is free.
+
+        The server chooses the number [1]_, but MAVProxy ignores answers with another than its own.
+        """
         content = self._content(request, packet)
         self._make_room(request)
-        number = next(n for n in range(MAX_SESSIONS) if n not in self._sessions)
+        number = packet.session
+        if number in self._sessions or number >= MAX_SESSIONS:
+            number = next(n for n in range(MAX_SESSIONS) if n not in self._sessions)
         self._sessions[number] = _Session(request.client_id, request.may_change, content)
         return number, struct.pack("<I", len(content))
 

@@ -61,7 +61,7 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
         (["imu", "--clock", "20"], "--clock 20: 16 or 8"),
         (["gps"], "make firmware"),
         (["--show"], "no port fits 'auto'"),
-        ([], "no serial port"),
+        ([], "no USB adapter is connected"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

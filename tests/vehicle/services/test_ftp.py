@@ -268,6 +268,13 @@ def test_the_directory(ftp: Ftp) -> None:
     assert struct.unpack("<I", crc.data)[0] == crc32(ftp.read(b"/general.json"))
 
 
+def test_session_number_of_the_request_is_taken_if_it_is_free(ftp: Ftp) -> None:
+    other = Ftp(GroundStation(ftp.station.vehicle, ftp.station.clock, client_id=8))
+    assert ftp.ask(Opcode.OPEN_FILE_RO, b"/general.json", session=81).session == 81
+    assert other.ask(Opcode.OPEN_FILE_RO, b"/general.json", session=81).session != 81
+    assert ftp.ask(Opcode.OPEN_FILE_RO, b"/general.json", session=255).session < 255
+
+
 def test_clients_keep_their_own_sessions(ftp: Ftp) -> None:
     other = Ftp(GroundStation(ftp.station.vehicle, ftp.station.clock, client_id=8))
     mine = ftp.ask(Opcode.OPEN_FILE_RO, b"/general.json").session
