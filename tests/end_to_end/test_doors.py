@@ -157,7 +157,7 @@ def block(heading: str, doors: Doors) -> str:
     """Return the code below a heading as it stands there, for ports of ours."""
     section = re.search(rf"^## {heading}\n(.*?)^## ", PROGRAMS.read_text(), re.M | re.S)
     assert section is not None
-    code = "\n".join(line[4:] for line in section[1].splitlines() if line[:4].isspace() or not line)
+    code = "\n".join(re.findall(r"^```\w+\n(.*?)^```$", section[1], re.M | re.S))
     places = {"14551": doors.udp, "56781": doors.web, "14590": doors.panel}
     for port, ours in places.items():
         code = code.replace(f"127.0.0.1:{port}", ours)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from tests.hub.conftest import LIMIT_S, Rig
 
 CHROMIUM = shutil.which("chromium")
-PROGRAMS = Path(__file__).resolve().parents[4] / "docs" / "programs.md"
+PROGRAMS = Path(__file__).resolve().parents[3] / "docs" / "programs.md"
 SKY, GROUND = [74, 163, 223], [122, 90, 58]
 
 pytestmark = [
@@ -25,7 +25,7 @@ pytestmark = [
 
 def documented_page(port: int) -> str:
     """Take the page out of the document, as a reader would, for a port of ours."""
-    lines = re.search(r"^    <canvas.*?^    </script>$", PROGRAMS.read_text(), re.M | re.S)
+    lines = re.search(r"^<canvas.*?^</script>$", PROGRAMS.read_text(), re.M | re.S)
     assert lines is not None
     return lines[0].replace("127.0.0.1:56781", f"127.0.0.1:{port}")
 

@@ -1,0 +1,79 @@
+"""Plain technical English: words of the project's former language do not come back."""
+
+import re
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+COVERED: Final = (
+    *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "firmware/README.md"),
+    *("config/gateway.toml", "gateway/fleet", "gateway/hub/transports/zenoh"),
+    *("gateway/printable.py", "gateway/wire/mavlink_json.py", "tools/make_troubleshooting.py"),
+)
+"""Files and folders that are checked; add a folder once its wording is plain."""
+
+WORDS: Final = {
+    r"told|tell|tells|telling": "report, indicate, contain",
+    r"believe|believes|believed|doubt|doubts|doubted": "accept, reject, inflate the variance",
+    r"unsure|less sure|surely": "standard deviation, uncertain",
+    r"anew": "again, repeatedly",
+    r"beside": "next to, in addition to",
+    r"(?<!hard )(?<!soft )(?<!hard-)(?<!soft-)iron(?! and soft)": "hard iron, soft iron, magnetic disturbance",
+    r"roughness": "vibration noise",
+    r"purse|wish|wishes": "token bucket, requested interval",
+    r"sealed|seal": "sequence and sign",
+    r"strangers?": "untrusted client",
+    r"visitors?|outlets?|inlets?": "client, subscriber, route",
+    r"forgets?|forgotten": "reset, clear, discard",
+    r"rooms?|houses?": "package, module",
+    r"namesakes?": "sites of the same name",
+    r"silence": "outage, gap, timeout",
+    r"whoever|whosoever": "a client that, everyone who",
+}
+"""Words that are not used, and terms to use instead."""
+
+ALLOWED: Final = {
+    # A room in a buffer, as everybody says; the Zenoh key attribute; the English verb in a quotation.
+    "docs/recordings.md": ("room of",),
+    "docs/clients.md": ("room of", "makes room", "lack of room"),
+}
+"""Legitimate uses, by file."""
+
+
+def files() -> list[Path]:
+    found: list[Path] = []
+    for name in COVERED:
+        path = ROOT / name
+        if path.is_dir():
+            found += [each for each in sorted(path.rglob("*")) if each.suffix in (".md", ".py")]
+        else:
+            found.append(path)
+    return found
+
+
+def violations(text: str, allowed: tuple[str, ...] = ()) -> list[str]:
+    """Return each line that contains a word of the list, with the terms to use instead."""
+    found = []
+    for number, line in enumerate(text.splitlines(), 1):
+        plain = line
+        for phrase in allowed:
+            plain = plain.replace(phrase, "")
+        for pattern, instead in WORDS.items():
+            if match := re.search(rf"\b(?:{pattern})\b", plain, re.IGNORECASE):
+                found.append(f"{number}: {match[0]!r}: {instead}")
+    return found
+
+
+@pytest.mark.parametrize("path", files(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_wording_is_plain(path: Path) -> None:
+    allowed = ALLOWED.get(str(path.relative_to(ROOT)), ())
+    assert violations(path.read_text(), allowed) == []
+
+
+def test_word_list_finds_words_and_accepts_terms() -> None:
+    assert violations("the sensor tells its bias; iron nearby; strangers") != []
+    assert violations("hard iron, soft-iron matrix, hard iron and soft iron") == []
+    assert violations("environment, ironing board, toldy") == []

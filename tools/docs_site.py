@@ -1,0 +1,39 @@
+"""Hook of mkdocs: pages of the repository outside docs/ become pages of the site.
+
+Links keep working in both places: `../SECURITY.md` of a page in docs/ is `SECURITY.md` of the site,
+and so is `docs/fleet.md` of a page at the top of the repository.
+"""
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+from mkdocs.structure.files import File, Files
+
+ROOT: Final = Path(__file__).resolve().parents[1]
+PAGES: Final = (
+    *("README.md", "SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "CITATION.cff"),
+    *("firmware/README.md", "firmware/PROTOCOL.md", "firmware/settings.h", "config/gateway.toml"),
+)
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages and files that pages link to."""
+    pictures = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("firmware/*.svg"))
+    for name in (*PAGES, *pictures):
+        if (ROOT / name).exists():
+            target = "repository.md" if name == "README.md" else name
+            files.append(File.generated(config, target, content=(ROOT / name).read_text()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Adapt links of a page to its place in the site."""
+    name = page.file.src_uri
+    if name in PAGES or name == "repository.md":
+        depth = "../" if "/" in name else ""
+        markdown = re.sub(r"\]\((?:\.\./)?docs/", f"]({depth}", markdown)
+    else:
+        markdown = markdown.replace("](../", "](")
+    markdown = re.sub(r"\]\((\.\./)?README\.md", r"](\1repository.md", markdown)
+    return markdown if "/" not in name else markdown.replace("](repository.md", "](README.md")
