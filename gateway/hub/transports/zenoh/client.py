@@ -161,8 +161,8 @@ class ZenohClient(Client):
         locator = self.endpoint.host
         if self.trusted and not locator.startswith((*SECURED, *LOCAL)):
             log.warning(
-                "%s: trusted=yes without TLS: whoever reaches the router or the network on the way "
-                "can command the vehicles; see docs/fleet.md, Mutual TLS",
+                "%s: trusted=yes without TLS: everyone who reaches the router or the network can "
+                "command the vehicles; see docs/fleet.md, Mutual TLS",
                 self.name,
             )
 
