@@ -223,6 +223,8 @@ class Route:
         Of the frames.
     targets : sequence of (Recipient, _RateLimit or None)
         The clients that get them, and how often.
+    source_id : int
+        The client that brings them.
     path : Path
         Of the frames' system.
     rejects : callable, optional
@@ -232,19 +234,21 @@ class Route:
     """
 
     __slots__ = (
-        "_direct", "_limited", "_on_foreign", "_others", "_path", "_rejects", "frames",
-        "message_id", "size",
+        "_direct", "_limited", "_on_foreign", "_others", "_path", "_rejects", "_source_id",
+        "frames", "message_id", "size",
     )  # fmt: skip
 
     def __init__(
         self,
         message_id: int,
         targets: Sequence[tuple[Recipient, _RateLimit | None]],
+        source_id: int,
         path: Path,
         rejects: Callable[[MavFrame, int], bool] | None,
         on_foreign: Callable[[bytes], None] | None,
     ) -> None:
         self.message_id = message_id
+        self._source_id = source_id
         self.frames = self.size = 0
         """Not yet in the counters of the direct clients."""
         self._path = path
@@ -258,8 +262,11 @@ class Route:
     def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
         """Send a frame to every client; a rejected one to none."""
         self._path.heard_us = now_us
-        if self._rejects is not None and not is_checked and self._rejects(frame, now_us):
-            return
+        if not is_checked:
+            if self._rejects is None:
+                self._path.stream.accept(frame.sequence, self._source_id, now_us)
+            elif self._rejects(frame, now_us):
+                return
         data = frame.data
         self.frames += 1
         self.size += len(data)
@@ -465,7 +472,7 @@ class Fanout:
             if subscription.client.client_id != source_id and interval_us != NO_MESSAGES:
                 limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
                 targets.append((subscription.recipient, limit))
-        return Route(frame.message_id, targets, path, rejects, on_foreign)
+        return Route(frame.message_id, targets, source_id, path, rejects, on_foreign)
 
     def align(self, client_ids: Sequence[int]) -> None:
         """Send links to one peer the same frames, number for number, from now on.

@@ -159,12 +159,7 @@ class Router:
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
             return
-        is_rejected = (
-            path is not None
-            and client.trusted
-            and table.is_shared(origin, now_us)
-            and self._is_rejected(client, path, frame, now_us)
-        )
+        is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
         if is_of_gateway(frame):
             # For each link separately, copies or not, and never forwarded.
             self._ask(client, frame, forwarded=False)
@@ -176,8 +171,13 @@ class Router:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
 
     def _is_rejected(self, client: Client, path: Path, frame: MavFrame, now_us: int) -> bool:
-        """Check a frame of a system with several paths; return whether it is a copy, or late."""
+        """Return whether a frame is a copy, or late; only one with several paths can be."""
         client_id = client.client_id
+        if not client.trusted:
+            return False
+        if not self._table.is_shared(frame.origin, now_us):
+            path.stream.accept(frame.sequence, client_id, now_us)
+            return False
         first = self._duplicates.check(frame, client_id, path, now_us, self._late_us)
         if first == NEW:
             return False

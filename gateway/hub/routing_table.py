@@ -14,6 +14,7 @@ show them would move the aircraft back, so those are dropped too. See `Duplicate
 Only trusted clients belong in the routing table: it decides who receives which frames.
 """
 
+from array import array
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
@@ -37,8 +38,6 @@ MEMORY_OF_ONE: Final = 224
 same bytes."""
 MEMORY_FRAMES: Final = 32_768
 """Per generation, of some 200 bytes each: half a minute at 1000 frames a second, 13 MB in all."""
-MAX_STREAMS: Final = 1024
-"""Systems and components with duplicates; 2 kB each."""
 NEIGHBOURS: Final = 8
 """Sequence numbers before and after a frame that show whether it is late."""
 
@@ -50,12 +49,49 @@ Note = TypeVar("Note")
 
 
 @dataclass(slots=True)
+class FrameStream:
+    """The frames of one system and component that were accepted."""
+
+    count: int = 0
+    leader: int = 0
+    """The client that brought the newest frame."""
+    newest_us: int = 0
+    """When the newest frame was sent, as estimated by the lag of its path."""
+    sent_us: "array[int]" = field(default_factory=lambda: array("q", bytes(8 * 256)))
+    """The same of the newest frame with each sequence number; 0 for none."""
+
+    def accept(self, sequence: int, client_id: int, sent_us: int) -> None:
+        """Register a frame that is neither a copy nor late."""
+        self.count += 1
+        self.sent_us[sequence] = sent_us
+        if sent_us >= self.newest_us:
+            self.newest_us, self.leader = sent_us, client_id
+
+    def is_behind(self, sequence: int, limit_us: int) -> bool:
+        """Return whether the frames after a number were accepted more than a limit ago.
+
+        The number is behind the newest one if a following number was seen later than a preceding
+        one; of a number ahead, the following were seen one turn of the counter ago.
+        """
+        after = self._nearest(sequence, 1)
+        return after > self._nearest(sequence, -1) and self.newest_us - after > limit_us
+
+    def _nearest(self, sequence: int, step: int) -> int:
+        for distance in range(step, step * (NEIGHBOURS + 1), step):
+            if sent_us := self.sent_us[sequence + distance & 0xFF]:
+                return sent_us
+        return 0
+
+
+@dataclass(slots=True)
 class Path:
     """One system as one client brings it."""
 
     since_us: int
     """Its first frame after a timeout."""
     heard_us: int
+    stream: FrameStream = field(default_factory=FrameStream)
+    """Frames of the system on all its paths."""
     is_station: bool = False
     """Whether the last heartbeat on this path was a ground station's."""
     lag_us: int = 0
@@ -93,6 +129,7 @@ class RoutingTable:
         """The same paths by system and component."""
         self._components: dict[int, set[Origin]] = {}
         """By system."""
+        self._streams: dict[Origin, FrameStream] = {}
 
     def hear(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
         """Register that a client has brought a frame of a system.
@@ -185,7 +222,8 @@ class RoutingTable:
                 return None
             del known[stalest]
             self._drop(client_id, stalest)
-        known[origin] = path = Path(now_us, now_us)
+        stream = self._streams.setdefault(origin, FrameStream())
+        known[origin] = path = Path(now_us, now_us, stream)
         self._to.setdefault(origin, {})[client_id] = path
         self._components.setdefault(origin[0], set()).add(origin)
         return path
@@ -194,7 +232,7 @@ class RoutingTable:
         paths = self._to[origin]
         del paths[client_id]
         if not paths:
-            del self._to[origin]
+            del self._to[origin], self._streams[origin]
             components = self._components[origin[0]]
             components.discard(origin)
             if not components:
@@ -236,34 +274,6 @@ class FrameMemory(Generic[Note]):
         self._recent[frame] = note
 
 
-@dataclass(slots=True)
-class _Stream:
-    """The frames of one system and component that were accepted."""
-
-    count: int = 0
-    leader: int = 0
-    """The client that brought the newest frame."""
-    newest_us: int = 0
-    """When the newest frame was sent, as estimated by the lag of its path."""
-    sent_us: list[int] = field(default_factory=lambda: [0] * 256)
-    """The same of the newest frame with each sequence number; 0 for none."""
-
-    def is_behind(self, sequence: int, limit_us: int) -> bool:
-        """Return whether the frames after a number were accepted more than a limit ago.
-
-        The number is behind the newest one if a following number was seen later than a preceding
-        one; of a number ahead, the following were seen one turn of the counter ago.
-        """
-        after = self._nearest(sequence, 1)
-        return after > self._nearest(sequence, -1) and self.newest_us - after > limit_us
-
-    def _nearest(self, sequence: int, step: int) -> int:
-        for distance in range(step, step * (NEIGHBOURS + 1), step):
-            if sent_us := self.sent_us[sequence + distance & 0xFF]:
-                return sent_us
-        return 0
-
-
 class DuplicateFilter:
     """Recognise copies and late frames of systems that are received on several paths.
 
@@ -275,8 +285,9 @@ class DuplicateFilter:
 
     Each copy measures the lag of its path behind the first one. A frame that is not a copy was
     sent about one lag before it arrived; if that is more than a limit before the newest frame of
-    its stream, or if its sequence number belongs before frames that old, it is late. The path that
-    brought the newest frame is always accepted, so a restarted system loses nothing.
+    its stream, or if its sequence number belongs before frames that old, it is late. (Sequence
+    numbers are registered even while there is one path, for when a second one appears.) The path
+    that brought the newest frame is always accepted, so a restarted system loses nothing.
     """
 
     def __init__(self) -> None:
@@ -285,7 +296,6 @@ class DuplicateFilter:
         )
         """When a frame was sent and received, by which client, as which of its stream, and whether
         its bytes were accepted before."""
-        self._streams: dict[Origin, _Stream] = {}
 
     def check(self, frame: MavFrame, client_id: int, path: Path, now_us: int, limit_us: int) -> int:
         """Register a frame of a system with several paths.
@@ -311,7 +321,7 @@ class DuplicateFilter:
         self._memory.turn(now_us)
         digest = hash(frame.data)
         known = self._memory.get(digest)
-        stream = self._stream_of(frame.origin)
+        stream = path.stream
         if known is not None:
             sent_us, received_us, first, count, is_repeated = known
             turned = stream.count - count >= MEMORY_OF_ONE
@@ -327,24 +337,13 @@ class DuplicateFilter:
         sent_us = now_us - path.lag_us
         if client_id != stream.leader and self._is_late(frame, stream, sent_us, now_us, limit_us):
             return LATE
-        stream.count += 1
-        stream.sent_us[frame.sequence] = sent_us
-        if sent_us >= stream.newest_us:
-            stream.newest_us, stream.leader = sent_us, client_id
+        stream.accept(frame.sequence, client_id, sent_us)
         self._memory.put(digest, (sent_us, now_us, client_id, stream.count, known is not None))
         return NEW
 
-    def _stream_of(self, origin: Origin) -> _Stream:
-        stream = self._streams.get(origin)
-        if stream is None:
-            if len(self._streams) >= MAX_STREAMS:
-                self._streams.clear()
-            stream = self._streams[origin] = _Stream()
-        return stream
-
     @staticmethod
     def _is_late(
-        frame: MavFrame, stream: _Stream, sent_us: int, now_us: int, limit_us: int
+        frame: MavFrame, stream: FrameStream, sent_us: int, now_us: int, limit_us: int
     ) -> bool:
         if sent_us < stream.newest_us - limit_us:
             return True

@@ -19,6 +19,8 @@ HUB_HELP: Final = {
     "published": "MAVLink frames of the gateway itself.",
     "forwarded": "Frames of other systems, such as an autopilot, that were forwarded.",
     "duplicates": "Copies by a second path, dropped: two endpoints reach one peer.",
+    "late": "Frames dropped because newer ones of their system had arrived on another link.",
+    "shed": "Telemetry of the gateway dropped because the processor was short of time.",
     "looped": "Frames of ours that came back: an endpoint leads to a router that sends to us.",
     "unroutable": "Frames for an unknown system, or from a client that may not send to it.",
     "unserved": "Requests dropped because their client exceeded its quota.",

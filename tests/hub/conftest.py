@@ -1,6 +1,7 @@
 """A hub on the manual clock, its clients on loopback sockets, and some frames."""
 
 import asyncio
+import select
 import socket
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -40,6 +41,10 @@ class Station:
     async def receive(self) -> bytes:
         async with asyncio.timeout(LIMIT_S):
             return await asyncio.get_running_loop().sock_recv(self.socket, 65535)
+
+    def is_empty(self) -> bool:
+        """Return whether there is nothing to read, without reading it."""
+        return not select.select([self.socket], (), (), 0)[0]
 
     def is_silent(self) -> bool:
         try:
@@ -104,6 +109,11 @@ class Rig:
     async def quiet(self) -> None:
         """Let everything go where it goes: on loopback each step takes one turn of the loop."""
         for _ in range(200):
+            await asyncio.sleep(0)
+
+    async def quiet_some(self) -> None:
+        """Let the hub read and send what is waiting."""
+        for _ in range(6):
             await asyncio.sleep(0)
 
     async def until_open(self, hub: Hub) -> None:

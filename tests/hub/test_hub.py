@@ -12,6 +12,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub import accepting
+from gateway.wire.mavlink_splitter import frame_of
 
 pytestmark = pytest.mark.io
 
@@ -191,6 +192,90 @@ async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     await rig.until(lambda: hub.counters().unroutable == 1)
     assert trusted.is_silent()
     assert rig.foreign == []
+
+
+async def test_a_monitor_gets_all_traffic_and_what_it_sends_is_ignored(world: Any) -> None:
+    hub = world.world
+    monitor = world.station()
+    hub.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes&allow=HEARTBEAT")
+    await world.until_open(hub)
+    client = hub._clients[hub.clients()[-1].client_id]
+    monitor.target = ("127.0.0.1", client._port)
+    request = world.first.sender.command(42, 1)
+    world.first.say(request)
+    assert await world.autopilot.receive() == await monitor.receive() == request
+    to_us = world.first.sender.command(1, 1)
+    world.first.say(to_us)
+    assert await monitor.receive() == to_us
+    answer = world.vehicle.ack()
+    hub.send(world.out(answer, hub.clients()[0].client_id))
+    telemetry = world.autopilot.sender.attitude()
+    world.autopilot.say(telemetry)
+    beat = world.second.sender.heartbeat()
+    world.second.say(beat)
+    got = [await monitor.receive() for _ in range(3)]
+    assert got[0] == answer
+    assert sorted(got[1:]) == sorted([telemetry, beat])
+    count, forwarded = len(world.incoming), hub.counters().forwarded
+    sender = world.sender(77)
+    for frame in (sender.heartbeat(), sender.command(42, 1), sender.command(1, 1)):
+        monitor.say(frame)
+    await world.until(lambda: client.counters.received == 3)
+    assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
+    await world.quiet()
+    heard = []
+    while not world.first.is_empty():
+        heard.append(frame_of(await world.first.receive()))
+    assert telemetry in [frame.data for frame in heard]
+    assert 77 not in {frame.origin[0] for frame in heard}
+
+
+async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0?allow=HEARTBEAT", ping_interval_s=1.0)
+    for frame in (rig.vehicle.home(), rig.vehicle.heartbeat()):
+        hub.send(rig.out(frame))
+    station = rig.station(hub.listening_ports()[0])
+    station.say(station.sender.heartbeat())
+    await rig.until(lambda: bool(rig.incoming))
+    for _ in range(8):
+        rig.clock.us += 500_000
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        hub.send(rig.out(rig.vehicle.attitude()))
+        rig.tick(hub)
+    await rig.quiet()
+    got = []
+    while not station.is_empty():
+        got.append(await station.receive())
+    assert [frame[7] for frame in got] == [0] * 9
+    assert [frame[4] for frame in got] == list(range(got[0][4], got[0][4] + 9))
+
+
+async def test_a_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> None:
+    """Frames that the first link has lost arrive three seconds late by the second one."""
+    hub = world.world
+    slow = world.station(hub.listening_ports()[0])
+    pilot = world.autopilot.sender
+    delayed = []
+    newest = -1
+    for number in range(400):
+        world.clock.us += 20_000
+        frame = pilot.attitude(time_ms=number)
+        delayed.append(frame)
+        if number % 10 != 5:
+            world.autopilot.say(frame)
+        if number >= 150:
+            slow.say(delayed[number - 150])
+        await world.quiet_some()
+        while not world.first.is_empty():
+            got = frame_of(await world.first.receive())
+            if got.message_id == 30:
+                time_ms = int.from_bytes(got.payload[:4], "little")
+                assert time_ms > newest
+                newest = time_ms
+    assert newest == 399
+    counters = hub.counters()
+    assert counters.late > 100, "all from before the slow link appeared, and the lost ones"
+    assert counters.duplicates > 80
 
 
 async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:

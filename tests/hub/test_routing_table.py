@@ -12,6 +12,7 @@ from gateway.hub.routing_table import (
     NEW,
     ROUTE_FRESH_US,
     DuplicateFilter,
+    FrameStream,
     Path,
     RedundantLinks,
     RoutingTable,
@@ -144,7 +145,8 @@ class Links:
 
     def __init__(self) -> None:
         self.filter = DuplicateFilter()
-        self.paths = {FAST: Path(0, 0), SLOW: Path(0, 0)}
+        stream = FrameStream()
+        self.paths = {FAST: Path(0, 0, stream), SLOW: Path(0, 0, stream)}
 
     def check(self, client_id: int, number: int, now_us: int, content: bytes | None = None) -> int:
         return self.filter.check(

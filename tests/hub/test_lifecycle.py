@@ -1,0 +1,353 @@
+"""Every transport: opens, sends, receives, breaks, opens again, is reconfigured, and closes."""
+
+import asyncio
+import contextlib
+import os
+import pty
+import socket
+import termios
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import gettempdir
+
+import pytest
+from wsproto import ConnectionType, WSConnection
+from wsproto.events import AcceptConnection, BytesMessage, Request
+
+from gateway.hub.hub import Hub
+from gateway.wire.mavlink_splitter import MavlinkSplitter
+from tests.hub.conftest import Rig
+from tests.kit.mavlink import frames_of
+from tests.ports import free_port
+
+pytestmark = pytest.mark.io
+
+
+class Far:
+    """The far end of one endpoint: reads without blocking, writes, breaks and returns."""
+
+    url = ""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig = rig
+        self.splitter = MavlinkSplitter()
+        self.frames: list[bytes] = []
+        self.open()
+        rig.closing.append(self.shut)
+
+    def open(self) -> None:
+        """Start, or start again at the same address."""
+        raise NotImplementedError
+
+    def arrive(self, hub: Hub) -> None:
+        """Connect, where it is the far end that connects."""
+
+    def read(self) -> bytes:
+        raise NotImplementedError
+
+    def write(self, data: bytes) -> None:
+        raise NotImplementedError
+
+    def shut(self) -> None:
+        """End so that the gateway can notice."""
+        raise NotImplementedError
+
+    def poll(self) -> list[bytes]:
+        with contextlib.suppress(BlockingIOError, OSError):
+            while data := self.read():
+                self.frames += frames_of(self.splitter.feed(data))
+        return self.frames
+
+
+class UdpFar(Far):
+    def open(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.setblocking(False)
+        self.port = getattr(self, "port", 0) or free_port()
+        self.socket.bind(("127.0.0.1", self.port))
+        self.url, self.target = f"udp:127.0.0.1:{self.port}", None
+
+    def read(self) -> bytes:
+        data, self.target = self.socket.recvfrom(65535)
+        return data
+
+    def write(self, data: bytes) -> None:
+        self.socket.sendto(data, self.target)
+
+    def shut(self) -> None:
+        self.socket.close()
+
+
+class UdpCaller(UdpFar):
+    def open(self) -> None:
+        super().open()
+        self.url = "udp-listen:127.0.0.1:0"
+
+    def arrive(self, hub: Hub) -> None:
+        self.target = ("127.0.0.1", hub.listening_ports()[0])
+        self.write(self.rig.sender(255, 190).heartbeat())
+
+
+class GroupFar(UdpFar):
+    def open(self) -> None:
+        super().open()
+        self.url = f"udp-broadcast:127.0.0.1:{self.port}"
+
+
+class TcpFar(Far):
+    peer: socket.socket | None = None
+
+    def open(self) -> None:
+        self.port = getattr(self, "port", 0) or free_port()
+        self.server = socket.create_server(("127.0.0.1", self.port))
+        self.server.setblocking(False)
+        self.url, self.peer = f"tcp:127.0.0.1:{self.port}", None
+
+    def read(self) -> bytes:
+        if self.peer is None:
+            self.peer, _ = self.server.accept()
+            self.peer.setblocking(False)
+        return self.peer.recv(65535)
+
+    def write(self, data: bytes) -> None:
+        assert self.peer is not None
+        self.peer.send(data)
+
+    def shut(self) -> None:
+        if self.peer is not None:
+            self.peer.close()
+        self.server.close()
+
+
+class TcpCaller(TcpFar):
+    def open(self) -> None:
+        self.url, self.peer = "tcp-listen:127.0.0.1:0", None
+
+    def arrive(self, hub: Hub) -> None:
+        self.peer = socket.create_connection(("127.0.0.1", hub.listening_ports()[0]))
+        self.peer.setblocking(False)
+
+    def shut(self) -> None:
+        if self.peer is not None:
+            self.peer.close()
+
+
+class WebFar(TcpFar):
+    """A WebSocket server by wsproto."""
+
+    role = ConnectionType.SERVER
+
+    def open(self) -> None:
+        super().open()
+        self.url = f"ws:127.0.0.1:{self.port}"
+        self.web = WSConnection(self.role)
+
+    def read(self) -> bytes:
+        payload = b""
+        while not payload:
+            data = super().read()
+            assert self.peer is not None
+            if not data and self.role is ConnectionType.SERVER:
+                # The gateway connects again.
+                self.peer.close()
+                self.peer, self.web = None, WSConnection(self.role)
+            if not data:
+                break
+            self.web.receive_data(data)
+            for event in self.web.events():
+                if isinstance(event, Request):
+                    self.peer.send(self.web.send(AcceptConnection()))
+                elif isinstance(event, BytesMessage):
+                    payload += event.data
+        return payload
+
+    def write(self, data: bytes) -> None:
+        super().write(self.web.send(BytesMessage(data=data)))
+
+
+class WebCaller(WebFar):
+    role = ConnectionType.CLIENT
+
+    def open(self) -> None:
+        self.url, self.peer = "ws-listen:127.0.0.1:0", None
+        self.web = WSConnection(self.role)
+
+    def arrive(self, hub: Hub) -> None:
+        self.peer = socket.create_connection(("127.0.0.1", hub.listening_ports()[0]))
+        self.peer.setblocking(False)
+        self.peer.send(self.web.send(Request(host="127.0.0.1", target="/")))
+
+    def shut(self) -> None:
+        if self.peer is not None:
+            self.peer.close()
+
+
+class SerialFar(Far):
+    def open(self) -> None:
+        self.near, far = pty.openpty()
+        os.set_blocking(self.near, False)
+        attributes = termios.tcgetattr(self.near)
+        attributes[3] &= ~(termios.ECHO | termios.ICANON)
+        termios.tcsetattr(self.near, termios.TCSANOW, attributes)
+        self.link = Path(gettempdir(), f"mavgate-{os.getpid()}-{id(self.rig)}")
+        self.link.unlink(missing_ok=True)
+        self.link.symlink_to(os.ttyname(far))
+        self.url = f"serial:{self.link}:115200"
+        self.far = far
+
+    def read(self) -> bytes:
+        return os.read(self.near, 4096)
+
+    def write(self, data: bytes) -> None:
+        os.write(self.near, data)
+
+    def shut(self) -> None:
+        self.link.unlink(missing_ok=True)
+        for descriptor in (self.near, self.far):
+            with contextlib.suppress(OSError):
+                os.close(descriptor)
+
+
+KINDS: dict[str, type[Far]] = {
+    "udp": UdpFar,
+    "udp-listen": UdpCaller,
+    "udp-broadcast": GroupFar,
+    "tcp": TcpFar,
+    "tcp-listen": TcpCaller,
+    "ws": WebFar,
+    "ws-listen": WebCaller,
+    "serial": SerialFar,
+}
+LISTENING = {"udp-listen", "tcp-listen", "ws-listen"}
+NOTICES_THE_END = set(KINDS) - {"udp-broadcast"}
+
+
+class Link:
+    """One endpoint of a hub with its far end."""
+
+    def __init__(self, rig: Rig, kind: str) -> None:
+        self.rig, self.kind = rig, kind
+        self.far = KINDS[kind](rig)
+        self.hub = rig.hub(self.far.url, ping_interval_s=0.0)
+        self.hub.send(rig.out(rig.vehicle.heartbeat()))
+
+    async def until_open(self) -> None:
+        self.far.arrive(self.hub)
+        await self.until(lambda: [c.state for c in self.hub.clients()] == ["open"])
+        self.far.poll()
+        self.far.frames.clear()
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        """Wait, with the far end reading and the hub ticking."""
+
+        def is_so() -> bool:
+            self.far.poll()
+            self.rig.clock.us += 2000
+            return condition()
+
+        await self.rig.until(is_so)
+
+    async def is_sent(self, frame: bytes) -> None:
+        self.hub.send(self.rig.out(frame))
+        await self.until(lambda: frame in self.far.frames)
+
+
+@pytest.fixture(params=KINDS)
+async def link(request: pytest.FixtureRequest, rig: Rig) -> Link:
+    link = Link(rig, request.param)
+    await link.until_open()
+    return link
+
+
+async def test_frames_are_sent_and_received(link: Link) -> None:
+    before = link.hub.clients()[0].dropped
+    for _ in range(3):
+        await link.is_sent(link.rig.vehicle.attitude())
+    said = link.rig.sender(255, 190).command(1, 1)
+    link.far.write(said)
+    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [said])
+    (client,) = link.hub.clients()
+    assert (client.state, client.dropped, client.queued) == ("open", before, 0)
+    assert client.sent >= 3
+    assert (255, 190) in client.systems
+
+
+async def test_garbage_is_counted_and_the_next_frame_is_received(link: Link) -> None:
+    await link.is_sent(link.rig.vehicle.attitude())
+    said = link.rig.sender(255, 190).command(1, 1)
+    link.far.write(b"garbage" + said)
+    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [said])
+    assert link.hub.clients()[0].bytes_garbage == 7
+
+
+async def test_a_changed_filter_applies_to_the_open_client(link: Link) -> None:
+    before = link.hub.clients()[0].client_id
+    settings = link.hub.settings
+    changed = (f"{settings.endpoints[0]}?deny=RAW_IMU",)
+    link.hub.apply(type(settings)(endpoints=changed, ping_interval_s=0.0))
+    link.hub.send(link.rig.out(link.rig.vehicle.raw_imu()))
+    link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
+    await link.until(lambda: 30 in {frame[7] for frame in link.far.frames})
+    assert [client.client_id for client in link.hub.clients()] == [before]
+    assert 27 not in {frame[7] for frame in link.far.frames}
+
+
+async def test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link) -> None:
+    if link.kind not in NOTICES_THE_END:
+        pytest.skip("a broadcast has no peer")
+    link.far.shut()
+
+    def is_noticed() -> bool:
+        link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
+        link.rig.clock.us += 100_000
+        return [client.state for client in link.hub.clients()] != ["open"]
+
+    await link.until(is_noticed)
+    link.far.splitter.reset()
+    link.far.open()
+    link.far.arrive(link.hub)
+    link.rig.clock.us += 2_000_000
+
+    def is_served() -> bool:
+        frame = link.rig.vehicle.attitude()
+        link.hub.send(link.rig.out(frame))
+        link.rig.clock.us += 100_000
+        return frame in link.far.poll()
+
+    await link.until(is_served)
+
+
+async def test_a_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:
+    link.hub.remove(link.far.url)
+    link.far.poll()
+    link.far.frames.clear()
+    link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
+    await link.rig.quiet()
+    link.far.poll()
+    assert link.far.frames == []
+    assert (link.hub.clients(), link.hub.endpoints()) == ((), ())
+
+
+async def test_an_unexpected_error_closes_and_the_next_tick_opens_again(
+    link: Link, caplog: pytest.LogCaptureFixture
+) -> None:
+    if link.kind in LISTENING:
+        pytest.skip("the client leaves, and the port stays open")
+    client = next(iter(link.hub._clients.values()))
+    client.fail(RuntimeError("unexpected"))
+    assert client.state == "unreachable"
+    assert client.reason == "unexpected"
+
+    def is_open() -> bool:
+        link.rig.clock.us += 100_000
+        return client.state == "open"
+
+    await link.until(is_open)
+
+
+async def test_closing_leaves_no_reader_and_no_task_behind(link: Link) -> None:
+    link.hub.close()
+    await link.rig.quiet()
+    assert link.hub.clients() == ()
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    assert not [task for task in others if "gateway" in repr(task)]
