@@ -11,16 +11,18 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
-from gateway.panel.state.dialogue.calibration_run import CalibrationRun, CalibrationStep, RunState
-from gateway.panel.state.dialogue.file_client import FileClient
-from gateway.panel.state.dialogue.parameter_client import AUTOPILOT, ListState, ParameterClient
-from gateway.panel.state.dialogue.parameter_meta import (
+from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
+from gateway.panel.state.files import FileClient
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.parameters import (
+    AUTOPILOT,
     GENERAL_PATHS,
+    ListState,
+    ParameterClient,
     ParameterMeta,
     parameter_path,
     parse_parameters,
 )
-from gateway.panel.state.fleet_picture import FleetPicture
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000
@@ -113,7 +115,7 @@ class Dialogues:
 
     Parameters
     ----------
-    fleet : FleetPicture
+    fleet : FleetState
         Passes on their messages.
     send : callable
         Sends one MAVLink message.
@@ -121,9 +123,7 @@ class Dialogues:
         The panel's.
     """
 
-    def __init__(
-        self, fleet: FleetPicture, send: Callable[[Any], None], clock: GatewayClock
-    ) -> None:
+    def __init__(self, fleet: FleetState, send: Callable[[Any], None], clock: GatewayClock) -> None:
         self._all: dict[int, Dialogue] = {}
         self._send = send
         self._clock = clock

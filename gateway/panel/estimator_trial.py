@@ -26,8 +26,8 @@ from gateway.analysis.sources import flight_of_blocks
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
-from gateway.panel.state.field_history import FloatArray
-from gateway.panel.state.sample_memory import TimedFrames
+from gateway.panel.state.fields import FloatArray
+from gateway.panel.state.fleet import TimedFrames
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record

@@ -11,8 +11,8 @@ from nicegui.element import Element
 
 from gateway.panel.access import Role
 from gateway.panel.added_views import ADDED_VIEWS, View
-from gateway.panel.state.shown_units import ShownUnits
-from gateway.panel.view_context import WEB, PanelParts, ViewContext
+from gateway.panel.playback import Playback
+from gateway.panel.view_context import LIVE, WEB, PanelParts, ViewContext
 from gateway.panel.views import (
     calibration_view,
     events_view,
@@ -24,6 +24,7 @@ from gateway.panel.views import (
     tuning_view,
 )
 from gateway.panel.widgets.prompts import notify_failure
+from gateway.printable import printable
 
 STATE_S: Final = 0.5
 SILENT_S: Final = 3.0
@@ -53,7 +54,10 @@ def build_page(parts: PanelParts, role: Role) -> None:
     role : Role
         Role of its user.
     """
-    _Page(ViewContext(parts, role, ShownUnits(parts.settings.units))).build()
+    page = ui.context.client
+    playback = Playback(parts.uplink, parts.fleet, page.id)
+    page.on_delete(playback.close)
+    _Page(ViewContext(parts, role, parts.settings.units, playback, page.id)).build()
 
 
 class PageRail(Element, component=WEB / "page_rail.js"):
@@ -77,9 +81,11 @@ class _Page:
 
     def build(self) -> None:
         """Build everything; a view is built when it is first shown."""
-        with ui.element("div").classes("shell"):
+        with ui.element("div").classes("shell") as self._shell:
             self._build_head()
-            events_view.build_banner(self._context)
+            with ui.element("div").classes("banners"):
+                self._build_recording_bar()
+                events_view.build_banner(self._context)
             self._build_rail()
             with ui.element("div").classes("stage"):
                 for view in self._views.values():
@@ -113,12 +119,26 @@ class _Page:
                 ui.label("viewer").classes("chip warn")
             units = ui.select(
                 {"metric": "metric", "imperial": "imperial", "aviation": "aviation"},
-                value=self._context.units.system,
+                value=self._context.units,
                 on_change=self._on_units,
             ).classes("choice")
             units.props('dense options-dense borderless aria-label="Units"')
             self._theme = ui.button(icon=THEMES[None], on_click=self._next_theme)
             self._theme.props('flat round dense aria-label="Light or dark"')
+
+    def _build_recording_bar(self) -> None:
+        """Build what marks a recording above every view."""
+        with ui.element("div").classes("recording-bar").props("role=status") as self._bar:
+            ui.icon("smart_display")
+            self._bar_text = ui.label().classes("figure banner-title")
+            self._bar_name = ui.label()
+            back = ui.button("Back to live", on_click=self._on_back)
+            back.props("no-caps dense unelevated color=white text-color=black")
+        self._bar.set_visibility(False)
+
+    def _on_back(self) -> None:
+        self._context.playback.close()
+        self._refresh()
 
     def _build_rail(self) -> None:
         self._rail = PageRail()
@@ -126,17 +146,18 @@ class _Page:
             {"key": view.key, "title": view.title, "icon": view.icon}
             for view in self._views.values()
         ]
-        self._rail.props["units"] = self._context.units.system
+        self._rail.props["units"] = self._context.units
+        self._rail.props["page"] = self._context.page
         self._rail.on("show", lambda event: self.show(event.args))
         self._rail.on("theme", self._next_theme)
         self._rail.on("toggle", self._on_space)
 
     async def _on_space(self) -> None:
-        if not self._context.parts.playback.name:
+        if not self._context.playback.name:
             return
         with notify_failure(self._context):
             self._context.check_may_change()
-            await self._context.parts.playback.toggle()
+            await self._context.playback.toggle()
 
     def _next_theme(self) -> None:
         order = list(THEMES)
@@ -144,7 +165,7 @@ class _Page:
         self._theme.props["icon"] = THEMES[self._dark.value]
 
     def _on_units(self, event: Any) -> None:
-        self._context.units.system = event.value
+        self._context.units = event.value
         self._rail.props["units"] = event.value
 
     def _on_choice(self, event: Any) -> None:
@@ -152,14 +173,16 @@ class _Page:
         self._rail.props["system_id"] = event.value
 
     def _refresh(self) -> None:
-        fleet, context = self._context.fleet, self._context
-        names = {key: fleet.vehicles[key].title for key in sorted(fleet.vehicles)}
+        context = self._context
+        names = {key: vehicle.title for key, vehicle in sorted(context.vehicles.items())}
         if names != self._names:
-            played = [key for key in names.keys() - self._names.keys() if key in fleet.origins]
+            origins = context.fleet.origins
+            played = [key for key in names.keys() - self._names.keys() if key in origins]
             self._names = names
             wanted = min(played, default=context.system_id)
             first = next(iter(names), None)
             self._choice.set_options(names, value=wanted if wanted in names else first)
+        self._show_recording()
         if (chips := _state_of(context)) != self._chips:
             self._chips = chips
             self._state.clear()
@@ -167,12 +190,28 @@ class _Page:
                 for text, kind in chips:
                     ui.label(text).classes("chip").classes(kind)
 
+    def _show_recording(self) -> None:
+        """Mark the page while it shows a recording."""
+        playback, status = self._context.playback, self._context.playback.status
+        shown = self._context.is_recording
+        if shown != self._bar.visible:
+            self._bar.set_visibility(shown)
+            self._shell.classes(replace="shell recording" if shown else "shell")
+        if shown and status is not None:
+            position, duration = (_clock(status[key]) for key in ("position_s", "duration_s"))
+            self._bar_text.set_text(f"RECORDING {position} of {duration}")
+            self._bar_name.set_text(printable(playback.name))
+
+
+def _clock(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
 
 def _mode_of(context: ViewContext) -> str:
     """Return where the data comes from."""
-    vehicle, status = context.vehicle, context.parts.watch.status
-    if vehicle is not None and vehicle.origin != "live":
-        return "recording"
+    status = context.parts.watch.status
     if status is None:
         return "MAVLink"
     return "simulation" if status["simulated"] else "serial"
@@ -184,11 +223,14 @@ def _state_of(context: ViewContext) -> list[tuple[str, str]]:
     if vehicle is None:
         return [("waiting for an aircraft", "warn")]
     now = vehicle.instant(context.now_us)
-    if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
-        return [(f"silent for {now.silent_s:.0f} s", "bad")]
     has_fix = now.fix_type >= 3
     fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
-    chips = [("link", "good"), (_mode_of(context), ""), (fix, "good" if has_fix else "bad")]
+    gps = (fix, "good" if has_fix else "bad")
+    if vehicle.origin != LIVE:
+        return [("recording", "recorded"), (fix, "" if has_fix else "bad")]
+    if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
+        return [(f"silent for {now.silent_s:.0f} s", "bad")]
+    chips = [("link", "good"), (_mode_of(context), ""), gps]
     recorder = context.parts.watch.recorder
     if recorder is not None and recorder["state"] != "idle":
         chips.append(("● REC" if recorder["state"] == "recording" else "not recording", "bad"))

@@ -29,17 +29,14 @@ from gateway.panel.access import ROLE, AccessControl, Logins
 from gateway.panel.api.rest import RestApi
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
 from gateway.panel.content_policy import ScriptNonces
-from gateway.panel.control_client import ControlClient
 from gateway.panel.dialogues import Dialogues
-from gateway.panel.gateway_watch import GatewayWatch
+from gateway.panel.gateway_client import ControlClient, GatewayWatch
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.recording_files import add_recording_files
-from gateway.panel.recording_player import Playback
-from gateway.panel.state.field_history import FieldHistory
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.sample_memory import SampleMemory
+from gateway.panel.state.fields import FieldHistory
+from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
 from gateway.panel.uplink import Uplink
 from gateway.panel.view_context import WEB, PanelParts
@@ -161,7 +158,7 @@ def make_parts(
     settings: PanelSettings, recordings: Path, connect: str | None, control_socket: Path | None
 ) -> PanelParts:
     """Build the parts shared by all pages; see `run_panel`."""
-    clock, fleet = GatewayClock(), FleetPicture()
+    clock, fleet = GatewayClock(), FleetState()
     control = ControlClient(control_socket)
     uplink = Uplink(connect, fleet, control, clock)
     history, samples = FieldHistory(), SampleMemory()
@@ -182,7 +179,6 @@ def make_parts(
         samples,
         dialogues,
         watch,
-        Playback(uplink, fleet),
     )
 
 
@@ -247,7 +243,6 @@ async def _serve(
         await server.serve_on(sock, on_open)
     finally:
         parts.dialogues.close()
-        parts.playback.close()
         parts.watch.close()
         parts.uplink.close()
 

@@ -16,11 +16,13 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway.clock import GatewayClock
 from gateway.panel.access import WS_POLICY_VIOLATION
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.vehicle_picture import PathPoint
+from gateway.panel.state.fleet import FleetState
 
 PATH: Final = "/telemetry"
 TRACKS_PATH: Final = "/path/{system_id}"
+HISTORY_PATH: Final = "/history/{system_id}"
+MAX_HISTORY: Final = 6000
+"""Moments of a history that a browser gets; of a longer one every n-th."""
 INTERVAL_S: Final = 0.033
 """Up to 30 frames a second, a little more than sources send: at the same rate the two would beat,
 and a state could wait a whole interval. The browser interpolates."""
@@ -36,13 +38,13 @@ class TelemetryFeed:
 
     Parameters
     ----------
-    fleet : FleetPicture
+    fleet : FleetState
         The aircraft.
     clock : GatewayClock
         The panel's clock.
     """
 
-    def __init__(self, fleet: FleetPicture, clock: GatewayClock) -> None:
+    def __init__(self, fleet: FleetState, clock: GatewayClock) -> None:
         self._fleet = fleet
         self._clock = clock
         self._made = (-1, -1, b"")
@@ -51,7 +53,8 @@ class TelemetryFeed:
         """Serve one browser until it leaves."""
         await socket.accept()
         grants = asyncio.Semaphore(GRANTS)
-        sending = asyncio.create_task(self._send(socket, grants))
+        page = socket.query_params.get("page", "")
+        sending = asyncio.create_task(self._send(socket, grants, page))
         with suppress(WebSocketDisconnect, asyncio.CancelledError):
             while True:
                 message = await socket.receive()
@@ -64,7 +67,7 @@ class TelemetryFeed:
                     grants.release()
         sending.cancel()
 
-    async def _send(self, socket: WebSocket, grants: asyncio.Semaphore) -> None:
+    async def _send(self, socket: WebSocket, grants: asyncio.Semaphore, page: str) -> None:
         news = asyncio.Event()
         leave = self._fleet.listen(lambda *_: news.set())
         try:
@@ -75,29 +78,35 @@ class TelemetryFeed:
                         async with asyncio.timeout(IDLE_S):
                             await news.wait()
                     news.clear()
-                    await socket.send_text(self._frame().decode())
+                    await socket.send_text(self._frame(page).decode())
                     await asyncio.sleep(INTERVAL_S)
         finally:
             leave()
 
-    def _frame(self) -> bytes:
-        """Encode the present state, once for all browsers."""
+    def _frame(self, page: str) -> bytes:
+        """Encode the present state, once for all pages that play no recording."""
         now_us = self._clock()
+        if any(origin.page == page for origin in self._fleet.origins.values()):
+            return self._encoded(now_us, page)
         version, made_us, frame = self._made
         if version != self._fleet.version or now_us - made_us > INTERVAL_S * 1e6:
-            instants = {
-                str(system_id): vehicle.instant(now_us)
-                for system_id, vehicle in self._fleet.vehicles.items()
-            }
-            frame = msgspec.json.encode({"time_us": now_us, "vehicles": instants})
+            frame = self._encoded(now_us, "")
             self._made = (self._fleet.version, now_us, frame)
         return frame
 
+    def _encoded(self, now_us: int, page: str) -> bytes:
+        instants = {
+            str(system_id): vehicle.instant(now_us)
+            for system_id, vehicle in self._fleet.visible(page).items()
+        }
+        return msgspec.json.encode({"time_us": now_us, "vehicles": instants})
 
-def add_tracks(app: FastAPI, fleet: FleetPicture) -> None:
+
+def add_tracks(app: FastAPI, fleet: FleetState) -> None:
     """Serve `/path/1`: `track` and `fixes` as lists of latitude, longitude, height AMSL.
 
-    The endpoint is a coroutine: it must run on the loop, which changes the paths.
+    And `/history/1`: the columns of `FlightHistory`. The endpoints are coroutines: they must run
+    on the loop, which changes what they read.
     """
 
     @app.get(TRACKS_PATH)
@@ -105,10 +114,20 @@ def add_tracks(app: FastAPI, fleet: FleetPicture) -> None:
         vehicle = fleet.vehicles.get(system_id)
         if vehicle is None:
             return Response(status_code=404)
-        paths = {"track": vehicle.track, "fixes": vehicle.fixes}
-        plain = {name: [_plain(point) for point in points] for name, points in paths.items()}
+        fixes = [(point.lat_deg, point.lon_deg, point.alt_amsl_m) for point in vehicle.fixes]
+        plain = {"track": vehicle.history.track(), "fixes": fixes}
         return Response(msgspec.json.encode(plain), media_type="application/json")
 
-
-def _plain(point: PathPoint) -> tuple[float, float, float]:
-    return (point.lat_deg, point.lon_deg, point.alt_amsl_m)
+    @app.get(HISTORY_PATH)
+    async def _history(system_id: int) -> Response:
+        vehicle = fleet.vehicles.get(system_id)
+        if vehicle is None:
+            return Response(status_code=404)
+        history = vehicle.history
+        step = max(1, len(history) // MAX_HISTORY + 1)
+        columns: dict[str, list[float]] = {"time_us": [*history.time_us[::step]]}
+        columns |= {
+            name: [float(f"{value:.9g}") for value in column[::step]]
+            for name, column in history.columns.items()
+        }
+        return Response(msgspec.json.encode(columns), media_type="application/json")

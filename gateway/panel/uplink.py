@@ -19,8 +19,8 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError
-from gateway.panel.control_client import ControlClient
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.gateway_client import ControlClient
+from gateway.panel.state.fleet import FleetState
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
@@ -61,7 +61,7 @@ class Uplink:
     ----------
     url : str or None
         An endpoint as in the settings; None for the gateway on this machine.
-    fleet : FleetPicture
+    fleet : FleetState
         Gets every message.
     control : ControlClient
         Finds where the gateway on this machine listens.
@@ -70,7 +70,7 @@ class Uplink:
     """
 
     def __init__(
-        self, url: str | None, fleet: FleetPicture, control: ControlClient, clock: GatewayClock
+        self, url: str | None, fleet: FleetState, control: ControlClient, clock: GatewayClock
     ) -> None:
         endpoints = () if url is None else (_trusting(url),)
         self.is_local = url is None

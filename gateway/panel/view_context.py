@@ -35,16 +35,13 @@ from nicegui import ui
 
 from gateway.clock import GatewayClock
 from gateway.panel.access import Role
-from gateway.panel.control_client import READING, ControlClient
 from gateway.panel.dialogues import Dialogues
-from gateway.panel.gateway_watch import GatewayWatch
+from gateway.panel.gateway_client import READING, ControlClient, GatewayWatch
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.recording_player import Playback
-from gateway.panel.state.field_history import FieldHistory
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.sample_memory import SampleMemory
-from gateway.panel.state.shown_units import ShownUnits
-from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.panel.playback import Playback
+from gateway.panel.state.fields import FieldHistory
+from gateway.panel.state.fleet import FleetState, SampleMemory
+from gateway.panel.state.vehicle import VehicleState
 from gateway.panel.uplink import Uplink
 
 WEB: Final = Path(__file__).parent / "web"
@@ -55,6 +52,10 @@ class NotAllowedError(Exception):
     """A viewer asked for a change."""
 
 
+LIVE: Final = "live"
+"""Origin of an aircraft that is not played."""
+
+
 @dataclass(frozen=True)
 class PanelParts:
     """Parts shared by all pages."""
@@ -63,7 +64,7 @@ class PanelParts:
     recordings: Path
     """Folder of the recordings, of a gateway that runs on this machine."""
     clock: GatewayClock
-    fleet: FleetPicture
+    fleet: FleetState
     control: ControlClient
     uplink: Uplink
     history: FieldHistory
@@ -71,8 +72,6 @@ class PanelParts:
     dialogues: Dialogues
     watch: GatewayWatch
     """The gateway's status of the last second."""
-    playback: Playback
-    """The recording that is played."""
 
     @property
     def recordings_folder(self) -> Path:
@@ -87,7 +86,12 @@ class ViewContext:
 
     parts: PanelParts
     role: Role
-    units: ShownUnits
+    units: str
+    """`metric`, `imperial` or `aviation`."""
+    playback: Playback
+    """The recording that this page plays."""
+    page: str
+    """Id of the page."""
     shown: str = ""
     """Key of the view that is shown."""
     system_id: int | None = None
@@ -97,14 +101,24 @@ class ViewContext:
     _on_show: dict[str, list[Callable[[], None]]] = field(default_factory=dict)
 
     @property
-    def fleet(self) -> FleetPicture:
+    def fleet(self) -> FleetState:
         """All aircraft."""
         return self.parts.fleet
 
     @property
-    def vehicle(self) -> VehiclePicture | None:
+    def vehicles(self) -> dict[int, VehicleState]:
+        """The aircraft that this page shows."""
+        return self.fleet.visible(self.page)
+
+    @property
+    def vehicle(self) -> VehicleState | None:
         """The selected aircraft; None before the first."""
         return None if self.system_id is None else self.fleet.vehicles.get(self.system_id)
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether the selected aircraft is played from a recording."""
+        return self.vehicle is not None and self.vehicle.origin != LIVE
 
     @property
     def now_us(self) -> int:

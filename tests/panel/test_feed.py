@@ -7,7 +7,7 @@ from typing import Any, cast
 from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.fleet import FleetState
 from gateway.panel.telemetry_feed import GRANTS, TelemetryFeed
 from tests.panel.messages import position
 
@@ -43,7 +43,7 @@ class Browser:
 
 
 async def test_slow_browser_gets_the_newest_only() -> None:
-    fleet, browser = FleetPicture(), Browser()
+    fleet, browser = FleetState(), Browser()
     feed = TelemetryFeed(fleet, GatewayClock())
     serving = asyncio.create_task(feed.serve(cast(WebSocket, browser)))
     fleet.take(position(10.0, 20.0), 0)
@@ -61,7 +61,7 @@ async def test_slow_browser_gets_the_newest_only() -> None:
 
 
 async def test_page_cannot_save_up_grants() -> None:
-    fleet, browser = FleetPicture(), Browser()
+    fleet, browser = FleetState(), Browser()
     feed = TelemetryFeed(fleet, GatewayClock())
     serving = asyncio.create_task(feed.serve(cast(WebSocket, browser)))
     await browser.until(GRANTS)

@@ -1,8 +1,8 @@
 import asyncio
 from typing import Any
 
-from gateway.panel.gateway_watch import GatewayWatch
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.gateway_client import GatewayWatch
+from gateway.panel.state.fleet import FleetState
 
 
 class Gateway:
@@ -22,7 +22,7 @@ class Gateway:
 
 async def test_a_late_answer_does_not_replace_a_later_one() -> None:
     gateway = Gateway()
-    watch = GatewayWatch(gateway, FleetPicture())  # type: ignore[arg-type]
+    watch = GatewayWatch(gateway, FleetState())  # type: ignore[arg-type]
     early = asyncio.create_task(watch.refresh())
     while not gateway.asked:
         await asyncio.sleep(0)

@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.panel.recorded_aircraft import FUSED_AGAIN, RECORDED, free_ids, look_into
+from gateway.panel.playback import FUSED_AGAIN, RECORDED, free_ids, look_into
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record

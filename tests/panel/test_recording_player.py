@@ -8,8 +8,8 @@ import pytest
 
 from gateway.live.control_socket import ControlError
 from gateway.panel import recording_player
-from gateway.panel.recording_player import Playback
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.playback import Playback
+from gateway.panel.state.fleet import FleetState
 
 
 class Player:
@@ -42,7 +42,7 @@ def player() -> Player:
 
 @pytest.fixture
 def playback(player: Player) -> Playback:
-    made = Playback(None, FleetPicture())  # type: ignore[arg-type]
+    made = Playback(None, FleetState())  # type: ignore[arg-type]
     made._control = player  # type: ignore[assignment]
     made.status = {"state": "playing", "position_s": 0.0}
     return made
@@ -112,7 +112,7 @@ async def test_a_player_that_does_not_answer_at_once_is_waited_for(
     class Uplink:
         playback_port = 1
 
-    playback = Playback(Uplink(), FleetPicture())  # type: ignore[arg-type]
+    playback = Playback(Uplink(), FleetState())  # type: ignore[arg-type]
     await playback.open(tmp_path, "day", fused_again=False)
     assert playback.status == {"state": "playing", "position_s": 0.0}
     playback.close()

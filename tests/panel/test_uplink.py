@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel import uplink as panel_uplink
-from gateway.panel.control_client import ControlClient
-from gateway.panel.state.fleet_picture import FleetPicture, Origin
+from gateway.panel.gateway_client import ControlClient
+from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import (
     ACK_TIMEOUT_S,
     PROGRESS_TIMEOUT_S,
@@ -64,7 +64,7 @@ async def test_what_is_played_stays_in_the_panel(
     tmp_path: Path, sockets: tuple[socket.socket, socket.socket]
 ) -> None:
     gateway, player = sockets
-    fleet = FleetPicture()
+    fleet = FleetState()
     url = f"udp:127.0.0.1:{gateway.getsockname()[1]}"
     uplink = Uplink(url, fleet, ControlClient(tmp_path / "none.sock"), GatewayClock())
     uplink.start()
@@ -132,7 +132,7 @@ async def test_command_that_is_being_carried_out_is_waited_for_longer(
 async def test_any_result_that_is_not_accepted_is_a_failure(
     tmp_path: Path, result: int, word: str
 ) -> None:
-    uplink = Uplink(None, FleetPicture(), ControlClient(tmp_path / "none.sock"), GatewayClock())
+    uplink = Uplink(None, FleetState(), ControlClient(tmp_path / "none.sock"), GatewayClock())
     waits = asyncio.ensure_future(uplink.command(1, mavlink.MAV_CMD_LOGGING_START))
     await asyncio.sleep(0)
     uplink._note_ack(

@@ -4,9 +4,8 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.panel.state.fleet_picture import MAX_VEHICLES, FleetPicture
-from gateway.panel.state.instant import Spot
-from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.panel.state.fleet import MAX_VEHICLES, FleetState
+from gateway.panel.state.vehicle import Spot, VehicleState
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, fix, heartbeat, position
 
@@ -14,18 +13,18 @@ HERE = (47.0, 8.0)
 
 
 @pytest.fixture
-def vehicle() -> VehiclePicture:
-    return VehiclePicture(1)
+def vehicle() -> VehicleState:
+    return VehicleState(1)
 
 
-def test_what_nobody_sent_is_not_known(vehicle: VehiclePicture) -> None:
+def test_what_nobody_sent_is_not_known(vehicle: VehicleState) -> None:
     now = vehicle.instant(0)
     assert math.isinf(now.silent_s)
     assert all(math.isnan(value) for value in (*now.q_nb, now.lat_deg, now.groundspeed_mps))
     assert (now.model, now.fix, now.home, now.mark) == ("none", None, None, None)
 
 
-def test_newest_attitude_is_taken_whichever_message_brings_it(vehicle: VehiclePicture) -> None:
+def test_newest_attitude_is_taken_whichever_message_brings_it(vehicle: VehicleState) -> None:
     q_nb = from_euler(0.3, -0.1, 1.5)
     vehicle.take(decoded(mavlink.MAVLink_attitude_quaternion_message(0, *q_nb, 0.1, 0, 0)), 0)
     assert vehicle.instant(0).q_nb == pytest.approx(q_nb, abs=1e-6)
@@ -36,7 +35,7 @@ def test_newest_attitude_is_taken_whichever_message_brings_it(vehicle: VehiclePi
     assert now.q_nb == pytest.approx(from_euler(-0.4, 0.2, 0.1), abs=1e-6)
 
 
-def test_position_is_in_si(vehicle: VehiclePicture) -> None:
+def test_position_is_in_si(vehicle: VehicleState) -> None:
     vehicle.take(position(*HERE, 431.5), 7)
     now = vehicle.instant(7)
     assert (now.lat_deg, now.lon_deg, now.alt_amsl_m) == pytest.approx((*HERE, 431.5))
@@ -44,7 +43,7 @@ def test_position_is_in_si(vehicle: VehiclePicture) -> None:
     assert (now.alt_home_m, now.heading_deg, now.time_us) == (5.0, 90.0, 7)
 
 
-def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehiclePicture) -> None:
+def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -> None:
     for step in range(50):
         vehicle.take(position(HERE[0] + step * 1e-5, HERE[1]), step * 20_000)
     for step in (0, 0, 1):
@@ -53,13 +52,13 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehiclePicture)
     assert [point.lat_deg for point in vehicle.fixes] == pytest.approx([47.0, 47.0001])
 
 
-def test_no_fix_is_no_place(vehicle: VehiclePicture) -> None:
+def test_no_fix_is_no_place(vehicle: VehicleState) -> None:
     vehicle.take(fix(0.0, 0.0, kind=mavlink.GPS_FIX_TYPE_NO_FIX, satellites=255), 0)
     now = vehicle.instant(0)
     assert (now.fix, now.satellites, len(vehicle.fixes)) == (None, 0, 0)
 
 
-def test_mark_is_found_from_distance_and_bearing(vehicle: VehiclePicture) -> None:
+def test_mark_is_found_from_distance_and_bearing(vehicle: VehicleState) -> None:
     vehicle.take(position(0.0, 179.999), 0)
     way = mavlink.MAVLink_nav_controller_output_message(
         math.nan, math.nan, 90, 90, 1113, math.nan, 0, math.nan
@@ -73,7 +72,7 @@ def test_mark_is_found_from_distance_and_bearing(vehicle: VehiclePicture) -> Non
     assert vehicle.instant(0).mark == Spot(1.0, 2.0, 3.0)
 
 
-def test_what_cannot_be_is_not_known(vehicle: VehiclePicture) -> None:
+def test_what_cannot_be_is_not_known(vehicle: VehicleState) -> None:
     vehicle.take(decoded(mavlink.MAVLink_attitude_message(0, math.inf, 0, 0, 1, 0, 0)), 0)
     vehicle.take(position(214.0, 8.0), 0)
     way = mavlink.MAVLink_nav_controller_output_message(0, 0, 90, 90, 1113, 0, 0, 0)
@@ -87,12 +86,12 @@ def test_what_cannot_be_is_not_known(vehicle: VehiclePicture) -> None:
     ("kind", "model"),
     [(1, "plane"), (2, "copter"), (13, "copter"), (4, "heli"), (19, "plane"), (26, "none")],
 )
-def test_model_follows_the_type(vehicle: VehiclePicture, kind: int, model: str) -> None:
+def test_model_follows_the_type(vehicle: VehicleState, kind: int, model: str) -> None:
     vehicle.take(heartbeat(kind), 0)
     assert vehicle.model == model
 
 
-def test_long_text_is_put_together(vehicle: VehiclePicture) -> None:
+def test_long_text_is_put_together(vehicle: VehicleState) -> None:
     for chunk, text in enumerate(("a" * 50, "b" * 50, "c")):
         vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
     vehicle.take(decoded(mavlink.MAVLink_statustext_message(2, b"next")), 0)
@@ -100,14 +99,14 @@ def test_long_text_is_put_together(vehicle: VehiclePicture) -> None:
     assert texts == [(1, 4, "a" * 50 + "b" * 50 + "c"), (2, 2, "next")]
 
 
-def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehiclePicture) -> None:
+def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehicleState) -> None:
     for chunk, text in enumerate(("a" * 50, "", "b")):
         vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
     assert [entry.text for entry in vehicle.texts.all] == ["a" * 50, "b"]
 
 
 def test_fleet_keeps_aircraft_apart_and_others_out() -> None:
-    fleet, heard = FleetPicture(), []
+    fleet, heard = FleetState(), []
     leave = fleet.listen(lambda system_id, message, _: heard.append(system_id))
     fleet.take(position(*HERE, system_id=3), 0)
     fleet.take(position(1.0, 2.0, system_id=4), 0)
@@ -121,7 +120,7 @@ def test_fleet_keeps_aircraft_apart_and_others_out() -> None:
 
 
 def test_forged_systems_do_not_fill_the_memory() -> None:
-    fleet = FleetPicture()
+    fleet = FleetState()
     for system_id in range(1, 200):
         fleet.take(heartbeat(system_id=system_id), 0)
     assert len(fleet.vehicles) == MAX_VEHICLES

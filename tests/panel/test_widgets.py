@@ -14,8 +14,7 @@ from nicegui.page import page
 
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
-from gateway.panel.state.dialogue.parameter_client import ParameterEntry
-from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+from gateway.panel.state.parameters import ParameterEntry, ParameterMeta
 from gateway.panel.widgets import comparison
 from gateway.panel.widgets.charts import StripChart
 from gateway.panel.widgets.comparison import ComparisonCard

@@ -1,19 +1,16 @@
-"""Alerts: lasting problems that an operator must not miss, unlike passing texts.
-
-Each is derived from the present MAVLink state, so that an alert ends as soon as its cause has
-gone, and works with any vehicle; alerts about a gateway's nodes and recorder come from its texts.
-"""
+"""Alerts for the operator, from an aircraft's messages and from the gateway's own status."""
 
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.status_texts import TimedText
-from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.panel.state.vehicle import TimedText, VehicleState
 from gateway.units import US_PER_S
+from gateway.vehicle.telemetry.health import node_role
 
 SILENT_S: Final = 5.0
 FIX_OLD_US: Final = 5 * US_PER_S
@@ -55,12 +52,12 @@ class Alert:
     detail: str = ""
 
 
-def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+def alerts_of(vehicle: VehicleState, now_us: int) -> list[Alert]:
     """Return the present problems of one aircraft, the most severe first.
 
     Parameters
     ----------
-    vehicle : VehiclePicture
+    vehicle : VehicleState
         Its state.
     now_us : int
         The panel's clock.
@@ -78,7 +75,7 @@ def alerts_of(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
     return sorted(found, key=lambda alert: -alert.level)
 
 
-def _gps(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+def _gps(vehicle: VehicleState, now_us: int) -> list[Alert]:
     """Return an alert for a GPS that lost its fix; one that never had one is still searching."""
     if not vehicle.fixes:
         return []
@@ -93,7 +90,7 @@ def _gps(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
     return [Alert("gps", AlertLevel.CRITICAL, "GPS lost", detail)]
 
 
-def _sensors(vehicle: VehiclePicture) -> list[Alert]:
+def _sensors(vehicle: VehicleState) -> list[Alert]:
     status = vehicle.newest.get("SYS_STATUS")
     if status is None:
         return []
@@ -105,7 +102,7 @@ def _sensors(vehicle: VehiclePicture) -> list[Alert]:
     return [Alert("sensors", AlertLevel.WARNING, "Sensors not healthy", ", ".join(names))]
 
 
-def _texts(vehicle: VehiclePicture, now_us: int) -> list[Alert]:
+def _texts(vehicle: VehicleState, now_us: int) -> list[Alert]:
     standing: dict[str, Alert] = {}
     for text in vehicle.texts.all:
         _fold(standing, text)
@@ -143,3 +140,63 @@ def _fold(standing: dict[str, Alert], text: TimedText) -> None:
 def _is_known(text: str) -> bool:
     patterns = (_SILENT, _BACK, _RECEIVER_LOST, _RECEIVER_BACK, _RECORDING_FAILED)
     return any(pattern.match(text) for pattern in patterns)
+
+
+NODE_SILENT_US: Final = 3 * US_PER_S
+BLOCKED: Final = "blocked"
+OWN_KEYS: Final = ("node ", "receiver", "recording")
+"""Key prefixes of the alerts made here, which come from texts if there is no status."""
+
+
+def with_status(
+    alerts: Iterable[Alert], status: Mapping[str, Any] | None, vehicle_id: int
+) -> list[Alert]:
+    """Replace alerts from the gateway's texts by those from its status of link and recorder.
+
+    Parameters
+    ----------
+    alerts : iterable of Alert
+        As `alerts_of` finds them for one aircraft.
+    status : mapping or None
+        Result of the control verb `status`; None without a gateway.
+    vehicle_id : int
+        The aircraft.
+
+    Returns
+    -------
+    list of Alert
+        The most severe first.
+    """
+    if status is None:
+        return list(alerts)
+    kept = [alert for alert in alerts if not alert.key.startswith(OWN_KEYS)]
+    roles = {
+        board["node"]["node_id"]: node_role(board["sensors_present"])
+        for aircraft in status["aircraft"]
+        if aircraft["vehicle_id"] == vehicle_id
+        for board in aircraft["boards"]
+    }
+    link = _link(status["report"], vehicle_id, roles)
+    found = [*kept, *link, *_recorder(status["recorder"])]
+    return sorted(found, key=lambda alert: -alert.level)
+
+
+def _link(report: Mapping[str, Any], vehicle_id: int, roles: Mapping[int, str]) -> list[Alert]:
+    if not report["connected"]:
+        # Without it every node is silent; that needs no alert.
+        return [Alert("receiver", AlertLevel.CRITICAL, "Receiver lost", report["port"])]
+    found = []
+    for link in report["nodes"]:
+        silent_us = report["time_us"] - link["last_time_us"]
+        node = link["node"]
+        if node["vehicle_id"] == vehicle_id and link["received"] and silent_us > NODE_SILENT_US:
+            name = f"{roles.get(node['node_id'], 'Node')} {node['node_id']}"
+            since = f"no radio packets for {silent_us // US_PER_S} s"
+            found.append(Alert(f"node {name}", AlertLevel.CRITICAL, f"{name} silent", since))
+    return found
+
+
+def _recorder(recorder: Mapping[str, Any] | None) -> list[Alert]:
+    if recorder is None or recorder["state"] != BLOCKED:
+        return []
+    return [Alert("recording", AlertLevel.CRITICAL, "Recording failed", recorder["reason"])]

@@ -9,17 +9,17 @@ from nicegui.element import Element
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.state.dialogue.calibration_run import (
+from gateway.panel.state.calibration import (
+    CELLS,
     SIDES,
     CalibrationRun,
     CalibrationStep,
     RunState,
 )
-from gateway.panel.state.dialogue.parameter_client import ListState
-from gateway.panel.state.dialogue.sphere_cover import CELLS
-from gateway.panel.state.field_history import FloatArray
+from gateway.panel.state.fields import FloatArray, unit_text
+from gateway.panel.state.parameters import ListState
 from gateway.panel.uplink import CommandFailedError
-from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.view_context import LIVE, WEB, ViewContext
 from gateway.panel.widgets.prompts import heading
 from gateway.panel.widgets.table import DataTable
 from gateway.printable import printable
@@ -37,7 +37,6 @@ SIDE_NAMES: Final = {
     "back": "tail down",
 }
 """By the side that lies below; see `calibration_run.SIDES`."""
-LIVE: Final = "live"
 
 TITLES: Final = {
     CalibrationStep.GYRO: ("Gyroscope", "360", "leave it at rest, 3 s"),
@@ -238,7 +237,11 @@ class _CalibrationView:
 
     def _build_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
-        found += [(name, old, new) for name, (old, new) in self._changes().items()]
+        metas = self._dialogue.metas if self._dialogue else {}
+        for name, (old, new) in self._changes().items():
+            meta = metas.get(name)
+            words = f"{meta.short} ({unit_text(meta.unit)}), {name}" if meta else name
+            found.append((words, old, new))
         table = DataTable(("", "before", "after")).classes("residuals")
         table.show(
             {name: ((name, ""), (_figure(old), ""), (_figure(new), "")) for name, old, new in found}

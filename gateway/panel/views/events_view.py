@@ -6,15 +6,13 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.clock import unix_time_us
-from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of
-from gateway.panel.state.gateway_alerts import with_status
-from gateway.panel.state.status_texts import TimedText
-from gateway.panel.view_context import ViewContext
+from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
+from gateway.panel.state.vehicle import TimedText
+from gateway.panel.view_context import LIVE, ViewContext
 from gateway.panel.widgets.table import Cells, DataTable
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.5
-LIVE: Final = "live"
 SEVERITIES: Final = (
     "Emergency", "Alert", "Critical", "Error", "Warning", "Notice", "Info", "Debug",
 )  # fmt: skip
@@ -33,13 +31,16 @@ def build(context: ViewContext) -> None:
 def build_banner(context: ViewContext) -> None:
     """Build the banners of alerts; shown above every view."""
     shown: list[Alert] = []
-    place = ui.element("div").classes("banners").props('role=alert aria-live="assertive"')
+    place = ui.element("div").props('role=alert aria-live="assertive"')
 
     def refresh() -> None:
         nonlocal shown
         vehicle = context.vehicle
-        alerts = [] if vehicle is None else alerts_of(vehicle, context.now_us)
-        if vehicle is not None and vehicle.origin == LIVE:
+        if vehicle is None or vehicle.origin != LIVE:
+            # What was wrong in a recording must not look like a problem of now.
+            alerts = []
+        else:
+            alerts = alerts_of(vehicle, context.now_us)
             alerts = with_status(alerts, context.parts.watch.status, vehicle.system_id)
         if alerts == shown:
             return

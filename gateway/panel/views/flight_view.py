@@ -1,4 +1,4 @@
-"""View 1: the primary flight display, the aircraft in 3D from two viewpoints, the map."""
+"""View 1: flight display, numbers, the aircraft in 3D from two viewpoints, map, timeline."""
 
 from typing import Final
 
@@ -7,6 +7,7 @@ from nicegui.element import Element
 
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.views.map_view import FlightMap
+from gateway.panel.widgets.recorder import RecorderControls
 
 THREE: Final = ui.scene
 """The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""
@@ -24,12 +25,25 @@ class FlightScene(Element, component=WEB / "flight_scene.js"):
     """The aircraft in 3D, drawn by the browser from the telemetry."""
 
 
+class NumberStrip(Element, component=WEB / "number_strip.js"):
+    """The flight in numbers, each with its unit and, once it is old, its age."""
+
+
+class FlightTimeline(Element, component=WEB / "flight_timeline.js"):
+    """The current flight over time, in which the page can go back."""
+
+
 def build(context: ViewContext) -> None:
     """Build the view."""
     with ui.element("div").classes("flight"):
+        with ui.element("div").classes("flight-numbers card"):
+            NumberStrip()
         with ui.element("div").classes("flight-instruments card"):
             FlightDisplay().classes("fill")
         with ui.element("div").classes("flight-map card"):
             FlightMap(context, full=False)
         with ui.element("div").classes("flight-scene card"):
             FlightScene()
+        with ui.element("div").classes("flight-foot card"):
+            FlightTimeline()
+            RecorderControls(context)

@@ -123,8 +123,8 @@ class LinkView:
 
     def _vehicle_rows(self) -> dict[str, Cells]:
         rows: dict[str, Cells] = {}
-        for system_id, vehicle in sorted(self._context.fleet.vehicles.items()):
-            ages = [self._age(vehicle.heard_us.get(name)) for name in _TELLING]
+        for system_id, vehicle in sorted(self._context.vehicles.items()):
+            ages = [self._age(vehicle.heard_us.get(name)) for name in _SHOWN]
             rows[str(system_id)] = (
                 (f"{vehicle.model} {system_id}", ""),
                 *ages,
@@ -139,7 +139,7 @@ class LinkView:
         return (f"{age_us / US_PER_S:.1f} s ago", "bad" if age_us > SILENT_US else "")
 
 
-_TELLING: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
+_SHOWN: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
 
 
 def build(context: ViewContext) -> None:

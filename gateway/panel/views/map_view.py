@@ -11,7 +11,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.instant import Spot
+from gateway.panel.state.vehicle import Spot
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets.prompts import closing, named_dialog, notify_failure
 
@@ -38,6 +38,7 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
             for style in styles
         ]
         self._props["full"] = full
+        self._props["may_mark"] = full and context.may_change
         if full and context.may_change:
             self.on("place", partial(_ask, context))
 

@@ -11,11 +11,11 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
-from gateway.panel.recorded_aircraft import Profile
+from gateway.panel.playback import SPEEDS, Playback, Profile
 from gateway.panel.recording_facts import RecordingFacts
-from gateway.panel.recording_player import SPEEDS, Playback
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets.prompts import confirm, heading, notify_failure
+from gateway.panel.widgets.recorder import RecorderControls
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
 from gateway.recordings.index import delete_recording, list_recordings
@@ -26,8 +26,6 @@ PLACE_S: Final = 0.25
 MUCH_LOST: Final = 0.05
 """A share of lost samples that a pilot should see."""
 FACTS: Final = ("Duration", "Distance", "Height", "Loss")
-IDLE: Final = "idle"
-STATES: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
 
 
 class TimeSlider(Element, component=WEB / "time_slider.js"):
@@ -55,7 +53,7 @@ class RecordingsView:
             with self._player:
                 self._build_player()
             with ui.element("div").classes("card padded"):
-                self._build_recorder()
+                RecorderControls(context)
             with ui.element("div").classes("card padded"):
                 with ui.element("div").classes("line"):
                     heading("Recordings").classes("spring")
@@ -81,22 +79,6 @@ class RecordingsView:
             buttons += [RowButton("delete", "Delete", self._ask_delete)]
         return buttons
 
-    def _build_recorder(self) -> None:
-        with ui.element("div").classes("line"):
-            self._state = ui.label().classes("chip").props("data-role=recorder")
-            self._detail = ui.label().classes("soft figure spring")
-            if not self._context.may_change:
-                return
-            start = ui.button("Start", icon="fiber_manual_record", on_click=self._order("start"))
-            start.props('no-caps color=negative aria-label="Start recording"')
-            stop = ui.button("Stop", icon="stop", on_click=self._order("stop"))
-            stop.props('no-caps outline aria-label="Stop recording"')
-        with ui.element("div").classes("line"):
-            self._name = ui.input(placeholder="Name for this recording, or the last one").props(
-                'dense outlined aria-label="Name of the recording"'
-            )
-            ui.button("Save", on_click=self._save).props("no-caps")
-
     def _build_player(self) -> None:
         with ui.element("div").classes("line"):
             self._title = ui.label().classes("title spring")
@@ -120,15 +102,7 @@ class RecordingsView:
         self._player.set_visibility(False)
 
     async def refresh(self) -> None:
-        """Show the recorder's state and the folder."""
-        recorder = self._context.parts.watch.recorder
-        if recorder is None:
-            self._state.set_text("no gateway on this machine")
-            self._detail.set_text(str(self._context.parts.recordings))
-        else:
-            self._state.set_text(recorder["state"])
-            self._state.classes(replace="chip").classes(STATES.get(recorder["state"], ""))
-            self._detail.set_text(_detail_of(recorder))
+        """Show the folder."""
         facts, search = self._facts, (self._search.value or "").strip()
         folder = self._context.parts.recordings_folder
         # Querying a catalogue of thousands would block the page too long.
@@ -140,7 +114,7 @@ class RecordingsView:
         self._table.show({entry.name: _row(entry, facts.of(entry.name)) for entry in shown})
 
     def _show_place(self) -> None:
-        playback = self._context.parts.playback
+        playback = self._context.playback
         status = playback.status
         self._player.set_visibility(status is not None)
         if status is None:
@@ -159,25 +133,6 @@ class RecordingsView:
         for key, value in new.items():
             if self._slider.props.get(key) != value:
                 self._slider.props[key] = value
-
-    def _order(self, word: str) -> Any:
-        async def order() -> None:
-            with notify_failure(self._context):
-                await self._context.ask(f"record.{word}")
-                await self._context.parts.watch.refresh()
-                await self.refresh()
-
-        return order
-
-    async def _save(self) -> None:
-        with notify_failure(self._context):
-            name = self._name.value
-            await self._context.ask("record.save", name=name.strip())
-            ui.notify(f"Saved as {name.strip()}", type="positive")
-            if self._name.value == name:
-                self._name.value = ""
-            await self._context.parts.watch.refresh()
-            await self.refresh()
 
     def _ask_delete(self, name: str) -> None:
         confirm(f"Delete the recording {name} for ever?", "Delete", partial(self._delete, name))
@@ -206,26 +161,26 @@ class RecordingsView:
         with notify_failure(context):
             context.check_may_change()
             ui.notify(f"Opening {printable(name)}…")
-            await context.parts.playback.open(
+            await context.playback.open(
                 context.parts.recordings_folder, name, fused_again=fused_again
             )
             self._show_place()
 
     async def _on_fused_again(self, event: Any) -> None:
-        playback = self._context.parts.playback
+        playback = self._context.playback
         if playback.name and event.value != playback.has_fused_again:
             await self._open(playback.name, fused_again=event.value)
 
     def _close(self) -> None:
         with notify_failure(self._context):
             self._context.check_may_change()
-            self._context.parts.playback.close()
+            self._context.playback.close()
             self._show_place()
 
     async def _play(self, verb: str, **params: Any) -> None:
         with notify_failure(self._context):
             self._context.check_may_change()
-            await self._context.parts.playback.order(verb, **params)
+            await self._context.playback.order(verb, **params)
             self._show_place()
 
     async def _on_seek(self, event: GenericEventArguments) -> None:
@@ -234,7 +189,7 @@ class RecordingsView:
     async def _on_toggle(self) -> None:
         with notify_failure(self._context):
             self._context.check_may_change()
-            await self._context.parts.playback.toggle()
+            await self._context.playback.toggle()
             self._show_place()
 
     async def _on_speed(self, event: Any) -> None:
@@ -250,14 +205,6 @@ def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
     """Return the heights of all played aircraft, those of the selected one first."""
     order = sorted(playback.aircraft, key=lambda key: (key != system_id, key))
     return [playback.aircraft[key].profile for key in order]
-
-
-def _detail_of(recorder: dict[str, Any]) -> str:
-    parts = [recorder["reason"]] if recorder["reason"] else []
-    if recorder["name"] and recorder["state"] != IDLE:
-        parts += [recorder["name"], f"{recorder['part_bytes'] / 1e6:.1f} MB"]
-    parts += [f"{recorder['free_bytes'] / 1e9:.1f} GB free in {recorder['folder']}"]
-    return " · ".join(parts)
 
 
 def _row(recording: Any, facts: Row | None) -> Cells:

@@ -6,8 +6,7 @@ from nicegui import ui
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.state.dialogue.parameter_client import ListState
-from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+from gateway.panel.state.parameters import ListState, ParameterMeta
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets.charts import LiveChart

@@ -5,7 +5,7 @@ import { leaflet as L } from "nicegui-leaflet";
 const EARTH_M = 6378137;
 const rad = Math.PI / 180;
 const CIRCLE_95 = 2.4477 / Math.SQRT2; // of the root of both axes' variances, as a radius
-const MAX_POINTS = 20000;
+const MAX_DOTS = 2000;
 const AIRCRAFT = {
   plane: "M16 2c1.4 0 2 2 2 5v5l12 6v3l-12-3v7l4 3v2l-6-1.6L10 30v-2l4-3v-7L2 21v-3l12-6V7c0-3 .6-5 2-5z",
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
@@ -91,12 +91,18 @@ export default {
         </select>
         <button :aria-pressed="follow" @click="follow = !follow" title="Keep the aircraft in the middle">{{ follow ? "Following" : "Follow" }}</button>
         <button v-if="full" @click="fit" title="Show all of the path">Fit</button>
-        <button v-if="full" @click="clear" title="Begin the drawn path anew">Clear path</button>
+        <button v-if="full" @click="clear" title="Clear the drawn path">Clear path</button>
       </div>
+      <div class="map-offline" v-if="offline" role="status">no map tiles (offline)</div>
       <div class="map-place" v-if="place">
         <span class="figure" data-role="place">{{ place }}</span>
         <button @click="copy" title="Copy latitude and longitude">{{ copied ? "Copied" : "Copy" }}</button>
       </div>
+      <form class="map-entry" v-if="full" @submit.prevent="locate">
+        <input v-model="entry" placeholder="latitude, longitude" aria-label="Coordinates to show" :aria-invalid="entry !== '' && !entered">
+        <button type="submit" :disabled="!entered" title="Show these coordinates">Show</button>
+        <button type="button" v-if="may_mark" :disabled="!entered" @click="$emit('place', entered)" title="Mark these coordinates or set home there">Mark …</button>
+      </form>
       <div class="map-legend" v-if="full">
         <span class="key track">fused</span><span class="key fix">GPS</span>
         <span v-for="origin in played" :key="origin" class="key" :class="origin.replace(' ', '-')">{{ origin }}</span>
@@ -104,8 +110,16 @@ export default {
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
       </div>
     </div>`,
-  props: { styles: Array, full: Boolean },
-  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "", played: [] }),
+  props: { styles: Array, full: Boolean, may_mark: Boolean },
+  computed: {
+    // The coordinates in the entry field, or null.
+    entered() {
+      const numbers = this.entry.match(/-?\d+(\.\d+)?/g)?.map(Number) ?? [];
+      const [lat_deg, lon_deg] = numbers;
+      return numbers.length === 2 && Math.abs(lat_deg) <= 90 && Math.abs(lon_deg) <= 180 ? { lat_deg, lon_deg } : null;
+    },
+  },
+  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "", played: [], offline: false, entry: "" }),
 
   mounted() {
     const map = (this.map = L.map(this.$refs.map, {
@@ -153,11 +167,24 @@ export default {
   methods: {
     set_style() {
       this.tiles?.remove();
+      this.offline = false;
       const style = this.styles[this.style];
       if (!style) return;
-      this.tiles = L.tileLayer(`/tiles/${this.style}/{z}/{x}/{y}`, {
-        maxZoom: 22, maxNativeZoom: style.max_zoom, attribution: style.attribution, errorTileUrl: "",
-      }).addTo(this.map);
+      // A tile that cannot be had is an error; its owner is named only where one is shown.
+      const options = { maxZoom: 22, maxNativeZoom: style.max_zoom, errorTileUrl: "" };
+      let loaded = 0;
+      this.tiles = L.tileLayer(`/tiles/${this.style}/{z}/{x}/{y}`, options);
+      this.tiles.on("loading", () => (loaded = 0));
+      this.tiles.on("tileload", () => {
+        loaded += 1;
+        this.offline = false;
+        if (style.attribution && this.tiles.options.attribution !== style.attribution) {
+          this.tiles.options.attribution = style.attribution;
+          this.map.attributionControl.addAttribution(style.attribution);
+        }
+      });
+      this.tiles.on("tileerror", () => (this.offline = loaded === 0));
+      this.tiles.addTo(this.map);
     },
     paint() {
       this.mark_colour = mavgate.colour("mark");
@@ -173,36 +200,37 @@ export default {
       const path = `<svg viewBox="0 0 32 32" class="craft"><path d="${AIRCRAFT[state.model] ?? AIRCRAFT.none}"/></svg>`;
       const one = {
         marker: L.marker(at(state), { icon: icon(path, 34), title: `Aircraft ${id}`, interactive: false, keyboard: false }).addTo(this.map),
-        generation: state.generation,
+        version: -1,
         colour: COLOURS[state.origin] ?? "track",
         track: L.polyline([], { color: mavgate.colour(COLOURS[state.origin] ?? "track"), weight: 3, interactive: false }).addTo(this.map),
         fixes: L.layerGroup().addTo(this.map),
-        fix: "",
       };
-      this.fetch_path(id, one);
       return one;
     },
-    async fetch_path(id, one) {
-      const answer = await fetch(`/path/${id}`);
-      if (!answer.ok) return;
-      const { track, fixes } = await answer.json();
-      one.track.setLatLngs([...track.map(([lat, lon]) => [lat, lon]), ...one.track.getLatLngs()]);
-      for (const [lat, lon] of fixes.slice(-2000)) this.dot(one, [lat, lon]);
+    // Bring the drawn path up to date with that of the telemetry.
+    draw_track(id, one) {
+      const track = mavgate.track(id);
+      const flat = ([lat, lon]) => [lat, lon];
+      if (one.version !== track.version) {
+        one.version = track.version;
+        one.track.setLatLngs(track.points.map(flat));
+        one.fixes.clearLayers();
+        one.points = track.points.length;
+        one.dots = Math.max(0, track.fixes.length - MAX_DOTS);
+      }
+      for (; one.points < track.points.length; one.points++) one.track.addLatLng(flat(track.points[one.points]));
+      for (; one.dots < track.fixes.length; one.dots++) this.dot(one, flat(track.fixes[one.dots]));
     },
     dot(one, place) {
       L.circleMarker(place, { pane: "fixes", radius: 1.8, weight: 1, fill: false, color: mavgate.colour("fix"), interactive: false, renderer: this.dots }).addTo(one.fixes);
       const dots = one.fixes.getLayers();
-      if (dots.length > 2500) for (const old of dots.slice(0, 500)) one.fixes.removeLayer(old);
+      if (dots.length > MAX_DOTS + 500) for (const old of dots.slice(0, 500)) one.fixes.removeLayer(old);
     },
     draw() {
-      for (const [id, state] of Object.entries(mavgate.vehicles)) {
+      for (const id of Object.keys(mavgate.vehicles)) {
+        const state = mavgate.shown(id);
         if (state.lat_deg === null) continue;
         const one = (this.craft[id] ??= this.make(id, state));
-        if (one.generation !== state.generation) {
-          one.generation = state.generation;
-          one.track.setLatLngs([]);
-          one.fixes.clearLayers();
-        }
         one.marker.setLatLng(at(state));
         const arrow = one.marker.getElement()?.querySelector("svg");
         if (arrow) {
@@ -210,15 +238,7 @@ export default {
           arrow.dataset.selected = id === mavgate.selected;
           arrow.dataset.origin = state.origin;
         }
-        const last = one.track.getLatLngs().at(-1);
-        if (!last || this.map.distance(last, at(state)) > 1) {
-          one.track.addLatLng(at(state));
-          if (one.track.getLatLngs().length > MAX_POINTS) one.track.setLatLngs(one.track.getLatLngs().slice(MAX_POINTS / 4));
-        }
-        if (state.fix && one.fix !== String(at(state.fix))) {
-          one.fix = String(at(state.fix));
-          this.dot(one, at(state.fix));
-        }
+        this.draw_track(id, one);
       }
       for (const [id, one] of Object.entries(this.craft)) {
         if (id in mavgate.vehicles) continue;
@@ -247,7 +267,7 @@ export default {
       if (state.mark) {
         const reported = state.mark_distance_m !== null;
         const distance = reported ? state.mark_distance_m : this.map.distance(here, at(state.mark));
-        const bearing = reported ? state.mark_bearing_deg : bearing_deg(here, at(state.mark));
+        const bearing = reported ? state.mark_bearing_deg : mavgate.bearing_deg(here, at(state.mark));
         this.way = `mark ${mavgate.show("distance", distance, 2).join(" ")}, ${Math.round(bearing) % 360}°`;
       }
       this.place = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;
@@ -272,11 +292,16 @@ export default {
       const all = tracks.reduce((sum, bounds) => sum.extend(bounds), L.latLngBounds([]));
       if (all.isValid()) this.map.fitBounds(all.pad(0.1));
     },
+    locate() {
+      if (!this.entered) return;
+      this.follow = false;
+      this.located ??= L.circleMarker([0, 0], { radius: 9, weight: 2, fill: false, interactive: false });
+      this.located.setStyle({ color: this.mark_colour }).setLatLng(at(this.entered)).addTo(this.map);
+      this.map.setView(at(this.entered), Math.max(this.map.getZoom(), 15), { animate: false });
+    },
     clear() {
-      for (const one of Object.values(this.craft)) {
-        one.track.setLatLngs([]);
-        one.fixes.clearLayers();
-      }
+      mavgate.clear_tracks();
+      this.stale = true;
     },
     async copy() {
       try {
@@ -294,10 +319,3 @@ export default {
     },
   },
 };
-
-function bearing_deg([lat, lon], [to_lat, to_lon]) {
-  const turn = (to_lon - lon) * rad;
-  const y = Math.sin(turn) * Math.cos(to_lat * rad);
-  const x = Math.cos(lat * rad) * Math.sin(to_lat * rad) - Math.sin(lat * rad) * Math.cos(to_lat * rad) * Math.cos(turn);
-  return (Math.atan2(y, x) / rad + 360) % 360;
-}

@@ -14,6 +14,8 @@ const SLOWEST_MS = 400;
 const LATE_MS = 45; // between two turns of the browser's own
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "Beside" };
 const SPAN_M = 2; // of the models
+const LEAST_HEIGHT_M = 0.3;
+const HEIGHT_ERROR_M = 5;
 const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
 const rad = Math.PI / 180;
 
@@ -121,57 +123,123 @@ function dart(main) {
 
 const MODELS = { plane, copter, heli: copter };
 
+// A line of some pixels' width, which WebGL's own lines do not have: a flat strip that faces the eye.
+const LINE_SHADER = `
+  uniform vec2 resolution;
+  uniform float width;
+  attribute vec3 begin;
+  attribute vec3 end;
+  varying float side;
+  void main() {
+    side = position.y;
+    vec4 from = projectionMatrix * modelViewMatrix * vec4(begin, 1.0);
+    vec4 to = projectionMatrix * modelViewMatrix * vec4(end, 1.0);
+    // What lies behind the eye is cut off at the near plane, where w is small but positive.
+    float near = 0.05;
+    if (from.w < near && to.w < near) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
+    if (from.w < near) from = mix(from, to, (near - from.w) / (to.w - from.w));
+    if (to.w < near) to = mix(to, from, (near - to.w) / (from.w - to.w));
+    vec2 along = (to.xy / to.w - from.xy / from.w) * resolution;
+    float size = length(along);
+    along = size > 1e-4 ? along / size : vec2(1.0, 0.0);
+    vec4 corner = position.x < 0.5 ? from : to;
+    vec2 away = vec2(-along.y, along.x) * position.y + along * (position.x - 0.5) * 0.8;
+    corner.xy += away * width / resolution * corner.w;
+    gl_Position = corner;
+  }`;
+
+// Soft edges, also where the machine's processor draws without antialiasing.
+const LINE_COLOUR = `
+  uniform vec3 colour;
+  uniform float opacity;
+  varying float side;
+  void main() {
+    gl_FragColor = vec4(colour, opacity * (1.0 - smoothstep(0.45, 1.0, abs(side))));
+    #include <colorspace_fragment>
+  }`;
+
+class WideLine {
+  constructor(colour, width, opacity) {
+    this.positions = new Float32Array(TAIL * 3);
+    const geometry = new THREE.InstancedBufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute([0, -1, 0, 1, -1, 0, 1, 1, 0, 0, 1, 0], 3));
+    geometry.setIndex([0, 1, 2, 0, 2, 3]);
+    this.buffer = new THREE.InstancedInterleavedBuffer(this.positions, 3, 1);
+    geometry.setAttribute("begin", new THREE.InterleavedBufferAttribute(this.buffer, 3, 0));
+    // The same numbers one point later.
+    this.later = new THREE.InstancedInterleavedBuffer(this.positions.subarray(3), 3, 1);
+    geometry.setAttribute("end", new THREE.InterleavedBufferAttribute(this.later, 3, 0));
+    this.material = new THREE.ShaderMaterial({
+      vertexShader: LINE_SHADER,
+      fragmentShader: LINE_COLOUR,
+      uniforms: { resolution: { value: new THREE.Vector2(1, 1) }, width: { value: width }, colour: { value: new THREE.Color(colour) }, opacity: { value: opacity } },
+      transparent: true, depthWrite: false, side: THREE.DoubleSide,
+    });
+    this.mesh = new THREE.Mesh(geometry, this.material);
+    this.mesh.frustumCulled = false;
+    this.show(0);
+  }
+  show(count) {
+    this.mesh.geometry.instanceCount = Math.max(0, count - 1);
+    this.mesh.visible = count > 1;
+    this.buffer.needsUpdate = this.later.needsUpdate = true;
+  }
+}
+
 class Path {
   constructor(scene, colour) {
-    this.positions = new Float32Array(TAIL * 3);
     this.count = 0;
-    const line = () => {
-      const geometry = new THREE.BufferGeometry();
-      geometry.setAttribute("position", new THREE.BufferAttribute(this.positions, 3));
-      return geometry;
-    };
-    this.line = new THREE.Line(line(), new THREE.LineBasicMaterial({ color: colour }));
-    this.shadow = new THREE.Line(line(), new THREE.LineBasicMaterial({ color: "#000000", transparent: true, opacity: 0.25 }));
-    this.shadow.scale.z = 0;
-    this.stalk = new THREE.Line(
-      new THREE.BufferGeometry().setFromPoints([new THREE.Vector3(), new THREE.Vector3()]),
-      new THREE.LineBasicMaterial({ color: colour, transparent: true, opacity: 0.5 }),
-    );
-    for (const part of this.parts()) {
-      part.frustumCulled = false;
-      scene.add(part);
-    }
+    this.version = -1;
+    this.read = 0;
+    this.line = new WideLine(colour, 3, 1);
+    this.shadow = new WideLine("#000000", 2.4, 0.25);
+    this.stalk = new WideLine(colour, 2, 0.6);
+    this.lines = [this.line, this.shadow, this.stalk];
+    for (const part of this.parts()) scene.add(part);
   }
   parts() {
-    return [this.line, this.shadow, this.stalk];
+    return this.lines.map((line) => line.mesh);
+  }
+  resize(width, height) {
+    for (const line of this.lines) line.material.uniforms.resolution.value.set(width, height);
+  }
+  // Bring the drawn path up to date with that of the telemetry.
+  update(track, place) {
+    if (this.version !== track.version) {
+      this.version = track.version;
+      this.count = 0;
+      this.read = Math.max(0, track.points.length - TAIL / 2);
+    }
+    if (this.read === track.points.length) return;
+    for (; this.read < track.points.length; this.read++) this.add(place(...track.points[this.read]));
+    for (const line of [this.line, this.shadow]) line.show(this.count);
   }
   add(point) {
-    const n = this.count;
-    if (n) {
-      const [x, y, z] = this.positions.subarray((n - 1) * 3, n * 3);
+    const at = this.line.positions;
+    if (this.count) {
+      const [x, y, z] = at.subarray((this.count - 1) * 3, this.count * 3);
       if (Math.hypot(point.x - x, point.y - y, point.z - z) < STEP_M) return;
     }
-    if (n === TAIL) {
+    if (this.count === TAIL) {
       // The older half goes, so that moving it is seldom.
-      this.positions.copyWithin(0, (TAIL / 2) * 3);
+      for (const line of [this.line, this.shadow]) line.positions.copyWithin(0, (TAIL / 2) * 3);
       this.count = TAIL / 2;
     }
-    this.positions.set([point.x, point.y, point.z], this.count * 3);
+    at.set([point.x, point.y, point.z], this.count * 3);
+    this.shadow.positions.set([point.x, point.y, 0.02], this.count * 3);
     this.count += 1;
-    for (const part of [this.line, this.shadow]) {
-      part.geometry.setDrawRange(0, this.count);
-      part.geometry.attributes.position.needsUpdate = true;
-    }
   }
   end(point) {
-    this.stalk.geometry.attributes.position.setXYZ(0, point.x, point.y, point.z);
-    this.stalk.geometry.attributes.position.setXYZ(1, point.x, point.y, 0);
-    this.stalk.geometry.attributes.position.needsUpdate = true;
+    this.stalk.positions.set([point.x, point.y, point.z, point.x, point.y, 0]);
+    this.stalk.show(2);
   }
-  clear() {
-    this.count = 0;
-    for (const part of [this.line, this.shadow]) part.geometry.setDrawRange(0, 0);
-  }
+}
+
+// The height above home at which something is drawn. The error of a height near the ground must not
+// hide an aircraft in it; a field that really lies below home is seen through the ground.
+function drawn_height(height) {
+  if (height >= LEAST_HEIGHT_M) return height;
+  return height > -HEIGHT_ERROR_M ? LEAST_HEIGHT_M : height + HEIGHT_ERROR_M + LEAST_HEIGHT_M;
 }
 
 export default {
@@ -238,8 +306,9 @@ export default {
       this.sun.position.set(-60, -40, 90);
       this.fill = new THREE.HemisphereLight("#ffffff", "#88775f", 1.6);
       this.scene.add(this.sun, this.fill);
-      this.ground = new THREE.Mesh(new THREE.CircleGeometry(8000, 48), new THREE.MeshBasicMaterial());
+      this.ground = new THREE.Mesh(new THREE.CircleGeometry(8000, 48), new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.72, depthWrite: false, side: THREE.DoubleSide }));
       this.ground.position.z = -0.3;
+      this.ground.renderOrder = -1;
       this.fine = new THREE.GridHelper(1000, 100);
       this.coarse = new THREE.GridHelper(16000, 160);
       this.coarse.position.z = -0.15;
@@ -288,23 +357,23 @@ export default {
       let east = lon - o.lon;
       if (east > 180) east -= 360;
       if (east < -180) east += 360;
-      return new THREE.Vector3(east * rad * cos * EARTH_M, (lat - o.lat) * rad * EARTH_M, alt - o.alt);
+      return new THREE.Vector3(east * rad * cos * EARTH_M, (lat - o.lat) * rad * EARTH_M, drawn_height(alt - o.alt));
     },
     take() {
       const now_ms = performance.now();
-      for (const [id, state] of Object.entries(mavgate.vehicles)) {
-        if (state.lat_deg === null || state.alt_amsl_m === null) continue;
+      for (const id of Object.keys(mavgate.vehicles)) {
+        const state = mavgate.shown(id);
+        if (!state || state.lat_deg === null || state.alt_amsl_m === null) continue;
         this.set_origin(state);
         const known = this.aircraft[id];
-        if (known && (known.model !== state.model || known.generation !== state.generation)) this.forget(id);
+        if (known && known.model !== state.model) this.forget(id);
         const craft = (this.aircraft[id] ??= this.make(id, state));
         const point = this.place(state.lat_deg, state.lon_deg, state.alt_amsl_m);
         if (!craft.point || craft.point.distanceToSquared(point) > 0) {
-          if (craft.point && craft.point.distanceTo(point) > 500) craft.path.clear();
           craft.point = point;
           craft.moved_ms = now_ms;
-          craft.path.add(point);
         }
+        craft.path.update(mavgate.track(id), (...spot) => this.place(...spot));
         craft.state = state;
         craft.turned_ms = now_ms;
       }
@@ -324,24 +393,14 @@ export default {
         for (const id of Object.keys(this.aircraft)) this.forget(id);
       }
     },
-    make(id, { model, origin, generation }) {
-      const main = id === mavgate.selected ? "#f2f5f7" : "#b9c6d1";
-      const group = (MODELS[model] ?? dart)(main, "#e0592a");
+    make(id, { model, origin }) {
+      const main = mavgate.colour(id === mavgate.selected ? "craft" : "craft-other");
+      const group = (MODELS[model] ?? dart)(main, mavgate.colour("craft-trim"));
       group.userData.yardstick = SPAN_M;
       this.scene.add(group);
-      const craft = { group, model, generation, path: new Path(this.scene, mavgate.colour(COLOURS[origin] ?? "track")), state: null, point: null };
+      const craft = { group, model, path: new Path(this.scene, mavgate.colour(COLOURS[origin] ?? "track")), state: null, point: null };
       craft.pose = new THREE.Quaternion();
-      this.fetch_path(id, craft);
       return craft;
-    },
-    async fetch_path(id, craft) {
-      const answer = await fetch(`/path/${id}`);
-      if (!answer.ok) return;
-      const { track } = await answer.json();
-      const since = Array.from(craft.path.positions.subarray(0, craft.path.count * 3));
-      craft.path.clear();
-      for (const [lat, lon, alt] of track.slice(-TAIL / 2)) craft.path.add(this.place(lat, lon, alt));
-      for (let i = 0; i < since.length; i += 3) craft.path.add(new THREE.Vector3(...since.slice(i, i + 3)));
     },
     forget(id) {
       const craft = this.aircraft[id];
@@ -386,6 +445,8 @@ export default {
         if (craft?.state) this.aim(view, camera, craft, i);
         for (const other of Object.values(this.aircraft)) this.scale(other, camera, view, other === craft);
         camera.updateProjectionMatrix();
+        const ratio = this.renderer.getPixelRatio();
+        for (const other of Object.values(this.aircraft)) other.path.resize(...size.map((pixels) => pixels * ratio));
         this.renderer.setViewport(...corner, ...size);
         this.renderer.setScissor(...corner, ...size);
         this.renderer.render(this.scene, camera);

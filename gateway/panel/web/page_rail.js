@@ -11,11 +11,12 @@ export default {
         <i class="q-icon material-icons" aria-hidden="true">{{ view.icon }}</i><span>{{ view.title }}</span>
       </button>
     </nav>`,
-  props: { views: Array, units: String, system_id: Number },
+  props: { views: Array, units: String, system_id: Number, page: String },
   data() {
     return { current: this.views[0].key };
   },
   mounted() {
+    mavgate.connect(this.page);
     this.$watch("units", (units) => (mavgate.units = units), { immediate: true });
     this.$watch("system_id", (id) => mavgate.select(id ?? null), { immediate: true });
     this.on_key = (event) => this.key(event);

@@ -7,6 +7,8 @@ const KEPT_MS = 300_000;
 const FOLLOW_MS = 200;
 const LIGHT = ["#0072b2", "#d55e00", "#009e73", "#a3337a", "#9a6400", "#3d4a57"];
 const DARK = ["#56b4e9", "#f09a3e", "#3ec9a0", "#e38ac0", "#f0e442", "#c3ced8"];
+// The gateway's clock less the browser's, and so the same time axis, for all charts of a page.
+let offset_ms = 0;
 const DASHES = ["solid", "dashed", "dotted", [8, 3, 2, 3], [12, 4], [2, 6]];
 
 export default {
@@ -18,7 +20,6 @@ export default {
     this.data = [];
     this.windowMs = 60_000;
     this.paused = false;
-    this.offsetMs = 0;
     this.chart = echarts.init(this.$el, null, { renderer: "canvas" });
     this.chart.on("datazoom", () => this.noteZoom());
     this.sizes = new ResizeObserver(() => this.chart.resize());
@@ -44,7 +45,8 @@ export default {
       this.layOut();
     },
     append(data, now_ms) {
-      this.offsetMs = now_ms - Date.now();
+      const offset = now_ms - Date.now();
+      if (Math.abs(offset - offset_ms) > FOLLOW_MS) offset_ms = offset;
       data.forEach(([times, values], n) => {
         const kept = this.data[n];
         if (!kept) return;
@@ -77,7 +79,7 @@ export default {
       return this.chart.getDataURL({ type: "png", pixelRatio: 2, backgroundColor: this.colour("card") });
     },
     now() {
-      return Date.now() + this.offsetMs;
+      return Math.floor(Date.now() / FOLLOW_MS) * FOLLOW_MS + offset_ms;
     },
     colour(name) {
       return getComputedStyle(document.body).getPropertyValue(`--${name}`).trim();
@@ -131,9 +133,10 @@ export default {
           animation: false,
           color: dark ? DARK : LIGHT,
           textStyle: { fontFamily: "system-ui, Roboto, sans-serif" },
-          grid: { left: 8, right: 12 + 48 * Math.max(0, right - 1), top: 30, bottom: 8, containLabel: true },
+          // The same margins in every chart, so that times stand below each other.
+          grid: { left: 62, right: 56 + 48 * Math.max(0, right - 1), top: 30, bottom: 26 },
           legend: {
-            show: this.fields.length > 0, top: 2, left: 48, type: "scroll", itemWidth: 22, itemHeight: 8,
+            show: this.fields.length > 0, top: 2, left: 84, type: "scroll", itemWidth: 22, itemHeight: 8,
             textStyle: { ...text, color: ink }, pageTextStyle: text, pageIconColor: ink,
           },
           tooltip: {
@@ -160,7 +163,7 @@ export default {
           ],
           series: this.fields.map(({ name, unit }, n) => ({
             type: "line", name, symbol: "none", yAxisIndex: units.indexOf(unit), showSymbol: false, sampling: "lttb",
-            lineStyle: { width: 1.6, type: DASHES[n % DASHES.length] }, data: this.data[n],
+            lineStyle: { width: 2, type: DASHES[n % DASHES.length] }, data: this.data[n],
           })),
         },
         { notMerge: true },

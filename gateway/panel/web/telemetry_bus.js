@@ -1,5 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
-// The page's telemetry: one WebSocket, the newest state of every aircraft, and who wants to know.
+// The page's telemetry: the newest state of every aircraft, its path, its past, and who subscribes.
+//
+// A page of the panel calls connect(), after which states come over one WebSocket; a page that
+// contains a whole flight sets `histories` and calls seek() instead.
 (() => {
   const FACTORS = {
     metric: { speed: [1, "m/s"], altitude: [1, "m"], climb: [1, "m/s"], length: [1, "m"], distance: [1000, "km"] },
@@ -7,7 +10,13 @@
     aviation: { speed: [1852 / 3600, "kt"], altitude: [0.3048, "ft"], climb: [0.3048 / 60, "ft/min"], length: [0.3048, "ft"], distance: [1852, "NM"] },
   };
   const FAR_M = 1000;
+  const GAP_US = 1_500_000; // a longer gap in the states is filled from the server's path
+  const STEP_M = 1;
+  const MAX_POINTS = 20000;
+  const EARTH_M = 6378137;
+  const rad = Math.PI / 180;
   const subscribers = new Set();
+  const tracks = {};
 
   const bus = {
     vehicles: {},
@@ -16,6 +25,9 @@
     units: "metric",
     connected: false,
     received_ms: 0,
+    now_us: 0,
+    past_us: null, // the moment of the past that is shown instead of the present
+    histories: {},
 
     subscribe(callback) {
       subscribers.add(callback);
@@ -24,8 +36,7 @@
     },
     select(system_id) {
       bus.selected = system_id === null ? null : String(system_id);
-      bus.state = bus.vehicles[bus.selected] ?? null;
-      publish();
+      bus.seek(null);
     },
     // Value of SI in the page's units: [text, unit].
     show(quantity, value, digits = 1) {
@@ -49,6 +60,41 @@
       observer.observe(document.body, { attributes: true, attributeFilter: ["class"] });
       return () => observer.disconnect();
     },
+    // The state of an aircraft that is shown: the present one, or of the past for the selected one.
+    shown: (id) => (id === bus.selected && bus.past_us !== null ? bus.state : bus.vehicles[id]),
+    // The path of an aircraft: `points` and `fixes` as [lat, lon, alt]. They only grow at their end
+    // while `version` stays.
+    track: (id) => (tracks[id] ??= new_track()),
+    clear_tracks() {
+      for (const track of Object.values(tracks)) reset(track);
+    },
+    distance_m(a, b) {
+      const north = (b[0] - a[0]) * rad * EARTH_M;
+      const east = ((((b[1] - a[1] + 540) % 360) + 360) % 360 - 180) * rad * EARTH_M * Math.cos(a[0] * rad);
+      return Math.hypot(north, east);
+    },
+    bearing_deg([lat, lon], [to_lat, to_lon]) {
+      const turn = (to_lon - lon) * rad;
+      const y = Math.sin(turn) * Math.cos(to_lat * rad);
+      const x = Math.cos(lat * rad) * Math.sin(to_lat * rad) - Math.sin(lat * rad) * Math.cos(to_lat * rad) * Math.cos(turn);
+      return (Math.atan2(y, x) / rad + 360) % 360;
+    },
+    // Shows a moment of the past of the selected aircraft; null is the present.
+    seek(time_us) {
+      bus.past_us = time_us;
+      choose_state();
+      publish();
+    },
+    async load_history(id) {
+      const answer = await fetch(`/history/${id}`);
+      if (!answer.ok) return null;
+      return (bus.histories[id] = await answer.json());
+    },
+    connect(page = "") {
+      if (connecting) return;
+      connecting = true;
+      open(page);
+    },
   };
   window.mavgate = bus;
 
@@ -62,10 +108,107 @@
     }
   }
 
+  function choose_state() {
+    const now = bus.vehicles[bus.selected] ?? null;
+    const history = bus.histories[bus.selected];
+    bus.state = bus.past_us === null || !history ? now : state_at(history, bus.past_us, now);
+  }
+
+  // The state at a moment of a history, between its rows; what it does not contain is of `now`.
+  function state_at(history, time_us, now) {
+    const times = history.time_us;
+    let low = 0;
+    let high = times.length - 1;
+    while (low < high) {
+      const middle = (low + high + 1) >> 1;
+      if (times[middle] <= time_us) low = middle;
+      else high = middle - 1;
+    }
+    const next = Math.min(low + 1, times.length - 1);
+    const span = times[next] - times[low];
+    const share = span > 0 && span < 3 * GAP_US ? Math.min(1, Math.max(0, (time_us - times[low]) / span)) : 0;
+    const state = { ...now, time_us, silent_s: 0, fix: null, mark: now?.mark ?? null };
+    for (const [name, column] of Object.entries(history)) {
+      if (name === "time_us") continue;
+      const [field, index] = name.split(".");
+      const [a, b] = [column[low], column[next]];
+      let value = a === null || b === null ? a : a + (b - a) * share;
+      if (field === "heading_deg" && a !== null && b !== null) value = (a + ((((b - a + 540) % 360) + 360) % 360 - 180) * share + 360) % 360;
+      if (index === undefined) state[field] = value;
+      else (state[field] = index === "0" ? [] : state[field])[index] = value;
+    }
+    const [p, q] = [low, next].map((row) => [0, 1, 2, 3].map((n) => history[`q_nb.${n}`][row]));
+    if (p[0] !== null && q[0] !== null) {
+      const sign = p.reduce((sum, v, n) => sum + v * q[n], 0) < 0 ? -1 : 1;
+      const mixed = p.map((v, n) => v + (sign * q[n] - v) * share);
+      const norm = Math.hypot(...mixed);
+      state.q_nb = mixed.map((v) => v / norm);
+    }
+    return state;
+  }
+  bus.state_at = state_at;
+
+  function new_track() {
+    return { points: [], fixes: [], version: 0, generation: null, time_us: null, loading: false, fix: "" };
+  }
+
+  function reset(track) {
+    track.points = [];
+    track.fixes = [];
+    track.fix = "";
+    track.version += 1;
+  }
+
+  function follow(id, state) {
+    const track = bus.track(id);
+    if (track.generation !== state.generation) {
+      if (track.generation !== null) reset(track);
+      track.generation = state.generation;
+    }
+    if (state.lat_deg === null) return;
+    // Also after another view was shown: the server has what came meanwhile.
+    if (track.time_us === null || bus.now_us - track.time_us > GAP_US) fill(id, track);
+    track.time_us = bus.now_us;
+    add(track, [state.lat_deg, state.lon_deg, state.alt_amsl_m ?? 0]);
+    if (state.fix && track.fix !== (track.fix = `${state.fix.lat_deg} ${state.fix.lon_deg}`)) {
+      track.fixes.push([state.fix.lat_deg, state.fix.lon_deg]);
+    }
+  }
+
+  function add(track, point) {
+    const last = track.points.at(-1);
+    if (last && bus.distance_m(last, point) < STEP_M && Math.abs(last[2] - point[2]) < STEP_M) return;
+    track.points.push(point);
+    if (track.points.length > MAX_POINTS) {
+      track.points.splice(0, MAX_POINTS / 4);
+      track.version += 1;
+    }
+  }
+
+  async function fill(id, track) {
+    if (track.loading) return;
+    track.loading = true;
+    const from = track.points.length;
+    try {
+      const answer = await fetch(`/path/${id}`);
+      if (!answer.ok) return;
+      const { track: points, fixes } = await answer.json();
+      const since = track.points.slice(from);
+      reset(track);
+      for (const point of [...points, ...since]) add(track, point);
+      track.fixes = fixes.slice(-MAX_POINTS);
+    } catch {
+      track.time_us = null;
+    } finally {
+      track.loading = false;
+    }
+  }
+
+  let connecting = false;
   let wait_ms = 250;
-  function connect() {
+  function open(page) {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
-    const socket = new WebSocket(`${scheme}://${location.host}/telemetry`);
+    const socket = new WebSocket(`${scheme}://${location.host}/telemetry?page=${encodeURIComponent(page)}`);
     socket.onopen = () => {
       wait_ms = 250;
       bus.connected = true;
@@ -73,16 +216,18 @@
     socket.onmessage = (event) => {
       const news = JSON.parse(event.data);
       bus.vehicles = news.vehicles;
+      bus.now_us = news.time_us;
       bus.received_ms = performance.now();
-      bus.state = bus.vehicles[bus.selected] ?? null;
+      for (const [id, state] of Object.entries(news.vehicles)) follow(id, state);
+      for (const id of Object.keys(tracks)) if (!(id in news.vehicles)) delete tracks[id];
+      if (bus.past_us === null) choose_state();
       publish();
       if (socket.readyState === WebSocket.OPEN) socket.send("1");
     };
     socket.onclose = () => {
       bus.connected = false;
-      setTimeout(connect, wait_ms);
+      setTimeout(open, wait_ms, page);
       wait_ms = Math.min(wait_ms * 2, 4000);
     };
   }
-  connect();
 })();

@@ -7,8 +7,7 @@ from typing import Final
 from nicegui import ui
 
 from gateway.clock import unix_time_us
-from gateway.panel.state.field_csv import fields_csv
-from gateway.panel.state.field_history import FloatArray, IntArray
+from gateway.panel.state.fields import FloatArray, IntArray, fields_csv, shown_unit
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.printable import printable
 
@@ -99,7 +98,7 @@ class LiveChart:
             return
         self._sent_us = {}
         history, system_id = self._context.parts.history, self._context.system_id or 0
-        named = [(name, history.unit(system_id, name)) for name in self.fields]
+        named = [(name, shown_unit(history.unit(system_id, name))[1]) for name in self.fields]
         self.element.set_fields(named, self._news(), unix_time_us() / 1000)
 
     def refresh(self) -> None:
@@ -119,8 +118,12 @@ class LiveChart:
         zero_us = self._zero_unix_us()
         history, system_id = self._context.parts.history, self._context.system_id or 0
         begin_us, end_us = round(begin_ms * 1000) - zero_us, round(end_ms * 1000) - zero_us
-        series = {name: history.series(system_id, name, begin_us, end_us) for name in self.fields}
-        units = {name: history.unit(system_id, name) for name in self.fields}
+        shown = {name: shown_unit(history.unit(system_id, name)) for name in self.fields}
+        series = {}
+        for name, (factor, _) in shown.items():
+            time_us, values = history.series(system_id, name, begin_us, end_us)
+            series[name] = (time_us, values * factor)
+        units = {name: unit for name, (_, unit) in shown.items()}
         return fields_csv(series, units, zero_us)
 
     def _on_ready(self) -> None:
@@ -137,7 +140,8 @@ class LiveChart:
             time_us, values = history.series(system_id, name, self._sent_us.get(name, -1))
             if len(time_us):
                 self._sent_us[name] = int(time_us[-1])
-            found.append(((time_us + zero_us) // 1000, values))
+            factor, _ = shown_unit(history.unit(system_id, name))
+            found.append(((time_us + zero_us) // 1000, values * factor))
         return found
 
 

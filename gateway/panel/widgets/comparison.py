@@ -9,7 +9,7 @@ from nicegui import ui
 from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
 from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
-from gateway.panel.state.field_history import FloatArray, IntArray
+from gateway.panel.state.fields import FloatArray, IntArray
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets.charts import StripChart
 from gateway.panel.widgets.prompts import heading

@@ -6,8 +6,8 @@ from typing import Any
 from nicegui import ui
 
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.state.dialogue.parameter_client import is_same_value
-from gateway.panel.state.dialogue.parameter_meta import ParameterMeta
+from gateway.panel.state.fields import unit_text
+from gateway.panel.state.parameters import ParameterMeta, is_same_value
 from gateway.panel.view_context import NotAllowedError, ViewContext
 from gateway.printable import printable
 
@@ -74,7 +74,7 @@ class ParameterRow:
             field = ui.select(options, value=value, on_change=lambda e: self._set(e.value))
             field.props("dense outlined options-dense")
         else:
-            field = ui.number(value=value, suffix=printable(meta.unit), format="%.7g")
+            field = ui.number(value=value, suffix=printable(unit_text(meta.unit)), format="%.7g")
             field.props("dense outlined step=any hide-bottom-space")
             # Only a finished value is sent, not each typed digit.
             field.on("keydown.enter", lambda: self._set(field.value))
@@ -106,9 +106,9 @@ def _range_of(meta: ParameterMeta) -> str:
     if math.isfinite(meta.low) or math.isfinite(meta.high):
         low = f"{meta.low:g}" if math.isfinite(meta.low) else "any"
         high = f"{meta.high:g}" if math.isfinite(meta.high) else "any"
-        parts.append(f"{low} to {high} {meta.unit}".strip())
+        parts.append(f"{low} to {high} {unit_text(meta.unit)}".strip())
     elif meta.unit:
-        parts.append(meta.unit)
+        parts.append(unit_text(meta.unit))
     if math.isfinite(meta.default):
         word = next((text for number, text in meta.choices if number == meta.default), None)
         parts.append(f"default {word or f'{meta.default:g}'}")

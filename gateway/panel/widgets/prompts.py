@@ -8,7 +8,7 @@ from nicegui import ui
 from nicegui.elements.mixins.text_element import TextElement
 
 from gateway.live.control_socket import ControlError
-from gateway.panel.recording_player import PlaybackError
+from gateway.panel.playback import PlaybackError
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext
 from gateway.printable import printable

@@ -24,9 +24,9 @@ from gateway.hub.settings import HubSettings
 from gateway.panel.access import COOKIE, AccessControl, Logins, hash_password
 from gateway.panel.api.rest import RestApi
 from gateway.panel.api.stream import MAX_WAITING_BYTES, MessageStream, Subscriber
-from gateway.panel.control_client import ControlClient
+from gateway.panel.gateway_client import ControlClient
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.state.fleet_picture import FleetPicture
+from gateway.panel.state.fleet import FleetState
 from gateway.panel.uplink import Uplink
 from gateway.records import Incoming, Outgoing
 from gateway.wire.mavlink_json import template
@@ -84,7 +84,7 @@ async def open_world(folder: Path, settings: PanelSettings) -> AsyncIterator[Wor
     clock = GatewayClock()
     hub = Hub(HubSettings(endpoints=("udp-listen:127.0.0.1:0",)), heard.append, clock)
     hub.start()
-    fleet, control = FleetPicture(), ControlClient(folder / "none")
+    fleet, control = FleetState(), ControlClient(folder / "none")
     uplink = Uplink(f"udp:127.0.0.1:{hub.listening_ports()[0]}", fleet, control, clock)
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url="/docs.json")
     for router in RestApi(uplink).routers():

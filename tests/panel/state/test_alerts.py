@@ -3,7 +3,7 @@ from typing import Any
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.alerts import AlertLevel, alerts_of
-from gateway.panel.state.vehicle_picture import VehiclePicture
+from gateway.panel.state.vehicle import VehicleState
 from gateway.units import US_PER_S
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
@@ -15,16 +15,16 @@ def gps(fix_type: int) -> Any:
     )
 
 
-def say(picture: VehiclePicture, text: str, now_us: int, severity: int = 2) -> None:
+def say(picture: VehicleState, text: str, now_us: int, severity: int = 2) -> None:
     picture.take(mavlink.MAVLink_statustext_message(severity, text.encode()), now_us)
 
 
-def titles(picture: VehiclePicture, now_us: int) -> list[str]:
+def titles(picture: VehicleState, now_us: int) -> list[str]:
     return [alert.title for alert in alerts_of(picture, now_us)]
 
 
-def picture_at(now_us: int = 0) -> VehiclePicture:
-    picture = VehiclePicture(1)
+def picture_at(now_us: int = 0) -> VehicleState:
+    picture = VehicleState(1)
     picture.take(HEARTBEAT, now_us)
     return picture
 

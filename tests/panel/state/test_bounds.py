@@ -5,10 +5,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.field_history import FieldHistory
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.sample_memory import SPAN_US, SampleMemory
-from gateway.panel.state.vehicle_picture import MAX_TRACK
+from gateway.panel.state.fields import FieldHistory
+from gateway.panel.state.fleet import SPAN_US, FleetState, SampleMemory
+from gateway.panel.state.vehicle import MAX_TRACK
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 
@@ -20,7 +19,7 @@ class Memory:
     """All that is kept by aircraft, fed on a manual clock."""
 
     def __init__(self) -> None:
-        self.fleet, self.history, self.samples = FleetPicture(), FieldHistory(), SampleMemory()
+        self.fleet, self.history, self.samples = FleetState(), FieldHistory(), SampleMemory()
         for listener in (self.history.take, self.samples.take):
             self.fleet.listen(listener)
         for forget in (self.history.forget, self.samples.forget):

@@ -1,6 +1,6 @@
 import numpy as np
 
-from gateway.panel.state.field_csv import fields_csv
+from gateway.panel.state.fields import fields_csv
 
 
 def test_fields_that_came_at_other_times_share_a_table() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.field_history import MAX_ROWS, SPAN_US, FieldHistory
+from gateway.panel.state.fields import MAX_ROWS, SPAN_US, FieldHistory
 from gateway.units import US_PER_S
 
 

@@ -2,8 +2,7 @@ from typing import Any
 
 import pytest
 
-from gateway.panel.state.alerts import Alert, AlertLevel
-from gateway.panel.state.gateway_alerts import with_status
+from gateway.panel.state.alerts import Alert, AlertLevel, with_status
 from gateway.units import US_PER_S
 
 NOW_US = 100 * US_PER_S

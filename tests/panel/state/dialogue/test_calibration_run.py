@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.dialogue.calibration_run import (
+from gateway.panel.state.calibration import (
+    CELLS,
     SIDES,
     CalibrationRun,
     CalibrationStep,
     RunState,
+    seen_cells,
 )
-from gateway.panel.state.dialogue.sphere_cover import CELLS, seen_cells
 from gateway.records import Incoming, Vec3
 from gateway.units import US_PER_S
 from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES

@@ -5,14 +5,15 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import EstimationSettings
-from gateway.panel.state.dialogue.file_client import FileClient
-from gateway.panel.state.dialogue.parameter_client import (
+from gateway.panel.state.files import FileClient
+from gateway.panel.state.parameters import (
     MAX_ATTEMPTS,
     MAX_PARAMETERS,
     ListState,
     ParameterClient,
+    parameter_path,
+    parse_parameters,
 )
-from gateway.panel.state.dialogue.parameter_meta import parameter_path, parse_parameters
 from gateway.records import Incoming
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S

@@ -1,29 +1,137 @@
-"""State of one aircraft from MAVLink: the newest of each message, its path, its texts."""
+"""State of one aircraft from MAVLink: the newest of each message, its history, its texts."""
 
 import math
+from array import array
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import msgspec
 import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
-from gateway.panel.state.instant import Instant, Spot
-from gateway.panel.state.status_texts import StatusTexts
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
 from gateway.vehicle.location import is_on_earth
 
+
+class Spot(msgspec.Struct, frozen=True):
+    """A position; its height is NaN if unknown."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float = NAN
+
+
+class Instant(msgspec.Struct, frozen=True, kw_only=True):
+    """State of an aircraft at one moment.
+
+    Everything is the newest from MAVLink, of any sender; NaN (null in the browser) means unknown.
+    """
+
+    system_id: int
+    time_us: int
+    """When the newest attitude or position came, on the panel's clock."""
+    model: str
+    """`plane`, `copter`, `heli`, `rover`, `boat` or `none`; see `VehicleState`."""
+    origin: str
+    """`live`, `recorded` or `fused again`."""
+    generation: int
+    """How often its path was restarted."""
+    silent_s: float
+    """Since the newest heartbeat."""
+    q_nb: tuple[float, float, float, float]
+    """Attitude, scalar first, body FRD to NED."""
+    rate_b_radps: tuple[float, float, float]
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    alt_home_m: float
+    """Above home."""
+    vel_n_mps: tuple[float, float, float]
+    groundspeed_mps: float
+    airspeed_mps: float
+    """Unknown where the vehicle sends its ground speed for want of a sensor."""
+    climb_mps: float
+    heading_deg: float
+    pos_std_m: float
+    """Horizontal standard deviation of the position, root of the sum of both axes."""
+    fix_type: int
+    """GPS_FIX_TYPE; 0 without a GPS."""
+    satellites: int
+    fix: Spot | None
+    """Newest GPS fix of two dimensions or more."""
+    home: Spot | None
+    mark: Spot | None
+    mark_distance_m: float
+    mark_bearing_deg: float
+    battery_v: float
+    battery_percent: float
+    armed: bool
+    attitude_s: float
+    """Age of the newest attitude, as the others below."""
+    position_s: float
+    hud_s: float
+    gps_s: float
+    battery_s: float
+
+
+CHUNK: Final = 50
+"""Letters of one message; a shorter one, or one with a zero, ends its text."""
+MAX_TEXTS: Final = 500
+MAX_LETTERS: Final = 2_000
+"""Longer texts are cut there."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedText:
+    """One text."""
+
+    number: int
+    """Counts up from 1, so that a page knows which are new."""
+    time_us: int
+    """On the panel's clock."""
+    severity: int
+    """MAV_SEVERITY: 0 emergency to 7 debug."""
+    text: str
+
+
+class StatusTexts:
+    """The texts of one aircraft, the oldest first."""
+
+    def __init__(self) -> None:
+        self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
+        self._count = 0
+        self._open: tuple[int, int] | None = None
+        """Id and next chunk of the newest entry, while it is incomplete."""
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
+        text, number, chunk = message.text, message.id, message.chunk_seq
+        if self._open == (number, chunk) and self.all:
+            joined = (self.all[-1].text + text)[:MAX_LETTERS]
+            self.all[-1] = replace(self.all[-1], text=joined)
+        elif text.strip():
+            self._count += 1
+            self.all.append(TimedText(self._count, now_us, message.severity, text))
+        else:
+            self._open = None
+            return
+        continues = number and len(text) == CHUNK
+        self._open = (number, chunk + 1) if continues else None
+
+
 DEGE7: Final = 1e7
 MM: Final = 1e3
 CM: Final = 1e2
+UNKNOWN_MV: Final = 65535
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 
 MAX_TRACK: Final = 20_000
-"""Points of a path: more than an hour at 5 Hz; the oldest are dropped."""
+"""Moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
 TRACK_INTERVAL_US: Final = 200_000
 ATTITUDE_FRESH_US: Final = US_PER_S
 """The quaternion is preferred to the angles unless it is older than this."""
@@ -31,6 +139,21 @@ ATTITUDE_FRESH_US: Final = US_PER_S
 PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
 COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
 OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat", 12: "boat"}
+
+
+HISTORY_COLUMNS: Final = {
+    "lat_deg": "d", "lon_deg": "d",
+    **dict.fromkeys(
+        (
+            "alt_amsl_m", "alt_home_m", "q_nb.0", "q_nb.1", "q_nb.2", "q_nb.3", "rate_b_radps.0",
+            "rate_b_radps.1", "rate_b_radps.2", "vel_n_mps.0", "vel_n_mps.1", "vel_n_mps.2",
+            "groundspeed_mps", "airspeed_mps", "climb_mps", "heading_deg", "pos_std_m", "fix_type",
+            "satellites", "mark_distance_m", "mark_bearing_deg", "battery_v", "battery_percent",
+        ),
+        "f",
+    ),
+}  # fmt: skip
+"""Columns of a history and their type: fields of `Instant`, `.n` for one of several numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +167,45 @@ class PathPoint:
     alt_amsl_m: float
 
 
-class VehiclePicture:
+class FlightHistory:
+    """States of one aircraft as columns over time."""
+
+    def __init__(self) -> None:
+        self.time_us = array("q")
+        self.columns = {name: array(kind) for name, kind in HISTORY_COLUMNS.items()}
+
+    def __len__(self) -> int:
+        return len(self.time_us)
+
+    @property
+    def newest_us(self) -> int:
+        """Time of the newest state; far in the past without any."""
+        return self.time_us[-1] if self.time_us else -TRACK_INTERVAL_US
+
+    def add(self, time_us: int, now: Instant) -> None:
+        """Add the state of one moment."""
+        self.time_us.append(time_us)
+        for name, column in self.columns.items():
+            field, _, index = name.partition(".")
+            value = getattr(now, field)
+            column.append(value[int(index)] if index else value)
+        if len(self.time_us) > MAX_TRACK:
+            # A quarter at once, so that moving the rest is seldom.
+            for column in (self.time_us, *self.columns.values()):
+                del column[: MAX_TRACK // 4]
+
+    def clear(self) -> None:
+        """Delete all states."""
+        for column in (self.time_us, *self.columns.values()):
+            del column[:]
+
+    def track(self) -> list[tuple[float, float, float]]:
+        """Return latitude, longitude and height AMSL of all moments."""
+        names = ("lat_deg", "lon_deg", "alt_amsl_m")
+        return list(zip(*(self.columns[name] for name in names), strict=True))
+
+
+class VehicleState:
     """Everything known about one system.
 
     Parameters
@@ -67,8 +228,8 @@ class VehiclePicture:
         """The newest message of its autopilot by name, as pymavlink decodes it."""
         self.heard_us: dict[str, int] = {}
         """When that came, on the panel's clock in µs."""
-        self.track: deque[PathPoint] = deque(maxlen=MAX_TRACK)
-        """Fused positions, a few a second."""
+        self.history = FlightHistory()
+        """Its states so far, a few a second."""
         self.fixes: deque[PathPoint] = deque(maxlen=MAX_TRACK)
         """GPS fixes."""
         self.texts = StatusTexts()
@@ -107,11 +268,16 @@ class VehiclePicture:
         name = f"{kind} {self.number}"
         return name if self.origin == "live" else f"{name}, {self.origin}"
 
-    def begin_anew(self) -> None:
+    def restart_path(self) -> None:
         """Restart the path, as after a seek in a recording."""
-        self.track.clear()
+        self.history.clear()
         self.fixes.clear()
         self.generation += 1
+
+    def _age_s(self, now_us: int, *names: str) -> float:
+        """Return the age of the newest of some messages; NaN if none came."""
+        heard_us = max((self.heard_us[name] for name in names if name in self.heard_us), default=0)
+        return (now_us - heard_us) / US_PER_S if heard_us else NAN
 
     def silent_s(self, now_us: int) -> float:
         """Return how long no heartbeat came; infinite if none ever did."""
@@ -140,7 +306,7 @@ class VehiclePicture:
         get = self.newest.get
         q_nb, rates = self._attitude()
         place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
-        fix = get("GPS_RAW_INT")
+        fix, beat = get("GPS_RAW_INT"), get("HEARTBEAT")
         mark, distance_m, bearing_deg = self._mark()
         return Instant(
             system_id=self.system_id,
@@ -168,6 +334,13 @@ class VehiclePicture:
             mark=mark,
             mark_distance_m=distance_m,
             mark_bearing_deg=bearing_deg,
+            **_battery(get("BATTERY_STATUS"), get("SYS_STATUS")),
+            attitude_s=self._age_s(now_us, "ATTITUDE_QUATERNION", "ATTITUDE"),
+            position_s=self._age_s(now_us, "GLOBAL_POSITION_INT"),
+            hud_s=self._age_s(now_us, "VFR_HUD"),
+            gps_s=self._age_s(now_us, "GPS_RAW_INT"),
+            battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
+            armed=bool(beat and beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
         )
 
     def _attitude(self) -> tuple[tuple[float, float, float, float], tuple[float, float, float]]:
@@ -211,13 +384,10 @@ class VehiclePicture:
     def _note_motion(self, _message: Any, now_us: int) -> None:
         self._moved_us = now_us
 
-    def _take_position(self, message: Any, now_us: int) -> None:
+    def _take_position(self, _message: Any, now_us: int) -> None:
         self._moved_us = now_us
-        if self.track and now_us - self.track[-1].time_us < TRACK_INTERVAL_US:
-            return
-        self.track.append(
-            PathPoint(now_us, message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
-        )
+        if now_us - self.history.newest_us >= TRACK_INTERVAL_US:
+            self.history.add(now_us, self.instant(now_us))
 
     def _take_fix(self, message: Any, now_us: int) -> None:
         spot = _spot_of_fix(message)
@@ -226,6 +396,16 @@ class VehiclePicture:
         last = self.fixes[-1] if self.fixes else None
         if last is None or (last.lat_deg, last.lon_deg) != (spot.lat_deg, spot.lon_deg):
             self.fixes.append(PathPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
+
+
+def _battery(battery: Any, system: Any) -> dict[str, float]:
+    """Return voltage and remaining charge, each NaN if unknown."""
+    volts = [mv / MM for mv in battery.voltages if mv != UNKNOWN_MV] if battery else []
+    if not volts and system and system.voltage_battery != UNKNOWN_MV:
+        volts = [system.voltage_battery / MM]
+    sources = [source.battery_remaining for source in (battery, system) if source]
+    percent = next((value for value in sources if value >= 0), NAN)
+    return {"battery_v": sum(volts) if volts else NAN, "battery_percent": float(percent)}
 
 
 def _rates(message: Any) -> tuple[float, float, float]:

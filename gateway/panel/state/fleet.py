@@ -1,10 +1,14 @@
-"""All known aircraft, and the listeners to their messages."""
+"""All known aircraft, the listeners to their messages, and their newest sensor frames."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.panel.state.vehicle_picture import VehiclePicture
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.panel.state.vehicle import VehicleState
+from gateway.units import US_PER_S
 
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: messages of a camera of the same system are ignored."""
@@ -24,19 +28,29 @@ class Origin:
     """`recorded` or `fused again`."""
     recorded_id: int
     """Its recorded system id."""
+    page: str = ""
+    """Id of the page that plays it, the only one that shows it."""
 
 
-class FleetPicture:
+class FleetState:
     """State from MAVLink, by system id."""
 
     def __init__(self) -> None:
-        self.vehicles: dict[int, VehiclePicture] = {}
+        self.vehicles: dict[int, VehicleState] = {}
         self.origins: dict[int, Origin] = {}
         """Of played aircraft, by their played system ids."""
         self.version = 0
         """Counts the messages, so that a reader knows whether there is new data."""
         self._listeners: list[Listener] = []
         self._on_forget: list[Callable[[int], None]] = []
+
+    def visible(self, page: str) -> dict[int, VehicleState]:
+        """Return the aircraft that a page shows: live ones, and those that it plays itself."""
+        return {
+            system_id: vehicle
+            for system_id, vehicle in self.vehicles.items()
+            if (origin := self.origins.get(system_id)) is None or (page and origin.page == page)
+        }
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call a listener with every message, until the returned function is called."""
@@ -77,11 +91,53 @@ class FleetPicture:
         if vehicle is None:
             if len(self.vehicles) >= MAX_VEHICLES:
                 return
-            vehicle = VehiclePicture(system_id)
+            vehicle = VehicleState(system_id)
             if origin := self.origins.get(system_id):
-                vehicle = VehiclePicture(system_id, origin.word, origin.recorded_id)
+                vehicle = VehicleState(system_id, origin.word, origin.recorded_id)
             self.vehicles[system_id] = vehicle
         vehicle.take(message, now_us)
         self.version += 1
         for listener in self._listeners:
             listener(system_id, message, now_us)
+
+
+SPAN_US: Final = 180 * US_PER_S
+MAX_FRAMES: Final = 40_000
+"""Three minutes at 200 a second; less at a higher rate."""
+
+SENSOR_MESSAGES: Final = frozenset(
+    {
+        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+        mavlink.MAVLINK_MSG_ID_RAW_IMU,
+        mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+    }
+)
+
+TimedFrames = list[tuple[int, bytes]]
+"""When each came, in µs on the panel's clock, and the frame."""
+
+
+class SampleMemory:
+    """Sensor frames of each aircraft."""
+
+    def __init__(self) -> None:
+        self._frames: dict[int, deque[tuple[int, bytes]]] = {}
+
+    def take(self, system_id: int, message: Any, now_us: int) -> None:
+        """Store a message, if it is a sensor's."""
+        if message.get_msgId() not in SENSOR_MESSAGES:
+            return
+        frames = self._frames.setdefault(system_id, deque(maxlen=MAX_FRAMES))
+        frames.append((now_us, bytes(message.get_msgbuf())))
+        while frames[0][0] < now_us - SPAN_US:
+            frames.popleft()
+
+    def forget(self, system_id: int) -> None:
+        """Delete the frames of an aircraft."""
+        self._frames.pop(system_id, None)
+
+    def frames(self, system_id: int) -> TimedFrames:
+        """Return the frames of an aircraft, the oldest first."""
+        return list(self._frames.get(system_id, ()))

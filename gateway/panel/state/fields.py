@@ -1,6 +1,7 @@
-"""The last minutes of every numeric field of every message, in bounded memory."""
+"""Received numeric fields over the last minutes, by aircraft and message; as CSV."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,41 @@ MAX_RATE_HZ: Final = 50
 LEAST_GAP_US: Final = US_PER_S * 3 // (4 * MAX_RATE_HZ)
 """Shorter than the interval, so that jitter does not thin out messages at that rate."""
 MAX_ROWS: Final = SPAN_US // LEAST_GAP_US
+SHOWN_UNITS: Final = {
+    "rad": (math.degrees(1.0), "°"),
+    "rad/s": (math.degrees(1.0), "°/s"),
+    "deg": (1.0, "°"),
+    "degE7": (1e-7, "°"),
+    "cdeg": (1e-2, "°"),
+    "deg/s": (1.0, "°/s"),
+    "cm/s": (1e-2, "m/s"),
+    "m/s/s": (1.0, "m/s²"),
+    "uT": (1.0, "µT"),
+    "gauss": (100.0, "µT"),
+    "degC": (1.0, "°C"),
+    "cdegC": (1e-2, "°C"),
+    "us": (1e-6, "s"),
+    "ms": (1e-3, "s"),
+}
+"""Factor and unit in which a field is shown, by the unit that MAVLink gives it."""
+
+
+UNIT_TEXTS: Final = {
+    "deg": "°", "deg/s": "°/s", "m/s/s": "m/s²", "m/s2": "m/s²", "m/s^2": "m/s²", "uT": "µT",
+    "degC": "°C", "us": "µs", "m2": "m²",
+}  # fmt: skip
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit as it is written in print: `m/s2` is m/s²."""
+    return UNIT_TEXTS.get(unit, unit)
+
+
+def shown_unit(unit: str) -> tuple[float, str]:
+    """Return the factor and the unit in which a field of a MAVLink unit is shown."""
+    return SHOWN_UNITS.get(unit, (1.0, unit))
+
+
 FIRST_ROWS: Final = 256
 MAX_KINDS: Final = 200
 """Messages of one aircraft, instances counted apart; more are forged."""
@@ -185,3 +221,37 @@ def _kind_of(message: Any) -> str:
     name: str = message.get_type()
     instance = getattr(message, "instance_field", None)
     return name if instance is None else f"{name}[{getattr(message, instance)}]"
+
+
+def fields_csv(
+    series: Mapping[str, tuple[IntArray, FloatArray]], units: Mapping[str, str], zero_unix_us: int
+) -> str:
+    """Write fields side by side.
+
+    Parameters
+    ----------
+    series : mapping of str to (ndarray, ndarray)
+        By name: times in µs on the panel's clock, growing, and values.
+    units : mapping of str to str
+        By name; appended to the name in the header.
+    zero_unix_us : int
+        Civil time of the clock's zero.
+
+    Returns
+    -------
+    str
+        A row for each time with any value, its first column seconds since 1970; empty where a
+        field has no value, or NaN.
+    """
+    heads = [f"{name} ({units[name]})" if units.get(name) else name for name in series]
+    lines = [",".join(["time_unix_s", *heads])]
+    columns = [dict(zip(t.tolist(), v.tolist(), strict=True)) for t, v in series.values()]
+    times = [t for t, _ in series.values()]
+    for time_us in np.unique(np.concatenate(times)).tolist() if times else []:
+        seconds = f"{(zero_unix_us + time_us) / US_PER_S:.6f}"
+        lines.append(",".join([seconds, *(_cell(column.get(time_us)) for column in columns)]))
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: float | None) -> str:
+    return "" if value is None or not math.isfinite(value) else f"{value:.9g}"

@@ -1,25 +1,159 @@
-"""A recording played beside the live aircraft, by a separate `mavgate play`.
+"""A recording played beside the live aircraft, by a separate `mavgate play`; its aircraft.
 
-It is a process with its own control socket, sends its frames only to a loopback port of the panel,
-and its aircraft get system ids that no live one has.
+The player is a process with its own control socket, sends its frames only to a loopback port of the
+panel, and its aircraft get system ids that no live one has.
 """
 
 import asyncio
 import logging
+import math
 import os
 import tempfile
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Collection, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from gateway.live.attachment import own_command
 from gateway.live.control_socket import ControlError
-from gateway.panel.control_client import ControlClient
-from gateway.panel.recorded_aircraft import FUSED_AGAIN, RecordedAircraft, free_ids, look_into
-from gateway.panel.state.fleet_picture import FleetPicture, Origin
+from gateway.panel.gateway_client import ControlClient
+from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import Uplink
-from gateway.recordings.index import RecordingError, find_recording
+from gateway.recordings.answers import FIRST_GROUND_STATION, is_station
+from gateway.recordings.columns import TableRow
+from gateway.recordings.files import FileKind, kind_of, read_chunks
+from gateway.recordings.formats.maps import TrackPoint, VehicleTrack, tracks_of_frames
+from gateway.recordings.index import RecordingError, find_recording, parts_together
+from gateway.recordings.opening import TlogFile
+from gateway.recordings.reading import recorded_frames
+from gateway.recordings.table import TableHeader, TableReader
+from gateway.units import US_PER_S
+
+PROFILE_POINTS: Final = 400
+HEIGHT_GAP_US: Final = US_PER_S // 5
+RECORDED: Final = "recorded"
+FUSED_AGAIN: Final = "fused again"
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """Height over time."""
+
+    time_s: tuple[float, ...] = ()
+    """Since its begin."""
+    alt_amsl_m: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedAircraft:
+    """One aircraft of a recording."""
+
+    recorded_id: int
+    """Its recorded MAVLink system id."""
+    origin: str
+    """`RECORDED`, or `FUSED_AGAIN` for one that is fused again while it plays."""
+    profile: Profile
+    """Empty if no height was recorded."""
+
+
+def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
+    """Read which aircraft the files hold.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Tlogs and tables of one recording.
+
+    Returns
+    -------
+    list of list of RecordedAircraft
+        One list for each flight that a player makes of these files, in its order.
+
+    Raises
+    ------
+    OSError
+        If one cannot be read.
+    """
+    flights = []
+    for parts in parts_together(files):
+        if kind_of(parts[0]) is FileKind.TLOG:
+            flights.append(_of_tlogs(parts))
+        else:
+            flights.append([_of_tables(parts)])
+    return flights
+
+
+def free_ids(count: int, taken: Collection[int]) -> range:
+    """Find consecutive free system ids, the highest possible.
+
+    Parameters
+    ----------
+    count : int
+        Number of ids.
+    taken : collection of int
+        Ids of others.
+
+    Raises
+    ------
+    ValueError
+        If there are not enough.
+    """
+    for first in range(FIRST_GROUND_STATION - count, 0, -1):
+        wanted = range(first, first + count)
+        if not any(system_id in wanted for system_id in taken):
+            return wanted
+    raise ValueError(f"{count} more aircraft have no room beside those that are shown")
+
+
+def _of_tlogs(parts: Sequence[Path]) -> list[RecordedAircraft]:
+    begins, origins, stations = list[int](), set[int](), set[int]()
+    for part in parts:
+        with closing(TlogFile(part)) as tlog:
+            begins.append(tlog.index.first_us or 0)
+            origins |= tlog.index.origins
+            stations |= tlog.index.stations
+    vehicles = sorted({origin >> 8 for origin in origins if not is_station(origin, stations)})
+    tracks = {track.name: track for track in tracks_of_frames(recorded_frames(parts, None), None)}
+    none = VehicleTrack("")
+    return [
+        RecordedAircraft(
+            system_id, RECORDED, _profile(tracks.get(f"system {system_id}", none).points, begins[0])
+        )
+        for system_id in vehicles
+    ]
+
+
+def _of_tables(parts: Sequence[Path]) -> RecordedAircraft:
+    vehicle_id, points, begin_us = 1, list[TrackPoint](), None
+    for part in parts:
+        reader = TableReader()
+        for chunk in read_chunks(part, None):
+            for event in reader.feed(chunk):
+                if isinstance(event, TableHeader):
+                    vehicle_id = event.vehicle_id
+                elif isinstance(event, TableRow):
+                    begin_us = event.time_us if begin_us is None else begin_us
+                    _note_height(event, points)
+    return RecordedAircraft(vehicle_id, FUSED_AGAIN, _profile(points, begin_us or 0))
+
+
+def _note_height(row: TableRow, points: list[TrackPoint]) -> None:
+    state = row.state
+    if state is None or not math.isfinite(state.alt_amsl_m):
+        return
+    if points and row.time_us - points[-1].time_us < HEIGHT_GAP_US:
+        return
+    points.append(TrackPoint(row.time_us, state.lat_deg, state.lon_deg, state.alt_amsl_m))
+
+
+def _profile(points: Sequence[TrackPoint], begin_us: int) -> Profile:
+    kept = points[:: max(1, len(points) // PROFILE_POINTS)]
+    return Profile(
+        tuple((point.time_us - begin_us) / US_PER_S for point in kept),
+        tuple(point.alt_amsl_m for point in kept),
+    )
+
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +163,8 @@ STEP_S: Final = 0.1
 WATCH_S: Final = 0.25
 LEAP_S: Final = 0.5
 """A larger step back is not jitter of the player's clock, but a loop or a seek."""
+MAX_PLAYERS: Final = 4
+"""Each is a process."""
 SPEEDS: Final = (0.25, 0.5, 1, 2, 5, 10, 50)
 
 
@@ -37,17 +173,20 @@ class PlaybackError(Exception):
 
 
 class Playback:
-    """The recording that is played, for all pages.
+    """The recording that one page plays.
 
     Parameters
     ----------
     uplink : Uplink
         Takes its frames.
-    fleet : FleetPicture
+    fleet : FleetState
         Gets its aircraft.
+    page : str
+        Id of the page.
     """
 
-    def __init__(self, uplink: Uplink, fleet: FleetPicture) -> None:
+    def __init__(self, uplink: Uplink, fleet: FleetState, page: str) -> None:
+        self._page = page
         self.name = ""
         """Of the recording; empty while none is open."""
         self.aircraft: dict[int, RecordedAircraft] = {}
@@ -86,6 +225,11 @@ class Playback:
         """
         async with self._opening:
             self.close()
+            players = {origin.page for origin in self._fleet.origins.values()}
+            if len(players) >= MAX_PLAYERS:
+                raise PlaybackError(
+                    f"{len(players)} other pages play recordings; close one of them first"
+                )
             await self._open(folder, name, fused_again=fused_again)
 
     async def _open(self, folder: Path, name: str, *, fused_again: bool) -> None:
@@ -157,7 +301,7 @@ class Playback:
             # A seek must not be drawn as a path.
             for system_id in self.aircraft:
                 if vehicle := self._fleet.vehicles.get(system_id):
-                    vehicle.begin_anew()
+                    vehicle.restart_path()
 
     async def refresh(self) -> None:
         """Poll the player's status; a player that has ended is closed."""
@@ -171,11 +315,16 @@ class Playback:
         """Give the aircraft free system ids; return the first of each flight."""
         firsts = []
         for flight in flights:
-            ids = free_ids(len(flight), {*self._fleet.vehicles, *self.aircraft})
+            ids = free_ids(
+                len(flight), {*self._fleet.vehicles, *self._fleet.origins, *self.aircraft}
+            )
             firsts.append(ids.start)
             self.aircraft.update(zip(ids, flight, strict=True))
         self._fleet.origins.update(
-            {key: Origin(one.origin, one.recorded_id) for key, one in self.aircraft.items()}
+            {
+                key: Origin(one.origin, one.recorded_id, self._page)
+                for key, one in self.aircraft.items()
+            }
         )
         return firsts
 

@@ -1,14 +1,47 @@
-"""The gateway's status over its control socket, polled once a second for all pages."""
+"""The gateway on this machine: requests to its control socket, and its status once a second."""
 
 import asyncio
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final
 
-from gateway.live.control_socket import ControlError
-from gateway.panel.control_client import ControlClient
-from gateway.panel.state.fleet_picture import FleetPicture
-from gateway.panel.state.instant import Spot
+from gateway.live.control_finder import find_socket
+from gateway.live.control_socket import ControlError, request
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.vehicle import Spot
 from gateway.records import NAN
+
+READING: Final = frozenset(
+    {"status", "verbs", "clients.list", "record.status", "record.list", "play.status"}
+)
+"""Verbs that a viewer may use: they change nothing."""
+
+
+class ControlClient:
+    """Send requests to a running gateway (or player).
+
+    Parameters
+    ----------
+    path : Path or None
+        Its socket; None for the gateway on this machine, searched at each request.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        self.path = path
+
+    async def ask(self, verb: str, **params: Any) -> Any:
+        """Send a request, and return the result, decoded from JSON.
+
+        Raises
+        ------
+        ControlError
+            If no gateway listens, or the request is refused.
+        """
+        return await asyncio.to_thread(self._ask, verb, params)
+
+    def _ask(self, verb: str, params: dict[str, Any]) -> Any:
+        return request(self.path or find_socket("run"), verb, params)
+
 
 INTERVAL_S: Final = 1.0
 
@@ -20,11 +53,11 @@ class GatewayWatch:
     ----------
     control : ControlClient
         Sends the requests.
-    fleet : FleetPicture
+    fleet : FleetState
         Gets the gateway's exact marks; MAVLink rounds them.
     """
 
-    def __init__(self, control: ControlClient, fleet: FleetPicture) -> None:
+    def __init__(self, control: ControlClient, fleet: FleetState) -> None:
         self.status: dict[str, Any] | None = None
         """Result of the verb `status`; None while no gateway runs."""
         self.before: dict[str, Any] | None = None

@@ -1,1 +1,0 @@
-"""Exchanges with an aircraft of more than one message: parameters, files, calibrations."""

@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: Apache-2.0
+// The flight in numbers: each with its unit, and its age once it is old.
+const OLD_S = 1.5;
+const EVERY_MS = 200;
+const rad = Math.PI / 180;
+
+export default {
+  template: `
+    <dl class="number-strip" aria-label="Flight in numbers">
+      <div v-for="item in items" :key="item.name" :class="{ old: item.age_s > limit }" :data-item="item.name">
+        <dt>{{ item.name }}</dt>
+        <dd><b>{{ item.text }}</b> <span class="unit">{{ item.unit }}</span> <span v-if="item.age_s > limit" class="age">{{ Math.round(item.age_s) }} s old</span></dd>
+      </div>
+    </dl>`,
+  data: () => ({ items: [], limit: OLD_S }),
+  mounted() {
+    let drawn_ms = 0;
+    this.stop = mavgate.subscribe((state) => {
+      const now_ms = performance.now();
+      if (now_ms - drawn_ms < EVERY_MS && state) return;
+      drawn_ms = now_ms;
+      this.items = state ? items_of(state) : [];
+    });
+  },
+  unmounted() {
+    this.stop?.();
+  },
+};
+
+function items_of(state) {
+  const past = mavgate.past_us !== null;
+  const age = (name) => (past ? 0 : (state[name] ?? 0));
+  const q = state.q_nb;
+  const angles = q && q[0] !== null ? euler(q) : [null, null, null];
+  const angle = (value, digits = 1) => (Number.isFinite(value) ? value.toFixed(digits) : "—");
+  const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
+  const here = [state.lat_deg, state.lon_deg];
+  const item = (name, text, unit, age_name) => ({ name, text, unit, age_s: age(age_name) });
+  const quantity = (name, kind, value, age_name, digits = 1) => item(name, ...mavgate.show(kind, value, digits), age_name);
+  const way = (name, spot, distance_m, bearing_deg) => {
+    if (!spot || !Number.isFinite(here[0])) return [];
+    const to = [spot.lat_deg, spot.lon_deg];
+    const [text, unit] = mavgate.show("distance", distance_m ?? mavgate.distance_m(here, to), 2);
+    const bearing = Math.round(bearing_deg ?? mavgate.bearing_deg(here, to)) % 360;
+    return [item(name, text, `${unit} ${bearing}°`, "position_s")];
+  };
+  return [
+    item("Roll", angle(angles[0]), "°", "attitude_s"),
+    item("Pitch", angle(angles[1]), "°", "attitude_s"),
+    item("Heading", angle(heading, 0), "°", "attitude_s"),
+    quantity("Ground speed", "speed", state.groundspeed_mps, "hud_s"),
+    quantity("Climb", "climb", state.climb_mps, "hud_s"),
+    quantity("Above home", "altitude", state.alt_home_m, "position_s"),
+    quantity("Above sea", "altitude", state.alt_amsl_m, "position_s"),
+    ...way("To home", state.home, null, null),
+    ...way("To mark", state.mark, state.mark_distance_m, state.mark_bearing_deg),
+    ...(state.mark ? [item("Mark at", `${state.mark.lat_deg.toFixed(6)}, ${state.mark.lon_deg.toFixed(6)}`, "°", "position_s")] : []),
+    item("Latitude", angle(state.lat_deg, 6), "°", "position_s"),
+    item("Longitude", angle(state.lon_deg, 6), "°", "position_s"),
+    item("Satellites", state.fix_type ? String(Math.round(state.satellites)) : "—", "", "gps_s"),
+    ...(Number.isFinite(state.battery_v) ? [item("Battery", state.battery_v.toFixed(2), Number.isFinite(state.battery_percent) ? `V ${Math.round(state.battery_percent)} %` : "V", "battery_s")] : []),
+  ];
+}
+
+function euler([w, x, y, z]) {
+  return [
+    Math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)) / rad,
+    Math.asin(Math.max(-1, Math.min(1, 2 * (w * y - z * x)))) / rad,
+    (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) / rad + 360) % 360,
+  ];
+}
