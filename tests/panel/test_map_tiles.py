@@ -5,16 +5,17 @@ import sqlite3
 import struct
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
 
+import httpx
 import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
-from gateway.panel.map_tiles import MapTiles, tidy
+from gateway.panel.map_tiles import MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
 
 pytestmark = pytest.mark.io
@@ -159,3 +160,20 @@ def test_oldest_tiles_go_first(tmp_path: Path) -> None:
         os.utime(file, (1e9 - age, 1e9 - age))
     tidy(tmp_path, 250)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]
+
+
+async def test_tile_without_an_end_is_not_read_to_it(tmp_path: Path) -> None:
+    sent = 0
+
+    async def endless() -> AsyncIterator[bytes]:
+        nonlocal sent
+        while sent < 100 * MAX_TILE:
+            sent += 1 << 16
+            yield picture(1).ljust(1 << 16, b"\0")
+
+    style = MapStyle(name="Net", url="http://tiles.example/{z}/{x}/{y}")
+    tiles = MapTiles(PanelSettings(tiles_folder=str(tmp_path), map_styles=(style,)))
+    transport = httpx.MockTransport(lambda _: httpx.Response(200, content=endless()))
+    tiles._client = httpx.AsyncClient(transport=transport)
+    assert await tiles.tile(0, 1, 0, 0) is None
+    assert sent < 2 * MAX_TILE

@@ -1,5 +1,7 @@
 """Recordings to the browser and from it, whatever is asked for or sent."""
 
+import os
+import tempfile
 from collections.abc import AsyncIterator
 from http import HTTPStatus
 from io import BytesIO
@@ -14,7 +16,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from starlette.types import Receive, Scope, Send
 
 from gateway.panel.access import ROLE
-from gateway.panel.recording_files import add_recording_files
+from gateway.panel.recording_files import CHUNK, add_recording_files, zip_stream
 from gateway.panel.view_context import Role
 
 pytestmark = pytest.mark.io
@@ -103,3 +105,39 @@ async def test_viewer_takes_and_does_not_bring(folder: Path) -> None:
         answer = await viewer.put("/recordings/other", content=flight())
     assert answer.status_code == HTTPStatus.FORBIDDEN
     assert [file.name for file in folder.iterdir()] == ["day_01.tlog"]
+
+
+async def test_uploads_get_the_mode_of_the_umask(client: httpx.AsyncClient, folder: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        await client.put("/recordings/day", content=flight())
+    finally:
+        os.umask(before)
+    assert (folder / "day_01.tlog").stat().st_mode & 0o777 == 0o640
+
+
+async def test_links_and_pipes_are_not_downloaded(client: httpx.AsyncClient, folder: Path) -> None:
+    (folder / "link_01.tlog").symlink_to(folder.parent / "secret_01.tlog")
+    answer = await client.get("/recordings/link")
+    assert answer.status_code == HTTPStatus.FORBIDDEN
+    os.mkfifo(folder / "pipe_01.tlog")
+    assert (await client.get("/recordings/pipe")).status_code == HTTPStatus.NOT_FOUND
+    (folder / "link_02.tlog").write_bytes(flight())
+    with ZipFile(BytesIO((await client.get("/recordings/link")).content)) as packed:
+        assert packed.namelist() == ["link_02.tlog"]
+
+
+def test_archive_is_packed_piece_by_piece_without_a_file_or_an_open_descriptor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large = tmp_path / "large_01.tlog"
+    large.write_bytes(os.urandom(4 * CHUNK))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    before = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    stream = zip_stream([large, tmp_path / "gone_01.tlog"])
+    first = next(stream)
+    assert 0 < len(first) < 2 * CHUNK
+    stream.close()
+    assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == before
+    with ZipFile(BytesIO(b"".join(zip_stream([large])))) as packed:
+        assert packed.read("large_01.tlog") == large.read_bytes()

@@ -48,7 +48,12 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -
         vehicle.take(position(HERE[0] + step * 1e-5, HERE[1]), step * 20_000)
     for step in (0, 0, 1):
         vehicle.take(fix(HERE[0] + step * 1e-4, HERE[1]), step)
-    assert len(vehicle.track) == 5
+    assert len(vehicle.history) == len(vehicle.history.track()) == 5
+    assert vehicle.history.columns["alt_amsl_m"][0] == pytest.approx(100.0)
+    vehicle.restart_path()
+    assert len(vehicle.history) == 0
+    vehicle.take(fix(HERE[0], HERE[1]), 2)
+    vehicle.take(fix(HERE[0] + 1e-4, HERE[1]), 3)
     assert [point.lat_deg for point in vehicle.fixes] == pytest.approx([47.0, 47.0001])
 
 

@@ -7,9 +7,17 @@ from typing import Any
 import pytest
 
 from gateway.live.control_socket import ControlError
-from gateway.panel import recording_player
-from gateway.panel.playback import Playback
-from gateway.panel.state.fleet import FleetState
+from gateway.panel import playback as playback_module
+from gateway.panel.playback import (
+    MAX_PLAYERS,
+    RECORDED,
+    Playback,
+    PlaybackError,
+    Profile,
+    RecordedAircraft,
+)
+from gateway.panel.state.fleet import FleetState, Origin
+from tests.panel.messages import heartbeat
 
 
 class Player:
@@ -42,7 +50,7 @@ def player() -> Player:
 
 @pytest.fixture
 def playback(player: Player) -> Playback:
-    made = Playback(None, FleetState())  # type: ignore[arg-type]
+    made = Playback(None, FleetState(), "page")  # type: ignore[arg-type]
     made._control = player  # type: ignore[assignment]
     made.status = {"state": "playing", "position_s": 0.0}
     return made
@@ -103,17 +111,42 @@ async def test_a_player_that_does_not_answer_at_once_is_waited_for(
         socket.touch()
         return Child()
 
-    monkeypatch.setattr(recording_player, "STEP_S", 0.0)
-    monkeypatch.setattr(recording_player, "ControlClient", lambda _: player)
+    monkeypatch.setattr(playback_module, "STEP_S", 0.0)
+    monkeypatch.setattr(playback_module, "ControlClient", lambda _: player)
     monkeypatch.setattr(asyncio, "create_subprocess_exec", start)
-    monkeypatch.setattr(recording_player, "look_into", lambda _: [[]])
+    monkeypatch.setattr(playback_module, "look_into", lambda _: [[]])
     (tmp_path / "day_01.tlog").write_bytes(b"")
 
     class Uplink:
         playback_port = 1
 
-    playback = Playback(Uplink(), FleetState())  # type: ignore[arg-type]
+    playback = Playback(Uplink(), FleetState(), "page")  # type: ignore[arg-type]
     await playback.open(tmp_path, "day", fused_again=False)
     assert playback.status == {"state": "playing", "position_s": 0.0}
     playback.close()
     assert playback.status is None
+
+
+async def test_recording_is_visible_on_the_page_that_opened_it_alone() -> None:
+    fleet = FleetState()
+    playback = Playback(None, fleet, "mine")  # type: ignore[arg-type]
+    recorded = RecordedAircraft(1, RECORDED, Profile())
+    (first,) = playback._number([[recorded]])
+    fleet.take(heartbeat(), 0)
+    fleet.take(heartbeat(system_id=first), 0)
+    assert set(fleet.visible("mine")) == {1, first}
+    assert set(fleet.visible("another")) == set(fleet.visible("")) == {1}
+    other = Playback(None, fleet, "another")  # type: ignore[arg-type]
+    assert other._number([[recorded]]) != [first]
+    playback.close()
+    assert set(fleet.visible("mine")) == {1}
+
+
+async def test_number_of_players_is_limited(tmp_path: Path) -> None:
+    fleet = FleetState()
+    for n in range(MAX_PLAYERS):
+        fleet.origins[100 + n] = Origin(RECORDED, 1, f"page {n}")
+    with pytest.raises(PlaybackError, match="close one of them first"):
+        await Playback(None, fleet, "one more").open(  # type: ignore[arg-type]
+            tmp_path, "day", fused_again=False
+        )

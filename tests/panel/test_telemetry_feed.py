@@ -1,14 +1,23 @@
 """A browser that does not keep up gets fewer states, and never old ones."""
 
 import asyncio
+import inspect
 import json
+from types import SimpleNamespace
 from typing import Any, cast
 
+import httpx
+from fastapi import FastAPI
+from fastapi.routing import APIRoute
 from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
+from gateway.panel.api.rest import RestApi
+from gateway.panel.map_tiles import MapTiles
+from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.recording_files import add_recording_files
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.telemetry_feed import GRANTS, TelemetryFeed
+from gateway.panel.telemetry_feed import GRANTS, MAX_HISTORY, TelemetryFeed, add_tracks
 from tests.panel.messages import position
 
 LIMIT_S = 60.0
@@ -21,6 +30,7 @@ class Browser:
         self.frames: list[dict[str, Any]] = []
         self.grants: asyncio.Queue[str | None] = asyncio.Queue()
         self.arrived = asyncio.Event()
+        self.query_params: dict[str, str] = {}
 
     async def accept(self) -> None:
         pass
@@ -78,3 +88,34 @@ async def test_page_cannot_save_up_grants() -> None:
     await browser.grants.put(None)
     async with asyncio.timeout(LIMIT_S):
         await serving
+
+
+async def test_history_and_path_are_served_while_the_aircraft_moves() -> None:
+    fleet, app = FleetState(), FastAPI()
+    add_tracks(app, fleet)
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+        assert (await client.get("/history/1")).status_code == 404
+        for n in range(2 * MAX_HISTORY):
+            fleet.take(position(47.0 + n * 1e-6, 8.0), n * 250_000)
+        history = (await client.get("/history/1")).json()
+        path = (await client.get("/path/1")).json()
+    assert MAX_HISTORY // 2 < len(history["time_us"]) <= MAX_HISTORY
+    assert {len(column) for column in history.values()} == {len(history["time_us"])}
+    assert history["q_nb.0"][0] is None
+    assert len(path["track"]) == 2 * MAX_HISTORY
+
+
+def test_every_endpoint_runs_on_the_loop() -> None:
+    """One in a thread would read what the loop changes meanwhile."""
+    app = FastAPI()
+    fleet = FleetState()
+    parts: Any = SimpleNamespace(recordings_folder=None)
+    add_tracks(app, fleet)
+    add_recording_files(app, parts)
+    MapTiles(PanelSettings(map_styles=())).serve(app)
+    uplink: Any = SimpleNamespace(listen=lambda _: None)
+    routes = [*app.routes, *(r for router in RestApi(uplink).routers() for r in router.routes)]
+    endpoints = [route.endpoint for route in routes if isinstance(route, APIRoute)]
+    assert len(endpoints) > 8
+    assert all(map(inspect.iscoroutinefunction, endpoints))
