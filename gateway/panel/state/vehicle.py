@@ -168,9 +168,16 @@ class PathPoint:
 
 
 class FlightHistory:
-    """States of one aircraft as columns over time."""
+    """States of one aircraft as columns over time.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    limit : int
+        Most states, beyond which the oldest quarter is deleted.
+    """
+
+    def __init__(self, limit: int = MAX_TRACK) -> None:
+        self._limit = limit
         self.time_us = array("q")
         self.columns = {name: array(kind) for name, kind in HISTORY_COLUMNS.items()}
 
@@ -189,10 +196,10 @@ class FlightHistory:
             field, _, index = name.partition(".")
             value = getattr(now, field)
             column.append(value[int(index)] if index else value)
-        if len(self.time_us) > MAX_TRACK:
+        if len(self.time_us) > self._limit:
             # A quarter at once, so that moving the rest is seldom.
             for column in (self.time_us, *self.columns.values()):
-                del column[: MAX_TRACK // 4]
+                del column[: self._limit // 4]
 
     def clear(self) -> None:
         """Delete all states."""

@@ -60,8 +60,12 @@
       observer.observe(document.body, { attributes: true, attributeFilter: ["class"] });
       return () => observer.disconnect();
     },
-    // The state of an aircraft that is shown: the present one, or of the past for the selected one.
-    shown: (id) => (id === bus.selected && bus.past_us !== null ? bus.state : bus.vehicles[id]),
+    // The state of an aircraft that is shown: the present one, or that of the moment chosen.
+    shown(id) {
+      if (bus.past_us === null) return bus.vehicles[id];
+      if (id === bus.selected) return bus.state;
+      return bus.histories[id] ? state_at(bus.histories[id], bus.past_us, bus.vehicles[id]) : bus.vehicles[id];
+    },
     // The path of an aircraft: `points` and `fixes` as [lat, lon, alt]. They only grow at their end
     // while `version` stays.
     track: (id) => (tracks[id] ??= new_track()),

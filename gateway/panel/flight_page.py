@@ -1,0 +1,286 @@
+"""A flight as one HTML file that needs no network: its data, and the panel's own web components.
+
+The recording's MAVLink messages (of a table, those of its fusion) go through the panel's own state
+of an aircraft, whose columns are stored as differences of integers. Data and scripts are packed;
+the browser unpacks them and runs the scripts as modules.
+"""
+
+import base64
+import gzip
+import html
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway import __version__
+from gateway.analysis.case import Case
+from gateway.analysis.flight_arrays import FloatArray
+from gateway.analysis.metrics import euler_rad
+from gateway.panel.state.vehicle import FlightHistory, VehicleState
+from gateway.printable import printable
+from gateway.recordings.opening import open_flights
+from gateway.recordings.play import Track
+from gateway.recordings.reading import FlightError, ReadOptions
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+
+WEB: Final = Path(__file__).parent / "web"
+COMPONENTS: Final = (
+    "flight_display.js", "flight_scene.js", "flight_map.js", "number_strip.js", "flight_plots.js",
+    "flight_page.js",
+)  # fmt: skip
+"""Those of the panel, the last of which contains the others."""
+STEP_US: Final = 250_000
+"""Between two states of the page, which interpolates."""
+COMPARED_STEP_US: Final = US_PER_S // 2
+MAX_ROWS: Final = 80_000
+"""States of one aircraft: more than five hours; of a longer flight every n-th is kept."""
+MAX_TEXTS: Final = 2000
+AUTOPILOT: Final = 1
+READ: Final = frozenset(
+    getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+    for name in (
+        "HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT",
+        "VFR_HUD", "HOME_POSITION", "STATUSTEXT", "BATTERY_STATUS", "SYS_STATUS",
+        "ESTIMATOR_STATUS", "NAV_CONTROLLER_OUTPUT",
+    )
+)  # fmt: skip
+"""Messages that a state is made of."""
+RESOLUTION: Final = {
+    "lat_deg": 1e-6, "lon_deg": 1e-6, "q_nb.0": 5e-4, "q_nb.1": 5e-4, "q_nb.2": 5e-4,
+    "q_nb.3": 5e-4, "fix_type": 1.0, "satellites": 1.0, "heading_deg": 1.0, "battery_v": 0.01,
+    "battery_percent": 1.0, "mark_distance_m": 1.0, "mark_bearing_deg": 1.0,
+}  # fmt: skip
+DEFAULT_RESOLUTION: Final = 0.1
+"""Of the other columns, m or m/s."""
+LEFT_OUT: Final = frozenset(
+    {*(f"rate_b_radps.{n}" for n in range(3)), *(f"vel_n_mps.{n}" for n in range(3))}
+)
+"""Columns that only serve to extrapolate."""
+LIBRARIES: Final = {
+    "vue": ("static/vue.esm-browser.prod.js", "Vue 3, (c) Yuxi Evan You and contributors, MIT"),
+    "nicegui-scene": (
+        "elements/scene/dist/index.js",
+        "three.js, (c) three.js authors, MIT, as NiceGUI, (c) Zauberzeug GmbH, MIT, bundles it",
+    ),
+    "nicegui-leaflet": (
+        "elements/leaflet/dist/index.js",
+        "Leaflet, (c) Volodymyr Agafonkin, CloudMade and contributors, BSD-2-Clause",
+    ),
+}
+"""By the name that the components import: file below NiceGUI's folder, and licence."""
+LEAFLET_CSS: Final = "elements/leaflet/dist/leaflet/leaflet.css"
+
+
+@dataclass(slots=True)
+class PageFlight:
+    """What a page shows of a flight."""
+
+    name: str
+    begin_us: int = 0
+    """Civil time of the first state, in µs since 1970; 0 if unknown."""
+    aircraft: dict[int, VehicleState] = field(default_factory=dict)
+    histories: dict[int, FlightHistory] = field(default_factory=dict)
+    texts: list[tuple[int, int, int, str]] = field(default_factory=list)
+    """Time in µs, system id, severity, text."""
+    compared: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
+    """By estimator: `time_us`, `roll_deg`, `pitch_deg`, `yaw_deg`, `alt_amsl_m`."""
+    remarks: list[str] = field(default_factory=list)
+
+
+def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageFlight:
+    """Read a recording in any format that can be played.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Its parts.
+    options : ReadOptions
+        How to fuse a table.
+    name : str
+        Name of the flight.
+
+    Returns
+    -------
+    PageFlight
+
+    Raises
+    ------
+    FlightError
+        If it contains no position.
+    OSError
+        If it cannot be read.
+    """
+    flight = PageFlight(name)
+    with ExitStack() as opened:
+        for recording in open_flights(files, options, opened):
+            flight.remarks += recording.remarks
+            for source in recording.sources:
+                _read_source(Track(source), flight)
+    flight.histories = {key: one for key, one in flight.histories.items() if len(one) > 1}
+    if not flight.histories:
+        raise FlightError(f"{name}: it contains no position, so there is no flight to show")
+    flight.begin_us = min(one.time_us[0] for one in flight.histories.values())
+    return flight
+
+
+def _read_source(track: Track, flight: PageFlight) -> None:
+    """Take the states of all aircraft out of one source of frames."""
+    reader: Any = mavlink.MAVLink(None)
+    heard: dict[int, int] = {}
+    while (time_us := track.peek_us()) is not None:
+        frame = track.take()
+        system_id, component_id = origin_of(frame)
+        if component_id != AUTOPILOT or message_id_of(frame) not in READ:
+            continue
+        try:
+            message = reader.decode(bytearray(frame))
+        except mavlink.MAVError:
+            continue
+        vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
+        texts = len(vehicle.texts.all) and vehicle.texts.all[-1].number
+        vehicle.take(message, time_us)
+        if vehicle.texts.all and vehicle.texts.all[-1].number != texts:
+            newest = vehicle.texts.all[-1]
+            if len(flight.texts) < MAX_TEXTS:
+                flight.texts.append((time_us, system_id, newest.severity, newest.text))
+        if message.get_type() == "GLOBAL_POSITION_INT" and (
+            time_us - heard.get(system_id, -STEP_US) >= STEP_US
+        ):
+            heard[system_id] = time_us
+            history = flight.histories.setdefault(system_id, FlightHistory(MAX_ROWS))
+            history.add(time_us, vehicle.instant(time_us))
+
+
+def add_comparison(flight: PageFlight, case: Case) -> None:
+    """Add the tracks of several estimators, on the flight's own clock."""
+    if len(case.tracks) < 2:
+        return
+    for name, track in case.tracks.items():
+        steps = np.searchsorted(
+            track.time_us, np.arange(track.time_us[0], track.time_us[-1], COMPARED_STEP_US)
+        )
+        angles = np.degrees(euler_rad(track.q_nb[steps]))
+        flight.compared[name] = {
+            "time_us": (track.time_us[steps] - track.time_us[0]).astype(float),
+            "roll_deg": angles[:, 0],
+            "pitch_deg": angles[:, 1],
+            "yaw_deg": angles[:, 2],
+            "alt_amsl_m": track.alt_amsl_m[steps],
+        }
+
+
+def render_page(flight: PageFlight) -> str:
+    """Return the HTML of a page.
+
+    Parameters
+    ----------
+    flight : PageFlight
+        As `read_flight` makes it.
+
+    Returns
+    -------
+    str
+        An HTML document that loads nothing.
+    """
+    packed = {"data": _packed(json.dumps(_data_of(flight), separators=(",", ":")))}
+    folder = _nicegui_folder()
+    modules = {name: folder / file for name, (file, _) in LIBRARIES.items()}
+    modules |= {f"./{name}": WEB / name for name in COMPONENTS}
+    sources = {name: path.read_text() for name, path in modules.items()}
+    packed["modules"] = _packed(json.dumps(sources))
+    css = "\n".join(
+        [
+            # No rule that is used here has a picture.
+            re.sub(r"url\([^)]*\)", "none", (folder / LEAFLET_CSS).read_text()),
+            (WEB / "panel.css").read_text(),
+        ]
+    )
+    licences = "; ".join(licence for _, licence in LIBRARIES.values())
+    template = (WEB / "flight_page.html").read_text()
+    values = {
+        "title": html.escape(printable(flight.name)),
+        "version": html.escape(__version__),
+        "licences": html.escape(licences),
+        "css": css,
+        "bus": (WEB / "telemetry_bus.js").read_text(),
+        **packed,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: values[match[1]], template)
+
+
+def _data_of(flight: PageFlight) -> dict[str, Any]:
+    zero_us = flight.begin_us
+    return {
+        "name": printable(flight.name),
+        "begin_us": zero_us,
+        "aircraft": [
+            {
+                "system_id": system_id,
+                "model": flight.aircraft[system_id].model,
+                "home": _spot(flight.aircraft[system_id].home),
+                "columns": dict(_columns_of(history, zero_us)),
+            }
+            for system_id, history in sorted(flight.histories.items())
+        ],
+        "texts": [
+            [(time_us - zero_us) / US_PER_S, system_id, severity, printable(text)]
+            for time_us, system_id, severity, text in flight.texts
+        ],
+        "compared": {
+            name: {key: _differences(values, _resolution(key)) for key, values in columns.items()}
+            for name, columns in flight.compared.items()
+        },
+        "remarks": [printable(remark) for remark in flight.remarks],
+    }
+
+
+def _spot(spot: Any) -> dict[str, float] | None:
+    if spot is None or not math.isfinite(spot.lat_deg):
+        return None
+    return {"lat_deg": spot.lat_deg, "lon_deg": spot.lon_deg, "alt_amsl_m": spot.alt_amsl_m}
+
+
+def _columns_of(history: FlightHistory, zero_us: int) -> Iterator[tuple[str, Any]]:
+    yield "time_us", _differences(np.array(history.time_us, float) - zero_us, 1000.0)
+    for name, column in history.columns.items():
+        values = np.array(column, float)
+        if name not in LEFT_OUT and np.isfinite(values).any():
+            yield name, _differences(values, _resolution(name))
+
+
+def _resolution(name: str) -> float:
+    return 1000.0 if name == "time_us" else RESOLUTION.get(name, DEFAULT_RESOLUTION)
+
+
+def _differences(values: FloatArray, resolution: float) -> dict[str, Any]:
+    """Encode a column: `d`, differences in units of `r`; null where it is unknown."""
+    counts = np.round(np.where(np.isfinite(values), values, 0.0) / resolution).astype(np.int64)
+    known = np.isfinite(values)
+    found: list[int | None] = []
+    last = 0
+    for count, is_known in zip(counts.tolist(), known.tolist(), strict=True):
+        found.append(count - last if is_known else None)
+        last = count if is_known else last
+    return {"r": resolution, "d": found}
+
+
+def _packed(text: str) -> str:
+    return base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
+
+
+def _nicegui_folder() -> Path:
+    """Return the folder of NiceGUI, without importing it, which takes a second."""
+    spec = find_spec("nicegui")
+    if spec is None or not spec.submodule_search_locations:
+        raise ModuleNotFoundError("No module named 'nicegui'", name="nicegui")
+    return Path(next(iter(spec.submodule_search_locations)))
