@@ -68,6 +68,11 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "recorded.report",
         "Make a page of figures and tables of a flight, those of the paper included.",
     ),
+    "page": CommandEntry(
+        "recorded.page",
+        "Make one HTML file of a flight: instruments, 3D, plan, slider, plots; opens offline.",
+        RECORDINGS,
+    ),
     "sweep": CommandEntry(
         "recorded.sweep",
         "Try settings on one flight or many, and write the best as a settings file.",

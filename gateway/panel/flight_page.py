@@ -22,14 +22,18 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.analysis.case import Case
-from gateway.analysis.flight_arrays import FloatArray
+from gateway.analysis.case import make_case
+from gateway.analysis.flight_arrays import FlightTrack, FloatArray, FusionSettings
 from gateway.analysis.metrics import euler_rad
+from gateway.analysis.sources import flight_of_blocks
 from gateway.panel.state.vehicle import FlightHistory, VehicleState
 from gateway.printable import printable
+from gateway.reasons import reason_of
+from gateway.recordings.fuse import aircraft_for
+from gateway.recordings.join import joined_tables
 from gateway.recordings.opening import open_flights
 from gateway.recordings.play import Track
-from gateway.recordings.reading import FlightError, ReadOptions
+from gateway.recordings.reading import FlightError, ReadOptions, open_rows
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
@@ -161,22 +165,45 @@ def _read_source(track: Track, flight: PageFlight) -> None:
             history.add(time_us, vehicle.instant(time_us))
 
 
-def add_comparison(flight: PageFlight, case: Case) -> None:
-    """Add the tracks of several estimators, on the flight's own clock."""
-    if len(case.tracks) < 2:
-        return
-    for name, track in case.tracks.items():
-        steps = np.searchsorted(
-            track.time_us, np.arange(track.time_us[0], track.time_us[-1], COMPARED_STEP_US)
+def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadOptions) -> None:
+    """Fuse the sensor data of a recording with every estimator; a remark says if there is none.
+
+    Parameters
+    ----------
+    flight : PageFlight
+        Gets the results.
+    files : sequence of Path
+        Tables of the recording, or another log with sensor data.
+    options : ReadOptions
+        How to read them.
+    """
+    try:
+        table = joined_tables([open_rows(file, options) for file in files])
+        aircraft = aircraft_for(files, table, options)
+        fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+        sensors = flight_of_blocks(
+            table.blocks, aircraft.calibration, fusion, name=flight.name, story=""
         )
-        angles = np.degrees(euler_rad(track.q_nb[steps]))
-        flight.compared[name] = {
-            "time_us": (track.time_us[steps] - track.time_us[0]).astype(float),
-            "roll_deg": angles[:, 0],
-            "pitch_deg": angles[:, 1],
-            "yaw_deg": angles[:, 2],
-            "alt_amsl_m": track.alt_amsl_m[steps],
-        }
+        case = make_case(sensors)
+    except (FlightError, OSError, ValueError) as error:
+        flight.remarks.append(f"The estimators are not compared: {reason_of(error)}")
+        return
+    zero_us = flight.begin_us - (table.header.unix_us_at_zero or 0)
+    for name, track in case.tracks.items():
+        flight.compared[name] = _compared(track, zero_us)
+
+
+def _compared(track: FlightTrack, zero_us: int) -> dict[str, FloatArray]:
+    moments_us = np.arange(track.time_us[0], track.time_us[-1], COMPARED_STEP_US)
+    rows = np.searchsorted(track.time_us, moments_us)
+    angles = np.degrees(euler_rad(track.q_nb[rows]))
+    return {
+        "time_us": (track.time_us[rows] - zero_us).astype(float),
+        "roll_deg": angles[:, 0],
+        "pitch_deg": angles[:, 1],
+        "yaw_deg": angles[:, 2] % 360.0,
+        "alt_amsl_m": track.alt_amsl_m[rows],
+    }
 
 
 def render_page(flight: PageFlight) -> str:

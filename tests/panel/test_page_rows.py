@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import to_euler
 from gateway.live.control_socket import request
+from gateway.recordings.tlog import encode_record
 from tests.panel.browsing import (
     START_LIMIT_MS,
     WAIT_MS,
@@ -23,6 +24,7 @@ from tests.panel.browsing import (
     show,
     wait_for,
 )
+from tests.panel.test_flight_page import frames
 from tests.panel.told_vehicle import ToldVehicle
 
 pytestmark = [
@@ -236,11 +238,10 @@ def test_3d_keeps_the_aircraft_while_the_theme_stays(page: Page) -> None:
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
-    # A scene that begins anew asks for the path anew.
-    assert not any("/path/" in url for url in asked)
-    with page.expect_request("**/path/*"):
-        page.emulate_media(color_scheme="dark")
+    page.emulate_media(color_scheme="dark")
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
+    # The path is known to the page, whatever is drawn again.
+    assert not any("/path/" in url for url in asked)
 
 
 def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
@@ -335,8 +336,9 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
     page.wait_for_function("mavgate.state.time_us > window.begun_us + 5e6")
     view.get_by_label("Stop recording").click()
     expect(state).to_have_text("idle")
-    view.get_by_label("Name of the recording").fill("morning flight")
-    view.get_by_text("Save", exact=True).click()
+    view.get_by_label("Save recording").click()
+    page.get_by_label("Name of the recording").fill("morning flight")
+    page.locator(".asks").get_by_role("button", name="Save").click()
     row = view.locator("tr[data-key='morning flight']")
     # One file after another gets the new name.
     expect(row).to_contain_text("3 csv+tlog")
@@ -368,7 +370,9 @@ def _move_in_time(page: Page, row: object) -> None:
     row.get_by_label("Open").click()  # type: ignore[attr-defined]
     slider = view.get_by_role("slider")
     expect(slider).to_be_visible()
-    page.wait_for_function("document.querySelector('.time-slider').dataset.points > 10")
+    page.wait_for_function(
+        "document.querySelector('[data-view=recordings] .time-slider').dataset.points > 10"
+    )
     # Both aircraft of the recording fly, under numbers that no live one has.
     expect(slider).to_have_attribute("data-curves", "2")
     flown = "Object.values(mavgate.vehicles).filter((v) => v.origin === 'recorded')"
@@ -377,6 +381,10 @@ def _move_in_time(page: Page, row: object) -> None:
     page.get_by_role("option", name="Plane 2, recorded").click()
     page.wait_for_function("mavgate.state.origin === 'recorded'")
     expect(page.locator(".chips").get_by_text("recording", exact=True)).to_be_visible()
+    expect(page.locator(".chips").get_by_text("link", exact=True)).to_have_count(0)
+    expect(page.locator(".recording-bar")).to_contain_text(
+        re.compile(r"RECORDING \d+:\d\d of \d+:\d\d")
+    )
     view.get_by_label("Play or pause").click()
     expect(view.get_by_label("Play or pause")).to_have_text("play_arrow")
     length_s = float(slider.get_attribute("aria-valuemax") or 0)
@@ -400,3 +408,63 @@ def _move_in_time(page: Page, row: object) -> None:
     view.get_by_label("Close the recording").click()
     expect(slider).to_be_hidden()
     page.wait_for_function("Object.values(mavgate.vehicles).every((v) => v.origin === 'live')")
+
+
+def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
+    """What is flown while the browser draws no view is drawn when the view is shown again."""
+    show(page, "flight")
+    show(page, "plots")
+    begin = page.evaluate("mavgate.track(mavgate.selected).points.length")
+    page.wait_for_function(f"mavgate.track(mavgate.selected).points.length > {begin} + 20")
+    show(page, "map")
+    page.wait_for_function(
+        """() => {
+            const map = document.querySelector('[data-view=map] .map').mavgate_map;
+            const lines = Object.values(map._layers).filter((layer) => layer.getLatLngs);
+            const track = mavgate.track(mavgate.selected).points;
+            return lines.some((line) => line.getLatLngs().length >= track.length - 2);
+        }"""
+    )
+    longest = page.evaluate(
+        """() => {
+            const points = mavgate.track(mavgate.selected).points;
+            return Math.max(...points.slice(1).map((p, n) => mavgate.distance_m(points[n], p)));
+        }"""
+    )
+    assert longest < 50
+
+
+def test_flight_view_goes_back_in_time_and_to_the_present(page: Page) -> None:
+    show(page, "flight")
+    view = page.locator("section[data-view='flight']")
+    slider = view.get_by_role("slider", name="Moment of the flight")
+    page.wait_for_function("(mavgate.histories[mavgate.selected]?.time_us.length ?? 0) > 20")
+    slider.press("ArrowLeft")
+    page.wait_for_function("mavgate.past_us !== null")
+    past_us = page.evaluate("mavgate.state.time_us")
+    page.wait_for_function(f"mavgate.now_us > {past_us} + 6e6")
+    assert page.evaluate("mavgate.state.time_us") == past_us
+    expect(view.locator(".number-strip [data-item='Ground speed'] b")).not_to_be_empty()
+    view.get_by_role("button", name="Go to live").click()
+    page.wait_for_function(f"mavgate.state.time_us > {past_us} + 6e6")
+
+
+def test_another_page_does_not_show_the_recording_of_this_one(
+    browser: Browser, page: Page, demo: Process
+) -> None:
+    (demo.log.parent / "recordings").mkdir(exist_ok=True)
+    folder = demo.log.parent / "recordings"
+    (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in frames(60)))
+    show(page, "recordings")
+    view = page.locator("section[data-view='recordings']")
+    view.locator("tr[data-key='mine']").get_by_label("Open").click()
+    expect(page.locator(".recording-bar")).to_be_visible(timeout=START_LIMIT_MS)
+    other = open_page(browser, demo.link())
+    other.wait_for_timeout(1500)
+    origins = other.evaluate("Object.values(mavgate.vehicles).map((v) => v.origin)")
+    assert origins == ["live", "live"]
+    expect(other.locator(".recording-bar")).to_be_hidden()
+    other.close()
+    page.get_by_role("button", name="Back to live").click()
+    expect(page.locator(".recording-bar")).to_be_hidden()
+    page.wait_for_function("mavgate.state && mavgate.state.origin === 'live'")

@@ -143,7 +143,9 @@ export default {
       const h = canvas.height / this.ratio;
       if (w < 40 || h < 40) return;
       const s = this.shown;
-      const stale = !this.goal || (now - this.cameAt) / 1000 > STALE_S || this.goal.silent_s > 5;
+      // A moment of the past, which somebody chose, is never old.
+      const chosen = window.mavgate?.past_us != null;
+      const stale = !this.goal || (!chosen && ((now - this.cameAt) / 1000 > STALE_S || this.goal.silent_s > 5));
       const angles = s.q ? euler(s.q) : null;
       const u = Math.min(w / 100, h / 75); // the unit of everything: 1 % of a 4:3 screen
       const font = (size) => `600 ${Math.max(size * u, 9).toFixed(1)}px "Roboto Condensed", Roboto, sans-serif`;

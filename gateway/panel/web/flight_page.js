@@ -18,6 +18,7 @@ const PARTS = [
   ["Battery", "V", [["battery_v", "voltage"]]],
 ];
 const COMPARED = [["roll_deg", "Roll", "°"], ["pitch_deg", "Pitch", "°"], ["yaw_deg", "Heading", "°"], ["alt_amsl_m", "Height above sea", "m"]];
+const YEAR_2000_US = 946_684_800_000_000; // an earlier time is that of no calendar
 const rad = Math.PI / 180;
 
 function column({ r, d }) {
@@ -96,7 +97,7 @@ export default {
       return `${clock(this.at_s)} of ${clock(this.duration_s)}`;
     },
     facts() {
-      const begin = this.flight.begin_us ? `${new Date(this.flight.begin_us / 1000).toISOString().slice(0, 16).replace("T", " ")} UTC, ` : "";
+      const begin = this.flight.begin_us > YEAR_2000_US ? `${new Date(this.flight.begin_us / 1000).toISOString().slice(0, 16).replace("T", " ")} UTC, ` : "";
       return `${begin}${clock(this.duration_s)}, ${(this.length_m() / 1000).toFixed(1)} km`;
     },
     groups() {
@@ -105,7 +106,7 @@ export default {
       const time_s = columns.time_us.map((us) => us / 1e6);
       const all = { ...columns, ...this.angles[this.selected] };
       const shown = PARTS.map(([title, unit, series]) => ({
-        title, unit, series: series.filter(([key]) => all[key]?.some(Number.isFinite)).map(([key, name]) => ({ name, time_s, values: all[key] })),
+        title, unit, series: series.filter(([key]) => all[key]?.some((v) => Number.isFinite(v) && v !== 0)).map(([key, name]) => ({ name, time_s, values: all[key] })),
       })).filter(({ series }) => series.length);
       const compared = Object.entries(this.compared);
       for (const [key, title, unit] of compared.length ? COMPARED : [])

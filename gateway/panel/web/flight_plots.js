@@ -112,7 +112,7 @@ export default {
         pen.strokeStyle = colours[n % colours.length];
         pen.setLineDash(DASHES[n % DASHES.length]);
         pen.lineWidth = 1.7;
-        pen.stroke(path_of(series, from, to, x, y, width));
+        pen.stroke(path_of(series, from, to, x, y, width, group.unit === "°" ? 180 : Infinity));
       });
       pen.setLineDash([]);
       pen.fillStyle = mavgate.colour("accent");
@@ -173,14 +173,16 @@ function range_of(series, from, to) {
   return [low - margin, high + margin];
 }
 
-// The path of a series; of many points in one column of pixels only the extremes are drawn.
-function path_of({ time_s, values }, from, to, x, y, width) {
+// The path of a series, interrupted at a larger leap; of many points in one column of pixels only
+// the extremes are drawn.
+function path_of({ time_s, values }, from, to, x, y, width, leap) {
   const path = new Path2D();
   const begin = Math.max(0, time_s.findIndex((t) => t >= from) - 1);
   let count = 0;
   while (begin + count < time_s.length && time_s[begin + count] <= to) count += 1;
   const step = Math.max(1, Math.floor(count / (2 * width)));
   let is_open = false;
+  let last = NaN;
   for (let n = begin; n <= begin + count && n < values.length; n += step) {
     let [low, high] = [n, n];
     for (let m = n; m < Math.min(n + step, values.length); m++) {
@@ -193,9 +195,11 @@ function path_of({ time_s, values }, from, to, x, y, width) {
       continue;
     }
     for (const m of low < high ? [low, high] : low === high ? [low] : [high, low]) {
-      if (is_open) path.lineTo(x(time_s[m]), y(values[m]));
+      // An angle that goes on from 360 to 0 degrees is no line across the plot.
+      if (is_open && Math.abs(values[m] - last) <= leap) path.lineTo(x(time_s[m]), y(values[m]));
       else path.moveTo(x(time_s[m]), y(values[m]));
       is_open = true;
+      last = values[m];
     }
   }
   return path;

@@ -1,0 +1,165 @@
+"""A flight as one file: what it contains, how large it is, and that it loads nothing."""
+
+import base64
+import gzip
+import json
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Page
+from pymavlink.dialects.v20 import all as mavlink
+from typer.testing import CliRunner
+
+from gateway.cli.app import app
+from gateway.cli.support.settings_options import read_options
+from gateway.config import GatewaySettings
+from gateway.panel.flight_page import PageFlight, read_flight, render_page
+from gateway.recordings.reading import FlightError
+from gateway.recordings.tlog import encode_record
+from tests.panel.browsing import needs_chromium
+
+BEGIN_US = 1_750_000_000_000_000
+HOSTILE = "</script><script>window.ran = 1</script><img src=x onerror=window.ran=1>"
+
+
+def frames(seconds: int, hz: int = 10) -> Iterator[tuple[int, bytes]]:
+    """Make the messages of a flight in circles, with a little noise."""
+    sender = mavlink.MAVLink(None, 3, 1)
+    for step in range(seconds * hz):
+        time_us, turn = BEGIN_US + step * 1_000_000 // hz, step / hz / 20
+        wobble = math.sin(step * 12.9898) * 0.03
+        north, east = round(20_000 * math.sin(turn)), round(20_000 * math.cos(turn))
+        height = 400 + 80 * math.sin(turn / 7)
+        messages: list[Any] = [
+            mavlink.MAVLink_attitude_message(0, 0.4 + wobble, wobble, turn % 6 - 3, 0, 0, 0),
+            mavlink.MAVLink_global_position_int_message(
+                0, 470_000_000 + north, 80_000_000 + east, round(height * 1e3),
+                round((height - 320) * 1e3), 0, 0, 0, round(turn * 5729) % 36000,
+            ),
+            mavlink.MAVLink_vfr_hud_message(18 + wobble, 17 + wobble, 10, 50, height, wobble),
+        ]  # fmt: skip
+        if step % hz == 0:
+            messages += [
+                mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3),
+                mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 11800, -1, 63, 0, 0, 0, 0, 0, 0),
+            ]
+        if step == 5 * hz:
+            text = HOSTILE.encode()[:50]
+            messages.append(mavlink.MAVLink_statustext_message(2, text))
+        for message in messages:
+            yield time_us, bytes(message.pack(sender))
+
+
+def flight_of(folder: Path, seconds: int) -> PageFlight:
+    path = folder / "day_01.tlog"
+    path.write_bytes(b"".join(encode_record(*record) for record in frames(seconds)))
+    return read_flight([path], read_options(GatewaySettings()), HOSTILE)
+
+
+def unpacked(page: str, name: str) -> Any:
+    packed = re.search(rf'id="{name}"[^>]*>([^<]*)<', page)
+    assert packed is not None
+    return json.loads(gzip.decompress(base64.b64decode(packed[1])))
+
+
+@pytest.mark.io
+def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
+    page = render_page(flight_of(tmp_path, 60))
+    assert HOSTILE not in page
+    data = unpacked(page, "data")
+    (aircraft,) = data["aircraft"]
+    assert (aircraft["system_id"], aircraft["model"]) == (3, "plane")
+    column = aircraft["columns"]["alt_amsl_m"]
+    heights = [column["r"] * sum(column["d"][: n + 1]) for n in range(len(column["d"]))]
+    assert heights[0] == pytest.approx(400.0)
+    assert len(heights) == pytest.approx(60 * 10 / 3, abs=2)
+    assert data["texts"] == [[5.0, 3, 2, HOSTILE[:50]]]
+    assert set(unpacked(page, "modules")) >= {"vue", "./flight_page.js"}
+
+
+@pytest.mark.io
+@pytest.mark.slow
+def test_page_of_an_hour_is_small(tmp_path: Path) -> None:
+    size = len(render_page(flight_of(tmp_path, 3600)).encode())
+    assert size <= 3_500_000
+    empty = len(render_page(flight_of(tmp_path, 10)).encode())
+    assert size - empty <= 500_000
+
+
+@pytest.mark.io
+def test_recording_without_a_position_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "day_01.tlog"
+    beat = mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3).pack(mavlink.MAVLink(None, 3, 1))
+    path.write_bytes(encode_record(BEGIN_US, bytes(beat)) * 3)
+    with pytest.raises(FlightError, match="no position"):
+        read_flight([path], read_options(GatewaySettings()), "day")
+
+
+@pytest.mark.io
+def test_command_writes_one_file_and_overwrites_none(tmp_path: Path) -> None:
+    flight_of(tmp_path, 30)
+    output = tmp_path / "flight.html"
+    command = ["page", str(tmp_path / "day_01.tlog"), "-o", str(output), "--no-compare"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert "MB" in done.output
+    again = CliRunner().invoke(app, command)
+    assert again.exit_code != 0
+    assert "--force" in again.output
+
+
+@pytest.mark.io
+@pytest.mark.slow
+@needs_chromium
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1024, "dark"), (1920, "light")])
+def test_page_opens_offline_and_moves(
+    browser: Browser, tmp_path: Path, width: int, scheme: Any
+) -> None:
+    path = tmp_path / "flight.html"
+    path.write_text(render_page(flight_of(tmp_path, 120)))
+    context = browser.new_context(
+        viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True
+    )
+    page = context.new_page()
+    troubles: list[str] = []
+    page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
+    page.on("pageerror", lambda error: troubles.append(str(error)))
+    page.on("request", lambda r: r.url.startswith("http") and troubles.append(r.url))
+    page.goto(path.as_uri())
+    page.locator(".number-strip").wait_for()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    assert page.evaluate("document.body.classList.contains('body--dark')") == (scheme == "dark")
+    page.locator("input[type=range]").focus()
+    page.keyboard.press("PageUp")
+    assert page.locator("[data-role=clock]").inner_text() == "1:00 of 1:59"
+    before = page.evaluate("mavgate.state.lat_deg")
+    page.keyboard.press("ArrowRight")
+    assert page.evaluate("mavgate.state.lat_deg") != before
+    page.keyboard.press("Space")
+    page.wait_for_function("mavgate.past_us > 66e6")
+    page.keyboard.press("Space")
+    page.get_by_title("Go to 0:05").click()
+    assert page.locator("[data-role=clock]").inner_text().startswith("0:05")
+    check_instruments(page)
+    assert page.evaluate("typeof ran") == "undefined"
+    assert troubles == []
+    context.close()
+
+
+def check_instruments(page: Page) -> None:
+    """Check that the instruments are drawn: none of their canvases has one colour only."""
+    many = """(canvas) => {
+        const copy = document.createElement('canvas');
+        [copy.width, copy.height] = [64, 64];
+        const pen = copy.getContext('2d');
+        pen.drawImage(canvas, 0, 0, 64, 64);
+        const data = new Uint32Array(pen.getImageData(0, 0, 64, 64).data.buffer);
+        return new Set(data).size > 3;
+    }"""
+    for place in (".flight-display canvas", ".plot canvas >> nth=0"):
+        assert page.locator(place).evaluate(many)
+    assert int(page.locator(".scene").get_attribute("data-frames") or 0) > 1
