@@ -35,6 +35,7 @@ from gateway.panel.map_tiles import MapTiles
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.recording_files import add_recording_files
+from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
@@ -179,6 +180,7 @@ def make_parts(
         samples,
         dialogues,
         watch,
+        RecordingJobs(),
     )
 
 
@@ -196,6 +198,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     add_tracks(app, parts.fleet)
     MapTiles(parts.settings).serve(app)
     add_recording_files(app, parts)
+    parts.jobs.serve(app)
     app.mount("/web", _CheckedFiles(directory=WEB))
     app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))
     _add_head()
@@ -244,6 +247,7 @@ async def _serve(
     finally:
         parts.dialogues.close()
         parts.watch.close()
+        parts.jobs.close()
         parts.uplink.close()
 
 

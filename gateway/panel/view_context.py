@@ -39,6 +39,7 @@ from gateway.panel.dialogues import Dialogues
 from gateway.panel.gateway_client import READING, ControlClient, GatewayWatch
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
+from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.state.vehicle import VehicleState
@@ -72,6 +73,8 @@ class PanelParts:
     dialogues: Dialogues
     watch: GatewayWatch
     """The gateway's status of the last second."""
+    jobs: RecordingJobs
+    """The catalogue and the exports of recordings."""
 
     @property
     def recordings_folder(self) -> Path:

@@ -13,8 +13,9 @@ from nicegui.events import GenericEventArguments
 
 from gateway.panel.playback import SPEEDS, Playback, Profile
 from gateway.panel.recording_facts import RecordingFacts
+from gateway.panel.recording_jobs import FORMATS
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets.prompts import confirm, heading, notify_failure
+from gateway.panel.widgets.prompts import closing, confirm, heading, named_dialog, notify_failure
 from gateway.panel.widgets.recorder import RecorderControls
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
@@ -22,6 +23,7 @@ from gateway.recordings.index import delete_recording, list_recordings
 from gateway.season.catalogue.catalogue_file import Row
 
 REFRESH_S: Final = 1.0
+IDLE: Final = "idle"
 PLACE_S: Final = 0.25
 MUCH_LOST: Final = 0.05
 """A share of lost samples that a pilot should see."""
@@ -75,6 +77,7 @@ class RecordingsView:
     def _buttons(self) -> list[RowButton]:
         buttons = [RowButton("play_arrow", "Open", self._open)]
         buttons += [RowButton("download", "Download", self._download)]
+        buttons += [RowButton("file_export", "Export", self._ask_export)]
         if self._context.may_change:
             buttons += [RowButton("delete", "Delete", self._ask_delete)]
         return buttons
@@ -103,15 +106,28 @@ class RecordingsView:
 
     async def refresh(self) -> None:
         """Show the folder."""
+        parts = self._context.parts
         facts, search = self._facts, (self._search.value or "").strip()
         folder = self._context.parts.recordings_folder
         # Querying a catalogue of thousands would block the page too long.
         await asyncio.to_thread(facts.look, folder, search)
         self._trouble.set_text(facts.trouble)
         recordings = list_recordings(folder)
-        self._trouble.set_visibility(bool(facts.trouble and recordings))
+        recorder = parts.watch.recorder
+        if recorder is None or recorder["state"] == IDLE:
+            parts.jobs.index(folder, recordings)
+        if parts.jobs.is_indexing:
+            self._trouble.set_text("Indexing the recordings …")
+        self._trouble.set_visibility(
+            bool(recordings) and bool(facts.trouble or parts.jobs.is_indexing)
+        )
         shown = [entry for entry in reversed(recordings) if facts.shows(entry.name, search)]
-        self._table.show({entry.name: _row(entry, facts.of(entry.name)) for entry in shown})
+        self._table.show(
+            {
+                entry.name: _row(entry, facts.of(entry.name), facts.track(entry.name))
+                for entry in shown
+            }
+        )
 
     def _show_place(self) -> None:
         playback = self._context.playback
@@ -151,6 +167,29 @@ class RecordingsView:
     def _download(self, name: str) -> None:
         ui.download.from_url(f"/recordings/{quote(name)}")
 
+    def _ask_export(self, name: str) -> None:
+        title = f"Export {name}"
+        with named_dialog(title) as dialog, ui.card().classes("asks"):
+            ui.label(printable(title)).classes("title")
+            for kind, (label, _, _) in FORMATS.items():
+                export = closing(dialog, partial(self._export, name, kind))
+                ui.button(label, on_click=export).props("no-caps outline")
+            ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+        dialog.on("hide", dialog.delete)
+        dialog.open()
+
+    async def _export(self, name: str, kind: str) -> None:
+        context, (label, _, _) = self._context, FORMATS[kind]
+        note = ui.notification(
+            f"{printable(name)}: making {label} …", spinner=True, timeout=None, type="ongoing"
+        )
+        with notify_failure(context):
+            try:
+                url = await context.parts.jobs.export(context.parts.recordings_folder, name, kind)
+                ui.download.from_url(url)
+            finally:
+                note.dismiss()
+
     async def _on_upload(self, event: GenericEventArguments) -> None:
         text = printable(str(event.args["text"]))
         ui.notify(text, type="positive" if event.args["ok"] else "negative")
@@ -160,10 +199,15 @@ class RecordingsView:
         context = self._context
         with notify_failure(context):
             context.check_may_change()
-            ui.notify(f"Opening {printable(name)}…")
-            await context.playback.open(
-                context.parts.recordings_folder, name, fused_again=fused_again
+            note = ui.notification(
+                f"Opening {printable(name)} …", spinner=True, timeout=None, type="ongoing"
             )
+            try:
+                await context.playback.open(
+                    context.parts.recordings_folder, name, fused_again=fused_again
+                )
+            finally:
+                note.dismiss()
             self._show_place()
 
     async def _on_fused_again(self, event: Any) -> None:
@@ -207,11 +251,11 @@ def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
     return [playback.aircraft[key].profile for key in order]
 
 
-def _row(recording: Any, facts: Row | None) -> Cells:
+def _row(recording: Any, facts: Row | None, track: str) -> Cells:
     when = datetime.fromtimestamp(recording.modified_s, UTC)
     kinds = sorted({Path(file).suffix.lstrip(".") for file in recording.files})
     return (
-        (recording.name, ""),
+        (recording.name, "", "", track),
         (f"{when:%Y-%m-%d %H:%M:%S}", ""),
         (f"{recording.size / 1e6:.2f} MB", ""),
         (f"{len(recording.files)} {'+'.join(kinds)}", ""),

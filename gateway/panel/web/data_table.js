@@ -9,7 +9,7 @@ export default {
           <td v-if="buttons.length"></td>
         </tr></thead>
         <tbody><tr v-for="row in rows" :key="row.key" :data-key="row.key">
-          <td v-for="[text, look, icon] in row.cells"><span :class="look"><i v-if="icon" class="q-icon material-icons" aria-hidden="true">{{ icon }}</i>{{ text }}</span></td>
+          <td v-for="[text, look, icon, track] in row.cells"><svg v-if="track" class="thumbnail" viewBox="0 0 46 24" aria-hidden="true"><polyline :points="track" /></svg><span :class="look"><i v-if="icon" class="q-icon material-icons" aria-hidden="true">{{ icon }}</i>{{ text }}</span></td>
           <td v-if="buttons.length" class="acts">
             <button v-for="([icon, title], n) in buttons" type="button" class="row-button" :title="title" :aria-label="title" @click="$emit('act', n, row.key)"><i class="q-icon material-icons" aria-hidden="true">{{ icon }}</i></button>
           </td>

@@ -6,8 +6,8 @@ const DARK = ["#56b4e9", "#f09a3e", "#3ec9a0", "#e38ac0", "#f0e442", "#c3ced8"];
 const DASHES = [[], [7, 4], [2, 3], [8, 3, 2, 3], [12, 4], [2, 6]];
 const LEFT = 56;
 const RIGHT = 10;
-const TOP = 26;
 const BOTTOM = 20;
+const NARROW = 620; // below it the names of the lines have a row of their own
 
 export default {
   template: `
@@ -57,9 +57,11 @@ export default {
       pen.setTransform(ratio, 0, 0, ratio, 0, 0);
       pen.clearRect(0, 0, width, height);
       const [from, to] = this.span();
+      const narrow = width < NARROW;
+      const top = narrow ? 42 : 26;
       const x = (t) => LEFT + ((t - from) / (to - from)) * (width - LEFT - RIGHT);
       const [low, high] = range_of(group.series, from, to);
-      const y = (v) => height - BOTTOM - ((v - low) / (high - low)) * (height - TOP - BOTTOM);
+      const y = (v) => height - BOTTOM - ((v - low) / (high - low)) * (height - top - BOTTOM);
       const [ink, soft, line] = ["ink", "soft", "line"].map(mavgate.colour);
       pen.font = "11px system-ui, sans-serif";
       pen.lineWidth = 1;
@@ -78,7 +80,7 @@ export default {
       for (const tick of ticks(from, to, Math.max(2, width / 110), [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600])) {
         pen.strokeStyle = line;
         pen.beginPath();
-        pen.moveTo(x(tick), TOP);
+        pen.moveTo(x(tick), top);
         pen.lineTo(x(tick), height - BOTTOM);
         pen.stroke();
         pen.fillStyle = soft;
@@ -90,7 +92,8 @@ export default {
       pen.font = "600 12px system-ui, sans-serif";
       const title = group.unit ? `${group.title} (${group.unit})` : group.title;
       pen.fillText(title, LEFT, 12);
-      let label_x = LEFT + pen.measureText(title).width + 16;
+      let label_x = narrow ? LEFT : LEFT + pen.measureText(title).width + 16;
+      const label_y = narrow ? 29 : 12;
       pen.font = "11px system-ui, sans-serif";
       pen.save();
       group.series.forEach(({ name }, n) => {
@@ -98,14 +101,14 @@ export default {
         pen.setLineDash(DASHES[n % DASHES.length]);
         pen.lineWidth = 2;
         pen.beginPath();
-        pen.moveTo(label_x, 12);
-        pen.lineTo(label_x + 20, 12);
+        pen.moveTo(label_x, label_y);
+        pen.lineTo(label_x + 20, label_y);
         pen.stroke();
-        pen.fillText(name, label_x + 25, 12);
+        pen.fillText(name, label_x + 25, label_y);
         label_x += 41 + pen.measureText(name).width;
       });
       pen.beginPath();
-      pen.rect(LEFT, TOP, width - LEFT - RIGHT, height - TOP - BOTTOM);
+      pen.rect(LEFT, top, width - LEFT - RIGHT, height - top - BOTTOM);
       pen.clip();
       pen.lineJoin = "round";
       group.series.forEach((series, n) => {
@@ -116,7 +119,7 @@ export default {
       });
       pen.setLineDash([]);
       pen.fillStyle = mavgate.colour("accent");
-      pen.fillRect(x(this.at) - 0.75, TOP, 1.5, height);
+      pen.fillRect(x(this.at) - 0.75, top, 1.5, height);
       pen.restore();
     },
     time_at(event) {

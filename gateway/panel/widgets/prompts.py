@@ -9,13 +9,15 @@ from nicegui.elements.mixins.text_element import TextElement
 
 from gateway.live.control_socket import ControlError
 from gateway.panel.playback import PlaybackError
+from gateway.panel.recording_jobs import ExportError
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext
 from gateway.printable import printable
 from gateway.recordings.index import RecordingError
 
 FAILURES: Final = (
-    ControlError, CommandFailedError, NotAllowedError, PlaybackError, RecordingError, OSError,
+    ControlError, CommandFailedError, ExportError, NotAllowedError, PlaybackError, RecordingError,
+    OSError,
 )  # fmt: skip
 
 

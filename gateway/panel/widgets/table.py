@@ -11,8 +11,9 @@ from gateway.panel.view_context import WEB
 from gateway.printable import printable
 
 Cells = Sequence[tuple[str, ...]]
-"""Text, style class and icon of each cell of a row; the class is `""`, `good`, `warn`, `bad`,
-`info` or `soft`, and the icon, a name of a Material icon, may be left out."""
+"""Text, style class, icon and track of each cell; the class is `""`, `good`, `warn`, `bad`,
+`info` or `soft`; the icon, a name of a Material icon, and the track, corners of a line in a box of
+46 by 24, may be left out."""
 
 
 @dataclass(frozen=True, slots=True)

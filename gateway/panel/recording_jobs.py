@@ -1,0 +1,192 @@
+"""Work on recordings in other processes: their catalogue, and exports to other formats.
+
+One export and one indexing run at a time, at the lowest priority, so that neither the gateway nor
+the page waits for them.
+"""
+
+import asyncio
+import logging
+import secrets
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+from zipfile import ZIP_DEFLATED, ZipFile
+
+from fastapi import FastAPI
+from starlette.responses import FileResponse, PlainTextResponse, Response
+
+from gateway.live.attachment import own_command
+from gateway.recordings.index import Recording, find_recording
+
+log = logging.getLogger(__name__)
+
+PATH: Final = "/exports/"
+LOWEST: Final = ("nice", "-n", "19")
+EXPORT_S: Final = 900.0
+"""Longest time for an export; a first start may compile for a minute of it."""
+KEPT_S: Final = 600.0
+"""After which a file that was made and not fetched is deleted."""
+MAX_WAITING: Final = 4
+INDEX_AGAIN_S: Final = 20.0
+"""Shortest time between two indexings."""
+FORMATS: Final = {
+    "csv": ("CSV table", "convert", ".csv"),
+    "tlog": ("tlog", "convert", ".tlog"),
+    "kml": ("KML (Google Earth)", "convert", ".kml"),
+    "gpx": ("GPX", "convert", ".gpx"),
+    "mcap": ("MCAP (Foxglove)", "convert", ".mcap"),
+    "page": ("Page (one HTML file)", "page", ".html"),
+    "report": ("Report (figures and tables)", "report", ".zip"),
+}
+"""Title, command and ending of the file of each export."""
+
+
+class ExportError(Exception):
+    """A recording cannot be exported; the text says why."""
+
+
+@dataclass(slots=True)
+class _Made:
+    file: Path
+    made_s: float
+
+
+class RecordingJobs:
+    """The catalogue and the exports of all pages."""
+
+    def __init__(self) -> None:
+        self._made: dict[str, _Made] = {}
+        self._folder: Path | None = None
+        self._exporting = asyncio.Lock()
+        self._waiting = 0
+        self._indexing: asyncio.Task[None] | None = None
+        self._indexed: object = None
+        self._indexed_s = -INDEX_AGAIN_S
+
+    @property
+    def is_indexing(self) -> bool:
+        """Whether the catalogue is being brought up to date."""
+        return self._indexing is not None and not self._indexing.done()
+
+    def index(self, folder: Path, recordings: list[Recording]) -> None:
+        """Bring the catalogue of a folder up to date if its recordings have changed."""
+        state = (folder, [(each.name, each.size, each.modified_s) for each in recordings])
+        waits = time.monotonic() - self._indexed_s < INDEX_AGAIN_S
+        if not recordings or self.is_indexing or waits or state == self._indexed:
+            return
+        self._indexed, self._indexed_s = state, time.monotonic()
+        self._indexing = asyncio.get_running_loop().create_task(self._index(folder))
+
+    async def export(self, folder: Path, name: str, kind: str) -> str:
+        """Export a recording, and return the address of the file.
+
+        Raises
+        ------
+        ExportError
+            If it cannot be made.
+        RecordingError
+            If there is no such recording.
+        """
+        if self._waiting >= MAX_WAITING:
+            raise ExportError("other exports are being made; try again in a while")
+        find_recording(folder, name)
+        self._waiting += 1
+        try:
+            async with self._exporting:
+                return await self._export(folder, name, kind)
+        finally:
+            self._waiting -= 1
+
+    def close(self) -> None:
+        """Delete what was made."""
+        if self._indexing is not None:
+            self._indexing.cancel()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+    def serve(self, app: FastAPI) -> None:
+        """Serve the files that were made, each under an address that cannot be guessed."""
+
+        @app.get(PATH + "{token}")
+        async def _fetch(token: str) -> Response:
+            made = self._made.get(token)
+            if made is None or not made.file.is_file():
+                return PlainTextResponse("this file is no longer there: export it again", 404)
+            return FileResponse(made.file, filename=made.file.name)
+
+    async def _export(self, folder: Path, name: str, kind: str) -> str:
+        _, command, suffix = FORMATS[kind]
+        self._delete_old()
+        if self._folder is None:
+            self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
+        token = secrets.token_urlsafe(16)
+        place = self._folder / token
+        place.mkdir()
+        with _settings_for(folder, place) as config:
+            target = place / f"{name}{suffix}"
+            output = place / name if kind == "report" else target
+            arguments = ["--config", str(config), "-o", str(output), "--", name]
+            await _run([*own_command(command), *arguments])
+        if kind == "report":
+            await asyncio.to_thread(_pack, output, target)
+        self._made[token] = _Made(target, time.monotonic())
+        return f"{PATH}{token}"
+
+    def _delete_old(self) -> None:
+        for token, made in list(self._made.items()):
+            if time.monotonic() - made.made_s > KEPT_S:
+                shutil.rmtree(made.file.parent, ignore_errors=True)
+                del self._made[token]
+
+    async def _index(self, folder: Path) -> None:
+        try:
+            await _run([*own_command("catalogue"), "index", str(folder)])
+        except ExportError as error:
+            log.info("the recordings in %s are not indexed: %s", folder, error)
+
+
+@contextmanager
+def _settings_for(folder: Path, place: Path) -> Iterator[Path]:
+    """Write settings with the folder of the recordings, which commands take names from."""
+    config = place / "settings.toml"
+    quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
+    config.write_text(f'[recording]\nfolder = "{quoted}"\n')
+    try:
+        yield config
+    finally:
+        with suppress(FileNotFoundError):
+            config.unlink()
+
+
+async def _run(command: list[str]) -> None:
+    """Run a command; raises ExportError with its last line if it fails."""
+    child = await asyncio.create_subprocess_exec(
+        *LOWEST,
+        *command,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.DEVNULL,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        async with asyncio.timeout(EXPORT_S):
+            _, text = await child.communicate()
+    except BaseException:
+        with suppress(ProcessLookupError):
+            child.kill()
+        await child.wait()
+        raise
+    if child.returncode:
+        lines = text.decode(errors="replace").strip().splitlines()
+        raise ExportError(lines[-1] if lines else f"the command ended with {child.returncode}")
+
+
+def _pack(folder: Path, target: Path) -> None:
+    with ZipFile(target, "w", ZIP_DEFLATED) as packed:
+        for file in sorted(folder.rglob("*")):
+            if file.is_file():
+                packed.write(file, file.relative_to(folder.parent))
