@@ -29,11 +29,12 @@ from gateway.analysis.sources import flight_of_blocks
 from gateway.panel.state.vehicle import FlightHistory, VehicleState
 from gateway.printable import printable
 from gateway.reasons import reason_of
+from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import aircraft_for
 from gateway.recordings.join import joined_tables
 from gateway.recordings.opening import open_flights
 from gateway.recordings.play import Track
-from gateway.recordings.reading import FlightError, ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions, open_rows
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 

@@ -18,7 +18,7 @@ from gateway.cli.app import app
 from gateway.cli.support.settings_options import read_options
 from gateway.config import GatewaySettings
 from gateway.panel.flight_page import PageFlight, read_flight, render_page
-from gateway.recordings.reading import FlightError
+from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
 from tests.panel.browsing import needs_chromium
 
