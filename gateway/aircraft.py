@@ -209,10 +209,12 @@ class Aircraft:
     def _recorded(
         self,
         record: FusedSample | BaroRaw | GpsFix | NodeStatus,
-        wanted: Iterable[VehicleAction],
+        wanted: Sequence[VehicleAction],
         now_us: int,
     ) -> list[Action]:
-        """Order the actions: frames first, then what is recorded, then changes of settings."""
+        """Order the actions: frames first, then the record, then changes of settings."""
+        if not wanted:
+            return [record]
         actions = self.perform(wanted, now_us)
         changed = [action for action in actions if isinstance(action, SettingsChanged)]
         if not changed:

@@ -225,14 +225,14 @@ class Vehicle:
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
-        told = self.telemetry.on_state(state, sample)
-        told += self._announcements.on_sample(sample, now_us)
-        told += self._announcements.on_flags(state.flags, now_us)
-        found = self._replies(told)
-        found += self._intervals.on_state(state.time_us)
+        messages = self.telemetry.on_state(state, sample)
+        messages += self._announcements.on_sample(sample, now_us)
+        messages += self._announcements.on_flags(state.flags, now_us)
+        answers = self._replies(messages) if messages else []
+        answers += self._intervals.on_state(state.time_us)
         if self._calibrator.busy:
-            found += self._calibrator.on_sample(sample)
-        return self._finish(found)
+            answers += self._calibrator.on_sample(sample)
+        return self._finish(answers) if answers else []
 
     def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
         """Take in one barometer sample."""

@@ -94,12 +94,15 @@ class ClockTracker:
             The stamp on the local clock, in µs; never later than the arrival.
         """
         remote_us = self._unwrap(remote_u32, arrival_us)
-        if self._is_stale(remote_us, arrival_us):
-            self._restart()
-            remote_us = remote_u32
         local_us = self._to_local(remote_us) if self._buckets else arrival_us
-        if local_us - arrival_us <= AHEAD_US:
+        late_us = arrival_us - local_us
+        if late_us >= -AHEAD_US:
             self._suspect_us = None
+            if late_us <= RESTART_JUMP_US:
+                self._late_since_us = None
+            elif self._is_stale(arrival_us):
+                self._restart()
+                remote_us, local_us = remote_u32, arrival_us
         elif self._is_doubtful(arrival_us - remote_us):
             return arrival_us
         if self._last_remote_us is None or remote_us > self._last_remote_us:
@@ -138,11 +141,8 @@ class ClockTracker:
         late_us = arrival_us - self._to_local(remote_us)
         return remote_us > self._last_remote_us and -slack_us <= late_us <= MAX_STALL_US
 
-    def _is_stale(self, remote_us: int, arrival_us: int) -> bool:
+    def _is_stale(self, arrival_us: int) -> bool:
         """Return whether stamps have been too late for longer than buffers explain."""
-        if not self._buckets or arrival_us - self._to_local(remote_us) <= RESTART_JUMP_US:
-            self._late_since_us = None
-            return False
         if self._late_since_us is None:
             self._late_since_us = arrival_us
         return arrival_us - self._late_since_us > DRAIN_US

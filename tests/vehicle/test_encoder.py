@@ -2,10 +2,11 @@ import math
 import random
 from typing import Any
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.encoding import Encoder
+from gateway.vehicle.encoding import Encoder, MessagePacker
 from tests.vehicle.samples import decode
 
 
@@ -70,3 +71,34 @@ def test_arrays_are_saturated_item_by_item() -> None:
     assert found.q[0] == pytest.approx(3.4028234e38)
     assert found.q[1] == pytest.approx(-3.4028234e38)
     assert found.q[2] == 0.5
+
+
+NUMERIC = [
+    kind
+    for kind in mavlink.mavlink_map.values()
+    if "char" not in kind.fieldtypes and len(kind.ordered_fieldnames) > 1
+]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_packers_are_byte_equal_to_pymavlink_over_the_dialect(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for kind in NUMERIC:
+        lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
+        arguments, values = [], []
+        for name, code in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+            numbers = [
+                float(number) if code in ("float", "double") else int(number)
+                for number in rng.integers(0, 100, lengths[name] or 1)
+            ]
+            arguments.append(numbers if lengths[name] else numbers[0])
+            values += numbers
+        packed = Encoder(7).encode(MessagePacker(kind)(*values))
+        assert packed == Encoder(7).encode(kind(*arguments)), kind.msgname
+
+
+def test_packer_saturates_numbers_beyond_their_fields() -> None:
+    packer = MessagePacker(mavlink.MAVLink_global_position_int_message)
+    [found] = decode([Encoder(1).encode(packer(-1, 1e300, -1e300, math.nan, 0, 1e9, -1e9, 0, 7e4))])
+    assert (found.time_boot_ms, found.lat, found.lon, found.alt) == (0, 2**31 - 1, -(2**31), 0)
+    assert (found.vx, found.vy, found.hdg) == (32767, -32768, 65535)

@@ -12,6 +12,7 @@ from msgspec.structs import fields, replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
+from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.location import Place
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import Health
@@ -104,7 +105,7 @@ UNKNOWN = {
 
 @pytest.mark.parametrize("name", UNKNOWN)
 def test_what_is_not_known_is_sent_as_the_definition_says(name: str) -> None:
-    message = UNKNOWN[name]()
+    [message] = decode([Encoder(1).encode(UNKNOWN[name]())])
     marks = invalid_marks(name)
     assert marks
     for field, mark in marks.items():
@@ -115,6 +116,6 @@ def test_what_is_not_known_is_sent_as_the_definition_says(name: str) -> None:
 
 
 def test_nothing_known_leaves_no_plausible_zero() -> None:
-    hud = messages.vfr_hud(NOTHING)
+    [hud] = decode([Encoder(1).encode(messages.vfr_hud(NOTHING))])
     assert all(math.isnan(value) for value in (hud.airspeed, hud.groundspeed, hud.alt, hud.climb))
     assert not messages.has_position(NOTHING)

@@ -80,6 +80,15 @@ PRESSURE_UPDATED: Final = (
 IMU_UPDATED: Final = ACCEL_UPDATED | GYRO_UPDATED | mavlink.HIGHRES_IMU_UPDATED_TEMPERATURE
 
 
+ATTITUDE_QUATERNION: Final = encoding.MessagePacker(mavlink.MAVLink_attitude_quaternion_message)
+ATTITUDE: Final = encoding.MessagePacker(mavlink.MAVLink_attitude_message)
+GLOBAL_POSITION_INT: Final = encoding.MessagePacker(mavlink.MAVLink_global_position_int_message)
+VFR_HUD: Final = encoding.MessagePacker(mavlink.MAVLink_vfr_hud_message)
+HIGHRES_IMU: Final = encoding.MessagePacker(mavlink.MAVLink_highres_imu_message)
+SCALED_PRESSURE: Final = encoding.MessagePacker(mavlink.MAVLink_scaled_pressure_message)
+"""The messages of samples, which are sent most often."""
+
+
 def boot_ms(time_us: int) -> int:
     """Turn the gateway clock into `time_boot_ms`, which wraps after 49.7 days."""
     return (time_us // MS_US) & encoding.UINT32_MAX
@@ -87,16 +96,14 @@ def boot_ms(time_us: int) -> int:
 
 def attitude_quaternion(state: NavState) -> Any:
     """Encode the attitude; `repr_offset_q` is all zero: not supported."""
-    return mavlink.MAVLink_attitude_quaternion_message(
-        boot_ms(state.time_us), *state.q_nb, *state.rate_b_radps, (0.0, 0.0, 0.0, 0.0)
+    return ATTITUDE_QUATERNION(
+        boot_ms(state.time_us), *state.q_nb, *state.rate_b_radps, 0.0, 0.0, 0.0, 0.0
     )
 
 
 def attitude(state: NavState) -> Any:
     """Encode the attitude as Euler angles."""
-    return mavlink.MAVLink_attitude_message(
-        boot_ms(state.time_us), *to_euler(state.q_nb), *state.rate_b_radps
-    )
+    return ATTITUDE(boot_ms(state.time_us), *to_euler(state.q_nb), *state.rate_b_radps)
 
 
 def has_position(state: NavState) -> bool:
@@ -126,7 +133,7 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
     heading = NAN
     if state.flags & NavFlags.HEADING_VALID:
         heading = to_euler(state.q_nb)[2]
-    return mavlink.MAVLink_global_position_int_message(
+    return GLOBAL_POSITION_INT(
         boot_ms(state.time_us),
         encoding.int32(state.lat_deg * DEGE7),
         encoding.int32(state.lon_deg * DEGE7),
@@ -147,14 +154,8 @@ def vfr_hud(state: NavState) -> Any:
     north, east, down = state.vel_n_mps
     speed = math.hypot(north, east)
     yaw = to_euler(state.q_nb)[2]
-    return mavlink.MAVLink_vfr_hud_message(
-        airspeed=speed,
-        groundspeed=speed,
-        heading=encoding.compass_deg(yaw) if math.isfinite(yaw) else 0,
-        throttle=0,
-        alt=state.alt_amsl_m,
-        climb=-down,
-    )
+    heading, throttle = encoding.compass_deg(yaw) if math.isfinite(yaw) else 0, 0
+    return VFR_HUD(speed, speed, heading, throttle, state.alt_amsl_m, -down)
 
 
 def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, updated: int) -> Any:
@@ -180,18 +181,20 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
     MAVLink_message
     """
     x, y, z = mag_b_ut
-    return mavlink.MAVLink_highres_imu_message(
+    diff_pressure, imu_id = NAN, 0
+    return HIGHRES_IMU(
         sample.time_us,
         *sample.accel_b_mps2,
         *sample.gyro_b_radps,
         x / UT_PER_GAUSS,
         y / UT_PER_GAUSS,
         z / UT_PER_GAUSS,
-        abs_pressure=NAN if baro is None else baro.pressure_pa / PA_PER_HPA,
-        diff_pressure=NAN,
-        pressure_alt=NAN if baro is None else baro.alt_pressure_m,
-        temperature=sample.temperature_degc,
-        fields_updated=updated,
+        NAN if baro is None else baro.pressure_pa / PA_PER_HPA,
+        diff_pressure,
+        NAN if baro is None else baro.alt_pressure_m,
+        sample.temperature_degc,
+        updated,
+        imu_id,
     )
 
 
@@ -332,11 +335,13 @@ def gps_global_origin(origin: Place, time_us: int) -> Any:
 
 def scaled_pressure(sample: BaroSample) -> Any:
     """Encode the barometer; the differential pressure, which nothing measures, is NaN."""
-    return mavlink.MAVLink_scaled_pressure_message(
+    press_diff, temperature_of_press_diff = NAN, 0
+    return SCALED_PRESSURE(
         boot_ms(sample.time_us),
         sample.pressure_pa / PA_PER_HPA,
-        NAN,
-        encoding.int16(sample.temperature_degc * 100.0),
+        press_diff,
+        encoding.int16(sample.temperature_degc * CENTI),
+        temperature_of_press_diff,
     )
 
 

@@ -177,6 +177,10 @@ class Telemetry:
         self._state_streams = [
             (message_id, self.streams[message_id]) for message_id in STATE_MESSAGES
         ]
+        self._timed_due_us: int | None = None
+        """When the next timed message is due; None if that must be computed."""
+        self._state_due_us = 0
+        """No sample before it carries a message."""
         self._builders = self._own_builders()
         self._timed = [*TIMED_MESSAGES]
         self._take_added()
@@ -232,6 +236,7 @@ class Telemetry:
     def reconfigure(self, settings: VehicleSettings) -> None:
         """Apply changed settings; only the rates that differ restart."""
         self.settings = settings
+        self._state_due_us, self._timed_due_us = 0, None
         self.motion.takeoff_speed_mps = settings.takeoff_speed_mps
         self.motion.takeoff_height_m = settings.takeoff_height_m
         for message_id, us in _intervals(settings).items():
@@ -261,7 +266,11 @@ class Telemetry:
         self.motion.update(state, self._ground_alt_m)
         time_us = state.time_us
         period_us = self._pace.take(time_us)
+        if time_us + period_us < self._state_due_us:
+            return []
         due = [m for m, stream in self._state_streams if stream.offer_paced(time_us, period_us)]
+        streams = (stream for _, stream in self._state_streams if stream.interval_us != OFF)
+        self._state_due_us = min((stream.due_us or 0 for stream in streams), default=time_us)
         return self._build_all(due, time_us) if due else []
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
@@ -311,10 +320,12 @@ class Telemetry:
     def poll(self, now_us: int) -> list[Any]:
         """Return the timed messages that are due."""
         if not self._polled:
-            self._polled = True
+            self._polled, self._timed_due_us = True, None
             for k, message_id in enumerate(self._timed):
                 self.streams[message_id].begin(now_us + k * APART_US)
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
+        if due:
+            self._timed_due_us = None
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
@@ -325,8 +336,10 @@ class Telemetry:
 
     def next_due_us(self) -> int:
         """Return when `poll` has something to send; the heartbeat never stops."""
-        due = (self.streams[m].due_us for m in self._timed if self.streams[m].interval_us > 0)
-        return min(0 if time_us is None else time_us for time_us in due)
+        if self._timed_due_us is None:
+            due = (self.streams[m].due_us for m in self._timed if self.streams[m].interval_us > 0)
+            self._timed_due_us = min(0 if time_us is None else time_us for time_us in due)
+        return self._timed_due_us
 
     def build(self, message_id: int, now_us: int) -> Any:
         """Build one message from the newest records.
