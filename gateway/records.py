@@ -165,6 +165,28 @@ class GpsFix(msgspec.Struct, frozen=True, gc=False):
     """Unix time of the fix, or None while the receiver does not report date and time as valid."""
 
 
+class RadioState(IntEnum):
+    """State of the radio module of a board."""
+
+    OK = 0
+    ABSENT = 1
+    FORGETS = 2
+    """It does not keep its configuration."""
+    ACTIVATED = 3
+    """It works, but needed ACTIVATE: it is no nRF24L01+."""
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, for people; empty if it works."""
+        match self:
+            case RadioState.ABSENT:
+                return "radio module does not answer"
+            case RadioState.FORGETS:
+                return "radio module does not keep its configuration"
+            case _:
+                return ""
+
+
 class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     """A node's own once-a-second report."""
 
@@ -181,6 +203,9 @@ class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     loop_max_us: int
     sample_rate_hz: int
     supply_mv: int
+    radio: RadioState = RadioState.OK
+    chips: tuple[str, ...] = ()
+    """Names of the chips found since its start; empty from firmware before 1.1."""
 
 
 class PipeCounters(msgspec.Struct, frozen=True, gc=False):
@@ -202,6 +227,7 @@ class ReceiverStatus(msgspec.Struct, frozen=True, gc=False):
     uart_dropped: int
     reset_cause: int
     pipes: tuple[PipeCounters, ...]
+    radio: RadioState = RadioState.OK
 
 
 RawRecord = ImuRaw | BaroRaw | GpsFix | NodeStatus

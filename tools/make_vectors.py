@@ -10,8 +10,9 @@ from pathlib import Path
 
 import msgspec
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters, RadioState
 from gateway.wire import payloads
+from gateway.wire.chips import Chips
 from gateway.wire.framing import encode_frame
 
 TARGET = Path(__file__).resolve().parent.parent / "tests" / "vectors" / "frames.json"
@@ -144,6 +145,39 @@ RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
             mag_gain=9,
         ),
     ),
+    "node_status_imu_chips": (
+        payloads.Header(NodeId(1, 0), 513, 61_000_000),
+        payloads.NodeStatusPayload(
+            firmware_version=(1, 1),
+            reset_cause=1,
+            sensors_present=7,
+            sensors_failed=2,
+            bus_errors=3,
+            radio_failed=12,
+            radio_retries=65_535,
+            loop_max_us=812,
+            sample_rate_hz=100,
+            supply_mv=3300,
+            radio=RadioState.ACTIVATED,
+            chips=Chips(imu=0x98, magnetometer=0x2C, barometer=0x60),
+        ),
+    ),
+    "node_status_gps_chips": (
+        payloads.Header(NodeId(1, 1), 77, 61_500_000),
+        payloads.NodeStatusPayload(
+            firmware_version=(1, 1),
+            reset_cause=8,
+            sensors_present=8,
+            sensors_failed=0,
+            bus_errors=0,
+            radio_failed=0,
+            radio_retries=2,
+            loop_max_us=790,
+            sample_rate_hz=5,
+            supply_mv=0,
+            chips=Chips(gps=0x1A, gps_baud_hundreds=576),
+        ),
+    ),
 }
 
 RECEIVER_STATUS = {
@@ -160,6 +194,16 @@ RECEIVER_STATUS = {
             *(PipeCounters(0, 0, 0),) * 3,
             PipeCounters(4_294_967_295, 65_536, 65_535),
         ),
+    ),
+    "receiver_status_radio_forgets": payloads.ReceiverStatusFrame(
+        frame_seq=3,
+        receiver_time_us=2_000_000,
+        channel=76,
+        noise_percent=0,
+        uart_dropped=0,
+        reset_cause=1,
+        pipes=(PipeCounters(0, 0, 0),) * 6,
+        radio=RadioState.FORGETS,
     ),
 }
 

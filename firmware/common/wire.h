@@ -48,6 +48,7 @@ enum WireGpsModule : uint8_t {
     WIRE_GPS_UBX = 2,  // of a generation that it does not name
     WIRE_GPS_UBX_6 = 6,
 };
+constexpr uint8_t WIRE_GPS_ACKNOWLEDGES = 1 << 4;
 
 // Scales of the magnetometer: 0 to 7 are the HMC5883L's gain codes.
 enum WireMagScale : uint8_t {
@@ -56,6 +57,14 @@ enum WireMagScale : uint8_t {
 };
 
 constexpr int16_t WIRE_MAG_OVERFLOW = -4096;
+
+// The radio module of the board that reports: bits 4 to 7 beside the reset cause.
+enum WireRadioState : uint8_t {
+    WIRE_RADIO_OK = 0,
+    WIRE_RADIO_ABSENT = 1,     // does not answer
+    WIRE_RADIO_FORGETS = 2,    // does not keep its configuration
+    WIRE_RADIO_ACTIVATED = 3,  // works, but needed ACTIVATE: no nRF24L01+
+};
 
 #define WIRE_PACKED __attribute__((packed))
 
@@ -117,11 +126,20 @@ struct WIRE_PACKED WireGpsQuality {
 };
 static_assert(sizeof(WireGpsQuality) == 32, "PROTOCOL.md: kind 4");
 
+// Which chips a node has found, by what they call themselves; 0 where there is none.
+struct WIRE_PACKED WireChips {
+    uint8_t imu;            // WHO_AM_I
+    uint8_t magnetometer;   // I2C address
+    uint8_t barometer;      // chip id, register 0xD0
+    uint8_t gps;            // bits 0-3 WireGpsModule, bit 4 it acknowledges its settings
+    uint16_t gps_baud;      // hundreds of baud
+};
+
 struct WIRE_PACKED WireNodeStatus {
     WireHeader header;
     uint8_t version_major;
     uint8_t version_minor;
-    uint8_t reset_cause;      // MCUSR
+    uint8_t reset_and_radio;  // bits 0-3 MCUSR, 4-7 WireRadioState
     uint8_t sensors_present;  // WireSensor
     uint8_t sensors_failed;
     uint16_t bus_errors;
@@ -130,8 +148,9 @@ struct WIRE_PACKED WireNodeStatus {
     uint16_t loop_max_us;
     uint16_t sample_rate_hz;
     uint16_t supply_mv;
+    WireChips chips;
 };
-static_assert(sizeof(WireNodeStatus) == 25, "PROTOCOL.md: kind 5");
+static_assert(sizeof(WireNodeStatus) == 31, "PROTOCOL.md: kind 5");
 
 struct WIRE_PACKED WireFrameHeader {
     uint8_t version_kind;
@@ -157,13 +176,17 @@ struct WIRE_PACKED WireReceiverStatus {
     uint8_t channel;
     uint8_t noise_percent;
     uint16_t dropped;
-    uint8_t reset_cause;
+    uint8_t reset_and_radio;
     WirePipe pipes[WIRE_PIPES];
 };
 static_assert(sizeof(WireReceiverStatus) == 72, "PROTOCOL.md: frame kind 2");
 
 constexpr uint8_t wire_version_kind(uint8_t kind) {
     return static_cast<uint8_t>(WIRE_VERSION << 4 | kind);
+}
+
+constexpr uint8_t wire_reset_and_radio(uint8_t reset_cause, WireRadioState radio) {
+    return static_cast<uint8_t>((reset_cause & 0x0F) | radio << 4);
 }
 
 constexpr uint8_t wire_vehicle_node(uint8_t vehicle_id, uint8_t node_id) {

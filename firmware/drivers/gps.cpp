@@ -440,6 +440,15 @@ bool gps_poll(Gps *gps) {
 
 bool gps_running(const Gps *gps) { return gps->solving; }
 
+WireChips gps_chips(const Gps *gps) {
+    WireChips chips = {};
+    if (gps->state == RUNNING) {
+        chips.gps = static_cast<uint8_t>(gps->module | (gps->acknowledged ? WIRE_GPS_ACKNOWLEDGES : 0));
+        chips.gps_baud = gps->baud_hundreds;
+    }
+    return chips;
+}
+
 uint16_t gps_errors(const Gps *gps) {
     return static_cast<uint16_t>(gps->errors + gps->failures);
 }

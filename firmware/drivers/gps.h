@@ -67,5 +67,8 @@ bool gps_poll(Gps *gps);
 // Whether solutions come in.
 bool gps_running(const Gps *gps);
 
+// What the receiver turned out to be, for the node report.
+WireChips gps_chips(const Gps *gps);
+
 // Errors of the line and of the messages while it runs, and failures of the set-up, wraps.
 uint16_t gps_errors(const Gps *gps);

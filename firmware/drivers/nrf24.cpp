@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "drivers/nrf24.h"
 
+#include <string.h>
+
 #include "hal/board.h"
 #include "hal/spi.h"
 #include "hal/stored_settings.h"
@@ -15,6 +17,8 @@ constexpr uint8_t W_TX_PAYLOAD = 0xA0;
 constexpr uint8_t FLUSH_TX = 0xE1;
 constexpr uint8_t FLUSH_RX = 0xE2;
 constexpr uint8_t NOP = 0xFF;
+constexpr uint8_t ACTIVATE = 0x50;  // nRF24L01 product specification 2.0, table 8
+constexpr uint8_t ACTIVATE_KEY = 0x73;
 
 // Registers, table 28.
 constexpr uint8_t CONFIG = 0x00;
@@ -39,6 +43,7 @@ constexpr uint8_t CONFIG_CRC_16 = 1 << 3 | 1 << 2;
 constexpr uint8_t FEATURE_DYNAMIC_LENGTH = 1 << 2;
 constexpr uint8_t ALL_PIPES = 0x3F;
 constexpr uint8_t ADDRESS_WIDTH_5 = 3;
+constexpr uint8_t ADDRESS_SIZE = 5;
 constexpr uint8_t FIFO_RX_EMPTY = 1 << 0;
 constexpr uint8_t FIFO_RX_FULL = 1 << 1;
 constexpr uint8_t CAUSES = NRF24_RECEIVED | NRF24_SENT | NRF24_GAVE_UP;
@@ -48,7 +53,15 @@ constexpr uint8_t RATE_2000_KBPS = 1 << 3;
 
 constexpr uint8_t POWER_UP_MS = 5;  // table 16: up to 4.5 ms for a crystal of 90 mH
 
+// Registers that are read back after the set-up and from time to time.
+constexpr uint8_t CHECKED[] = {CONFIG, EN_AA, EN_RXADDR, SETUP_AW, RF_CH, RF_SETUP, DYNPD, FEATURE};
+// RF_SETUP without the PLL's lock and without bit 0, which clones use otherwise.
+constexpr uint8_t RF_SETUP_USED = 0xAE;
+
 uint8_t config;
+uint8_t pipes;     // mask of those in use
+uint8_t own_pipe;  // of the address in RX_ADDR_P0
+bool activated;
 
 uint8_t rf_setup() {
     const SettingsBlock &settings = stored_settings();
@@ -83,36 +96,70 @@ uint8_t read_register(uint8_t address) {
 
 // Pipes 1 to 5 share four bytes and differ in the lowest, which is sent first. The chosen bytes
 // are neither runs of equal bits nor like a preamble.
-void write_address(uint8_t address, uint8_t pipe) {
+void fill_address(uint8_t of_pipe, uint8_t bytes[ADDRESS_SIZE]) {
     const uint32_t upper = stored_settings().radio_address;
-    const uint8_t bytes[5] = {
-        static_cast<uint8_t>(0x93 + 0x11 * pipe),
-        static_cast<uint8_t>(upper),
-        static_cast<uint8_t>(upper >> 8),
-        static_cast<uint8_t>(upper >> 16),
-        static_cast<uint8_t>(upper >> 24),
-    };
-    const bool shared = address > RX_ADDR_P0 + 1 && address < TX_ADDR;
-    command(W_REGISTER | address, bytes, nullptr, shared ? 1 : sizeof bytes);
+    bytes[0] = static_cast<uint8_t>(0x93 + 0x11 * of_pipe);
+    for (uint8_t i = 1; i < ADDRESS_SIZE; ++i) {
+        bytes[i] = static_cast<uint8_t>(upper >> 8 * (i - 1));
+    }
 }
 
-void set_up_common() {
-    spi_enable_radio(false);
-    write_register(CONFIG, CONFIG_CRC_16);
-    write_register(SETUP_AW, ADDRESS_WIDTH_5);
-    write_register(RF_CH, stored_settings().radio_channel);
-    write_register(RF_SETUP, rf_setup());
+void write_address(uint8_t address, uint8_t of_pipe) {
+    uint8_t bytes[ADDRESS_SIZE];
+    fill_address(of_pipe, bytes);
+    const bool shared = address > RX_ADDR_P0 + 1 && address < TX_ADDR;
+    command(W_REGISTER | address, bytes, nullptr, shared ? 1 : ADDRESS_SIZE);
+}
+
+// What a checked register is set to.
+uint8_t wanted(uint8_t address) {
+    switch (address) {
+        case CONFIG:
+            return config;
+        case SETUP_AW:
+            return ADDRESS_WIDTH_5;
+        case RF_CH:
+            return stored_settings().radio_channel;
+        case RF_SETUP:
+            return rf_setup();
+        case FEATURE:
+            return FEATURE_DYNAMIC_LENGTH;
+        default:
+            return pipes;  // EN_AA, EN_RXADDR, DYNPD
+    }
+}
+
+// An nRF24L01 without the plus, and clones of it, hide FEATURE and DYNPD until ACTIVATE is sent; sent
+// again, it hides them again.
+void write_feature() {
     write_register(FEATURE, FEATURE_DYNAMIC_LENGTH);
+    activated = read_register(FEATURE) != FEATURE_DYNAMIC_LENGTH;
+    if (activated) {
+        const uint8_t key = ACTIVATE_KEY;
+        command(ACTIVATE, &key, nullptr, 1);
+        write_register(FEATURE, FEATURE_DYNAMIC_LENGTH);
+    }
+}
+
+void set_up(uint8_t pipe_mask, uint8_t pipe) {
+    spi_enable_radio(false);
+    pipes = pipe_mask;
+    own_pipe = pipe;
+    config = CONFIG_CRC_16;
+    write_feature();
+    for (const uint8_t address : CHECKED) {
+        write_register(address, wanted(address));
+    }
     command(FLUSH_TX, nullptr, nullptr, 0);
     command(FLUSH_RX, nullptr, nullptr, 0);
     write_register(STATUS, CAUSES);
 }
 
-bool power_up(uint8_t mode) {
+WireRadioState power_up(uint8_t mode) {
     config = CONFIG_CRC_16 | CONFIG_POWER_UP | mode;
     write_register(CONFIG, config);
     board_wait_ms(POWER_UP_MS);
-    return nrf24_configured();
+    return nrf24_check();
 }
 
 void write_retries(uint8_t pause, uint8_t retries) {
@@ -121,31 +168,45 @@ void write_retries(uint8_t pause, uint8_t retries) {
 
 }  // namespace
 
-bool nrf24_start_sender(uint8_t pipe) {
-    set_up_common();
+WireRadioState nrf24_start_sender(uint8_t pipe) {
+    set_up(1, pipe);
     write_address(TX_ADDR, pipe);
     write_address(RX_ADDR_P0, pipe);  // the acknowledgement comes to the address it was sent to
-    write_register(EN_AA, 1);
-    write_register(EN_RXADDR, 1);
-    write_register(DYNPD, 1);
     return power_up(0);
 }
 
-bool nrf24_start_receiver() {
-    set_up_common();
+WireRadioState nrf24_start_receiver() {
+    set_up(ALL_PIPES, 0);
     for (uint8_t pipe = 0; pipe < WIRE_PIPES; ++pipe) {
         write_address(static_cast<uint8_t>(RX_ADDR_P0 + pipe), pipe);
     }
-    write_register(EN_AA, ALL_PIPES);
-    write_register(EN_RXADDR, ALL_PIPES);
-    write_register(DYNPD, ALL_PIPES);
-    const bool ok = power_up(CONFIG_RECEIVE);
+    const WireRadioState state = power_up(CONFIG_RECEIVE);
     spi_enable_radio(true);
-    return ok;
+    return state;
 }
 
-bool nrf24_configured() {
-    return read_register(CONFIG) == config && read_register(RF_CH) == stored_settings().radio_channel;
+WireRadioState nrf24_check() {
+    uint8_t zeros = 0;
+    uint8_t ones = 0xFF;
+    bool kept = true;
+    for (const uint8_t address : CHECKED) {
+        const uint8_t value = read_register(address);
+        zeros |= value;
+        ones &= value;
+        const uint8_t mask = address == RF_SETUP ? RF_SETUP_USED : 0xFF;
+        kept = kept && ((value ^ wanted(address)) & mask) == 0;
+    }
+    if (zeros == 0 || ones == 0xFF) {
+        return WIRE_RADIO_ABSENT;
+    }
+    uint8_t address[ADDRESS_SIZE];
+    uint8_t read[ADDRESS_SIZE];
+    fill_address(own_pipe, address);
+    command(RX_ADDR_P0, nullptr, read, ADDRESS_SIZE);
+    if (!kept || memcmp(read, address, ADDRESS_SIZE) != 0) {
+        return WIRE_RADIO_FORGETS;
+    }
+    return activated ? WIRE_RADIO_ACTIVATED : WIRE_RADIO_OK;
 }
 
 void nrf24_send(const uint8_t *payload, uint8_t size, uint8_t pause, uint8_t retries) {

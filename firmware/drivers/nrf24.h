@@ -1,6 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // nRF24L01+: Enhanced ShockBurst with dynamic payload length, 2-byte CRC and automatic
 // acknowledgement. Product specification 1.0.
+//
+// Clones are used if they keep their configuration. None of what they do otherwise is used: the
+// Si24R1 has the packet's NO_ACK bit reversed, which matters only with EN_DYN_ACK.
 #pragma once
 
 #include <stdint.h>
@@ -12,12 +15,16 @@ constexpr uint8_t NRF24_RECEIVED = 1 << 6;
 constexpr uint8_t NRF24_SENT = 1 << 5;
 constexpr uint8_t NRF24_GAVE_UP = 1 << 4;
 
-// Both return false if the chip does not keep what is written to it.
-bool nrf24_start_sender(uint8_t pipe);
-bool nrf24_start_receiver();
+// Both set the chip up and check it.
+WireRadioState nrf24_start_sender(uint8_t pipe);
+WireRadioState nrf24_start_receiver();
 
-// False if the chip has lost its configuration, as after a dip of its supply.
-bool nrf24_configured();
+// Reads the configuration back: it is lost after a dip of the supply.
+WireRadioState nrf24_check();
+
+inline bool nrf24_usable(WireRadioState state) {
+    return state == WIRE_RADIO_OK || state == WIRE_RADIO_ACTIVATED;
+}
 
 // Puts one payload on the air; the chip sends it again up to `retries` times, each `pause` times
 // 250 us after the last, until it is acknowledged.

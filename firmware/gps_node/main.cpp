@@ -27,9 +27,9 @@ void send_solution() {
 }
 
 NodeHealth health() {
-    constexpr uint8_t present = WIRE_SENSOR_GPS;
-    constexpr uint8_t none = 0;
-    return NodeHealth{gps.seen ? present : none, gps_running(&gps) ? none : present, gps_errors(&gps)};
+    const uint8_t present = gps.seen ? WIRE_SENSOR_GPS : 0;
+    const uint8_t failed = gps_running(&gps) ? 0 : WIRE_SENSOR_GPS;
+    return NodeHealth{present, failed, gps_errors(&gps), gps_chips(&gps)};
 }
 
 }  // namespace

@@ -51,10 +51,16 @@ def gps_quality(f: dict[str, Any]) -> str:
 def node_status(f: dict[str, Any]) -> str:
     """Build the body of a node status."""
     names = (
-        "reset_cause", "sensors_present", "sensors_failed", "bus_errors", "radio_failed",
-        "radio_retries", "loop_max_us", "sample_rate_hz", "supply_mv",
+        "sensors_present", "sensors_failed", "bus_errors", "radio_failed", "radio_retries",
+        "loop_max_us", "sample_rate_hz", "supply_mv",
     )  # fmt: skip
-    return ", ".join(str(number) for number in [*f["firmware_version"], *(f[n] for n in names)])
+    numbers = [*f["firmware_version"], reset_and_radio(f), *(f[n] for n in names)]
+    return ", ".join([*map(str, numbers), braces(list(f["chips"].values()))])
+
+
+def reset_and_radio(f: dict[str, Any]) -> int:
+    """Join reset cause and state of the radio module."""
+    return int(f["reset_cause"] | f["radio"] << 4)
 
 
 BODIES = {
@@ -84,7 +90,7 @@ def status_vector(vector: dict[str, Any]) -> str:
     f = vector["fields"]
     pipes = ", ".join(f"{{{p['received']}u, {p['lost']}u, {p['overruns']}}}" for p in f["pipes"])
     head = f"{{wire_version_kind(2), {f['frame_seq']}, WIRE_NO_PIPE, {f['receiver_time_us']}u}}"
-    body = f"{f['channel']}, {f['noise_percent']}, {f['uart_dropped']}, {f['reset_cause']}"
+    body = f"{f['channel']}, {f['noise_percent']}, {f['uart_dropped']}, {reset_and_radio(f)}"
     value = f"WireReceiverStatus{{{head}, {body}, {{{pipes}}}}}"
     images = f'"{vector["content_hex"]}", "{vector["frame_hex"]}"'
     return f'    {{"{vector["name"]}", bytes_of({value}), 0, 0, 0u, "", {images}}},'
@@ -93,6 +99,8 @@ def status_vector(vector: dict[str, Any]) -> str:
 def main() -> None:
     """Write the table to standard output."""
     vectors = json.loads(Path(sys.argv[1]).read_text(encoding="utf-8"))
+    # The node report of firmware 1.0 is read, but not sent any more.
+    vectors = [v for v in vectors if v["fields"].get("chips", ()) is not None]
     table = [radio_vector(v) if v["kind"] in BODIES else status_vector(v) for v in vectors]
     head = "// Written by vectors_header.py out of frames.json.\n"
     sys.stdout.write(f"{head}static const std::vector<Vector> VECTORS = {{\n")

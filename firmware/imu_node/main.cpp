@@ -85,7 +85,7 @@ void poll_sensors(uint32_t now_us) {
 }
 
 NodeHealth health() {
-    return NodeHealth{sensors_present(&sensors), sensors_failed(&sensors), twi_errors()};
+    return NodeHealth{sensors_present(&sensors), sensors_failed(&sensors), twi_errors(), sensors_chips(&sensors)};
 }
 
 }  // namespace

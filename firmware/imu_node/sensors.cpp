@@ -26,7 +26,11 @@ bool set_up(Sensors *sensors, uint8_t index) {
         case SENSOR_MAG:
             sensors->mag_due_us = clock_us();
             sensors->compass = compass_set_up();
-            return sensors->compass != nullptr;
+            if (sensors->compass == nullptr) {
+                return false;
+            }
+            sensors->mag_address = sensors->compass->address;
+            return true;
         default:
             sensors->baro_converting = false;
             sensors->baro_due_us = clock_us();
@@ -204,4 +208,13 @@ uint8_t sensors_failed(const Sensors *sensors) {
         bits = static_cast<uint8_t>(bits | (sensors->states[index].answering ? 0 : 1 << index));
     }
     return bits;
+}
+
+WireChips sensors_chips(const Sensors *sensors) {
+    const SensorState *states = sensors->states;
+    WireChips chips = {};
+    chips.imu = states[SENSOR_IMU].seen ? sensors->imu_id : 0;
+    chips.magnetometer = sensors->mag_address;
+    chips.barometer = states[SENSOR_BARO].seen ? sensors->barometer.id : 0;
+    return chips;
 }

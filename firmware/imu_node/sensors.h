@@ -35,6 +35,7 @@ struct Sensors {
     uint32_t baro_due_us;
     uint32_t baro_began_us;  // the conversion now running
     const CompassChip *compass;
+    uint8_t mag_address;  // of the compass found last
     Barometer barometer;
     uint8_t bytes[IMU_DATA_SIZE];  // the transfer now running
 };
@@ -65,3 +66,6 @@ uint8_t sensors_poll(Sensors *sensors, uint32_t now_us, SensorReadings *readings
 // WireSensor bits.
 uint8_t sensors_present(const Sensors *sensors);
 uint8_t sensors_failed(const Sensors *sensors);
+
+// The chips found last, whether they answer now or not.
+WireChips sensors_chips(const Sensors *sensors);

@@ -33,7 +33,7 @@ void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &hea
     WireNodeStatus status = {};
     status.version_major = FIRMWARE_VERSION_MAJOR;
     status.version_minor = FIRMWARE_VERSION_MINOR;
-    status.reset_cause = board_reset_cause();
+    status.reset_and_radio = wire_reset_and_radio(board_reset_cause(), sender->radio);
     status.sensors_present = health.sensors_present;
     status.sensors_failed = health.sensors_failed;
     status.bus_errors = health.bus_errors;
@@ -44,6 +44,7 @@ void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &hea
                              : static_cast<uint16_t>(report->loop_max_us);
     status.sample_rate_hz = report->samples;
     status.supply_mv = board_supply_mv();
+    status.chips = health.chips;
     report->loop_max_us = 0;
     report->samples = 0;
     radio_sender_push(sender, WIRE_NODE_STATUS, now_us, &status, sizeof status);

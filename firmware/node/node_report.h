@@ -17,6 +17,7 @@ struct NodeHealth {
     uint8_t sensors_present;
     uint8_t sensors_failed;
     uint16_t bus_errors;
+    WireChips chips;
 };
 
 // Sleeps until the next event, feeds the watchdog and times the loop's waking part. Returns the

@@ -57,7 +57,8 @@ void count_lost(RadioSender *sender) {
 }
 
 void set_up(RadioSender *sender) {
-    sender->state = nrf24_start_sender(stored_settings().radio_pipe) ? IDLE : ABSENT;
+    sender->radio = nrf24_start_sender(stored_settings().radio_pipe);
+    sender->state = nrf24_usable(sender->radio) ? IDLE : ABSENT;
     sender->since_us = clock_us();
 }
 
@@ -96,7 +97,7 @@ void follow(RadioSender *sender, uint32_t now_us) {
         sender->state = PAUSING;
     } else {
         count_lost(sender);
-        if (!nrf24_configured()) {
+        if (!nrf24_usable(nrf24_check())) {
             sender->state = ABSENT;
         }
     }

@@ -23,6 +23,7 @@
 
 struct RadioSender {
     uint8_t state;
+    WireRadioState radio;  // at the last set-up
     bool acknowledged;  // the last payload
     uint8_t vehicle_node;
     uint8_t rounds;

@@ -35,7 +35,7 @@ const SettingsImage IMAGE SETTINGS_IN_FLASH =
 enum NoiseState : uint8_t { NOISE_IDLE, NOISE_LISTENING, NOISE_HEARD };
 
 struct Receiver {
-    bool radio_present;
+    WireRadioState radio;
     NoiseState noise_state;
     uint8_t sequence;
     uint16_t dropped;
@@ -60,7 +60,7 @@ void send_frame(const void *content, uint8_t size) {
 }
 
 void set_up_radio() {
-    receiver.radio_present = nrf24_start_receiver();
+    receiver.radio = nrf24_start_receiver();
     receiver.set_up_due_us = clock_us() + SET_UP_EVERY_US;
     receiver.noise_state = NOISE_IDLE;
     receiver.noise_due_us = clock_us() + NOISE_EVERY_US;
@@ -136,17 +136,17 @@ void poll_status(uint32_t now_us) {
     status.channel = stored_settings().radio_channel;
     status.noise_percent = take_noise_percent();
     status.dropped = receiver.dropped;
-    status.reset_cause = board_reset_cause();
+    status.reset_and_radio = wire_reset_and_radio(board_reset_cause(), receiver.radio);
     memcpy(status.pipes, receiver.link.pipes, sizeof status.pipes);
     send_frame(&status, sizeof status);
-    if (receiver.radio_present && !nrf24_configured()) {
-        receiver.radio_present = false;
+    if (nrf24_usable(receiver.radio)) {
+        receiver.radio = nrf24_check();
         receiver.set_up_due_us = now_us;  // the last one may lie more than half a wrap back
     }
 }
 
 LedCode led_code(uint32_t now_us) {
-    if (!receiver.radio_present) {
+    if (!nrf24_usable(receiver.radio)) {
         return LED_NO_RADIO;
     }
     if (clock_passed(now_us, receiver.heard_us + QUIET_US)) {
@@ -170,7 +170,7 @@ int main() {
         events_wait();
         board_feed_watchdog();
         const uint32_t now_us = clock_us();
-        if (receiver.radio_present) {
+        if (nrf24_usable(receiver.radio)) {
             poll_radio();
             poll_noise(now_us);
         } else if (clock_passed(now_us, receiver.set_up_due_us)) {

@@ -26,6 +26,8 @@ class Packet:
     payload: bytes
     identity: int
     is_ack: bool
+    no_ack: bool = False
+    """The sender wants no acknowledgement."""
 
     @property
     def duration_ps(self) -> int:

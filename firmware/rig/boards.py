@@ -14,7 +14,7 @@ from firmware.rig.gps import COMPUTING_S, GPS_MODULES, Gps
 from firmware.rig.i2c import I2cBus
 from firmware.rig.imu import IMU_CHIPS, Imu
 from firmware.rig.mcu import FIRMWARE, Mcu
-from firmware.rig.nrf24 import Nrf24
+from firmware.rig.nrf24 import RADIO_CHIPS, Nrf24
 from firmware.rig.world import World
 
 _CE: Final = 1 << 1
@@ -33,6 +33,9 @@ class Parts:
     gps: str = "u-blox M8"
     gps_baud: int | None = None
     """Stored speed; that of the module if None."""
+    radio: str = "nRF24L01+"
+    """The receiver's."""
+    node_radio: str = "nRF24L01+"
 
 
 @dataclass
@@ -85,7 +88,11 @@ class Board:
         setup.bench.timers.append(self.timer)
         self._radio_line = True
         self.radio = Nrf24(
-            setup.bench, setup.air, lambda: self.timer.now_ps, self._drive_radio_line
+            setup.bench,
+            setup.air,
+            lambda: self.timer.now_ps,
+            self._drive_radio_line,
+            RADIO_CHIPS[setup.parts.radio if program == "receiver" else setup.parts.node_radio],
         )
         self.mcu.on_spi = self.radio.exchange
         self.mcu.on_port_b = self._port_b

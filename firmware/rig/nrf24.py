@@ -5,6 +5,7 @@ Times and rules are those of the product specification 1.0; section numbers stan
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Final
 
 from firmware.rig.air import Air, Packet
@@ -24,6 +25,32 @@ _RESET_VALUES: Final = {
     RF_SETUP: 0x0E, OBSERVE_TX: 0, DYNPD: 0, FEATURE: 0,
 }  # fmt: skip
 _PIPES: Final = 6
+_EN_DYN_ACK: Final = 1 << 0
+_ACTIVATE, _ACTIVATE_KEY = 0x50, 0x73
+
+
+@dataclass(frozen=True, slots=True)
+class RadioChip:
+    """How a chip differs from the nRF24L01+."""
+
+    hides_features: bool = False
+    """FEATURE and DYNPD are out of reach until ACTIVATE; a second one hides them again."""
+    reverses_no_ack: bool = False
+    """In the packet; a receiver minds the bit only with EN_DYN_ACK."""
+    lost_registers: tuple[int, ...] = ()
+    """A broken module: these registers keep their reset value."""
+
+
+RADIO_CHIPS: Final = {
+    "nRF24L01+": RadioChip(),
+    "nRF24L01": RadioChip(hides_features=True),
+    "Si24R1": RadioChip(reverses_no_ack=True),
+    "clone with ACTIVATE": RadioChip(hides_features=True, reverses_no_ack=True),
+    "forgets FEATURE": RadioChip(lost_registers=(FEATURE,)),
+    "forgets DYNPD": RadioChip(lost_registers=(DYNPD,)),
+    "forgets the rate": RadioChip(lost_registers=(RF_SETUP,)),
+    "forgets its address": RadioChip(lost_registers=(RX_ADDR_P0,)),
+}
 
 
 class Nrf24:
@@ -45,8 +72,9 @@ class Nrf24:
         air: Air,
         board_now_ps: Callable[[], int],
         set_irq: Callable[[bool], None],
+        chip: RadioChip,
     ) -> None:
-        self._bench, self._air = bench, air
+        self._bench, self._air, self._chip = bench, air, chip
         self._board_now_ps, self._set_irq = board_now_ps, set_irq
         self.absent = False
         air.listeners.append(self)
@@ -57,6 +85,7 @@ class Nrf24:
         self.registers = dict(_RESET_VALUES)
         self.addresses = {RX_ADDR_P0 + pipe: b"\xe7" * 5 for pipe in range(_PIPES)}
         self.addresses[TX_ADDR] = b"\xe7" * 5
+        self._features_hidden = self._chip.hides_features
         self._causes = 0
         self._tx: deque[tuple[bytes, int]] = deque()
         self._rx: deque[tuple[int, bytes]] = deque()
@@ -130,6 +159,8 @@ class Nrf24:
             self._tx.append((data, self._identity))
             if self._ce and not self._receiving_mode() and len(self._tx) == 1:
                 self._begin_job()
+        elif command == _ACTIVATE and data == bytes([_ACTIVATE_KEY]):
+            self._features_hidden = self._chip.hides_features and not self._features_hidden
         elif command == 0xE1:
             self._tx.clear()
             self._job += 1
@@ -148,6 +179,10 @@ class Nrf24:
         return self.registers.get(register, 0)
 
     def _write_register(self, register: int, data: bytes) -> None:
+        if register in self._chip.lost_registers:
+            return
+        if register in (FEATURE, DYNPD) and self._features_hidden:
+            return
         if register in self.addresses:
             whole = self.addresses[register]
             self.addresses[register] = data[:5] + whole[len(data) :]
@@ -181,8 +216,9 @@ class Nrf24:
         def send() -> None:
             if job == self._job and self._tx and self._powered:
                 payload, identity = self._tx[0]
+                address, no_ack = self.addresses[TX_ADDR], self._chip.reverses_no_ack
                 packet = Packet(
-                    self._channel, self._kbps, self.addresses[TX_ADDR], payload, identity, False
+                    self._channel, self._kbps, address, payload, identity, False, no_ack
                 )
                 self._listening_ps = None
                 self._air.send(packet, self, lambda: self._sent(job))
@@ -254,7 +290,9 @@ class Nrf24:
             self._rx.append((pipe, packet.payload))
             self._causes |= RX_DR
             self._drive_irq()
-        if self.registers[EN_AA] >> pipe & 1:
+        minds_no_ack = self.registers[FEATURE] & _EN_DYN_ACK
+        no_ack = packet.no_ack != self._chip.reverses_no_ack
+        if self.registers[EN_AA] >> pipe & 1 and not (minds_no_ack and no_ack):
             self._acknowledge(packet)
 
     def _acknowledge(self, packet: Packet) -> None:

@@ -183,6 +183,8 @@ def _link_line(snapshot: Snapshot) -> Text:
         line.append(f"  radio {sum(node.lost for node in report.nodes)} lost")
         line.append(f", channel {report.receiver.channel}")
         line.append(f", noise {report.receiver.noise_percent} %")
+        if problem := report.receiver.radio.problem:
+            line.append(f", {problem}", style="red")
     return line
 
 

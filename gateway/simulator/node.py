@@ -18,6 +18,7 @@ from gateway.simulator.noise import FloatArray
 from gateway.simulator.samplers import BaroSamples, DeviceClock, ImuSamples
 from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, IntArray
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.wire.chips import GPS_ACKNOWLEDGES, SENSOR_IMU, Chips
 from gateway.wire.payloads import (
     BaroPayload,
     GpsFixPayload,
@@ -43,6 +44,10 @@ PHASES: Final = 4
 
 IMU_SENSORS: Final = 0b0111
 GPS_SENSORS: Final = 0b1000
+IMU_CHIPS: Final = Chips(imu=0x68, magnetometer=0x1E, barometer=0x55)
+"""MPU6050, HMC5883L, BMP180."""
+GPS_CHIPS: Final = Chips(gps=8 | GPS_ACKNOWLEDGES, gps_baud_hundreds=576)
+"""A u-blox M8."""
 POWER_ON: Final = 1
 LOOP_US: Final = 1400
 SUPPLY_MV: Final = 3300
@@ -119,7 +124,7 @@ class Node(ABC):
 
     def _report(self, time_s: float) -> Sent:
         status = NodeStatusPayload(
-            firmware_version=(1, 0),
+            firmware_version=(1, 1),
             reset_cause=POWER_ON,
             sensors_present=self._sensors,
             sensors_failed=0,
@@ -129,6 +134,7 @@ class Node(ABC):
             loop_max_us=LOOP_US,
             sample_rate_hz=self._rate_hz,
             supply_mv=SUPPLY_MV,
+            chips=IMU_CHIPS if self._sensors & SENSOR_IMU else GPS_CHIPS,
         )
         return Sent(time_s, self._clock.at(time_s), status)
 

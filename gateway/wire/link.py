@@ -24,6 +24,7 @@ from gateway.records import (
 )
 from gateway.units import M_PER_CM, M_PER_MM, US_PER_S
 from gateway.wire import payloads
+from gateway.wire.chips import chip_names
 from gateway.wire.framing import Fault, FrameDecoder
 from gateway.wire.timesync import WRAP_US, ClockTracker
 
@@ -363,6 +364,8 @@ def _node_status(
         loop_max_us=status.loop_max_us,
         sample_rate_hz=status.sample_rate_hz,
         supply_mv=status.supply_mv,
+        radio=status.radio,
+        chips=() if status.chips is None else chip_names(status.chips, status.sensors_present),
     )
 
 
@@ -375,6 +378,7 @@ def _receiver_status(status: payloads.ReceiverStatusFrame, time_us: int) -> Rece
         uart_dropped=status.uart_dropped,
         reset_cause=status.reset_cause,
         pipes=status.pipes,
+        radio=status.radio,
     )
 
 

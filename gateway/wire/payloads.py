@@ -14,7 +14,8 @@ from typing import Final
 
 import msgspec
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters, RadioState
+from gateway.wire.chips import Chips
 from gateway.wire.framing import Fault, FaultKind
 
 PROTOCOL_VERSION: Final = 1
@@ -52,7 +53,9 @@ _IMU: Final = struct.Struct("<3h3h3hhHB")
 _BARO: Final = struct.Struct("<Ih")
 _GPS_FIX: Final = struct.Struct("<Iiii3hBB")
 _GPS_QUALITY: Final = struct.Struct("<IHHHHHhBBBBBBBB")
-_NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHH")
+_NODE_STATUS_1_0: Final = struct.Struct("<BBBBBHHHHHH")
+"""Of firmware 1.0: without the chips."""
+_NODE_STATUS: Final = struct.Struct("<BBBBBHHHHHHBBBBH")
 _RECEIVER_HEAD: Final = struct.Struct("<BBHB")
 _PIPE: Final = struct.Struct("<IIH")
 
@@ -63,6 +66,8 @@ _imu_flags = cache(ImuFlags)
 
 _MAG_SHIFT: Final = 4
 _GYRO_SHIFT: Final = 2
+_RADIO_SHIFT: Final = 4
+_RESET_MASK: Final = 0x0F
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
@@ -139,6 +144,9 @@ class NodeStatusPayload:
     loop_max_us: int
     sample_rate_hz: int
     supply_mv: int
+    radio: RadioState = RadioState.OK
+    chips: Chips | None = None
+    """None from firmware 1.0, whose report ends before them."""
 
 
 Payload = ImuPayload | BaroPayload | GpsFixPayload | GpsQualityPayload | NodeStatusPayload
@@ -165,6 +173,7 @@ class ReceiverStatusFrame:
     uart_dropped: int
     reset_cause: int
     pipes: tuple[PipeCounters, ...]
+    radio: RadioState = RadioState.OK
 
 
 def encode_payload(header: Header, payload: Payload) -> bytes:
@@ -191,9 +200,8 @@ def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
     """Build the content of a receiver status frame."""
     first = PROTOCOL_VERSION << 4 | FrameKind.RECEIVER_STATUS
     head = _FRAME_HEADER.pack(first, status.frame_seq, 0xFF, status.receiver_time_us)
-    body = _RECEIVER_HEAD.pack(
-        status.channel, status.noise_percent, status.uart_dropped, status.reset_cause
-    )
+    cause = status.reset_cause | status.radio << _RADIO_SHIFT
+    body = _RECEIVER_HEAD.pack(status.channel, status.noise_percent, status.uart_dropped, cause)
     pipes = b"".join(_PIPE.pack(p.received, p.lost, p.overruns) for p in status.pipes)
     return head + body + pipes
 
@@ -249,12 +257,11 @@ def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
         return Fault(FaultKind.VERSION, len(data))
     if address >> 3 == 0:
         return Fault(FaultKind.VALUE, len(data))
-    layout = _BODIES.get(first & 0xF)
+    layout = _BODIES.get((first & 0xF, len(data) - _HEADER.size))
     if layout is None:
-        return Fault(FaultKind.KIND, len(data))
+        kind = FaultKind.PAYLOAD if first & 0xF in _KINDS else FaultKind.KIND
+        return Fault(kind, len(data))
     body_struct, read = layout
-    if len(data) != _HEADER.size + body_struct.size:
-        return Fault(FaultKind.PAYLOAD, len(data))
     try:
         payload = read(body_struct.unpack_from(data, _HEADER.size))
     except ValueError:
@@ -268,10 +275,20 @@ def _decode_receiver_status(
     if len(body) != _RECEIVER_HEAD.size + PIPES * _PIPE.size:
         return Fault(FaultKind.PAYLOAD, size)
     channel, noise, dropped, cause = _RECEIVER_HEAD.unpack_from(body)
-    if noise > 100:
+    radio = cause >> _RADIO_SHIFT
+    if noise > 100 or radio not in _RADIO_STATES:
         return Fault(FaultKind.VALUE, size)
     pipes = tuple(PipeCounters(*p) for p in _PIPE.iter_unpack(body[_RECEIVER_HEAD.size :]))
-    return ReceiverStatusFrame(frame_seq, receiver_time_us, channel, noise, dropped, cause, pipes)
+    return ReceiverStatusFrame(
+        frame_seq=frame_seq,
+        receiver_time_us=receiver_time_us,
+        channel=channel,
+        noise_percent=noise,
+        uart_dropped=dropped,
+        reset_cause=cause & _RESET_MASK,
+        pipes=pipes,
+        radio=RadioState(radio),
+    )
 
 
 def _encode_body(payload: Payload) -> tuple[PayloadKind, bytes]:
@@ -315,9 +332,9 @@ def _encode_quality(payload: GpsQualityPayload) -> bytes:
 
 
 def _encode_node_status(payload: NodeStatusPayload) -> bytes:
-    return _NODE_STATUS.pack(
+    values = (
         *payload.firmware_version,
-        payload.reset_cause,
+        payload.reset_cause | payload.radio << _RADIO_SHIFT,
         payload.sensors_present,
         payload.sensors_failed,
         payload.bus_errors,
@@ -327,6 +344,11 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
         payload.sample_rate_hz,
         payload.supply_mv,
     )
+    chips = payload.chips
+    if chips is None:
+        return _NODE_STATUS_1_0.pack(*values)
+    found = (chips.imu, chips.magnetometer, chips.barometer, chips.gps, chips.gps_baud_hundreds)
+    return _NODE_STATUS.pack(*values, *found)
 
 
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
@@ -380,14 +402,37 @@ def _read_gps_quality(words: tuple[int, ...]) -> GpsQualityPayload:
 
 
 def _read_node_status(words: tuple[int, ...]) -> NodeStatusPayload:
-    major, minor, *rest = words
-    return NodeStatusPayload((major, minor), *rest)
+    major, minor, cause, present, failed, bus, unsent, resent, loop, rate, supply = words[:11]
+    return NodeStatusPayload(
+        firmware_version=(major, minor),
+        reset_cause=cause & _RESET_MASK,
+        sensors_present=present,
+        sensors_failed=failed,
+        bus_errors=bus,
+        radio_failed=unsent,
+        radio_retries=resent,
+        loop_max_us=loop,
+        sample_rate_hz=rate,
+        supply_mv=supply,
+        radio=RadioState(cause >> _RADIO_SHIFT),
+        chips=Chips(*words[11:]) if len(words) > 11 else None,
+    )
 
 
-_BODIES: Final[dict[int, tuple[struct.Struct, Callable[[tuple[int, ...]], Payload]]]] = {
-    PayloadKind.IMU: (_IMU, _read_imu),
-    PayloadKind.BARO: (_BARO, _read_baro),
-    PayloadKind.GPS_FIX: (_GPS_FIX, _read_gps_fix),
-    PayloadKind.GPS_QUALITY: (_GPS_QUALITY, _read_gps_quality),
-    PayloadKind.NODE_STATUS: (_NODE_STATUS, _read_node_status),
+_KINDS: Final = frozenset(PayloadKind)
+_RADIO_STATES: Final = frozenset(RadioState)
+
+_BODIES: Final[
+    dict[tuple[int, int], tuple[struct.Struct, Callable[[tuple[int, ...]], Payload]]]
+] = {
+    (kind, layout.size): (layout, read)
+    for kind, layout, read in (
+        (PayloadKind.IMU, _IMU, _read_imu),
+        (PayloadKind.BARO, _BARO, _read_baro),
+        (PayloadKind.GPS_FIX, _GPS_FIX, _read_gps_fix),
+        (PayloadKind.GPS_QUALITY, _GPS_QUALITY, _read_gps_quality),
+        (PayloadKind.NODE_STATUS, _NODE_STATUS_1_0, _read_node_status),
+        (PayloadKind.NODE_STATUS, _NODE_STATUS, _read_node_status),
+    )
 }
+"""By kind and size of the body: a payload that has grown is still read in its old size."""

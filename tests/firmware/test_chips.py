@@ -11,7 +11,8 @@ from firmware.rig.compass import make_compass
 from firmware.rig.gps import GPS_MODULES
 from firmware.rig.imu import IMU_CHIPS
 from firmware.rig.world import Moment, Solution, World
-from gateway.records import GpsFixType, ImuFlags
+from gateway.records import GpsFixType, ImuFlags, RadioState
+from gateway.wire.chips import chip_names
 from gateway.wire.payloads import (
     MAG_LSB_PER_GAUSS,
     BaroPayload,
@@ -287,3 +288,101 @@ def test_nmea_receiver_without_a_fix_reports_none(bench: MakeBench) -> None:
     fix, quality = rig.last(GpsFixPayload), rig.last(GpsQualityPayload)
     assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 2)
     assert quality.h_acc_cm == 65_535
+
+
+WORKING_RADIOS = ("nRF24L01+", "nRF24L01", "Si24R1", "clone with ACTIVATE")
+ACTIVATED = {"nRF24L01", "clone with ACTIVATE"}
+
+
+@pytest.mark.parametrize("receiver", WORKING_RADIOS)
+@pytest.mark.parametrize("node", WORKING_RADIOS)
+def test_radio_clones_work_with_one_another(bench: MakeBench, receiver: str, node: str) -> None:
+    rig = bench(parts=Parts(radio=receiver, node_radio=node))
+    rig.imu_node()
+    rig.run(2.3)
+    assert len(rig.payloads(ImuPayload, since_s=1.0)) == pytest.approx(130, abs=3)
+    assert rig.lost(0) == 0
+    expected = dict.fromkeys(ACTIVATED, RadioState.ACTIVATED)
+    status = rig.last(NodeStatusPayload)
+    assert status.radio == expected.get(node, RadioState.OK)
+    assert status.reset_cause == 1
+    assert rig.statuses[-1].radio == expected.get(receiver, RadioState.OK)
+
+
+@pytest.mark.parametrize(
+    ("radio", "state"),
+    [
+        ("forgets FEATURE", RadioState.FORGETS),
+        ("forgets DYNPD", RadioState.FORGETS),
+        ("forgets the rate", RadioState.FORGETS),
+        ("forgets its address", RadioState.FORGETS),
+    ],
+)
+def test_receiver_reports_a_radio_that_keeps_no_configuration(
+    bench: MakeBench, radio: str, state: RadioState
+) -> None:
+    rig = bench(parts=Parts(radio=radio))
+    rig.imu_node()
+    rig.run(2.2)
+    assert not rig.frames
+    assert [status.radio for status in rig.statuses] == [state, state]
+
+
+def test_receiver_reports_a_radio_that_does_not_answer_and_that_it_is_back(
+    bench: MakeBench,
+) -> None:
+    rig = bench()
+    rig.imu_node()
+    rig.receiver.radio.absent = True
+    rig.run(1.2)
+    assert rig.statuses[-1].radio == RadioState.ABSENT
+    rig.receiver.radio.absent = False
+    rig.run(1.5)
+    assert rig.statuses[-1].radio == RadioState.OK
+    assert rig.payloads(ImuPayload)
+
+
+@pytest.mark.parametrize(
+    ("parts", "names"),
+    [
+        (Parts(), ("MPU6050", "HMC5883L", "BMP180")),
+        (Parts("MPU6500", "QMC5883L", "BMP280"), ("MPU6500", "QMC5883L", "BMP280")),
+        (Parts("ICM-20689", "QMC5883P", "BME280"), ("ICM-20689", "QMC5883P", "BME280")),
+        (
+            Parts("clone 0x72", "DA5883", "BMP280 at 0x77"),
+            ("MPU6050 look-alike, id 0x72", "HMC5883L", "BMP280"),
+        ),
+        (Parts("clone 0x00"), ("MPU6050 look-alike, id 0x00", "HMC5883L", "BMP180")),
+    ],
+)
+def test_imu_node_reports_its_chips(bench: MakeBench, parts: Parts, names: tuple[str, ...]) -> None:
+    rig = bench(parts=parts)
+    rig.imu_node()
+    rig.run(1.2)
+    status = rig.last(NodeStatusPayload)
+    assert status.chips is not None
+    assert chip_names(status.chips, status.sensors_present) == names
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("u-blox 6", "u-blox 6 at 57600 baud"),
+        ("u-blox 7", "u-blox 7 at 57600 baud"),
+        ("u-blox M8", "u-blox M8 at 57600 baud"),
+        ("u-blox 9", "u-blox 9 at 57600 baud"),
+        ("u-blox M10", "u-blox M10 at 57600 baud"),
+        (
+            "u-blox, no acknowledgement",
+            "u-blox look-alike at 57600 baud, acknowledges nothing",
+        ),
+        ("NMEA", "NMEA receiver at 9600 baud"),
+    ],
+)
+def test_gps_node_reports_its_receiver(bench: MakeBench, name: str, text: str) -> None:
+    rig = bench(parts=Parts(gps=name))
+    rig.gps_node()
+    rig.run(FOUND_S + 1.2)
+    status = rig.last(NodeStatusPayload)
+    assert status.chips is not None
+    assert chip_names(status.chips, status.sensors_present) == (text,)

@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.records import GpsFixType, ImuFlags, NodeId
+from gateway.records import GpsFixType, ImuFlags, NodeId, RadioState
+from gateway.wire.chips import Chips, chip_names
 from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.payloads import (
     ACCEL_RANGES_G,
@@ -28,6 +29,8 @@ from gateway.wire.payloads import (
     encode_receiver_status,
 )
 
+NODE_STATUS_SIZES = {25, 31}
+"""Firmware 1.0 sends it without the chips."""
 VECTORS = json.loads((Path(__file__).parent.parent / "vectors" / "frames.json").read_text())
 RADIO = [vector for vector in VECTORS if "payload_hex" in vector]
 STATUS = [vector for vector in VECTORS if vector["kind"] == "ReceiverStatus"]
@@ -68,7 +71,9 @@ class TestRadioVectors:
 
     def test_any_other_length_is_a_fault(self, vector: dict) -> None:
         packet = bytes.fromhex(vector["payload_hex"])
-        for size in set(range(MAX_PAYLOAD + 4)) - {len(packet)}:
+        sizes = NODE_STATUS_SIZES if vector["kind"] == "NodeStatusPayload" else {len(packet)}
+        assert len(packet) in sizes
+        for size in set(range(MAX_PAYLOAD + 4)) - sizes:
             padded = packet[:size].ljust(size, b"\x01")
             assert isinstance(decode_payload(padded), Fault)
 
@@ -114,6 +119,40 @@ def test_unknown_magnetometer_scale_is_a_fault(scale: int) -> None:
         assert decoded[1].mag_gain == scale
     else:
         assert decoded == Fault(FaultKind.VALUE, len(packet))
+
+
+@pytest.mark.parametrize("radio", range(16))
+def test_unknown_radio_state_is_a_fault(radio: int) -> None:
+    status = bytes.fromhex("15 09 0000 00000000 0101") + bytes([radio << 4 | 1]) + bytes(20)
+    receiver = bytes.fromhex("12 00 ff 00000000 4c000000") + bytes([radio << 4 | 1]) + bytes(60)
+    decoded, frame = decode_payload(status), decode_content(receiver)
+    if radio <= max(RadioState):
+        assert (decoded[1].radio, decoded[1].reset_cause) == (RadioState(radio), 1)
+        assert (frame.radio, frame.reset_cause) == (RadioState(radio), 1)
+    else:
+        assert decoded == Fault(FaultKind.VALUE, len(status))
+        assert frame == Fault(FaultKind.VALUE, len(receiver))
+
+
+@pytest.mark.parametrize(
+    ("chips", "present", "names"),
+    [
+        (Chips(0x68, 0x1E, 0x55), 7, ("MPU6050", "HMC5883L", "BMP180")),
+        (Chips(0x98, 0x2C, 0x60), 7, ("ICM-20689", "QMC5883P", "BME280")),
+        (Chips(0x00, 0x0D), 3, ("MPU6050 look-alike, id 0x00", "QMC5883L")),
+        (Chips(0x68), 0, ()),
+        (Chips(gps=0x1A, gps_baud_hundreds=576), 8, ("u-blox M10 at 57600 baud",)),
+        (
+            Chips(gps=0x02, gps_baud_hundreds=576),
+            8,
+            ("u-blox look-alike at 57600 baud, acknowledges nothing",),
+        ),
+        (Chips(gps=0x01, gps_baud_hundreds=96), 8, ("NMEA receiver at 9600 baud",)),
+        (Chips(), 8, ()),
+    ],
+)
+def test_chips_are_named(chips: Chips, present: int, names: tuple[str, ...]) -> None:
+    assert chip_names(chips, present) == names
 
 
 FIX = GpsFixPayload(1000, 10, 20, 30, (1, 2, 3), GpsFixType.FIX_3D, True, 9)

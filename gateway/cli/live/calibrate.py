@@ -36,7 +36,7 @@ from gateway.live.serial_port import (
     find_receiver,
 )
 from gateway.recordings.reading import open_rows
-from gateway.records import GpsFix, ImuRaw, RawRecord
+from gateway.records import GpsFix, ImuRaw, NodeStatus, RawRecord
 from gateway.sensing.calibrating import (
     FIELD_SIDES,
     CalibrationError,
@@ -53,6 +53,7 @@ from gateway.sensing.calibrating import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
+from gateway.wire.chips import SENSOR_IMU
 from gateway.wire.link import Link
 
 POLL_S: Final = 0.5
@@ -297,10 +298,16 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     except PortNotFoundError as error:
         refuse(str(error))
     serial = msgspec.structs.replace(serial, port=device)
+    shown: tuple[str, ...] = ()
 
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
+        nonlocal shown
         collecting = _Collecting(vehicle, seconds, turned=turned)
-        return asyncio.run(_listen(serial, vehicle, collecting))
+        samples = asyncio.run(_listen(serial, vehicle, collecting))
+        if collecting.chips not in ((), shown):
+            shown = collecting.chips
+            _show_chips(shown)
+        return samples
 
     return capture
 
@@ -311,6 +318,8 @@ class _Collecting:
     def __init__(self, vehicle: int, seconds: float, *, turned: bool) -> None:
         self._vehicle, self._seconds, self._turned = vehicle, seconds, turned
         self.raws: list[ImuRaw] = []
+        self.chips: tuple[str, ...] = ()
+        """What the IMU node reported last."""
         self._shown_s = 0.0
         label = "sides of the field seen" if turned else "listening"
         unit = f"{{task.completed:.0f}} of {FIELD_SIDES}" if turned else "{task.completed:.0f} s"
@@ -324,7 +333,13 @@ class _Collecting:
     def add(self, records: Iterable[RawRecord]) -> bool:
         """Take the next records; return whether they are enough."""
         raws, seconds = self.raws, self._seconds
-        raws += [r for r in records if isinstance(r, ImuRaw) and r.node.vehicle_id == self._vehicle]
+        for record in records:
+            if record.node.vehicle_id != self._vehicle:
+                continue
+            if isinstance(record, ImuRaw):
+                raws.append(record)
+            elif isinstance(record, NodeStatus) and record.sensors_present & SENSOR_IMU:
+                self.chips = record.chips
         span_s = (raws[-1].time_us - raws[0].time_us) / US_PER_S if raws else 0.0
         if not self._turned:
             self.bar.update(self._task, completed=min(span_s, seconds), refresh=True)
@@ -359,6 +374,11 @@ async def _listen(serial: SerialSettings, vehicle: int, collecting: _Collecting)
 
 def _capture_live(vehicle: int) -> Capture:
     """Take the samples of the running gateway."""
+    for aircraft in ask("status")["aircraft"]:
+        boards = aircraft["boards"] if aircraft["vehicle_id"] == vehicle else ()
+        for board in boards:
+            if board["chips"] and board["sensors_present"] & SENSOR_IMU:
+                _show_chips(board["chips"])
 
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
         collecting, idle_s = _Collecting(vehicle, seconds, turned=turned), 0.0
@@ -375,6 +395,10 @@ def _capture_live(vehicle: int) -> Capture:
         return node_samples(collecting.raws)
 
     return capture
+
+
+def _show_chips(chips: Iterable[str]) -> None:
+    console.print(f"sensors: {', '.join(chips)}")
 
 
 def _ask(text: str) -> None:

@@ -19,6 +19,7 @@ from gateway.cli.support.terminal import (
     print_json,
     table_of,
 )
+from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
 PANEL: Final = "A running gateway"
@@ -150,6 +151,15 @@ def _summary(snapshot: Record) -> str:
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     radio = f"radio: {counted(received, 'payload')}, {lost} lost"
     lines = [f"up {up}, receiver {receiver}", f"{serial}; {radio}"]
+    if report["receiver"] is not None:
+        problem = RadioState(report["receiver"]["radio"]).problem
+        lines += [f"receiver: {problem}"] if problem else []
+    lines += [
+        f"node {_node_name(board)}: {', '.join(board['chips'])}"
+        for one in snapshot["aircraft"]
+        for board in one["boards"]
+        if board["chips"]
+    ]
     if snapshot["slow_s"]:
         lines.append(
             f"this computer is too slow: up to {snapshot['slow_s']:.1f} s late, samples are lost"

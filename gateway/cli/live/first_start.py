@@ -193,7 +193,8 @@ def _check_nodes(seen: Observed, vehicle: int) -> None:
         failed = _sensors(status.sensors_failed)
         version = "{}.{}".format(*status.firmware_version)
         volts = f"{status.supply_mv / 1000:.2f}" if status.supply_mv else ""
-        found = _sensors(status.sensors_present & ~status.sensors_failed)
+        found = ", ".join(status.chips)
+        found = found or _sensors(status.sensors_present & ~status.sensors_failed)
         table.add_row(
             str(node), version, found, failed, f"{link.rate_hz:.0f}", f"{share:.1f}", volts
         )

@@ -8,6 +8,7 @@ from nicegui import ui
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets.prompts import confirm, heading, notify_failure
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
+from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
@@ -36,7 +37,17 @@ class LinkView:
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
                 self._nodes = DataTable(
-                    ("Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age"),
+                    (
+                        "Node",
+                        "Rate",
+                        "Received",
+                        "Lost",
+                        "Loss",
+                        "Restarts",
+                        "Clock",
+                        "Age",
+                        "Chips",
+                    ),
                     "No node was heard.",
                 )
             with ui.element("div").classes("card padded wide"):
@@ -98,8 +109,12 @@ class LinkView:
             return
         self._receiver.set_text(_receiver_line(status))
         now_us = status["report"]["time_us"]
+        boards = {_name_of(b): b for one in status["aircraft"] for b in one["boards"]}
         self._nodes.show(
-            {_name_of(node): _node_row(node, now_us) for node in status["report"]["nodes"]}
+            {
+                (name := _name_of(node)): _node_row(node, now_us, boards.get(name))
+                for node in status["report"]["nodes"]
+            }
         )
         before = {} if watch.before is None else _sent_by_client(watch.before)
         span_s = (status["time_us"] - (watch.before or status)["time_us"]) / US_PER_S
@@ -155,6 +170,8 @@ def _receiver_line(status: Record) -> str:
     ]
     if (receiver := report["receiver"]) is not None:
         parts.append(f"channel {receiver['channel']}, noise {receiver['noise_percent']} %")
+        if problem := RadioState(receiver["radio"]).problem:
+            parts.append(problem.upper())
     parts += [counted(count, f"{kind} fault") for kind, count in report["faults"]]
     return " · ".join(parts)
 
@@ -163,7 +180,7 @@ def _name_of(node: Record) -> str:
     return f"{node['node']['vehicle_id']}.{node['node']['node_id']}"
 
 
-def _node_row(node: Record, now_us: int) -> Cells:
+def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
     total = node["received"] + node["lost"]
     loss = 100 * node["lost"] / total if total else 0.0
     age_us = max(0, now_us - node["last_time_us"])
@@ -177,6 +194,7 @@ def _node_row(node: Record, now_us: int) -> Cells:
         (str(node["restarts"]), "warn" if node["restarts"] else ""),
         (f"{node['clock_skew_ppm']:+.0f} ppm", ""),
         (f"{age_us / US_PER_S:.1f} s", "bad" if age_us > SILENT_US else "good"),
+        (", ".join(board["chips"]) if board is not None else UNKNOWN, ""),
     )
 
 

@@ -267,7 +267,7 @@ class Announcements:
         """Announce changes in the state of the boards."""
         found = []
         for one in findings:
-            found += self._announcer.track(one.topic, one.is_bad, one.text, now_us, initially=False)
+            found += self._announcer.track(one.topic, one.state, one.text, now_us, initially=False)
         return found
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:

@@ -53,10 +53,11 @@ MV: Final = 1e3
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The state of one topic of one node."""
+    """The state of one topic of one board."""
 
     topic: str
-    is_bad: bool
+    state: object
+    """Announced when it changes; False at the start."""
     text: StatusText
 
 
@@ -155,7 +156,9 @@ class NodeHealth:
         failed = status.radio_failed - before.radio_failed & WORD
         failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
         number = status.node.node_id
+        chips = StatusText(INFO, f"{name}: {', '.join(status.chips)}")
         return [
+            Finding(f"chips {number}", status.chips or False, chips),
             self._supply(known, name),
             _finding(
                 f"bus {number}",
@@ -172,10 +175,18 @@ class NodeHealth:
         ]
 
     def take_link(self, report: LinkReport, names: dict[int, str]) -> list[Finding]:
-        """Note the payloads for which the receiver had no room."""
+        """Note the receiver's radio module, and the payloads for which it had no room."""
         if report.receiver is None:
             return []
-        found = []
+        problem = report.receiver.radio.problem
+        found = [
+            _finding(
+                "receiver radio",
+                bool(problem),
+                f"Receiver: {problem}",
+                "Receiver: radio module works again",
+            )
+        ]
         for link in report.nodes:
             node = self._nodes.get(link.node.node_id)
             if link.node.vehicle_id != self._vehicle_id or node is None:
