@@ -4,6 +4,7 @@ import math
 from typing import Final
 
 from gateway.geometry.quaternion import to_euler
+from gateway.reasons import receiver_state
 from gateway.status import Snapshot
 from gateway.units import counted
 
@@ -13,7 +14,8 @@ UNKNOWN: Final = "—"
 def summary_line(snapshot: Snapshot) -> str:
     """Summarise a snapshot in one line for a log."""
     report = snapshot.report
-    parts = [f"receiver {report.port} {'connected' if report.connected else 'not connected'}"]
+    receiver = receiver_state(report.connected, report.bytes_received, report.frames)
+    parts = [f"receiver {report.port} {receiver}"]
     parts += [
         f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
         for node in report.nodes

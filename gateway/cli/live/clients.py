@@ -19,6 +19,7 @@ from gateway.cli.support.terminal import (
     print_json,
     table_of,
 )
+from gateway.reasons import receiver_state
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
@@ -145,7 +146,8 @@ def _show_endpoints(urls: Sequence[str]) -> None:
 def _summary(snapshot: Record) -> str:
     report = snapshot["report"]
     up_s = snapshot["time_us"] // US_PER_S
-    receiver = f"{report['port']} {'connected' if report['connected'] else 'not connected'}"
+    state = receiver_state(report["connected"], report["bytes_received"], report["frames"])
+    receiver = f"{report['port']} {state}"
     up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
     received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
