@@ -20,7 +20,17 @@ from gateway.analysis.flight_arrays import (
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.geometry.atmosphere import pressure_altitude_m
-from gateway.recordings.columns import BARO, GPS, NAV, NODE_TIME, RAW, SI, fix_of_cells, has_group
+from gateway.recordings.columns import (
+    BARO,
+    GPS,
+    GPS_CODEC,
+    NAV,
+    NAV_CODEC,
+    NODE_TIME,
+    RAW,
+    SI,
+    has_group,
+)
 from gateway.recordings.fuse import calibrated_of
 from gateway.recordings.table import TableBlock
 from gateway.records import GpsFix, RawRecord
@@ -171,7 +181,7 @@ def _arrays_of(cells: FloatArray, calibration: NodeCalibration) -> _Arrays:
     counts = samples[:, RAW]
     bare_mag = turned.apply_all(new_field_ut(np.nan_to_num(counts), flags))
     baros = cells[has_group(cells, BARO)][:, BARO]
-    fixes = [fix_of_cells(row, 1) for row in cells[has_group(cells, GPS)][:, GPS].tolist()]
+    fixes = [GPS_CODEC.read(row, 1) for row in cells[has_group(cells, GPS)][:, GPS].tolist()]
     node_time_us = np.where(np.isnan(counts[:, 0]), NO_COUNTS, samples[:, NODE_TIME])
     return _Arrays(
         time_us=samples[:, 0].astype(np.int64),
@@ -183,22 +193,23 @@ def _arrays_of(cells: FloatArray, calibration: NodeCalibration) -> _Arrays:
         mag_uncalibrated_b_ut=bare_mag,
         baro_time_us=baros[:, 0].astype(np.int64),
         baro_alt_m=np.array([*map(pressure_altitude_m, baros[:, 3].tolist())], np.float64),
-        fixes=[fix for fix in fixes if fix is not None],
+        fixes=fixes,
         states=cells[has_group(cells, NAV)][:, NAV],
     )
 
 
 def _track_of_cells(states: FloatArray) -> FlightTrack:
     """Take a track out of cells of `NAV_COLUMNS`, only what the states vouch for."""
+    at = {name.removeprefix("nav_"): k for k, name in enumerate(NAV_CODEC.columns)}
     track = FlightTrack(
-        time_us=states[:, 0].astype(np.int64),
-        q_nb=states[:, 1:5],
-        lat_deg=states[:, 8],
-        lon_deg=states[:, 9],
-        alt_amsl_m=states[:, 10],
-        vel_n_mps=states[:, 11:14],
+        time_us=states[:, at["time_us"]].astype(np.int64),
+        q_nb=states[:, at["q_w"] : at["q_z"] + 1],
+        lat_deg=states[:, at["lat_deg"]],
+        lon_deg=states[:, at["lon_deg"]],
+        alt_amsl_m=states[:, at["alt_amsl_m"]],
+        vel_n_mps=states[:, at["vel_north_mps"] : at["vel_down_mps"] + 1],
     )
-    return track.where_valid(states[:, 23].astype(np.int64))
+    return track.where_valid(states[:, at["flags"]].astype(np.int64))
 
 
 def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:

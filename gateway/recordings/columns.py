@@ -11,10 +11,10 @@ Python's own `float` and `repr`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Any, Final, Generic, TypeVar
 
 import msgspec
 import numpy as np
@@ -31,7 +31,6 @@ from gateway.records import (
     NavFlags,
     NavState,
     NodeId,
-    Vec3,
 )
 from gateway.units import counted
 
@@ -42,67 +41,163 @@ _node: Final = lru_cache(64)(NodeId)
 _imu_flags: Final = lru_cache(256)(ImuFlags)
 _nav_flags: Final = lru_cache(256)(NavFlags)
 
+XYZ, NED = ("x", "y", "z"), ("north", "east", "down")
+NO_VECTOR: Final = (None, None, None)
+
+# By kind: whether its cells are whole numbers, whether it may be empty, how a record `r` is written
+# and how it is read from the cells `c`.
+_KINDS: Final = {
+    "whole": (True, False, "r.{a}", "int({c})"),
+    "maybe": (True, True, "r.{a}", "None if isnan({c}) else int({c})"),
+    "real": (False, False, "r.{a}", "{c}"),
+    "flag": (True, False, "int(r.{a})", "{c} == 1.0"),
+    "node": (True, False, "r.{a}.node_id", "_node(vehicle_id, int({c}))"),
+    "fix type": (True, False, "int(r.{a})", "GpsFixType(int({c}))"),
+    "flags": (True, False, "int(r.{a})", "_nav_flags(int({c}))"),
+    "counts": (True, False, "*r.{a}", "({all_int})"),
+    "vector": (False, False, "*r.{a}", "({all})"),
+    "maybe vector": (False, True, "*(r.{a} or NO_VECTOR)", "None if isnan({c}) else ({all})"),
+}
+
+Read = TypeVar("Read")
+
+
+class Codec(Generic[Read]):
+    """The columns of one kind of record, and the functions that write and read them.
+
+    Parameters
+    ----------
+    record : type
+        Of the record; what no field gives it is passed to `read`.
+    prefix : str
+        Of its columns.
+    fields : tuple
+        Each a kind of `_KINDS`, the attribute, and the column or columns (a pattern and its parts)
+        if they are not named like the attribute.
+    """
+
+    def __init__(self, record: type[Read], prefix: str, *fields: tuple[Any, ...]) -> None:
+        self.columns: tuple[str, ...] = ()
+        self.whole: tuple[str, ...] = ()
+        self.needed: tuple[str, ...] = ()
+        written, read = [], []
+        for kind, attribute, *named in fields:
+            is_whole, may_be_empty, write, get = _KINDS[kind]
+            pattern, parts = (*named, ("",))[:2] if named else (attribute, ("",))
+            names = tuple(prefix + pattern.format(part) for part in parts)
+            cells = [f"c[{len(self.columns) + k}]" for k in range(len(names))]
+            every, as_int = ", ".join(cells), ", ".join(f"int({cell})" for cell in cells)
+            written.append(write.format(a=attribute))
+            got = get.format(c=cells[0], all=every, all_int=as_int)
+            read.append(f"{attribute}={got}")
+            self.columns += names
+            self.whole += names if is_whole else ()
+            self.needed += names if is_whole and not may_be_empty else ()
+        self.empty = (None,) * len(self.columns)
+        scope = globals() | {"isnan": math.isnan, "record": record}
+        # As dataclasses makes its methods: a loop over the fields would take three times as long.
+        self.write: Callable[[Read], tuple[Cell, ...]] = eval(
+            f"lambda r: ({', '.join(written)},)", scope
+        )
+        """Return a record's cells."""
+        self.read: Callable[..., Read] = eval(
+            f"lambda c, vehicle_id=0, **known: record({', '.join(read)}, **known)", scope
+        )
+        """Make a record of its cells, of which the first is not NaN."""
+
+
+RAW_CODEC: Final = Codec(
+    ImuRaw,
+    "",
+    ("counts", "accel_raw", "accel_{}_raw", XYZ),
+    ("counts", "gyro_raw", "gyro_{}_raw", XYZ),
+    ("counts", "mag_raw", "mag_{}_raw", XYZ),
+    ("whole", "temperature_raw"),
+    ("whole", "accel_range_g"),
+    ("whole", "gyro_range_dps"),
+    ("whole", "mag_lsb_per_gauss"),
+)
+SI_CODEC: Final = Codec(
+    ImuCalibrated,
+    "",
+    ("vector", "accel_b_mps2", "accel_{}_b_mps2", XYZ),
+    ("vector", "gyro_b_radps", "gyro_{}_b_radps", XYZ),
+    ("maybe vector", "mag_b_ut", "mag_{}_b_ut", XYZ),
+    ("real", "temperature_degc"),
+)
+BARO_CODEC: Final = Codec(
+    BaroRaw,
+    "baro_",
+    ("whole", "time_us"),
+    ("node", "node", "node_id"),
+    ("whole", "node_time_us"),
+    ("real", "pressure_pa"),
+    ("real", "temperature_degc"),
+)
+GPS_CODEC: Final = Codec(
+    GpsFix,
+    "gps_",
+    ("whole", "time_us"),
+    ("node", "node", "node_id"),
+    ("whole", "node_time_us"),
+    ("whole", "itow_ms"),
+    ("fix type", "fix_type"),
+    ("flag", "fix_ok"),
+    ("whole", "satellites"),
+    ("whole", "lat_dege7"),
+    ("whole", "lon_dege7"),
+    ("real", "alt_amsl_m"),
+    ("vector", "vel_n_mps", "vel_{}_mps", NED),
+    ("real", "alt_ellipsoid_m"),
+    ("real", "h_acc_m"),
+    ("real", "v_acc_m"),
+    ("real", "speed_acc_mps"),
+    ("real", "course_acc_deg"),
+    ("real", "pdop"),
+    ("maybe", "utc_us"),
+)
+NAV_CODEC: Final = Codec(
+    NavState,
+    "nav_",
+    ("whole", "time_us"),
+    ("vector", "q_nb", "q_{}", ("w", "x", "y", "z")),
+    ("vector", "rate_b_radps", "rate_{}_b_radps", XYZ),
+    ("real", "lat_deg"),
+    ("real", "lon_deg"),
+    ("real", "alt_amsl_m"),
+    ("vector", "vel_n_mps", "vel_{}_mps", NED),
+    ("vector", "attitude_std_rad", "attitude_std_{}_rad", NED),
+    ("vector", "vel_std_mps", "vel_std_{}_mps", NED),
+    ("vector", "pos_std_m", "pos_std_{}_m", NED),
+    ("flags", "flags"),
+)
+
 HEAD_COLUMNS: Final = ("time_us", "node_id", "node_time_us", "imu_flags")
-RAW_COLUMNS: Final = (
-    *("accel_x_raw", "accel_y_raw", "accel_z_raw", "gyro_x_raw", "gyro_y_raw", "gyro_z_raw"),
-    *("mag_x_raw", "mag_y_raw", "mag_z_raw", "temperature_raw"),
-    *("accel_range_g", "gyro_range_dps", "mag_lsb_per_gauss"),
+"""Shared by the counts and the calibrated values of a sample."""
+_GROUPS: Final = (RAW_CODEC, SI_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
+COLUMNS: Final[tuple[str, ...]] = (
+    *HEAD_COLUMNS,
+    *(name for group in _GROUPS for name in group.columns),
 )
-SI_COLUMNS: Final = (
-    *("accel_x_b_mps2", "accel_y_b_mps2", "accel_z_b_mps2"),
-    *("gyro_x_b_radps", "gyro_y_b_radps", "gyro_z_b_radps"),
-    *("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut", "temperature_degc"),
-)
-BARO_COLUMNS: Final = (
-    *("baro_time_us", "baro_node_id", "baro_node_time_us"),
-    *("baro_pressure_pa", "baro_temperature_degc"),
-)
-GPS_COLUMNS: Final = (
-    *("gps_time_us", "gps_node_id", "gps_node_time_us", "gps_itow_ms"),
-    *("gps_fix_type", "gps_fix_ok", "gps_satellites"),
-    *("gps_lat_dege7", "gps_lon_dege7", "gps_alt_amsl_m"),
-    *("gps_vel_north_mps", "gps_vel_east_mps", "gps_vel_down_mps", "gps_alt_ellipsoid_m"),
-    *("gps_h_acc_m", "gps_v_acc_m", "gps_speed_acc_mps", "gps_course_acc_deg", "gps_pdop"),
-    "gps_utc_us",
-)
-NAV_COLUMNS: Final = (
-    *("nav_time_us", "nav_q_w", "nav_q_x", "nav_q_y", "nav_q_z"),
-    *("nav_rate_x_b_radps", "nav_rate_y_b_radps", "nav_rate_z_b_radps"),
-    *("nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m"),
-    *("nav_vel_north_mps", "nav_vel_east_mps", "nav_vel_down_mps"),
-    *("nav_attitude_std_north_rad", "nav_attitude_std_east_rad", "nav_attitude_std_down_rad"),
-    *("nav_vel_std_north_mps", "nav_vel_std_east_mps", "nav_vel_std_down_mps"),
-    *("nav_pos_std_north_m", "nav_pos_std_east_m", "nav_pos_std_down_m", "nav_flags"),
-)
-COLUMNS: Final = HEAD_COLUMNS + RAW_COLUMNS + SI_COLUMNS + BARO_COLUMNS + GPS_COLUMNS + NAV_COLUMNS
+NAV_COLUMNS: Final = NAV_CODEC.columns
+WHOLE_COLUMNS: Final = frozenset((*HEAD_COLUMNS, *(n for group in _GROUPS for n in group.whole)))
+"""Those that hold whole numbers."""
+UNITS: Final = {
+    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
+    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
+    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
+}  # fmt: skip
+"""Unit of a column, by the ending of its name."""
 
 
-def _columns_of(names: tuple[str, ...]) -> slice:
+def span_of(*names: str) -> slice:
+    """Return where columns that follow each other are in a row."""
     first = COLUMNS.index(names[0])
     return slice(first, first + len(names))
 
 
-RAW: Final = _columns_of(RAW_COLUMNS)
-SI: Final = _columns_of(SI_COLUMNS)
-MAG: Final = _columns_of(("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut"))
-BARO: Final = _columns_of(BARO_COLUMNS)
-GPS: Final = _columns_of(GPS_COLUMNS)
-NAV: Final = _columns_of(NAV_COLUMNS)
-
-WHOLE_COLUMNS: Final = frozenset(
-    name
-    for name in COLUMNS
-    if name in {*HEAD_COLUMNS, *RAW_COLUMNS, "gps_fix_type", "gps_fix_ok", "gps_satellites"}
-    or name.endswith(("_us", "_node_id", "_dege7", "_itow_ms", "_flags"))
-)
-"""Those that hold whole numbers."""
-
-_NO_RAW: Final = (None,) * len(RAW_COLUMNS)
-_NO_SI: Final = (None,) * len(SI_COLUMNS)
-_NO_BARO: Final = (None,) * len(BARO_COLUMNS)
-_NO_GPS: Final = (None,) * len(GPS_COLUMNS)
-_NO_NAV: Final = (None,) * len(NAV_COLUMNS)
-_NO_VECTOR: Final = (None, None, None)
+RAW, SI, BARO, GPS, NAV = (span_of(*group.columns) for group in _GROUPS)
+MAG: Final = span_of("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut")
 
 
 LARGEST_WHOLE: Final = 1 << 53
@@ -131,29 +226,36 @@ def row_to_line(row: TableRow) -> str:
 
 def cells_of(row: TableRow) -> tuple[Cell, ...]:
     """Return a row's values in the order of `COLUMNS`; absent ones are None."""
+    imu = row.raw or row.imu
+    node_time_us = row.raw.node_time_us if row.raw else None
     return (
         row.time_us,
-        *_head_cells(row),
-        *(_raw_cells(row.raw) if row.raw else _NO_RAW),
-        *(_si_cells(row.imu) if row.imu else _NO_SI),
-        *(_baro_cells(row.baro) if row.baro else _NO_BARO),
-        *(_gps_cells(row.gps) if row.gps else _NO_GPS),
-        *(_nav_cells(row.state) if row.state else _NO_NAV),
+        *((imu.node.node_id, node_time_us, int(imu.flags)) if imu else NO_VECTOR),
+        *(RAW_CODEC.write(row.raw) if row.raw else RAW_CODEC.empty),
+        *(SI_CODEC.write(row.imu) if row.imu else SI_CODEC.empty),
+        *(BARO_CODEC.write(row.baro) if row.baro else BARO_CODEC.empty),
+        *(GPS_CODEC.write(row.gps) if row.gps else GPS_CODEC.empty),
+        *(NAV_CODEC.write(row.state) if row.state else NAV_CODEC.empty),
     )
 
 
 def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
     """Make a row of the numbers of its cells, in the order of `COLUMNS`."""
     time_us = int(cells[0])
-    has_raw, has_si = (not math.isnan(cells[group.start]) for group in (RAW, SI))
-    flags = _imu_flags(int(cells[3])) if has_raw or has_si else ImuFlags(0)
+    has_raw, has_si, has_baro, has_gps, has_nav = (
+        not math.isnan(cells[group.start]) for group in (RAW, SI, BARO, GPS, NAV)
+    )
+    head: dict[str, Any] = {}
+    if has_raw or has_si:
+        node, flags = _node(vehicle_id, int(cells[1])), _imu_flags(int(cells[3]))
+        head = {"time_us": time_us, "node": node, "flags": flags}
     return TableRow(
         time_us=time_us,
-        baro=baro_of_cells(cells[BARO], vehicle_id),
-        gps=fix_of_cells(cells[GPS], vehicle_id),
-        raw=_read_raw(cells, time_us, vehicle_id, flags) if has_raw else None,
-        imu=_read_si(cells, time_us, vehicle_id, flags) if has_si else None,
-        state=state_of_cells(cells[NAV]),
+        baro=BARO_CODEC.read(cells[BARO], vehicle_id) if has_baro else None,
+        gps=GPS_CODEC.read(cells[GPS], vehicle_id) if has_gps else None,
+        raw=RAW_CODEC.read(cells[RAW], node_time_us=int(cells[2]), **head) if has_raw else None,
+        imu=SI_CODEC.read(cells[SI], **head) if has_si else None,
+        state=NAV_CODEC.read(cells[NAV]) if has_nav else None,
     )
 
 
@@ -228,161 +330,16 @@ def _calibrated(fused: FusedSample) -> ImuCalibrated:
     )
 
 
-def _head_cells(row: TableRow) -> tuple[Cell, ...]:
-    if row.raw:
-        return (row.raw.node.node_id, row.raw.node_time_us, int(row.raw.flags))
-    if row.imu:
-        return (row.imu.node.node_id, None, int(row.imu.flags))
-    return (None, None, None)
-
-
-def _raw_cells(raw: ImuRaw) -> tuple[Cell, ...]:
-    return (
-        *(*raw.accel_raw, *raw.gyro_raw, *raw.mag_raw, raw.temperature_raw),
-        *(raw.accel_range_g, raw.gyro_range_dps, raw.mag_lsb_per_gauss),
-    )
-
-
-def _si_cells(imu: ImuCalibrated) -> tuple[Cell, ...]:
-    mag = imu.mag_b_ut or _NO_VECTOR
-    return (*imu.accel_b_mps2, *imu.gyro_b_radps, *mag, imu.temperature_degc)
-
-
-def _baro_cells(baro: BaroRaw) -> tuple[Cell, ...]:
-    return (
-        *(baro.time_us, baro.node.node_id, baro.node_time_us),
-        *(baro.pressure_pa, baro.temperature_degc),
-    )
-
-
-def _gps_cells(fix: GpsFix) -> tuple[Cell, ...]:
-    return (
-        *(fix.time_us, fix.node.node_id, fix.node_time_us, fix.itow_ms),
-        *(int(fix.fix_type), int(fix.fix_ok), fix.satellites),
-        *(fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_m, *fix.vel_n_mps, fix.alt_ellipsoid_m),
-        *(fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps, fix.course_acc_deg, fix.pdop),
-        fix.utc_us,
-    )
-
-
-def _nav_cells(state: NavState) -> tuple[Cell, ...]:
-    return (
-        *(state.time_us, *state.q_nb, *state.rate_b_radps),
-        *(state.lat_deg, state.lon_deg, state.alt_amsl_m, *state.vel_n_mps),
-        *(*state.attitude_std_rad, *state.vel_std_mps, *state.pos_std_m, int(state.flags)),
-    )
-
-
-def _vector(cells: Sequence[float]) -> Vec3:
-    x, y, z = cells
-    return (x, y, z)
-
-
-def _read_raw(cells: Sequence[float], time_us: int, vehicle_id: int, flags: ImuFlags) -> ImuRaw:
-    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, *ranges = map(int, cells[RAW])
-    accel_range_g, gyro_range_dps, mag_lsb_per_gauss = ranges
-    return ImuRaw(
-        time_us=time_us,
-        node=_node(vehicle_id, int(cells[1])),
-        node_time_us=int(cells[2]),
-        accel_raw=(ax, ay, az),
-        gyro_raw=(gx, gy, gz),
-        mag_raw=(mx, my, mz),
-        temperature_raw=temperature,
-        accel_range_g=accel_range_g,
-        gyro_range_dps=gyro_range_dps,
-        mag_lsb_per_gauss=mag_lsb_per_gauss,
-        flags=flags,
-    )
-
-
-def _read_si(
-    cells: Sequence[float], time_us: int, vehicle_id: int, flags: ImuFlags
-) -> ImuCalibrated:
-    si = cells[SI]
-    return ImuCalibrated(
-        time_us=time_us,
-        node=_node(vehicle_id, int(cells[1])),
-        accel_b_mps2=_vector(si[0:3]),
-        gyro_b_radps=_vector(si[3:6]),
-        mag_b_ut=None if math.isnan(si[6]) else _vector(si[6:9]),
-        temperature_degc=si[9],
-        flags=flags,
-    )
-
-
-def baro_of_cells(cells: Sequence[float], vehicle_id: int) -> BaroRaw | None:
-    """Make a payload of the cells of `BARO_COLUMNS`; None where they are empty."""
-    if math.isnan(cells[0]):
-        return None
-    return BaroRaw(
-        time_us=int(cells[0]),
-        node=_node(vehicle_id, int(cells[1])),
-        node_time_us=int(cells[2]),
-        pressure_pa=cells[3],
-        temperature_degc=cells[4],
-    )
-
-
-def fix_of_cells(cells: Sequence[float], vehicle_id: int) -> GpsFix | None:
-    """Make a fix of the cells of `GPS_COLUMNS`; None where they are empty."""
-    if math.isnan(cells[0]):
-        return None
-    return GpsFix(
-        time_us=int(cells[0]),
-        node=_node(vehicle_id, int(cells[1])),
-        node_time_us=int(cells[2]),
-        itow_ms=int(cells[3]),
-        fix_type=GpsFixType(int(cells[4])),
-        fix_ok=cells[5] == 1.0,
-        satellites=int(cells[6]),
-        lat_dege7=int(cells[7]),
-        lon_dege7=int(cells[8]),
-        alt_amsl_m=cells[9],
-        vel_n_mps=_vector(cells[10:13]),
-        alt_ellipsoid_m=cells[13],
-        h_acc_m=cells[14],
-        v_acc_m=cells[15],
-        speed_acc_mps=cells[16],
-        course_acc_deg=cells[17],
-        pdop=cells[18],
-        utc_us=None if math.isnan(cells[19]) else int(cells[19]),
-    )
-
-
-def state_of_cells(cells: Sequence[float]) -> NavState | None:
-    """Make a state of the cells of `NAV_COLUMNS`; None where they are empty."""
-    if math.isnan(cells[0]):
-        return None
-    w, x, y, z = cells[1:5]
-    return NavState(
-        time_us=int(cells[0]),
-        q_nb=(w, x, y, z),
-        rate_b_radps=_vector(cells[5:8]),
-        lat_deg=cells[8],
-        lon_deg=cells[9],
-        alt_amsl_m=cells[10],
-        vel_n_mps=_vector(cells[11:14]),
-        attitude_std_rad=_vector(cells[14:17]),
-        vel_std_mps=_vector(cells[17:20]),
-        pos_std_m=_vector(cells[20:23]),
-        flags=_nav_flags(int(cells[23])),
-    )
-
-
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in COLUMNS])
 _WHOLE: Final = np.flatnonzero(IS_WHOLE)
 _AT: Final = {name: place for place, name in enumerate(COLUMNS)}
-_MAY_BE_EMPTY: Final = {"gps_utc_us"}
-"""Of the whole numbers of a group that is there."""
 _NEEDED: Final = {
-    group.start: [k for k in _WHOLE.tolist() if group.start <= k < group.stop
-                  and COLUMNS[k] not in _MAY_BE_EMPTY]
-    for group in (RAW, BARO, GPS, NAV)
-}  # fmt: skip
+    span_of(*group.columns).start: [COLUMNS.index(name) for name in group.needed]
+    for group in (RAW_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
+}
 """By a group's first column, without which it is not there."""
 TIMES: Final = [
     k for k, name in enumerate(COLUMNS) if name.endswith("time_us") and "node" not in name

@@ -27,8 +27,10 @@ from gateway.geometry.angle import wrap_180
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import (
     BARO,
+    BARO_CODEC,
     FLAGS,
     GPS,
+    GPS_CODEC,
     NAV,
     NAV_COLUMNS,
     NODE_ID,
@@ -37,8 +39,6 @@ from gateway.recordings.columns import (
     WHOLE_COLUMNS,
     FloatArray,
     TableRow,
-    baro_of_cells,
-    fix_of_cells,
     has_group,
     write_lines,
 )
@@ -200,7 +200,7 @@ def heard_of(cells: FloatArray, vehicle_id: int) -> list[tuple[int, BaroRaw | Gp
     has_sample = has_group(cells, RAW) | has_group(cells, SI)
     before: IntArray = np.cumsum(has_sample) - has_sample
     found: list[tuple[int, int, BaroRaw | GpsFix]] = []
-    for order, group, make in ((0, BARO, baro_of_cells), (1, GPS, fix_of_cells)):
+    for order, group, make in ((0, BARO, BARO_CODEC.read), (1, GPS, GPS_CODEC.read)):
         rows = np.flatnonzero(has_group(cells, group))
         for row, values in zip(rows.tolist(), cells[rows, group].tolist(), strict=True):
             record = make(values, vehicle_id)

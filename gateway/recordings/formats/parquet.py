@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.columns import COLUMNS, WHOLE_COLUMNS, TableRow, cells_of
+from gateway.recordings.columns import COLUMNS, UNITS, WHOLE_COLUMNS, TableRow, cells_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
@@ -85,12 +85,6 @@ HEADER: Final = b"mavgate.header"
 END: Final = "mavgate.end"
 """Comments after the last row."""
 
-UNITS: Final = {
-    "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
-    "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
-    "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
-}  # fmt: skip
-"""By the ending of a column's name."""
 TRUTHS: Final = {"gps_fix_ok"}
 
 _TYPES: Final = {
