@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gateway.aircraft import Aircraft
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings
 from gateway.hub.endpoint import parse_endpoint, stays_here
@@ -91,8 +92,9 @@ class PlayerDaemon:
         self._player = self._make_player(flights)
         self._hub = Hub(settings.hub, self._on_frame, self._now_us, on_gone=self._on_gone)
         self._numbering = _Numbering()
+        metadata = Aircraft(1, settings.default_aircraft).vehicle.metadata
         self._vehicles = [
-            RecordedVehicle(played_as, self._answers_of(flight, system_id, played_as))
+            RecordedVehicle(played_as, self._answers_of(flight, system_id, played_as), metadata)
             for flight in flights
             for system_id, played_as in flight.system_ids.items()
         ]

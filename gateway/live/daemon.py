@@ -40,6 +40,7 @@ from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.reasons import reason_of
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableHeader
+from gateway.recordings.tlog import UNRECORDED
 from gateway.records import (
     RECORDED_ONLY,
     BaroRaw,
@@ -126,7 +127,7 @@ class Daemon:
             unix_time_us,
             self._table_head,
             self._announce,
-            lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
+            *(lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state, self._introduction),
         )
         self._budget = RecordingBudget()
         self._control = self._make_control()
@@ -301,6 +302,10 @@ class Daemon:
             log.warning("no orders can be taken: %s", error)
         self._notifier.ready()
 
+    def _introduction(self, vehicle_id: int) -> list[bytes]:
+        vehicle = self._pipeline.find(vehicle_id).vehicle
+        return [sent.frame for sent in vehicle.introduction()]
+
     def _table_head(self, vehicle_id: int) -> TableHeader:
         return header_for(self._pipeline.find(vehicle_id).settings, vehicle_id)
 
@@ -337,6 +342,8 @@ class Daemon:
         for sent in frames:
             self._sent[sent.message_id] += 1
             frame, to = sent.frame, sent.client_id
+            if sent.message_id in UNRECORDED:
+                continue
             if to in (None, RECORDED_ONLY) or self._budget.takes(to, len(frame), self.now_us()):
                 self._recorder.frame(frame)
 

@@ -46,6 +46,7 @@ class Part:
         self.size = 0
         """Bytes added, those beyond the limit included."""
         self._tables: dict[int, _Table] = {}
+        self._introduced: set[int] = set()
 
     def add(self, ending: str, data: bytes) -> None:
         """Buffer bytes for one file, unless too many wait already."""
@@ -61,6 +62,12 @@ class Part:
     def add_frame(self, frame: bytes, now_us: int) -> None:
         """Buffer a MAVLink frame for the tlog."""
         self.add(TLOG, encode_record(self.stamper.stamp(now_us), frame))
+
+    def introduces(self, vehicle_id: int) -> bool:
+        """Return whether this part has nothing of an aircraft yet; from then on it has."""
+        is_new = vehicle_id not in self._introduced
+        self._introduced.add(vehicle_id)
+        return is_new
 
     def has_table(self, vehicle_id: int) -> bool:
         """Return whether the table of an aircraft was prepared."""

@@ -72,6 +72,9 @@ class Recorder:
         Called with whether it is a problem, and a text for the user.
     state_of : callable
         Returns the state of a vehicle's fusion after all records passed to `flight`.
+    introduction_of : callable
+        Returns the frames of a vehicle that every part begins with: version, modes, parameters,
+        missions, home.
     """
 
     def __init__(
@@ -82,12 +85,13 @@ class Recorder:
         header_of: Callable[[int], TableHeader],
         announce: Callable[[bool, str], None],
         state_of: Callable[[int], FusionState | None] = lambda _: None,
+        introduction_of: Callable[[int], list[bytes]] = lambda _: [],
     ) -> None:
         self._settings = settings
         self._clock, self._machine_us = now_us, unix_us
         self._header_of = header_of
         self._announce = announce
-        self._state_of = state_of
+        self._state_of, self._introduction_of = state_of, introduction_of
         self._session = Session(settings)
         self._civil = CivilClock()
         self._seen: set[int] = set()
@@ -220,6 +224,9 @@ class Recorder:
             record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
         )
         part = self._part
+        if part is not None and part.introduces(vehicle_id):
+            for frame in self._introduction_of(vehicle_id):
+                self.frame(frame)
         if part is not None and self._settings.table:
             if not part.has_table(vehicle_id):
                 part.prepare_table(self._header(vehicle_id, part))

@@ -58,6 +58,18 @@ _FEEDING: Final = frozenset(
     )
 )  # fmt: skip
 """Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
+ANSWERS: Final = np.array(
+    [
+        MESSAGE_IDS[name]
+        for name in (
+            "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
+            "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
+            "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
+            "PING", "TIMESYNC",
+        )
+    ]
+)  # fmt: skip
+"""Answers to a station that asked in flight: one of today could take them for its own."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
 
@@ -77,10 +89,19 @@ def is_command(frame: bytes, stations: Set[int]) -> bool:
     return target < FIRST_GROUND_STATION and target not in {s >> 8 for s in stations}
 
 
+def answers_of(batch: Batch, stations: Set[int]) -> IntArray:
+    """Find the records in which a vehicle answers a station."""
+    is_station_s = (batch.origins >> 8 >= FIRST_GROUND_STATION) | np.isin(
+        batch.origins, list(stations)
+    )
+    return np.flatnonzero(np.isin(batch.message_ids, ANSWERS) & ~is_station_s)
+
+
 def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
-    """Find the records that are neither from a station nor requests to a vehicle."""
+    """Find the records that are neither from a station, nor requests, nor answers to one."""
     origins = batch.origins[begin:]
     kept = (origins >> 8 < FIRST_GROUND_STATION) & ~np.isin(origins, list(stations))
+    kept &= ~np.isin(batch.message_ids[begin:], ANSWERS)
     for i in np.flatnonzero(kept & np.isin(batch.message_ids[begin:], _LOOKED_AT)).tolist():
         kept[i] = not is_command(batch.frame(begin + i), stations)
     found: IntArray = np.flatnonzero(kept) + begin

@@ -72,7 +72,7 @@ from gateway.recordings.table import (
     TableReader,
     encode_header,
 )
-from gateway.recordings.tlog import ORDER_US, Stamper, TlogRecord
+from gateway.recordings.tlog import ORDER_US, UNRECORDED, Stamper, TlogRecord
 from gateway.records import (
     RECORDED_ONLY,
     BaroRaw,
@@ -630,16 +630,16 @@ class RecordedFusion:
     def introduction(self) -> Iterator[bytes]:
         """Yield the frames with the vehicle's version and the parameters that it is fused with."""
         vehicle = Aircraft(self._table.header.vehicle_id, self._aircraft).vehicle
-        for action in vehicle.introduction():
-            if isinstance(action, Outgoing):
-                yield action.frame
+        return (sent.frame for sent in vehicle.introduction())
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink that the gateway would have sent, at civil times."""
         stamper = Stamper(self._zero_us or 0)
         for row in self._table.rows:
             for now_us, action in self._replay.take(row):
-                if isinstance(action, Outgoing) and action.client_id in (None, RECORDED_ONLY):
+                if not isinstance(action, Outgoing) or action.message_id in UNRECORDED:
+                    continue
+                if action.client_id in (None, RECORDED_ONLY):
                     yield TlogRecord(stamper.stamp(now_us), action.frame)
 
     def table(self) -> RecordedTable:

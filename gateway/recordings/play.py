@@ -16,6 +16,7 @@ due at once and the owner's batch size sets the pace.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from enum import StrEnum
 from itertools import chain
@@ -24,7 +25,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from gateway.recordings.answers import telemetry_of
+from gateway.recordings.answers import answers_of, telemetry_of
 from gateway.recordings.tlog import (
     SEEK_BYTES,
     STRIDE,
@@ -36,15 +37,15 @@ from gateway.recordings.tlog import (
 )
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.mavlink_splitter import message_id_of, origin_of, sequence_of, with_sequence
 
 BLOCK_BYTES: Final = 1 << 18
 """Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
 
 CONTEXT_RECORDS: Final = 20 * STRIDE
 """How far back a seek looks for frames that a ground station needs: a minute and more."""
-CONTEXT_IDS: Final = (0, 1, 22, 24, 30, 31, 33, 49, 74, 148, 242, 245)
-"""HEARTBEAT, SYS_STATUS, PARAM_VALUE, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
+CONTEXT_IDS: Final = (0, 1, 24, 30, 31, 33, 49, 74, 148, 242, 245)
+"""HEARTBEAT, SYS_STATUS, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
 HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
 PARAM_VALUE_ID: Final = 22
 PARAM_NAME: Final = slice(18, 34)
@@ -162,8 +163,7 @@ class Track:
                 newest.pop(key, None)
                 newest[key] = frame
             if len(reached):
-                here = batch.records(self._wanted(batch, begin))
-                self._records = chain(here, self._records_of(batches))
+                self._records = self._records_of(chain([batch], batches), begin)
                 break
         self._next = next(self._records, None)
         return [self._addressed(frame) for frame in newest.values()]
@@ -173,8 +173,34 @@ class Track:
             return np.arange(begin, len(batch))
         return telemetry_of(batch, begin, self._source.index.stations)
 
-    def _records_of(self, batches: Iterator[Batch]) -> Iterator[TlogRecord]:
-        return chain.from_iterable(batch.records(self._wanted(batch, 0)) for batch in batches)
+    def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
+        """Yield what is played, numbered as if the left out answers had never been sent.
+
+        `begin` is the first record of the first batch.
+        """
+        left_out: Counter[int] = Counter()
+        for batch in batches:
+            wanted = self._wanted(batch, begin)
+            answers = self._left_out(batch)
+            answers, begin = answers[answers >= begin], 0
+            if not len(answers) and not left_out:
+                yield from batch.records(wanted)
+                continue
+            is_answer = np.isin(every := np.union1d(wanted, answers), answers)
+            for i, is_left_out in zip(every.tolist(), is_answer.tolist(), strict=True):
+                origin = int(batch.origins[i])
+                if is_left_out:
+                    left_out[origin] += 1
+                    continue
+                frame = batch.frame(i)
+                if count := left_out[origin]:
+                    frame = with_sequence(frame, sequence_of(frame) - count & 0xFF)
+                yield TlogRecord(int(batch.time_us[i]), frame)
+
+    def _left_out(self, batch: Batch) -> IntArray:
+        if self._with_commands:
+            return np.empty(0, np.int64)
+        return answers_of(batch, self._source.index.stations)
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])

@@ -76,6 +76,9 @@ FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
 MAX_JUMPS: Final = 1000
 
 HEARTBEAT_ID: Final = 0
+UNRECORDED: Final = frozenset({235})
+"""HIGH_LATENCY2, for links too narrow for the rest: beside these in a recording a ground station
+would take each one for another state of the vehicle."""
 
 
 def _crc_extra_table() -> ExtraArray:

@@ -4,12 +4,12 @@
 | ------------------------------------ | ------------------------------------------------------- |
 | PARAM_REQUEST_LIST, …_READ           | the recorded values; PARAM_ERROR where there are none   |
 | PARAM_SET                            | PARAM_ERROR and the recorded value: it stays            |
-| MISSION_REQUEST_LIST and its items   | the recorded items; MISSION_ACK unsupported without     |
+| MISSION_REQUEST_LIST and its items   | the recorded items; none where there are none           |
 | an upload, MISSION_CLEAR_ALL         | MISSION_ACK denied                                      |
 | REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded message; unsupported if it was never sent  |
 | SET_MESSAGE_INTERVAL                 | thins what is played to the client that asks            |
 | any other command, SET_MODE          | denied: the past cannot be changed                      |
-| files                                | FTP's "file not found"                                  |
+| files, COMPONENT_METADATA            | of own recordings the parameters' metadata              |
 | PING, TIMESYNC                       | answered                                                |
 """
 
@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.actions import Answer, Reply, Request
-from gateway.vehicle.encoding import Encoder
+from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
 from gateway.vehicle.plan import MISSION, read_item
 from gateway.vehicle.requests import RequestReader
 from gateway.vehicle.services.commands import (
@@ -35,7 +35,7 @@ from gateway.vehicle.services.commands import (
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import HEARTBEAT, KEEPS_CLIENTS_US, NONE
-from gateway.vehicle.services.missions import KINDS, MissionService, mission_ack
+from gateway.vehicle.services.missions import KINDS, MissionService
 from gateway.vehicle.services.parameter_service import (
     BATCH,
     BATCH_INTERVAL_US,
@@ -44,6 +44,7 @@ from gateway.vehicle.services.parameter_service import (
     MAX_LISTENERS,
     UNKNOWN,
 )
+from gateway.vehicle.services.parameters import Metadata
 from gateway.vehicle.services.queries import QueryService
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
@@ -86,16 +87,20 @@ class RecordedVehicle:
         Its MAVLink system id, as it is played.
     answers : Answers
         What its log holds.
+    metadata : Metadata, optional
+        Of the parameters, used where the recorded ones are those.
     """
 
-    def __init__(self, system_id: int, answers: Answers) -> None:
+    def __init__(self, system_id: int, answers: Answers, metadata: Metadata | None = None) -> None:
         self.system_id = system_id
         self._answers = answers
         self._reader = RequestReader(system_id)
         self._encoder = Encoder(system_id)
         self._mavlink: Any = mavlink.MAVLink(None)
         self._missions = MissionService(lambda *_: [], lambda *_: [])
-        self._ftp = FtpService({})
+        own = metadata is not None and metadata.describes(answers.parameters())
+        self._metadata = metadata if own else None
+        self._ftp = FtpService({} if self._metadata is None else self._metadata.files())
         self._queries = QueryService(lambda *_: [], lambda *_: [])
         self._lists: dict[int, list[bytes]] = {}
         self._due_us: int | None = None
@@ -193,12 +198,10 @@ class RecordedVehicle:
         if self._missions.changes_state(request):
             return self._missions.refuse(request)
         kind = int(getattr(request.message, "mission_type", MISSION))
-        recorded = self._answers.mission(kind) if kind in KINDS else None
-        if recorded is not None:
+        if kind in KINDS:
+            recorded = self._answers.mission(kind) or ()
             items = (read_item(self._mavlink.decode(bytearray(frame))) for frame in recorded)
             self._missions.items[kind] = tuple(items)
-        elif request.message.get_type() != "MISSION_ACK":
-            return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         return self._missions.handle(request, now_us)
 
     def _command(self, request: Request, _now_us: int) -> list[Answer]:
@@ -214,6 +217,8 @@ class RecordedVehicle:
     def _send(self, command: Command, message_id: int) -> list[Answer]:
         client_id = command.request.client_id
         frames = self._answers.frames(message_id)
+        if message_id == MAVLINK_MSG_ID_COMPONENT_METADATA and self._metadata is not None:
+            frames = [self._encoder.encode(self._metadata.announcement(0)).frame]
         if not frames:
             return [command.ack(UNSUPPORTED)]
         return [command.ack(ACCEPTED), *(Outgoing(f, message_id, client_id) for f in frames)]

@@ -7,6 +7,7 @@ from typing import Any, Final, Protocol
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import (
+    RECORDED_ONLY,
     BaroSample,
     GpsFix,
     ImuSample,
@@ -14,6 +15,7 @@ from gateway.records import (
     LinkReport,
     NavState,
     NodeStatus,
+    Outgoing,
 )
 from gateway.settings import Settings
 from gateway.units import US_PER_S
@@ -50,8 +52,6 @@ from gateway.vehicle.services.intervals import IntervalService
 from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
 from gateway.vehicle.services.parameter_service import PACKED_PATH, ParameterService
 from gateway.vehicle.services.parameters import (
-    GENERAL_PATH,
-    PARAMETER_PATH,
     Metadata,
     ParameterTable,
 )
@@ -154,13 +154,7 @@ class Vehicle:
             self.system_id, ParameterTable(sections), {HOME_SECTION: self.places}
         )
         self._metadata = Metadata(self._parameters.table)
-        self._ftp = FtpService(
-            {
-                GENERAL_PATH: lambda *_: self._metadata.general(),
-                PARAMETER_PATH: lambda *_: self._metadata.parameters(),
-                PACKED_PATH: self._parameters.packed,
-            }
-        )
+        self._ftp = FtpService({**self._metadata.files(), PACKED_PATH: self._parameters.packed})
         self._calibrator = Calibrator(
             self.system_id, lambda: self.in_flight, lambda: self.telemetry.state
         )
@@ -311,11 +305,28 @@ class Vehicle:
         answers += self._replies(self._refusal_texts.say(status, now_us))
         return self._finish(answers)
 
-    def introduction(self) -> list[Action]:
-        """Encode version and parameters, which every ground station requests at its start."""
-        asked = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, MAVLINK_MSG_ID_PROTOCOL_VERSION)
+    @property
+    def metadata(self) -> Metadata:
+        """Descriptions of the parameters."""
+        return self._metadata
+
+    def introduction(self) -> list[Outgoing]:
+        """Encode what every ground station requests at its start, for a recording alone.
+
+        Version, modes, parameters, home, and missions as if they were downloaded; in a sequence of
+        their own, so that no client counts a loss.
+        """
+        encoder = Encoder(self.system_id)
+        asked = (
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+            MAVLINK_MSG_ID_PROTOCOL_VERSION,
+            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES,
+            mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+        )
         known = [message for number in asked for message in self._build(number, 0)]
-        return self._finish([*self._replies(known), *self._parameters.values()])
+        known += [each.message for each in self._parameters.values() if isinstance(each, Reply)]
+        known += self.places.missions.download()
+        return [encoder.encode(message, RECORDED_ONLY) for message in known]
 
     def poll(self, now_us: int) -> list[Action]:
         """Return the actions that are due by time."""

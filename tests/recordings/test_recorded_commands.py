@@ -16,15 +16,18 @@ CHANNELS = [1500] * 8
 TELEMETRY: list[tuple[tuple[int, int], Any]] = [
     (VEHICLE, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)),
     (VEHICLE, mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0)),
-    (VEHICLE, mavlink.MAVLink_param_value_message(b"A", 1.0, 9, 1, 0)),
-    (VEHICLE, mavlink.MAVLink_command_ack_message(400, 0)),
-    (VEHICLE, mavlink.MAVLink_mission_count_message(255, 190, 3)),
-    (VEHICLE, mavlink.MAVLink_mission_request_int_message(42, 190, 3)),
     (VEHICLE, mavlink.MAVLink_odometry_message(
         0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0] * 21, [0] * 21)),
     (COMPANION, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
     (COMPANION, mavlink.MAVLink_statustext_message(6, b"here")),
 ]  # fmt: skip
+ANSWERS: list[tuple[tuple[int, int], Any]] = [
+    (VEHICLE, mavlink.MAVLink_param_value_message(b"A", 1.0, 9, 1, 0)),
+    (VEHICLE, mavlink.MAVLink_command_ack_message(400, 0)),
+    (VEHICLE, mavlink.MAVLink_mission_count_message(255, 190, 3)),
+    (VEHICLE, mavlink.MAVLink_mission_request_int_message(42, 190, 3)),
+]
+"""To a station that asked in flight."""
 COMMANDS: list[tuple[tuple[int, int], Any]] = [
     (OLD_STATION, mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)),
     (OLD_STATION, mavlink.MAVLink_statustext_message(6, b"hello")),
@@ -58,8 +61,22 @@ def played(track: Track) -> list[bytes]:
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda said: said[1].get_type())
 def test_commands_stay_out(command: tuple[tuple[int, int], Any]) -> None:
     # The last heartbeat tells who was a station all the time.
-    data = tlog_of([*TELEMETRY[:4], command, *TELEMETRY[4:], COMMANDS[0]])
+    data = tlog_of([*TELEMETRY[:2], command, *TELEMETRY[2:], COMMANDS[0]])
     assert played(make_track(data)) == frames_of(tlog_of(TELEMETRY))
+
+
+@pytest.mark.parametrize("answer", ANSWERS, ids=lambda said: said[1].get_type())
+def test_answers_stay_out_and_leave_no_gap_in_the_sequence(
+    answer: tuple[tuple[int, int], Any],
+) -> None:
+    mav, frames = mavlink.MAVLink(None, *VEHICLE), []
+    for _, message in [TELEMETRY[0], answer, answer, TELEMETRY[1], answer, TELEMETRY[0]]:
+        frames.append(bytes(message.pack(mav)))
+        mav.seq += 1
+    data = b"".join(encode_record(START_US + i, frame) for i, frame in enumerate(frames))
+    found = [mavlink.MAVLink(None).decode(bytearray(frame)) for frame in played(make_track(data))]
+    assert [m.get_type() for m in found] == ["HEARTBEAT", "ATTITUDE", "HEARTBEAT"]
+    assert [m.get_seq() for m in found] == [0, 1, 2]
 
 
 def test_they_are_played_to_who_asks_for_them() -> None:

@@ -1,10 +1,9 @@
 """A track reads on, seeks, and tells what came before."""
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.play import Track
-from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 
@@ -68,17 +67,6 @@ def test_seek_tells_the_newest_of_what_must_be_known() -> None:
     context = track.seek(records[100].time_us)
     assert context == [records[97].frame, records[99].frame]
     assert [message_id_of(frame) for frame in context] == [31, 0]
-
-
-def test_every_parameter_is_reported() -> None:
-    mav = mavlink.MAVLink(None, 1, 1)
-    frames = [
-        bytes(mavlink.MAVLink_param_value_message(name, value, 9, 2, 0).pack(mav))
-        for name, value in [(b"ALPHA", 1.0), (b"BETA", 2.0), (b"ALPHA", 3.0)]
-    ]
-    data = b"".join(encode_record(START_US + i, frame) for i, frame in enumerate(frames))
-    track = make_track(data)
-    assert track.seek(START_US + 3) == [frames[1], frames[2]]
 
 
 def test_shift_and_sender() -> None:

@@ -208,6 +208,17 @@ class MissionService:
         total = count if count else 0xFFFF
         return mavlink.MAVLink_mission_current_message(self.current, total, state, 0)
 
+    def download(self) -> list[Any]:
+        """Return the messages of a download of all that is stored, to nobody."""
+        found: list[Any] = []
+        for kind, items in self.items.items():
+            found.append(mavlink.MAVLink_mission_count_message(0, 0, len(items), kind))
+            found += [
+                write_item(item, number, kind, (0, 0), kind == MISSION and number == self.current)
+                for number, item in enumerate(items)
+            ]
+        return found
+
     def _list(self, request: Request, _now_us: int) -> list[Answer]:
         kind = request.message.mission_type
         if kind not in KINDS:

@@ -24,7 +24,7 @@ import lzma
 import math
 import struct
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import takewhile
@@ -446,6 +446,16 @@ class Metadata:
 
     def __init__(self, table: ParameterTable) -> None:
         self._general, self._parameters = _files(table.kinds)
+        self._names = {parameter.name for parameter in table.parameters}
+
+    def describes(self, names: Iterable[str]) -> bool:
+        """Return whether parameters, of which there are some, are those of this version."""
+        found = set(names)
+        return bool(found) and found <= self._names
+
+    def files(self) -> dict[str, Callable[..., bytes]]:
+        """Return the files by their FTP paths."""
+        return {GENERAL_PATH: lambda *_: self._general, PARAMETER_PATH: lambda *_: self._parameters}
 
     def general(self) -> bytes:
         """Return the file that lists the others."""
