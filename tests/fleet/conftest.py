@@ -33,10 +33,10 @@ class World:
         self.got: list[Any] = []
 
     def open_site(
-        self, name: str, options: str = "", recordings: Path | None = None, beside: str = ""
+        self, name: str, options: str = "", recordings: Path | None = None, extra: str = ""
     ) -> Any:
         url = f"zenoh:{self.place}?site={name}{options}"
-        return self.add_site(name, url, beside=beside, recordings=recordings)
+        return self.add_site(name, url, extra=extra, recordings=recordings)
 
     def add_site(
         self,
@@ -44,7 +44,7 @@ class World:
         url: str,
         *,
         system: int = 1,
-        beside: str = "",
+        extra: str = "",
         recordings: Path | None = None,
     ) -> Any:
         incoming: list[Any] = []
@@ -52,7 +52,7 @@ class World:
         rig.clock = self.rig.clock
         rig.incoming = incoming
         rig.vehicle = rig.sender(system)
-        hub = rig.hub(url, *filter(None, [beside]), recordings=recordings)
+        hub = rig.hub(url, *filter(None, [extra]), recordings=recordings)
         self.rig.closing += rig.closing
         self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
         return hub

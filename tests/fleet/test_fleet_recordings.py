@@ -38,7 +38,7 @@ CONTENT = np.random.default_rng(1).bytes(SIZE)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A site's recordings, and a secret beside them."""
+    """A site's recordings, and a secret outside of them."""
     folder = tmp_path / "recordings"
     folder.mkdir()
     (folder / NAME).write_bytes(CONTENT)
@@ -67,7 +67,9 @@ async def spoken_for(world: World, work: "asyncio.Task[Any]") -> Any:
 
 
 class TestOverTheSession:
-    async def test_list_and_get(self, world: World, folder: Path, tmp_path: Path) -> None:
+    async def test_recordings_are_listed_and_fetched_and_differing_files_kept(
+        self, world: World, folder: Path, tmp_path: Path
+    ) -> None:
         await opened(world, folder)
         runner = CliRunner()
 
@@ -94,7 +96,7 @@ class TestOverTheSession:
         none = await run("fleet", "recordings", "get", "field-b", "flight")
         assert (none.exit_code, "does not answer" in none.output) == (2, True)
 
-    async def test_the_site_goes_in_the_middle_and_comes_back(
+    async def test_fetch_continues_after_the_site_has_reconnected(
         self, world: World, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(fetching, "LARGEST", fetching.SMALLEST)
@@ -129,7 +131,7 @@ class TestOverTheSession:
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
         assert sorted(set(offsets)) == [*range(0, SIZE, fetching.SMALLEST)], "none from the start"
 
-    async def test_a_stopped_fetch_goes_on_where_it_was(
+    async def test_stopped_fetch_continues_at_its_offset(
         self, world: World, folder: Path, tmp_path: Path
     ) -> None:
         await opened(world, folder)
@@ -157,7 +159,7 @@ class TestOverTheSession:
         assert min(offset for offset in asked if offset >= 0) == have
         assert (tmp_path / "fetched" / NAME).read_bytes() == CONTENT
 
-    async def test_site_that_does_not_trust_its_fleet_offers_no_recordings(
+    async def test_site_without_trusted_yes_offers_no_recordings(
         self, world: World, folder: Path
     ) -> None:
         world.open_site("field-a", recordings=folder)
@@ -204,7 +206,7 @@ class TestAnswers:
             json.dumps({"file": NAME, "size": MAX_PIECE + 1}).encode(),
         ],
     )
-    def test_what_is_no_query(self, folder: Path, asked: bytes) -> None:
+    def test_malformed_query_is_refused(self, folder: Path, asked: bytes) -> None:
         with pytest.raises(RefusedQueryError):
             RecordingAnswers(folder)(asked)
 
@@ -244,7 +246,7 @@ class TestAnswers:
             site_queries.QueryAnswers._payload_of(query)
         query.payload.to_bytes.assert_not_called()
 
-    def test_pieces_and_digests(self, folder: Path) -> None:
+    def test_piece_and_digest_equal_the_file(self, folder: Path) -> None:
         answer = RecordingAnswers(folder)
 
         def ask(**fields: object) -> bytes:
@@ -269,7 +271,7 @@ class TestFetch:
         one = RecordingFetch("site", folder, ask, wait=lambda _: None)
         return one.fetch(NAME, size, lambda _: None)
 
-    def test_what_changed_meanwhile_is_not_kept(self, tmp_path: Path) -> None:
+    def test_file_changed_during_the_fetch_is_discarded(self, tmp_path: Path) -> None:
         with pytest.raises(FetchError, match="changed"):
             self.fetch(tmp_path, CONTENT, "0" * 64)
         assert not (tmp_path / NAME).exists()
@@ -277,7 +279,7 @@ class TestFetch:
         assert self.fetch(tmp_path, CONTENT, good)
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
-    def test_a_recording_that_has_grown_since_is_gone_on_with(self, tmp_path: Path) -> None:
+    def test_grown_recording_is_continued(self, tmp_path: Path) -> None:
         asked: list[int] = []
 
         def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
@@ -296,30 +298,30 @@ class TestFetch:
         with pytest.raises(FetchError, match="differs"):
             RecordingFetch("site", tmp_path, ask).fetch(NAME, 25_000, lambda _: None)
 
-    def test_another_file_under_the_name_is_begun_anew(self, tmp_path: Path) -> None:
+    def test_partial_file_of_other_content_is_replaced(self, tmp_path: Path) -> None:
         (tmp_path / f".{NAME}.part").write_bytes(b"x" * 5000)
         assert self.fetch(tmp_path, CONTENT, hashlib.sha256(CONTENT[:10_000]).hexdigest())
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
-    def test_a_file_that_became_shorter(self, tmp_path: Path) -> None:
+    def test_shortened_file_is_an_error(self, tmp_path: Path) -> None:
         with pytest.raises(FetchError, match="shorter"):
             self.fetch(tmp_path, CONTENT[:100], "", size=10_000)
 
-    def test_a_site_that_never_answers(
+    def test_site_that_never_answers_is_an_error(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(fetching, "PATIENCE_S", -1.0)
         one = RecordingFetch("site", tmp_path, lambda *_: {"data": None}, wait=lambda _: None)
-        with pytest.raises(FetchError, match="goes on from here"):
+        with pytest.raises(FetchError, match="continues from here"):
             one.fetch(NAME, 10, lambda _: None)
 
     @pytest.mark.parametrize("name", ["../flight_01.tlog", "flight.txt", "x/flight_01.tlog"])
     def test_names_that_leave_the_folder(self, tmp_path: Path, name: str) -> None:
         one = RecordingFetch("site", tmp_path, lambda *_: {}, wait=lambda _: None)
-        with pytest.raises(FetchError, match="no file of a recording"):
+        with pytest.raises(FetchError, match="not a file of a recording"):
             one.fetch(name, 10, lambda _: None)
 
-    def test_pieces_follow_the_link(self) -> None:
+    def test_piece_size_follows_the_speed_of_the_link(self) -> None:
         pace = PiecePace()
         sizes = []
         for took_s in [0.01] * 8 + [0.1] + [0.5] * 3:
@@ -333,7 +335,7 @@ class TestFetch:
         assert pace.size == fetching.SMALLEST
 
     @pytest.mark.parametrize(("took_s", "waited_s"), [(0.1, 0.1), (3.0, fetching.SLOW_S)])
-    def test_telemetry_gets_its_share_of_the_link(
+    def test_pauses_leave_half_of_the_link_to_telemetry(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float
     ) -> None:
         now_s = 0.0

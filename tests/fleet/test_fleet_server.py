@@ -31,7 +31,7 @@ pytestmark = pytest.mark.io
 STATUSTEXT = 253
 
 
-async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: World) -> None:
+async def test_two_aircraft_1_get_two_ids_and_a_command_reaches_the_right_one(world: World) -> None:
     for name in ("field-a", "field-b", "office"):
         world.open_site(name)
     await world.until(lambda: len(world.systems()) == 2)
@@ -51,7 +51,7 @@ async def test_two_aircraft_1_are_two_here_and_a_command_finds_its_own(world: Wo
     assert (answer.get_srcSystem(), answer.target_system) == (ids["field-b"], 255)
 
 
-async def test_vehicles_that_were_not_heard_for_long_keep_nobody_out(
+async def test_id_of_an_abandoned_vehicle_is_passed_on(
     world: World, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(fleet_server, "POLL_S", 0.01)
@@ -68,7 +68,7 @@ async def test_vehicles_that_were_not_heard_for_long_keep_nobody_out(
     )
 
 
-async def test_sites_that_have_gone_make_room_for_others(
+async def test_abandoned_site_is_removed_when_sites_are_full(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fleet_server, "MAX_SITES", 3)
@@ -86,7 +86,7 @@ async def test_sites_that_have_gone_make_room_for_others(
     assert "field-2" not in {client.name for client in fleet._hub.clients()}
 
 
-async def test_one_sites_frames_never_reach_another(world: World) -> None:
+async def test_frames_of_one_site_never_reach_another(world: World) -> None:
     for name in ("field-a", "field-b"):
         world.open_site(name)
     await world.until(lambda: len(world.systems()) == 2)
@@ -102,7 +102,7 @@ async def test_one_sites_frames_never_reach_another(world: World) -> None:
         assert before[name] <= hub.clients()[0].received
 
 
-async def test_a_site_goes_and_that_is_reported_once(world: World) -> None:
+async def test_disconnected_site_is_reported_once(world: World) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)
@@ -117,8 +117,8 @@ async def test_a_site_goes_and_that_is_reported_once(world: World) -> None:
     assert gone == {"field-a": True, "field-b": False}
 
 
-async def test_what_a_site_is_fed_with_ends_after_one_round(world: World) -> None:
-    hub = world.open_site("field-a", beside="udp-listen:127.0.0.1:0")
+async def test_frames_fed_back_through_a_site_end_after_one_round(world: World) -> None:
+    hub = world.open_site("field-a", extra="udp-listen:127.0.0.1:0")
     world.fleet._ids.set_by_hand("field-a", 1, 7)
     world.fleet._hub.add(f"udp:127.0.0.1:{hub.listening_ports()[0]}")
     await world.until(lambda: world.fleet.status()["sites"][0:1] != [] and 7 in world.systems())
@@ -131,7 +131,7 @@ async def test_what_a_site_is_fed_with_ends_after_one_round(world: World) -> Non
     assert "looped frames dropped" in await run("fleet", "status")
 
 
-async def test_unsigned_forged_and_replayed_frames_of_a_site_with_passphrase_are_dropped(
+async def test_rejected_frames_of_a_site_with_passphrase_are_counted(
     world: World,
 ) -> None:
     hub = world.open_site("field-s")
@@ -156,23 +156,23 @@ async def test_unsigned_forged_and_replayed_frames_of_a_site_with_passphrase_are
     assert "frames of field-s dropped: 1 unsigned, 1 forged, 1 replayed" in shown
 
 
-async def test_garbage_and_names_that_are_none(world: World) -> None:
+async def test_garbage_and_invalid_site_names_are_counted(world: World) -> None:
     import zenoh
 
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
     config.insert_json5("connect/endpoints", json.dumps([world.place]))
     config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config) as stranger:
-        stranger.put("mavlink/field-x/1/out", b"no MAVLink at all")
-        stranger.put("mavlink/field- x/1/out", b"\xfd")
+    with zenoh.open(config) as client:
+        client.put("mavlink/field-x/1/out", b"no MAVLink at all")
+        client.put("mavlink/field- x/1/out", b"\xfd")
         await world.until(lambda: bool(world.fleet.status()["bad_names"]))
         sites = {site["name"]: site for site in world.fleet.status()["sites"]}
         assert sites["field-x"]["bytes_garbage"] == 17
         assert set(sites) == {"field-x"}
 
 
-async def test_ids_are_kept_shown_and_set_by_hand(world: World, settings: FleetSettings) -> None:
+async def test_assigned_id_is_used_shown_and_saved(world: World, settings: FleetSettings) -> None:
     world.open_site("field-a")
     await world.until(lambda: bool(world.systems()))
     socket_path = world.fleet.control_socket
@@ -185,7 +185,7 @@ async def test_ids_are_kept_shown_and_set_by_hand(world: World, settings: FleetS
     assert json.loads(Path(settings.ids_file).read_text()) == {"field-a/1": 77}
 
 
-async def test_an_id_that_the_disk_does_not_keep_is_an_error(
+async def test_id_that_cannot_be_saved_is_an_error(
     world: World, settings: FleetSettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> int:
@@ -204,14 +204,14 @@ async def test_an_id_that_the_disk_does_not_keep_is_an_error(
     ("text", "words"),
     [("[]", "object"), ('{"x": 1}', "SITE/SYSTEM"), ('{"a/1": 5, "b/1": 5}', "twice")],
 )
-def test_a_file_of_ids_that_is_none(settings: FleetSettings, text: str, words: str) -> None:
+def test_malformed_file_of_ids_is_refused(settings: FleetSettings, text: str, words: str) -> None:
     Path(settings.ids_file).write_text(text)
     with pytest.raises(ValueError, match=words):
         FleetServer(settings, HubSettings())
 
 
 @pytest.mark.parametrize("site", ["a/b", "", "a**", "a b", "$*"])
-def test_patterns_that_are_none(settings: FleetSettings, site: str) -> None:
+def test_malformed_site_pattern_is_refused(settings: FleetSettings, site: str) -> None:
     with pytest.raises(ValueError, match="site"):
         FleetServer(FleetSettings(sites=(site,), ids_file=settings.ids_file), HubSettings())
 
@@ -237,7 +237,7 @@ class TestTheCommand:
             process.kill()
             process.wait()
 
-    def test_ends_at_once(self, tmp_path: Path, settings: FleetSettings) -> None:
+    def test_fleet_ends_on_sigterm(self, tmp_path: Path, settings: FleetSettings) -> None:
         process = self.start(tmp_path, "--listen", settings.listen)
         host, port = settings.listen.removeprefix("tcp/").split(":")
         end_s = time.monotonic() + LIMIT_S
@@ -247,7 +247,7 @@ class TestTheCommand:
             time.sleep(0.1)
         self.end(process)
 
-    def test_ends_soon_when_its_router_never_answers(
+    def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(
         self, tmp_path: Path, settings: FleetSettings
     ) -> None:
         """Zenoh waits for a router to say who it is: here for an hour."""

@@ -1,4 +1,4 @@
-"""What a fleet tells of its sites: round trips, rates, namesakes, and the same as metrics."""
+"""Status and metrics of a fleet: round trips, rates, sites of the same name."""
 
 import asyncio
 import json
@@ -19,7 +19,7 @@ def site_of(world: World, name: str) -> dict[str, Any]:
     return {site["name"]: site for site in world.fleet.status()["sites"]}.get(name, {})
 
 
-async def test_round_trip_rate_and_table(world: World) -> None:
+async def test_status_shows_round_trip_and_rate(world: World) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)
@@ -39,7 +39,7 @@ async def test_round_trip_rate_and_table(world: World) -> None:
     assert {site["name"] for site in listed["sites"]} == {"field-a", "field-b"}
 
 
-async def test_metrics(world: World) -> None:
+async def test_metrics_contain_sites_and_vehicles(world: World) -> None:
     world.open_site("field-a")
     await world.until(lambda: bool(world.systems()))
     port = free_port()
@@ -54,7 +54,7 @@ async def test_metrics(world: World) -> None:
     assert "mavgate_hub_forwarded_total" in text
 
 
-async def test_two_sites_of_one_name_are_shown_here_too(
+async def test_two_sites_of_one_name_are_reported(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
     first = world.open_site("field-a")
@@ -68,7 +68,7 @@ async def test_two_sites_of_one_name_are_shown_here_too(
     assert site_of(world, "field-a")["is_here"], "the other one is there still"
 
 
-async def test_a_vehicle_that_is_left_out(world: World, tmp_path: Path) -> None:
+async def test_excluded_vehicle_is_not_shown(world: World, tmp_path: Path) -> None:
     world.open_site("field-a")
     world.open_site("field-b")
     await world.until(lambda: len(world.systems()) == 2)

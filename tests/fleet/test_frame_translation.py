@@ -54,14 +54,14 @@ def command(target: int) -> Any:
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_from_the_site(v1: bool) -> None:
+def test_sender_of_a_frame_from_the_site_is_translated(v1: bool) -> None:
     there = translation()
     got = read(there.from_site(packed(attitude(), 1, v1=v1), 0) or b"")
     assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_to_the_site(v1: bool) -> None:
+def test_target_of_a_frame_to_the_site_is_translated(v1: bool) -> None:
     system_id, frame = translation().to_site(packed(command(2), 255, v1=v1), 0) or (0, b"")
     got = read(frame)
     assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
@@ -87,7 +87,7 @@ def follow(leader: int, kind: Any) -> Any:
         mavlink.MAVLink_mission_item_int_message,
     ],
 )
-def test_a_system_that_a_command_names(kind: Any, v1: bool) -> None:
+def test_system_named_in_a_command_is_translated(kind: Any, v1: bool) -> None:
     both = translation()
     _, frame = both.to_site(packed(follow(2, kind), 255, v1=v1), 0) or (0, b"")
     there = read(frame)
@@ -97,7 +97,7 @@ def test_a_system_that_a_command_names(kind: Any, v1: bool) -> None:
 
 
 @pytest.mark.parametrize("value", [0.0, -2.0, float("nan"), 255.0, 1e30])
-def test_what_names_no_vehicle_stays(value: float) -> None:
+def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
     message = mavlink.MAVLink_command_long_message(
         2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
     )
@@ -107,20 +107,20 @@ def test_what_names_no_vehicle_stays(value: float) -> None:
     assert got.param3 == pytest.approx(value, nan_ok=True)
 
 
-def test_who_steers_a_gimbal() -> None:
+def test_controlling_systems_of_a_gimbal_are_translated() -> None:
     message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
     got = read(translation().from_site(packed(message, 1), 0) or b"")
     assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
     assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
 
 
-def test_an_answer_keeps_the_ground_station_it_is_for() -> None:
+def test_target_of_an_answer_is_unchanged() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190)
     got = read(translation().from_site(packed(ack, 1), 0) or b"")
     assert (got.get_srcSystem(), got.target_system, got.target_component) == (2, 255, 190)
 
 
-def test_a_vehicle_that_addresses_another_of_its_site() -> None:
+def test_target_within_the_site_is_translated() -> None:
     """As an autopilot its gimbal, or one aircraft the next."""
     got = read(translation().from_site(packed(command(1), 30), 0) or b"")
     assert (got.get_srcSystem(), got.target_system) == (30, 2)
@@ -145,7 +145,7 @@ ANSWERED: list[Any] = [
 
 
 @pytest.mark.parametrize("message", ASKED, ids=lambda each: each.get_type())
-def test_parameters_and_missions_are_asked_of_the_vehicle(message: Any) -> None:
+def test_parameter_and_mission_requests_reach_the_vehicle(message: Any) -> None:
     system_id, frame = translation().to_site(packed(message, 255), 0) or (0, b"")
     got = read(frame)
     assert (system_id, got.get_srcSystem(), got.target_system) == (1, 255, 1)
@@ -153,14 +153,14 @@ def test_parameters_and_missions_are_asked_of_the_vehicle(message: Any) -> None:
 
 
 @pytest.mark.parametrize("message", ANSWERED, ids=lambda each: each.get_type())
-def test_parameters_and_missions_are_answered_to_the_station(message: Any) -> None:
+def test_parameter_and_mission_answers_reach_the_station(message: Any) -> None:
     got = read(translation().from_site(packed(message, 1), 0) or b"")
     assert got.get_srcSystem() == 2
     assert got.to_dict() == message.to_dict()
 
 
 @pytest.mark.parametrize("unix_us", [0, 946_684_800_000_000, 4_102_444_800_000_000])
-def test_a_clock_that_is_wrong_by_years_is_passed_on_as_it_is(unix_us: int) -> None:
+def test_wrong_time_in_a_message_is_unchanged(unix_us: int) -> None:
     message = mavlink.MAVLink_system_time_message(unix_us, 5)
     frame = packed(message, 1)
     given = translation().from_site(frame, 0) or b""
@@ -168,17 +168,17 @@ def test_a_clock_that_is_wrong_by_years_is_passed_on_as_it_is(unix_us: int) -> N
     assert given[6:-2] == frame[6:-2], "all but the sender and the checksum"
 
 
-def test_what_a_station_says_to_all_stays_as_it_is() -> None:
+def test_broadcast_of_a_station_is_unchanged() -> None:
     beat = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255)
     assert translation().to_site(beat, 0) == (0, beat)
 
 
-def test_a_zero_that_version_2_has_cut_off_is_still_nobody() -> None:
+def test_target_cut_off_by_mavlink_2_remains_zero() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0)
     assert read(translation().from_site(packed(ack, 1), 0) or b"").target_system == 0
 
 
-def test_what_does_not_change_passes_byte_for_byte() -> None:
+def test_frame_without_a_change_passes_byte_for_byte() -> None:
     there = FrameTranslation("a", IdMap({("a", 1): 1}))
     frame = packed(attitude(), 1, key=KEY)
     assert there.from_site(frame, 0) is frame
@@ -192,26 +192,26 @@ class TestSigned:
         assert read(got, KEY).get_srcSystem() == 2
         assert got[-13:-6] == frame[-13:-6]
 
-    def test_to_the_site(self) -> None:
+    def test_target_of_a_frame_to_the_site_is_translated(self) -> None:
         found = translation(KEY).to_site(packed(command(2), 255, key=KEY), 0)
         assert found is not None
         assert read(found[1], KEY).target_system == 1
 
     @pytest.mark.parametrize("place", [-1, -10, 15])
-    def test_forged(self, place: int) -> None:
+    def test_forged_frame_is_dropped_and_counted(self, place: int) -> None:
         frame = bytearray(packed(attitude(), 1, key=KEY))
         frame[place] ^= 1
         there = translation(KEY)
         assert there.from_site(bytes(frame), 0) is None
         assert there.counters.forged == 1
 
-    def test_without_a_passphrase(self) -> None:
+    def test_signed_frame_that_changes_is_dropped_without_a_passphrase(self) -> None:
         there = translation()
         assert there.from_site(packed(attitude(), 1, key=KEY), 0) is None
         assert there.counters.signed == 1
 
 
-def test_an_unknown_message_cannot_change() -> None:
+def test_unknown_message_that_changes_is_dropped() -> None:
     frame = bytearray(packed(attitude(), 1))
     frame[7:10] = (16_000_000).to_bytes(3, "little")
     there = translation()
@@ -219,7 +219,7 @@ def test_an_unknown_message_cannot_change() -> None:
     assert there.counters.unknown == 1
 
 
-def test_who_has_another_sites_id_now_is_not_commanded_there() -> None:
+def test_command_for_an_id_passed_to_another_site_is_not_sent_to_the_former() -> None:
     """Site b has an aircraft 30 of its own, which had the id 30 here, too."""
     ids = IdMap()
     there = FrameTranslation("b", ids)
@@ -232,7 +232,7 @@ def test_who_has_another_sites_id_now_is_not_commanded_there() -> None:
     assert found[0] == 1
 
 
-def test_no_id_left() -> None:
+def test_frame_of_a_vehicle_without_id_is_counted() -> None:
     ids = IdMap()
     for n in range(260):
         ids.id_of(f"site-{n}", 1)
@@ -241,7 +241,7 @@ def test_no_id_left() -> None:
     assert there.counters.unmapped == 1
 
 
-def test_system_0_is_nobody() -> None:
+def test_system_0_gets_no_id() -> None:
     there = translation()
     assert there.from_site(packed(attitude(), 0), 0) is None
     assert there.counters.unmapped == 1
@@ -257,7 +257,7 @@ def test_system_0_is_nobody() -> None:
     ],
     ids=["gaps", "a text overtakes", "a restart"],
 )
-def test_loss_by_the_sequence_numbers(numbers: tuple[int, ...], lost: int) -> None:
+def test_loss_is_counted_by_sequence_numbers(numbers: tuple[int, ...], lost: int) -> None:
     there = translation()
     for number in numbers:
         frame = bytearray(packed(attitude(), 1))
@@ -267,7 +267,7 @@ def test_loss_by_the_sequence_numbers(numbers: tuple[int, ...], lost: int) -> No
 
 
 @pytest.mark.parametrize("message_id", sorted(TARGET_OFFSETS))
-def test_every_message_with_a_target(message_id: int) -> None:
+def test_target_of_every_message_is_translated(message_id: int) -> None:
     """There and back again gives the same bytes; on the way it is for the other system."""
     kind = mavlink.mavlink_map[message_id]
     chance = random.Random(message_id)

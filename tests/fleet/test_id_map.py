@@ -7,7 +7,7 @@ import pytest
 from gateway.fleet.id_map import FIRST_ID, LAST_ID, MAX_WAITING, Handover, IdMap
 
 
-def test_the_first_keeps_its_id_and_the_second_gets_the_lowest_that_is_free() -> None:
+def test_first_vehicle_keeps_its_id_and_second_gets_the_lowest_free_one() -> None:
     ids = IdMap()
     assert ids.id_of("a", 1) == 1
     assert ids.id_of("b", 1) == 2
@@ -18,7 +18,7 @@ def test_the_first_keeps_its_id_and_the_second_gets_the_lowest_that_is_free() ->
     assert ids.vehicle_of(9) is None
 
 
-def test_what_was_kept_holds() -> None:
+def test_saved_ids_are_used_again() -> None:
     first = IdMap()
     for site in "abc":
         first.id_of(site, 1)
@@ -27,11 +27,11 @@ def test_what_was_kept_holds() -> None:
     assert again.id_of("a", 1) == 1
 
 
-def test_ids_of_ground_stations_are_given_to_nobody() -> None:
+def test_ids_of_ground_stations_are_not_assigned() -> None:
     assert IdMap().id_of("a", 255) == 1
 
 
-def test_a_vehicle_that_is_left_out_makes_room_for_one_that_waits() -> None:
+def test_id_of_an_excluded_vehicle_goes_to_a_waiting_one() -> None:
     ids = IdMap()
     for n in range(LAST_ID + 2):
         ids.id_of(f"site-{n}", 1)
@@ -48,7 +48,7 @@ def test_a_vehicle_that_is_left_out_makes_room_for_one_that_waits() -> None:
     assert not again.left_out
 
 
-def test_more_than_there_are_ids_for() -> None:
+def test_vehicles_beyond_the_number_of_ids_wait() -> None:
     ids = IdMap()
     found = [ids.id_of(f"site-{n}", 1) for n in range(300)]
     given = [own_id for own_id in found if own_id is not None]
@@ -70,7 +70,7 @@ def filled(sites: int) -> IdMap:
 
 
 @pytest.mark.parametrize("sites", [1, 2, 5])
-def test_no_site_uses_up_the_ids_of_others(sites: int) -> None:
+def test_no_site_takes_all_ids(sites: int) -> None:
     ids = filled(sites)
     assert ids.id_of("field", 7) is not None
     assert ids.id_of("many-0", 249) is None
@@ -89,7 +89,7 @@ def test_site_gets_no_more_ids_than_its_limit() -> None:
     assert ids.known_id("field", 4) == 9, "the operator may exceed the limit"
 
 
-def test_who_is_heard_keeps_its_id() -> None:
+def test_received_vehicle_keeps_its_id() -> None:
     ids = filled(8)
     assert ids.id_of("field", 7) is None
     before = ids.items()
@@ -104,7 +104,7 @@ def test_who_is_heard_keeps_its_id() -> None:
     assert ids.id_of(*silent) is None, "it waits in its turn"
 
 
-def test_a_site_gets_no_ids_of_smaller_ones_but_its_own() -> None:
+def test_site_gets_no_id_of_a_smaller_site() -> None:
     ids = filled(8)
     heard_us = {vehicle: 1000 for vehicle, _ in ids.items()}
     (smallest, *_, largest) = sorted(heard_us, key=lambda each: ids._shares()[each[0]])
@@ -118,14 +118,14 @@ def test_a_site_gets_no_ids_of_smaller_ones_but_its_own() -> None:
     assert (done.former, done.holder[0]) == (largest, "many-0")
 
 
-def test_those_that_wait_are_no_more_than_some() -> None:
+def test_number_of_waiting_vehicles_is_bounded() -> None:
     ids = filled(8)
     for number in range(MAX_WAITING):
         assert ids.id_of(f"s{number}", 1) is None
     assert len(ids.unmapped) == MAX_WAITING
 
 
-def test_by_hand() -> None:
+def test_id_assigned_by_the_operator_is_swapped() -> None:
     ids = IdMap()
     for site in "abc":
         ids.id_of(site, 1)
@@ -138,7 +138,7 @@ def test_by_hand() -> None:
             ids.set_by_hand("a", 1, wrong)
 
 
-def test_an_id_that_is_left_by_hand_goes_to_one_that_waits() -> None:
+def test_id_freed_by_the_operator_goes_to_a_waiting_vehicle() -> None:
     ids = IdMap()
     for n in range(LAST_ID):
         ids.id_of(f"site-{n}", 1)
@@ -151,7 +151,7 @@ def test_an_id_that_is_left_by_hand_goes_to_one_that_waits() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_no_two_share_an_id_whatever_is_done(seed: int) -> None:
+def test_no_two_vehicles_share_an_id_after_random_operations(seed: int) -> None:
     chance = random.Random(seed)
     ids = IdMap()
     for _ in range(400):

@@ -33,7 +33,7 @@ def on_disk(kept: IdsFile) -> object:
     return json.loads(kept.file.read_bytes())
 
 
-async def test_ids_are_kept_for_the_next_start(kept: IdsFile) -> None:
+async def test_ids_are_saved_for_the_next_start(kept: IdsFile) -> None:
     assert await kept.keep() == ""
     assert not kept.file.exists()
     kept.ids.set_by_hand("field-a", 1, 77)
@@ -45,9 +45,7 @@ async def test_ids_are_kept_for_the_next_start(kept: IdsFile) -> None:
     again.close()
 
 
-async def test_they_are_kept_only_once_the_disk_has_them(
-    kept: IdsFile, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_keep_waits_for_the_disk(kept: IdsFile, monkeypatch: pytest.MonkeyPatch) -> None:
     may_write, begun, write_new = threading.Event(), asyncio.Event(), id_map.write_new
     loop = asyncio.get_running_loop()
 
@@ -68,7 +66,7 @@ async def test_they_are_kept_only_once_the_disk_has_them(
     assert on_disk(kept) == {"field-a/1": 77}
 
 
-async def test_a_disk_that_refuses_is_reported_and_tried_again(
+async def test_failed_write_is_reported_and_retried(
     kept: IdsFile, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     kept.ids.set_by_hand("field-a", 1, 77)
@@ -81,7 +79,7 @@ async def test_a_disk_that_refuses_is_reported_and_tried_again(
     assert on_disk(kept) == {"field-a/1": 77}
 
 
-async def test_the_last_ids_are_kept_at_the_end(kept: IdsFile) -> None:
+async def test_last_ids_are_saved_on_close(kept: IdsFile) -> None:
     kept.ids.set_by_hand("field-a", 1, 77)
     kept.close()
     assert on_disk(kept) == {"field-a/1": 77}

@@ -30,7 +30,7 @@ class Ring:
         return self.sites[name].from_site(frame, self.now_us, is_own=is_own)
 
 
-def test_frames_end_after_one_round_and_give_nobody_an_id() -> None:
+def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
     ring = Ring()
     for _ in range(300):
         for name in "ab":
@@ -44,7 +44,7 @@ def test_frames_end_after_one_round_and_give_nobody_an_id() -> None:
     assert ring.sites["a"].counters.looped == ring.sites["b"].counters.looped == 0
 
 
-def test_through_the_site_that_it_is_from() -> None:
+def test_frame_returned_through_its_own_site_is_no_loop() -> None:
     ring = Ring(IdMap({("a", 1): 7}))
     given = ring.give("a", ring.attitude("a"))
     assert given is not None
@@ -53,7 +53,7 @@ def test_through_the_site_that_it_is_from() -> None:
     assert ring.ids.known_id("a", 7) is None
 
 
-def test_two_of_one_type_are_told_apart_by_the_first_frame_that_differs() -> None:
+def test_two_equal_vehicles_are_separated_by_the_first_differing_frame() -> None:
     """Their heartbeats are equal, byte for byte."""
     ring = Ring()
     assert ring.give("a", ring.vehicles["a"].heartbeat()) is not None
@@ -66,7 +66,7 @@ def test_two_of_one_type_are_told_apart_by_the_first_frame_that_differs() -> Non
     assert ring.ids.known_id("b", 1) == 2
 
 
-def test_two_gateways_that_send_the_same_all_the_time() -> None:
+def test_two_gateways_with_equal_frames_are_taken_for_a_loop() -> None:
     """As one recording played at two sites: what a gateway made itself is no copy."""
     ring = Ring()
     for _ in range(100):
@@ -79,7 +79,7 @@ def test_two_gateways_that_send_the_same_all_the_time() -> None:
     assert [ring.sites[name].counters.looped for name in "abc"] == [0, 0, 200]
 
 
-def test_two_of_one_type_that_only_ever_repeat_themselves_in_step() -> None:
+def test_two_equal_vehicles_with_constant_frames_keep_their_ids() -> None:
     ring = Ring()
     for _ in range(MAX_CHANCE + 1):
         frames = [vehicle.heartbeat() for vehicle in ring.vehicles.values()]
@@ -92,7 +92,7 @@ def test_two_of_one_type_that_only_ever_repeat_themselves_in_step() -> None:
     assert ring.give("c", given) is None, "its id is not its own: this has gone round"
 
 
-def test_a_looped_vehicle_that_had_an_id_falls_silent() -> None:
+def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
     ring = Ring(IdMap({("b", 1): 2, ("c", 2): 3}))
     passed = 0
     for _ in range(100):
@@ -105,7 +105,7 @@ def test_a_looped_vehicle_that_had_an_id_falls_silent() -> None:
     assert ring.give("c", own) is not None, "an aircraft that is really there"
 
 
-def test_a_command_ends_by_either_way_back() -> None:
+def test_returned_command_ends_on_both_ways() -> None:
     ring = Ring(IdMap({("a", 1): 7}))
     said = Sender(255, 190).command(7, 1)
     found = ring.sites["a"].to_site(said, 0)
@@ -119,7 +119,7 @@ def test_a_command_ends_by_either_way_back() -> None:
     assert ring.loops.looped == 1
 
 
-def test_memory_ends_in_time_and_number() -> None:
+def test_memory_is_bounded_in_time_and_number() -> None:
     ring = Ring()
     given = ring.give("b", ring.attitude("b"))
     assert given is not None

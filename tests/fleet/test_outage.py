@@ -18,8 +18,8 @@ def settings(settings: FleetSettings, router: Router) -> FleetSettings:
     return msgspec.structs.replace(settings, listen=router.place, router=router.place)
 
 
-async def test_the_router_dies_and_comes_back(world: World, router: Router) -> None:
-    site = world.open_site("field-a", beside="udp-listen:127.0.0.1:0")
+async def test_router_outage_loses_old_frames_and_recovers(world: World, router: Router) -> None:
+    site = world.open_site("field-a", extra="udp-listen:127.0.0.1:0")
     local = world.rig.station(site.listening_ports()[0])
     local.say(local.sender.heartbeat())
     await world.until(lambda: bool(world.systems()))

@@ -114,15 +114,15 @@ class Far:
 
 @pytest.fixture
 def visit(router: Router) -> Iterator[Callable[..., Far]]:
-    visitors: list[Far] = []
+    clients: list[Far] = []
 
     def make(*keys: str) -> Far:
-        visitors.append(Far(router.place, *keys))
-        return visitors[-1]
+        clients.append(Far(router.place, *keys))
+        return clients[-1]
 
     yield make
-    for visitor in visitors:
-        visitor.session.close()
+    for client in clients:
+        client.session.close()
 
 
 @pytest.fixture
@@ -160,7 +160,9 @@ async def until_heard(rig: Rig, hub: Any, far: Far) -> None:
 
 
 class TestSite:
-    async def test_both_ways(self, rig: Rig, router: Router, visit: Callable[..., Far]) -> None:
+    async def test_frames_pass_in_both_directions(
+        self, rig: Rig, router: Router, visit: Callable[..., Far]
+    ) -> None:
         hub = await open_site(rig, router)
         far = visit("mavlink/field/*/out")
         await until_heard(rig, hub, far)
@@ -176,7 +178,7 @@ class TestSite:
         far.session.put("mavlink/field/1/in", rig.sender(255, 190).heartbeat())
         await until(rig, hub, lambda: hub.clients()[0].received == 2)
 
-    async def test_an_autopilot_behind_it_has_keys_of_its_own_and_no_mark(
+    async def test_autopilot_behind_the_site_has_its_own_key_and_no_attachment(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         hub = await open_site(rig, router)
@@ -194,7 +196,7 @@ class TestSite:
         await until(rig, hub, heard)
         assert far.marks == {"mavlink/field/7/out": {None}, "mavlink/field/1/out": {OWN}}
 
-    async def test_filters_rates_and_packing(
+    async def test_filters_rates_and_packing_apply(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
@@ -208,7 +210,7 @@ class TestSite:
         await until(rig, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
         assert not far.messages(27)
 
-    async def test_a_burst_arrives_whole_and_in_order(
+    async def test_burst_arrives_completely_and_in_order(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         """Telemetry gives way on a congested link, never on an idle one."""
@@ -233,7 +235,7 @@ class TestSite:
         await until(rig, hub, lambda: bool(rig.incoming))
         assert rig.incoming[0].trusted == trusted
 
-    async def test_the_keys_of_mavlink_server(
+    async def test_raw_keys_of_mavlink_server(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         hub = await open_site(rig, router, "keys=mavlink_raw")
@@ -245,7 +247,7 @@ class TestSite:
 
 
 class TestTrouble:
-    async def test_the_router_goes_and_comes_back(
+    async def test_site_reconnects_after_a_router_restart(
         self, rig: Rig, router: Router, visit: Callable[..., Far]
     ) -> None:
         hub = await open_site(rig, router)
@@ -295,28 +297,26 @@ class TestTrouble:
         assert rig.incoming[0].frame[4] == 7
         assert hub.clients()[0].bytes_garbage > 4000
 
-    async def test_no_router_yet(self, rig: Rig) -> None:
+    async def test_missing_router_is_reported(self, rig: Rig) -> None:
         place = f"tcp/127.0.0.1:{free_port()}"
         hub = rig.hub(f"zenoh:{place}?site=field")
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
         assert hub.clients()[0].reason.startswith(f"no router answers at {place}")
 
-    def test_where_certificates_are_used_they_may_be_the_reason(self) -> None:
+    def test_error_of_a_tls_router_mentions_certificates(self) -> None:
         error = zenoh.ZError("Unable to connect to any of [Single(tls/h:1)]!  at /x/y.rs:4.")
         text = "no router answers at tls/h:1, or a certificate does not fit"
         assert zenoh_session._message_of(error) == text
 
     @pytest.mark.parametrize("name", zenoh_session.TLS_FILES)
-    async def test_a_certificate_that_is_not_there_is_named(
-        self, rig: Rig, tmp_path: Path, name: str
-    ) -> None:
+    async def test_missing_certificate_is_named(self, rig: Rig, tmp_path: Path, name: str) -> None:
         file, missing = tmp_path / "zenoh.json5", tmp_path / "missing.pem"
         file.write_text(json.dumps({"transport": {"link": {"tls": {name: str(missing)}}}}))
         hub = rig.hub(f"zenoh:tls/127.0.0.1:7447?site=field&config={file}")
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
         assert hub.clients()[0].reason == f"{name} {missing}: No such file or directory"
 
-    async def test_a_router_that_stalls_holds_nobody_up(
+    async def test_stalled_router_delays_no_other_client(
         self, rig: Rig, router: Router, patient: Path
     ) -> None:
         hub = await open_site(rig, router, f"site=field&config={patient}")
@@ -340,14 +340,16 @@ class TestTrouble:
         assert local.dropped == 0
         router.signal(signal.SIGCONT)
 
-    async def test_two_sites_of_one_name_are_shown_on_both(self, rig: Rig, router: Router) -> None:
+    async def test_two_sites_of_one_name_are_reported_on_both(
+        self, rig: Rig, router: Router
+    ) -> None:
         first, second = [await open_site(rig, router) for _ in range(2)]
         for hub in (first, second):
             await until(rig, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023
         second.close()
         await until(rig, first, lambda: first.clients()[0].reason == "")
 
-    async def test_without_zenoh_it_says_what_is_missing(
+    async def test_missing_zenoh_package_is_reported(
         self, rig: Rig, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setitem(sys.modules, "zenoh", None)
@@ -356,7 +358,7 @@ class TestTrouble:
         missing = "the extra mavgate[fleet] is not installed: see mavgate doctor"
         assert hub.clients()[0].reason == missing
 
-    async def test_a_file_that_is_none(self, rig: Rig, tmp_path: Path) -> None:
+    async def test_malformed_configuration_file_is_reported(self, rig: Rig, tmp_path: Path) -> None:
         file = tmp_path / "zenoh.json5"
         file.write_text("{")
         hub = rig.hub(f"zenoh:tcp/127.0.0.1:7447?site=field&config={file}")
@@ -370,37 +372,37 @@ def said_again(rig: Rig, hub: Any, far: Far, heard: int) -> bool:
 
 
 class TestLoopQueue:
-    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest(self) -> None:
+    async def test_flood_is_handled_in_turns_and_the_oldest_items_are_dropped(self) -> None:
         taken: list[int] = []
-        inlet = LoopQueue(taken.append)
+        queue = LoopQueue(taken.append)
         for n in range(MAX_WAITING + 10):
-            inlet.put(n)
+            queue.put(n)
         most = 0
         while len(taken) < MAX_WAITING:
             before = len(taken)
             await asyncio.sleep(0)
             most = max(most, len(taken) - before)
         assert taken == list(range(10, MAX_WAITING + 10))
-        assert inlet.dropped == 10
+        assert queue.dropped == 10
         assert most <= 2 * AT_ONCE
-        inlet.close()
-        inlet.put(0)
+        queue.close()
+        queue.put(0)
         await asyncio.sleep(0)
         assert len(taken) == MAX_WAITING
 
-    async def test_what_costs_more_is_taken_in_more_turns(self) -> None:
+    async def test_costly_items_are_handled_in_more_turns(self) -> None:
         taken: list[int] = []
-        inlet = LoopQueue(taken.append, lambda _: 0.5)
+        queue = LoopQueue(taken.append, lambda _: 0.5)
         for n in range(8):
-            inlet.put(n)
+            queue.put(n)
         for turn in range(1, 5):
             await asyncio.sleep(0)
             assert taken == list(range(2 * turn))
 
-    async def test_in_a_pause_nothing_is_taken_and_nothing_is_lost(self) -> None:
+    async def test_pause_delays_items_without_loss(self) -> None:
         pauses_s, done = [1e-6, 1e-6, 0.0], asyncio.Event()
-        inlet = LoopQueue(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
-        inlet.put(0)
+        queue = LoopQueue(lambda _: done.set(), pause_s=lambda: pauses_s.pop(0))
+        queue.put(0)
         async with asyncio.timeout(LIMIT_S):
             await done.wait()
         assert not pauses_s
@@ -421,13 +423,13 @@ class TestFlood:
         assert client.counters.bytes_garbage == 1000 * len(beat)
         assert before - hub.untrusted_reads.level == (MAX_MESSAGE if trusted == "no" else 0)
 
-    def test_large_messages_are_taken_one_a_turn(self) -> None:
+    def test_large_message_takes_a_whole_turn(self) -> None:
         assert zenoh_client._cost_of((b"", MAX_MESSAGE)) >= 1.0
         assert zenoh_client._cost_of((b"", 1)) == 1 / AT_ONCE
 
 
 class TestSubscription:
-    async def test_large_messages_are_taken_a_few_a_turn(self) -> None:
+    async def test_large_messages_are_handled_a_few_a_turn(self) -> None:
         waiting = [MagicMock(payload=bytes(MAX_MESSAGE)) for _ in range(100)]
         subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
         subscriber.__iter__.return_value = iter(())
@@ -436,7 +438,7 @@ class TestSubscription:
         Subscription(session, "flood", taken.append)._drain()
         assert len(taken) == BYTES_AT_ONCE // MAX_MESSAGE
 
-    async def test_a_flood_is_taken_in_turns_and_loses_the_oldest_telemetry_of_all_alike(
+    async def test_flood_is_handled_in_turns_and_the_oldest_telemetry_is_dropped(
         self, router: Router, visit: Callable[..., Far], monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(zenoh_session, "MAX_WAITING", 100)
@@ -516,7 +518,7 @@ finally:
 
 
 @pytest.mark.parametrize("stalls", [False, True])
-def test_a_process_ends_soon_when_its_session_is_closed(
+def test_process_ends_soon_after_its_session_is_closed(
     router: Router, patient: Path, *, stalls: bool
 ) -> None:
     """Zenoh may wait for a stalled link, Python for threads and for what is still declared."""

@@ -1,6 +1,6 @@
 """Files of a site's recordings, fetched in pieces through a running fleet.
 
-A partial file is kept beside the target as `.NAME.part` until it is complete and its SHA-256 is
+A partial file is kept next to the target as `.NAME.part` until it is complete and its SHA-256 is
 that of the site's file: an incomplete file never looks complete. An existing partial file is
 continued, if it is the beginning of the site's file.
 """
@@ -20,12 +20,12 @@ from gateway.recordings.index import is_file_name
 
 SMALLEST: Final = 4 << 10
 LARGEST: Final = 128 << 10
-"""The most that a site answers at once."""
+"""Largest piece of one answer."""
 FAST_S: Final = 0.05
 SLOW_S: Final = 0.2
 RETRY_S: Final = 1.0
 PATIENCE_S: Final = 60.0
-"""How long a site that has gone is waited for."""
+"""Longest wait for a disconnected site."""
 DIGEST_WAIT_S: Final = 330.0
 PIECE_WAIT_S: Final = 20.0
 READ_SIZE: Final = 1 << 20
@@ -49,7 +49,7 @@ class PiecePace:
         self.size = SMALLEST
 
     def note(self, took_s: float) -> None:
-        """Note how long a piece of this size took."""
+        """Adapt the size to the duration of the last piece."""
         if took_s < FAST_S:
             self.size = min(self.size * 2, LARGEST)
         elif took_s > SLOW_S:
@@ -114,14 +114,14 @@ class RecordingFetch:
             If the disk fails.
         """
         if not is_file_name(name):
-            raise FetchError(f"the site lists {name!r}, which is no file of a recording")
+            raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
         target, part = self._folder / name, self._folder / f".{name}.part"
         if target.exists():
             if self._is_same(target, size, name):
                 advance(size)
                 return False
             if not self._force and not self._has_grown(target, size, name):
-                raise FetchError(f"{target} is there and differs; --force fetches it anew")
+                raise FetchError(f"{target} exists and differs; use --force to replace it")
         self._folder.mkdir(parents=True, exist_ok=True)
         with part.open("a+b") as file:
             try:
@@ -129,7 +129,7 @@ class RecordingFetch:
             except BlockingIOError as error:
                 raise FetchError(f"{target} is being fetched by another program") from error
             if target.exists() and not file.seek(0, os.SEEK_END):
-                # What is there may be the beginning; if it is not, it is begun anew.
+                # The existing file may be the beginning; otherwise the fetch starts from zero.
                 with target.open("rb") as known:
                     shutil.copyfileobj(known, file)
             self._fill(file, name, size, advance)
@@ -193,7 +193,7 @@ class RecordingFetch:
                 return answer
             if time.monotonic() > end_s:
                 raise FetchError(
-                    f"site {self._site} does not answer; the same command goes on from here"
+                    f"site {self._site} does not answer; the same command continues from here"
                 )
             self._wait(RETRY_S)
 
