@@ -172,7 +172,7 @@ def test_led_flashes_count_the_fault(bench: MakeBench, absent: str, per_cycle: i
     rig.run(2.2)
     assert flashes == []
     if absent == "sensor":
-        node.bmp180.absent = True
+        node.barometer.absent = True
     else:
         (rig.receiver if absent == "receiver" else node).radio.absent = True
     rig.run(2.1)

@@ -151,6 +151,8 @@ def _check_receiver(seen: Observed, serial: SerialSettings) -> None:
         _hint(f"{serial.port}: no report of the receiver in {LOOK_S:.0f} s")
         return
     _good(f"{serial.port}, channel {receiver.channel}, noise {receiver.noise_percent} %")
+    if receiver.radio.problem:
+        _hint(f"receiver: {receiver.radio.problem}; check its wiring and 3.3 V supply")
     if receiver.noise_percent > NOISY_PERCENT:
         _hint(
             "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all boards "
@@ -198,6 +200,8 @@ def _check_nodes(seen: Observed, vehicle: int) -> None:
         table.add_row(
             str(node), version, found, failed, f"{link.rate_hz:.0f}", f"{share:.1f}", volts
         )
+        if status.radio.problem:
+            hints.append(f"Node {node}: {status.radio.problem}; try another module")
         if failed:
             hints.append(f"Node {node}: {failed} missing or failed: check its wiring and supply")
         if share > LOSSY_PERCENT and link.lost > FEW_LOST:

@@ -39,7 +39,13 @@ def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(
     config.write_text(f'aircraft_folder = "{tmp_path}"\n')
     done = setup("--simulated", "--config", str(config))
     assert done.exit_code == 0, done.output
-    for text in ("channel 76", "IMU, compass, barometer", "gyro: done", "level: done", "mag: done"):
+    for text in (
+        "channel 76",
+        "MPU6050, HMC5883L, BMP180",
+        "gyro: done",
+        "level: done",
+        "mag: done",
+    ):
         assert text in done.output
     assert load_aircraft(load(config)) == {}
 
