@@ -77,7 +77,7 @@ class RecordingsView:
     def _buttons(self) -> list[RowButton]:
         buttons = [RowButton("play_arrow", "Open", self._open)]
         buttons += [RowButton("download", "Download", self._download)]
-        buttons += [RowButton("file_export", "Export", self._ask_export)]
+        buttons += [RowButton("share", "Export", self._ask_export)]
         if self._context.may_change:
             buttons += [RowButton("delete", "Delete", self._ask_delete)]
         return buttons
