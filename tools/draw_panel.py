@@ -1,4 +1,7 @@
-"""Draw docs/pictures/panel_*.png: the panel on the simulated flight, in a real Chromium."""
+"""Draw docs/pictures/panel_*.png and flight_page.png, in a real Chromium.
+
+The first show the panel on the simulated flight, the last a flight as one file.
+"""
 
 import re
 import subprocess
@@ -49,8 +52,30 @@ def draw(page: Page, view: str) -> None:
     print(target)
 
 
+def draw_flight_page() -> None:
+    """Make a page of a recorded flight, and photograph it."""
+    target = PICTURES / "flight_page.png"
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        page_file = Path(folder, "flight.html")
+        flight = PICTURES.parents[1] / "tests" / "golden" / "take_off.csv.gz"
+        command = [sys.executable, "-m", "gateway.cli", "page", str(flight), "-o", str(page_file)]
+        subprocess.run(command, check=True)
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        page = browser.new_page(viewport=SIZE, color_scheme="dark")
+        page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
+        page.goto(page_file.as_uri())
+        page.locator("input[type=range]").focus()
+        for _ in range(11):
+            page.keyboard.press("ArrowRight")
+        page.wait_for_timeout(3000)
+        page.screenshot(path=target)
+        browser.close()
+    print(target)
+
+
 def main() -> None:
     """Start the demo, draw, end it."""
+    draw_flight_page()
     with tempfile.TemporaryDirectory() as folder:
         config, log = Path(folder, "gateway.toml"), Path(folder, "log")
         config.write_text(CONFIG.format(folder=folder))

@@ -33,16 +33,19 @@ FAULTS: Final = """
     return false;
   };
   const found = [];
-  const name = (e) => `${e.tagName}.${e.className} ${(e.ariaLabel || e.textContent || '').trim().slice(0, 30)}`;
-  const all = [...section.querySelectorAll(controls), ...document.querySelectorAll('.head button, .head input, .rail button')].filter(seen);
+  const text = (e) => (e.ariaLabel || e.textContent || '').trim().slice(0, 30);
+  const name = (e) => `${e.tagName}.${e.className} ${text(e)}`;
+  const around = document.querySelectorAll('.head button, .head input, .rail button');
+  const all = [...section.querySelectorAll(controls), ...around].filter(seen);
   for (const element of all) {
     const box = element.getBoundingClientRect();
-    if (!scrolls(element) && (box.right > innerWidth + 1 || box.left < -1)) found.push(`cut: ${name(element)}`);
+    const is_cut = box.right > innerWidth + 1 || box.left < -1;
+    if (is_cut && !scrolls(element)) found.push(`cut: ${name(element)}`);
   }
   const boxes = all.filter((e) => e.matches('button, select, a') && !scrolls(e));
   for (const a of boxes)
     for (const b of boxes) {
-      if (a === b || a.contains(b) || b.contains(a) || a.compareDocumentPosition(b) & 2) continue;
+      if (a.contains(b) || b.contains(a) || a.compareDocumentPosition(b) & 2) continue;
       const [p, q] = [a.getBoundingClientRect(), b.getBoundingClientRect()];
       const wide = Math.min(p.right, q.right) - Math.max(p.left, q.left);
       const high = Math.min(p.bottom, q.bottom) - Math.max(p.top, q.top);

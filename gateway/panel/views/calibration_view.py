@@ -28,6 +28,16 @@ REFRESH_S: Final = 0.2
 STORE: Final = 1.0
 """PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 MIN_CELLS: Final = 60
+GUIDE: Final = {
+    CalibrationStep.GYRO: "When: before the first flight, and when the temperature has changed by "
+    "more than 10 °C. Good: a rate at rest below 0.1 °/s.",
+    CalibrationStep.ACCEL: "When: once for each board. Good: an error of gravity over the six "
+    "sides below 0.05 m/s².",
+    CalibrationStep.LEVEL: "When: the board was mounted or moved in the aircraft, after the "
+    "accelerometer. Good: a tilt when level below 0.5°.",
+    CalibrationStep.MAG: "When: anything of iron or a power wire was moved, or in another region. "
+    "Good: a spread of the field's strength below 1.5 µT.",
+}
 SIDE_NAMES: Final = {
     "down": "level",
     "up": "upside down",
@@ -172,6 +182,7 @@ class _CalibrationView:
             self._build_buttons(run, ready=ready)
             if run is not None and run.state is RunState.DONE:
                 self._build_residuals(run)
+            ui.label(GUIDE[self._step]).classes("soft guide-note")
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
