@@ -64,6 +64,9 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "live.doctor",
         "Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.",
     ),
+    "map": CommandEntry(
+        "live.map", "Fetch an area of a map for the panel, for use without a network."
+    ),
     "report": CommandEntry(
         "recorded.report",
         "Make a page of figures and tables of a flight, those of the paper included.",

@@ -7,6 +7,7 @@ map's owner does not see the users.
 import asyncio
 import hashlib
 import logging
+import re
 import sqlite3
 import time
 from collections.abc import Callable
@@ -36,6 +37,8 @@ TIDY_EVERY: Final = 200
 """Tiles fetched between two checks of the folder's size."""
 MAX_ZOOM: Final = 24
 BROWSER_S: Final = 3600
+MAX_FILES: Final = 16
+STYLE_NAME: Final = re.compile(r"[\w .-]{1,32}")
 SIGNATURES: Final = (
     (b"\x89PNG", "image/png"),
     (b"\xff\xd8\xff", "image/jpeg"),
@@ -46,6 +49,17 @@ SIGNATURES: Final = (
 def kind_of_image(data: bytes) -> str | None:
     """Return the media type of a picture by its first bytes; None for anything else."""
     return next((kind for head, kind in SIGNATURES if data.startswith(head)), None)
+
+
+def styles_of(settings: PanelSettings) -> list[MapStyle]:
+    """Return the styles of the settings, and one for each PMTiles file in the tiles' folder."""
+    folder = Path(settings.tiles_folder).expanduser()
+    found = [
+        MapStyle(name=path.stem[:32], url=str(path), max_zoom=MAX_ZOOM)
+        for path in sorted(folder.glob("*.pmtiles"))[:MAX_FILES]
+        if STYLE_NAME.fullmatch(path.stem[:32])
+    ]
+    return [*settings.map_styles, *found]
 
 
 class MapTiles:
@@ -60,7 +74,7 @@ class MapTiles:
     def __init__(self, settings: PanelSettings) -> None:
         self._folder = Path(settings.tiles_folder).expanduser()
         self._limit = settings.tiles_limit_mb * 1_000_000
-        self._sources = [self._source(style) for style in settings.map_styles]
+        self._sources = [self._source(style) for style in styles_of(settings)]
         self._fetched = 0
         self._turns = asyncio.Semaphore(AT_ONCE)
         self._client: httpx.AsyncClient | None = None
@@ -156,7 +170,7 @@ def tidy(folder: Path, limit: int) -> None:
     """Delete the oldest files below a folder until the rest is within a limit in bytes."""
     files = []
     for file in folder.rglob("*"):
-        if file.is_file():
+        if file.is_file() and file.suffix != ".pmtiles":
             stat = file.stat()
             files.append((stat.st_mtime, stat.st_size, file))
     excess = sum(size for _, size, _ in files) - limit

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 from typer.testing import CliRunner
 
@@ -137,6 +137,8 @@ def test_page_opens_offline_and_moves(
     page.keyboard.press("PageUp")
     assert page.locator("[data-role=clock]").inner_text() == "1:00 of 1:59"
     before = page.evaluate("mavgate.state.lat_deg")
+    shown = page.locator(".number-strip [data-item=Latitude] b")
+    expect(shown).to_have_text(f"{before:.6f}")
     page.keyboard.press("ArrowRight")
     assert page.evaluate("mavgate.state.lat_deg") != before
     page.keyboard.press("Space")

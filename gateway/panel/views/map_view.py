@@ -11,6 +11,7 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.panel.map_tiles import styles_of
 from gateway.panel.state.vehicle import Spot
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets.prompts import closing, named_dialog, notify_failure
@@ -32,7 +33,7 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
 
     def __init__(self, context: ViewContext, *, full: bool) -> None:
         super().__init__()
-        styles = context.parts.settings.map_styles
+        styles = styles_of(context.parts.settings)
         self._props["styles"] = [
             {key: to_builtins(style)[key] for key in ("name", "attribution", "max_zoom")}
             for style in styles

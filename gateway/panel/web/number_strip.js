@@ -14,16 +14,16 @@ export default {
     </dl>`,
   data: () => ({ items: [], limit: OLD_S }),
   mounted() {
-    let drawn_ms = 0;
-    this.stop = mavgate.subscribe((state) => {
-      const now_ms = performance.now();
-      if (now_ms - drawn_ms < EVERY_MS && state) return;
-      drawn_ms = now_ms;
-      this.items = state ? items_of(state) : [];
-    });
+    // At most a few times a second, and always once more after the last change.
+    const update = () => {
+      this.timer = undefined;
+      this.items = mavgate.state ? items_of(mavgate.state) : [];
+    };
+    this.stop = mavgate.subscribe(() => (this.timer ??= setTimeout(update, EVERY_MS)));
   },
   unmounted() {
     this.stop?.();
+    clearTimeout(this.timer);
   },
 };
 

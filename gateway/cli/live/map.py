@@ -1,0 +1,107 @@
+"""`mavgate map get`: an area of a map for the panel, for use without a network."""
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from gateway.cli.support.errors import how_to_add, refuse
+from gateway.cli.support.named_recordings import files_of, folder_of
+from gateway.cli.support.recording_options import refusing
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+    read_options,
+)
+from gateway.cli.support.terminal import console_of
+
+group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.add_typer(group, name="map")
+
+
+@group.callback()
+def _group() -> None:
+    """Keep `get` a word of its own."""
+
+
+@group.command("get")
+def get(
+    *,
+    source: Annotated[
+        str,
+        typer.Option(
+            "--from",
+            help="A PMTiles file of raster tiles: an https:// address whose owner permits "
+            "extracts, or a path.",
+        ),
+    ],
+    around: Annotated[
+        str, typer.Option("--around", help="A recording, or LATITUDE,LONGITUDE in degrees.")
+    ],
+    radius: Annotated[str, typer.Option("--radius", help="Margin: 5km, 800m, 3mi.")] = "5km",
+    zoom: Annotated[int, typer.Option("--zoom", min=1, max=22, help="Greatest zoom.")] = 16,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name of the map style; by default the area's.")
+    ] = None,
+    config: ConfigOption = None,
+) -> None:
+    """Copy an area of a map into a file that the panel offers as a map style.
+
+    Only what the area needs is fetched, one request at a time.
+    """
+    try:
+        from gateway.panel import map_area
+        from gateway.panel.flight_page import read_flight
+    except ModuleNotFoundError as error:
+        refuse(f"maps belong to the panel, and {error.name} is missing: {how_to_add('panel')}")
+    settings = or_refuse(lambda: load_settings(config))
+    places: list[tuple[float, float]] = []
+    if (pair := _coordinates(around)) is not None:
+        places = [pair]
+    else:
+        with refusing():
+            files = files_of([Path(around)], folder_of(settings), "tlogs")
+            flight = read_flight(files, read_options(settings), around)
+        for history in flight.histories.values():
+            places += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)
+    folder = Path(settings.panel.tiles_folder).expanduser()
+    target = folder / f"{_file_name(name or around)}.pmtiles"
+    try:
+        box = map_area.box_around(places, map_area.length_m(radius))
+        folder.mkdir(parents=True, exist_ok=True)
+        with Progress(console=console_of(stderr=True), transient=True) as progress:
+            task = progress.add_task("fetching tiles", total=None)
+            count = map_area.extract_area(
+                map_area.open_source(source),
+                target,
+                box,
+                zoom,
+                lambda done, total: progress.update(task, completed=done, total=total),
+            )
+    except FileExistsError:
+        refuse(f"{target} is there already; delete it, or choose another --name")
+    except (map_area.MapAreaError, ValueError, OSError) as error:
+        with suppress(FileNotFoundError):
+            target.unlink()
+        refuse(str(error))
+    print(f"{target}: {count} tiles, {target.stat().st_size / 1e6:.1f} MB")
+
+
+def _coordinates(text: str) -> tuple[float, float] | None:
+    """Return latitude and longitude if a text is such a pair within its ranges."""
+    try:
+        lat_deg, lon_deg = (float(part) for part in text.split(","))
+    except ValueError:
+        return None
+    return (lat_deg, lon_deg) if abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0 else None
+
+
+def _file_name(text: str) -> str:
+    return "".join(letter if letter.isalnum() or letter in " .-_" else "_" for letter in text)[:32]
