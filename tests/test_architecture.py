@@ -39,12 +39,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "aircraft_status": FOUNDATION | {"vehicle", "aircraft", "status"},
     "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "reasons"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output"},
-    "season": FOUNDATION
+    "batch": FOUNDATION
     | STAGES
     | JOINED
     | {"recordings", "analysis", "extensions", "output"}
     | EDGES,
-    "panel": FOUNDATION | STAGES | {"status", "recordings", "analysis", "season"} | EDGES,
+    "panel": FOUNDATION | STAGES | {"status", "recordings", "analysis", "batch"} | EDGES,
     "fleet": FOUNDATION | STAGES | {"output"} | EDGES,
     "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
@@ -59,7 +59,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"status", "recordings", "config", "player", "analysis"}
-    | {"extensions", "panel", "fleet", "flashing", "season", "output"}
+    | {"extensions", "panel", "fleet", "flashing", "batch", "output"}
     | EDGES,
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
@@ -73,8 +73,8 @@ IMPURE_PARTS = {
     "hub/transports/zenoh",
 }
 """Impure parts of pure packages."""
-PURE_FOLDERS = {"panel/state", "season/statistics"}
-PURE_FILES = {
+PURE_FOLDERS = {"panel/state"}
+PURE_FILES = {"batch/facts.py", "batch/statistics.py"} | {
     f"recordings/{name}.py"
     for name in (
         *("columns", "table", "tlog", "tlog_scan", "answers", "join", "moment", "play"),
@@ -188,7 +188,7 @@ def test_no_stage_knows_an_edge() -> None:
         if module.startswith(("gateway.live", "gateway.hub.transports"))
     }
     assert knowing <= (
-        {"cli", "config", "flashing", "fleet", "hub", "live", "panel", "player"} | {"season"}
+        {"cli", "config", "flashing", "fleet", "hub", "live", "panel", "player"} | {"batch"}
     )
 
 

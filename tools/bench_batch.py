@@ -36,19 +36,23 @@ from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
 from gateway.analysis.sources import ideal_calibration
 from gateway.analysis.tuning.axis import parse_axis
+from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
+from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
+from gateway.batch.storage import items_of
+from gateway.batch.tasks import (
+    LOOKING,
+    FlightTask,
+    FuseTask,
+    ReportTask,
+    ResultFolder,
+    SweepTask,
+    run_season,
+)
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw
-from gateway.season.batch.dask_executor import DaskCluster
-from gateway.season.batch.flight_tasks import FlightTask, FuseTask, ReportTask, SweepTask
-from gateway.season.batch.result_folder import ResultFolder
-from gateway.season.batch.season_run import LOOKING, run_season
-from gateway.season.batch.storage import items_of
-from gateway.season.catalogue.catalogue_file import CATALOGUE_NAME, find_flights, geojson_of
-from gateway.season.catalogue.indexing import index_folder
-from gateway.season.executors import Executor, LocalProcesses
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings

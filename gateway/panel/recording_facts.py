@@ -5,13 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.season.catalogue.catalogue_file import (
-    CATALOGUE_NAME,
-    CatalogueError,
-    Row,
-    find_flights,
-    geojson_of,
-)
+from gateway.batch.catalogue import CATALOGUE_NAME, CatalogueError, Row, find_flights, geojson_of
 
 OPERATORS: Final = frozenset("<>=")
 """Characters that make a search a condition."""

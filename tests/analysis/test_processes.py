@@ -12,7 +12,7 @@ from contextlib import suppress
 import pytest
 
 from gateway.analysis.processes import copies
-from gateway.season.executors import LocalProcesses
+from gateway.batch.executors import LocalProcesses
 
 COLLECTED: list[str] = []
 

@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
+from gateway.batch.catalogue import Catalogue, CataloguedFile
+from gateway.batch.facts import FlightFacts
 from gateway.panel.recording_facts import RecordingFacts
-from gateway.season.catalogue.catalogue_file import Catalogue, CataloguedFile
-from gateway.season.statistics.flight_facts import FlightFacts
 
 pytestmark = pytest.mark.io
 

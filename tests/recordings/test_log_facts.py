@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from gateway.analysis.case import make_case
 from gateway.analysis.reporting.sections.estimators import estimators
+from gateway.batch.tasks import read_season_flight
 from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
@@ -16,7 +17,6 @@ from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
 from gateway.recordings.fuse import RecordedFusion, aircraft_for
 from gateway.recordings.reading import ReadOptions, open_rows, settings_of
-from gateway.season.batch.flight_tasks import read_season_flight
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -31,8 +31,8 @@ from gateway.units import US_PER_S, counted
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from gateway.batch.catalogue import FlightFigures
     from gateway.recordings.summary import Glance
-    from gateway.season.catalogue.catalogue_file import FlightFigures
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
@@ -178,9 +178,8 @@ def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance
 
 def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]]":
     """Bring the catalogue of the recordings up to date, and take their figures from it."""
-    from gateway.season.catalogue.catalogue_file import CatalogueError, figures_of
-    from gateway.season.catalogue.indexing import index_folder
-    from gateway.season.executors import ThisProcess
+    from gateway.batch.catalogue import CatalogueError, figures_of, index_folder
+    from gateway.batch.executors import ThisProcess
 
     folder = recordings[0].files[0].parent
     console = console_of(stderr=True)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from gateway.cli.season.season_work import (
+from gateway.cli.recorded.batch_work import (
     JobsOption,
     SchedulerOption,
     SeasonFiles,
@@ -30,8 +30,8 @@ from gateway.units import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from gateway.season.batch.flight_tasks import FlightResult
-    from gateway.season.statistics.season_errors import Versus
+    from gateway.batch.statistics import Versus
+    from gateway.batch.tasks import FlightResult
 
 FAILED: Final = 1
 """What the command ends with where a recording failed."""
@@ -79,7 +79,7 @@ def _add_judging(name: Literal["fuse", "report"], text: str) -> None:
         scheduler: SchedulerOption = None,
         config: ConfigOption = None,
     ) -> None:
-        from gateway.season.batch.flight_tasks import FuseTask, ReportTask
+        from gateway.batch.tasks import FuseTask, ReportTask
 
         if name == "report" and not _can_make_pages():
             refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
@@ -107,8 +107,8 @@ def info(
     config: ConfigOption = None,
 ) -> None:
     """Tell what each of many files holds, one by one, as `mavgate info` does."""
-    from gateway.season.batch.flight_tasks import InfoTask
-    from gateway.season.batch.season_page import flight_table
+    from gateway.batch.page import flight_table
+    from gateway.batch.tasks import InfoTask
 
     work = SeasonWork(files, config, jobs, scheduler)
     task = InfoTask(season_options(config, columns, "recorded"))
@@ -155,7 +155,7 @@ def sweep(
     force: ForceOption = False,
 ) -> None:
     """Find one set of settings for many flights; those of other days judge what was chosen."""
-    from gateway.cli.season.season_sweeping import run_season_sweep
+    from gateway.cli.recorded.batch_work import run_season_sweep
     from gateway.cli.support.sweeping import SweepOptions
 
     work = SeasonWork(files, config, jobs, scheduler)
@@ -169,8 +169,8 @@ def sweep(
 
 def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
-    from gateway.season.batch.season_page import errors_of, flight_table, write_season_page
-    from gateway.season.statistics.season_errors import errors_by_group
+    from gateway.batch.page import errors_of, flight_table, write_season_page
+    from gateway.batch.statistics import errors_by_group
 
     compared = None if against is None else _compare(results, against)
     grid = table_of(
@@ -197,9 +197,9 @@ def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | Non
 
 
 def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
-    from gateway.season.batch.result_folder import read_results
-    from gateway.season.batch.season_page import errors_of
-    from gateway.season.statistics.season_errors import versus
+    from gateway.batch.page import errors_of
+    from gateway.batch.statistics import versus
+    from gateway.batch.tasks import read_results
 
     with refusing():
         found = versus(errors_of(results), errors_of([*read_results(against)]))

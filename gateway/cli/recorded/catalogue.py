@@ -9,16 +9,15 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
+from gateway.batch.catalogue import CatalogueError, Row, find_flights, geojson_of, index_folder
+from gateway.batch.executors import LocalProcesses
+from gateway.batch.facts import UNITS
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.named_recordings import folder_of
 from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.recordings.index import RecordingError, find_recording
-from gateway.season.catalogue.catalogue_file import CatalogueError, Row, find_flights, geojson_of
-from gateway.season.catalogue.indexing import index_folder
-from gateway.season.executors import LocalProcesses
-from gateway.season.statistics.flight_facts import UNITS
 from gateway.units import counted
 
 INDEX: Final = "index"

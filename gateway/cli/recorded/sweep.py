@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from gateway.batch.storage import is_url
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import Loading, ReferenceOption, SystemOption
 from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
@@ -13,7 +14,6 @@ from gateway.cli.support.settings_options import (
     load_settings,
     or_refuse,
 )
-from gateway.season.batch.storage import is_url
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 
@@ -86,8 +86,7 @@ def sweep(
     )
     given = flights or []
     if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
-        from gateway.cli.season.season_sweeping import run_season_sweep
-        from gateway.cli.season.season_work import SeasonWork, season_options
+        from gateway.cli.recorded.batch_work import SeasonWork, run_season_sweep, season_options
 
         if reference is not None or system is not None:
             refuse("--reference and --system belong to one flight")

@@ -7,7 +7,14 @@ from typing import Annotated, Final
 
 import msgspec
 import typer
-from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    DownloadColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of
@@ -102,15 +109,24 @@ def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Momen
 
 @contextmanager
 def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
-    """Show the progress of reading, on a terminal."""
+    """Show the progress of reading, and that the command computes after that, on a terminal."""
     total = sum(file.stat().st_size for file in files if file.exists())
-    columns = (TextColumn("reading"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    columns = (
+        *(TextColumn("{task.description}"), BarColumn(), DownloadColumn()),
+        *(TimeElapsedColumn(), TimeRemainingColumn()),
+    )
     console = console_of(stderr=True)
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as progress:
         task = progress.add_task("reading", total=total)
-        yield lambda count: progress.advance(task, count)
+
+        def advance(count: int) -> None:
+            progress.advance(task, count)
+            if progress.tasks[task].completed >= total:
+                progress.update(task, description="computing", total=None)
+
+        yield advance
 
 
 def print_remarks(remarks: Iterable[str]) -> None:

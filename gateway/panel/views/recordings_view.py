@@ -11,6 +11,7 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
+from gateway.batch.catalogue import Row
 from gateway.panel.playback import SPEEDS, Playback, Profile
 from gateway.panel.recording_facts import RecordingFacts
 from gateway.panel.recording_jobs import FORMATS
@@ -20,7 +21,6 @@ from gateway.panel.widgets.recorder import RecorderControls
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
 from gateway.recordings.index import delete_recording, list_recordings
-from gateway.season.catalogue.catalogue_file import Row
 
 REFRESH_S: Final = 1.0
 IDLE: Final = "idle"

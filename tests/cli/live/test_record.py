@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from gateway.batch.catalogue import CATALOGUE_NAME
 from gateway.cli.app import app
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import RecorderVerbs
-from gateway.season.catalogue.catalogue_file import CATALOGUE_NAME
 from tests.conftest import ManualClock
 from tests.live.test_recorder import Bench
 from tests.recordings.frames import make_frames

@@ -1,8 +1,16 @@
-"""What can be done to each recording of a season: the same here and on any machine."""
+"""Tasks on single recordings, their results in a folder, and a run over all recordings."""
 
+import errno
+import fcntl
+import os
+import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, ClassVar, Final, Protocol
@@ -17,14 +25,22 @@ from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.axis import Axis, SweepError, grid
 from gateway.analysis.tuning.contest import Trials, base_score, make_contest
+from gateway.batch.executors import Executor, WorkFailed
+from gateway.batch.facts import began_text
+from gateway.batch.storage import (
+    BatchItem,
+    digest_of_files,
+    local_files,
+    stamp_of_item,
+    without_user,
+)
+from gateway.output import write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import aircraft_for, fused_lines
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.join import joined_tables
 from gateway.recordings.reading import ReadOptions, header_for, open_rows
 from gateway.recordings.summary import describe
-from gateway.season.batch.storage import BatchItem, digest_of_files, local_files, without_user
-from gateway.season.statistics.flight_facts import began_text
 
 HELD: Final = "held_m"
 """Errors at the withheld fixes, by estimator."""
@@ -294,3 +310,184 @@ def _figures(case: Case) -> dict[str, Any]:
     known = {name: value for name, value in summarise(case).items() if value == value}
     held = {name: withheld_error_m(case, name) for name in case.tracks}
     return {"summary": known, HELD: {name: m for name, m in held.items() if m == m}}
+
+
+RESULTS: Final = "results"
+PARTIAL: Final = ".partial"
+"""Where files are written before they are put in their place."""
+
+
+class ResultFolder:
+    """Results of many recordings.
+
+    Raises OSError if it cannot be written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        (folder / RESULTS).mkdir(parents=True, exist_ok=True)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out, and remove what was left half written: by a killed one, or by this.
+
+        Raises OSError if another run is at work in it.
+        """
+        descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            _lock(descriptor, self.folder)
+            self._clear()
+            try:
+                yield
+            finally:
+                self._clear()
+        finally:
+            # Processes that were forked meanwhile have it open, too.
+            with suppress(OSError):
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+            os.close(descriptor)
+
+    def find(self, key: str) -> FlightResult | None:
+        """Return a result that is kept with all its files; None if it is to be made."""
+        found = _read(self._path(key))
+        if found is None or not all((self.folder / name).exists() for name in found.files):
+            return None
+        return found
+
+    def keep(self, result: FlightResult, files: Files) -> None:
+        """Write a result: its files first, all under other names, then itself."""
+        staged = self.folder / PARTIAL / result.key
+        for name, content in files.items():
+            path = staged / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_new(path, [content])
+        # What belongs together (a page and its figures) is a folder, and is put in place at once.
+        for unit in {Path(*Path(name).parts[:2]) for name in files}:
+            target = self.folder / unit
+            target.parent.mkdir(exist_ok=True)
+            if target.is_dir():
+                shutil.rmtree(target)
+            (staged / unit).replace(target)
+        shutil.rmtree(staged, ignore_errors=True)
+        write_new(self._path(result.key), [msgspec.json.encode(result)], overwrite=True)
+
+    def _clear(self) -> None:
+        """Remove what was not put in its place."""
+        shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
+
+    def _path(self, key: str) -> Path:
+        return self.folder / RESULTS / f"{key}.json"
+
+
+def _lock(descriptor: int, folder: Path) -> None:
+    """Lock a folder as long as it is open; the lock ends with the process, however that ends."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        text = "another mavgate batch writes its results here; wait, or name another folder"
+        raise OSError(errno.EBUSY, text, str(folder)) from error
+    except OSError:
+        # Some network disks have no locks.
+        return
+
+
+def read_results(folder: Path) -> Iterator[FlightResult]:
+    """Read all results of a folder, the newest last; raises OSError if there is none.
+
+    Those of one tick of the file system's clock stand by name.
+    """
+    paths = list((folder / RESULTS).iterdir())
+    for path in sorted(paths, key=lambda path: (path.stat().st_mtime_ns, path.name)):
+        if path.suffix == ".json" and (found := _read(path)) is not None:
+            yield found
+
+
+def _read(path: Path) -> FlightResult | None:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=FlightResult)
+    except (FileNotFoundError, msgspec.DecodeError):
+        return None
+
+
+Tell = Callable[[str, int, int], None]
+"""Called with what was done last, how many are done, and of how many."""
+LOOKING: Final = "looking for changes"
+"""What is done first: it decides which recordings are to be worked on."""
+
+
+def run_season(
+    task: FlightTask,
+    items: Sequence[BatchItem],
+    executor: Executor,
+    folder: ResultFolder | None,
+    tell: Tell,
+) -> list[FlightResult]:
+    """Do a task on every recording that it is not done on yet."""
+    found: list[FlightResult | None] = [None] * len(items)
+    todo: list[tuple[BatchItem, str, str, str]] = []
+    numbers: list[int] = []
+    stamps = _stamps(items, executor, tell)
+    names = _names(items, stamps)
+    for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
+        if isinstance(stamp, WorkFailed):
+            found[number] = _failed(task, item, "", "", stamp)
+            continue
+        key = _key(task, stamp)
+        kept = folder.find(key) if folder is not None else None
+        if kept is not None:
+            found[number] = msgspec.structs.replace(kept, place=as_text(item.place))
+        else:
+            todo.append((item, stamp, key, names[number]))
+            numbers.append(number)
+    done = len(items) - len(todo)
+    for place, outcome in executor.run(partial(work_on, task), todo):
+        item, stamp, key, _ = todo[place]
+        if isinstance(outcome, WorkFailed):
+            result = _failed(task, item, stamp, key, outcome)
+        else:
+            result, files = outcome
+            if result.version != __version__:
+                reason = WorkFailed(f"done by mavgate {result.version}; here is {__version__}")
+                result = _failed(task, item, stamp, key, reason)
+            elif folder is not None:
+                folder.keep(result, files)
+        found[numbers[place]] = result
+        done += 1
+        tell(item.place, done, len(items))
+    return [result for result in found if result is not None]
+
+
+def _stamps(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[str | WorkFailed]:
+    found: list[str | WorkFailed] = [""] * len(items)
+    for done, (number, outcome) in enumerate(executor.run(stamp_of_item, items), 1):
+        found[number] = outcome
+        tell(LOOKING, done, len(items))
+    return found
+
+
+def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
+    """Name what is written; where two recordings have one name, with a part of their stamps."""
+    names = [name_of(item) for item in items]
+    often = Counter(names)
+    return [
+        f"{name}-{stamp[:8]}" if often[name] > 1 and isinstance(stamp, str) else name
+        for name, stamp in zip(names, stamps, strict=True)
+    ]
+
+
+def _key(task: FlightTask, stamp: str) -> str:
+    told = "\n".join((task.name, stamp, __version__)).encode()
+    return sha256(told + b"\n" + task.fingerprint).hexdigest()[:32]
+
+
+def _failed(
+    task: FlightTask, item: BatchItem, stamp: str, key: str, failure: WorkFailed
+) -> FlightResult:
+    return FlightResult(
+        place=as_text(item.place),
+        digest=stamp,
+        key=key,
+        task=task.name,
+        version=__version__,
+        error=failure.reason,
+    )

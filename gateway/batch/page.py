@@ -7,13 +7,8 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from gateway.season.batch.flight_tasks import HELD, FlightResult
-from gateway.season.statistics.season_errors import (
-    FlightErrors,
-    GroupErrors,
-    Versus,
-    errors_by_group,
-)
+from gateway.batch.statistics import FlightErrors, GroupErrors, Versus, errors_by_group
+from gateway.batch.tasks import HELD, FlightResult
 from gateway.units import counted
 
 ALL: Final = "all"

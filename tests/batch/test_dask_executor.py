@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.season.batch.dask_executor import ClusterError, DaskCluster
-from gateway.season.executors import WorkFailed
+from gateway.batch.executors import ClusterError, DaskCluster, WorkFailed
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.io
@@ -84,7 +83,7 @@ def test_work_that_fails_fails_alone(address: str, tmp_path: Path) -> None:
 def test_a_scheduler_that_is_not_there_is_said(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.season.batch.dask_executor.CONNECT_S", 0.3)
+    monkeypatch.setattr("gateway.batch.executors.CONNECT_S", 0.3)
     with pytest.raises(ClusterError, match="no Dask scheduler answers"):
         DaskCluster("tcp://127.0.0.1:9")
 
@@ -92,6 +91,6 @@ def test_a_scheduler_that_is_not_there_is_said(
 def test_workers_of_another_version_are_refused(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gateway.season.batch.dask_executor.__version__", "0.0.1")
+    monkeypatch.setattr("gateway.batch.executors.__version__", "0.0.1")
     with pytest.raises(ClusterError, match=r"here is mavgate 0\.0\.1, but"):
         DaskCluster(address)

@@ -15,14 +15,21 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.sections.ground_track import ground_track
+from gateway.batch.executors import LocalProcesses, WorkError, WorkFailed, failure_of
+from gateway.batch.storage import BatchItem, StorageError, StoredFile, items_of
+from gateway.batch.tasks import (
+    RESULTS,
+    FlightResult,
+    FuseTask,
+    InfoTask,
+    ResultFolder,
+    read_results,
+    run_season,
+    without_secrets,
+)
 from gateway.cli.app import app
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.reading import ReadOptions
-from gateway.season.batch.flight_tasks import FlightResult, FuseTask, InfoTask, without_secrets
-from gateway.season.batch.result_folder import RESULTS, ResultFolder, read_results
-from gateway.season.batch.season_run import run_season
-from gateway.season.batch.storage import BatchItem, StorageError, StoredFile, items_of
-from gateway.season.executors import LocalProcesses, WorkError, WorkFailed, failure_of
 
 pytestmark = pytest.mark.io
 
@@ -399,7 +406,7 @@ def test_without_the_extra_it_says_how_to_add_it(
     words: tuple[str, ...], lacking: str, season: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(f"gateway.cli.season.season_work.{lacking}", lambda: False)
+    monkeypatch.setattr(f"gateway.cli.recorded.batch_work.{lacking}", lambda: False)
     named = [word.format(season=season) for word in words]
     code, text = run("fuse", *named, "-o", tmp_path)
     assert code == 2

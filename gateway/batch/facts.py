@@ -1,27 +1,286 @@
-"""The flights of one recording, computed from its bytes without reading all of them."""
+"""Facts of one flight for the catalogue, computed from its recording in one pass."""
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
+from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
+from gateway.geometry.angle import wrap_180
+from gateway.geometry.geodesy import radii_m
 from gateway.recordings.answers import is_station
 from gateway.recordings.columns import TableRow
+from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import (
     GLOBAL_POSITION_INT_ID,
     HEARTBEAT_ID,
     STEP_US,
+    GroundDistance,
     TimesSpan,
 )
 from gateway.recordings.table import TableEvent, TableFault, TableHeader, TableReader
-from gateway.recordings.tlog import Batch, TlogIndex, payload_of
+from gateway.recordings.tlog import DAY_US, Batch, TlogIndex, payload_of
 from gateway.records import NavFlags, NodeStatus
-from gateway.season.statistics.flight_facts import FlightFacts, FlightTally, began_text, lost_share
-from gateway.season.statistics.track_shape import Place
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
+
+TOLERANCE_M: Final = 3.0
+"""Less than the error of the GPS."""
+MAX_PLACES: Final = 400
+"""Of one track; a day in circles gets coarser instead of larger."""
+
+Place = tuple[float, float, float]
+"""Latitude and longitude in deg, height above mean sea level in m."""
+
+
+def simplified(places: Sequence[Place]) -> list[Place]:
+    """Leave out places that the straight lines between the others pass within a few metres.
+
+    The method of Ramer, Douglas and Peucker [1]_, with a greater tolerance where too many are left.
+
+    Parameters
+    ----------
+    places : sequence of Place
+        In the order of their times.
+
+    References
+    ----------
+    .. [1] D. Douglas, T. Peucker, "Algorithms for the reduction of the number of points required to
+       represent a digitized line or its caricature", Cartographica 10(2), 1973.
+    """
+    if len(places) < 3:
+        return list(places)
+    plane, tolerance_m = _in_metres(places), TOLERANCE_M
+    while np.count_nonzero(kept := _kept(plane, tolerance_m)) > MAX_PLACES:
+        tolerance_m *= 2.0
+    return [place for place, keep in zip(places, kept.tolist(), strict=True) if keep]
+
+
+def feature(places: Sequence[Place], properties: Mapping[str, Any]) -> dict[str, Any]:
+    """Write a track as a GeoJSON feature (RFC 7946); cut in two where it crosses 180 degrees."""
+    lines: list[list[list[float]]] = [[]]
+    for lat, lon, alt in places:
+        if lines[-1] and abs(lon - lines[-1][-1][0]) > 180.0:
+            lines.append([])
+        lines[-1].append([round(lon, 7), round(lat, 7), round(alt, 2)])
+    lines = [line if len(line) > 1 else line * 2 for line in lines if line]
+    return {
+        "type": "Feature",
+        "geometry": {"type": "MultiLineString", "coordinates": lines} if lines else None,
+        "properties": dict(properties),
+    }
+
+
+def feature_collection(features: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Put features together as one GeoJSON document."""
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def _in_metres(places: Sequence[Place]) -> NDArray[np.float64]:
+    lat, lon, alt = np.array(places, np.float64).T
+    meridian, parallel = radii_m(float(lat[0]), float(alt[0]))
+    east_deg = wrap_180(lon - lon[0])
+    return np.column_stack([np.radians(lat - lat[0]) * meridian, np.radians(east_deg) * parallel])
+
+
+def _kept(plane: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
+    kept = np.zeros(len(plane), np.bool_)
+    kept[[0, -1]] = True
+    stretches = [(0, len(plane) - 1)]
+    while stretches:
+        begin, end = stretches.pop()
+        if end - begin < 2:
+            continue
+        away = _distances_m(plane[begin + 1 : end], plane[begin], plane[end])
+        farthest = int(np.argmax(away))
+        if away[farthest] > tolerance_m:
+            middle = begin + 1 + farthest
+            kept[middle] = True
+            stretches += [(begin, middle), (middle, end)]
+    return kept
+
+
+def _distances_m(
+    points: NDArray[np.float64], begin: NDArray[np.float64], end: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Distances from the line between two points: it ends there."""
+    line = end - begin
+    length2 = float(line @ line)
+    share = ((points - begin) @ line / length2).clip(0.0, 1.0) if length2 else np.zeros(len(points))
+    return np.asarray(np.linalg.norm(points - begin - share[:, np.newaxis] * line, axis=1))
+
+
+POINT_US: Final = US_PER_S // 10
+"""Positions nearer in time than this add nothing new of a flight."""
+SILENCE_STEPS: Final = 2.5
+"""So many usual intervals without a fix are an outage, where fixes come seldom."""
+EARLIEST_US: Final = 315_532_800 * US_PER_S
+"""1980, when GPS began: what is earlier counts from the start of a clock."""
+LOST_STEP: Final = 1.5
+"""So many usual intervals between two samples are a loss."""
+
+
+class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """One flight in the catalogue; None is what is not known.
+
+    The names are those of the columns that a query may use.
+    """
+
+    vehicle: int | None = None
+    """MAVLink system id."""
+    began: str | None = None
+    """Begin, UTC: YYYY-MM-DD HH:MM:SS."""
+    duration: float | None = None
+    """From the first record to the last, s."""
+    distance: float | None = None
+    """Over ground, m."""
+    highest: float | None = None
+    """Above the first position, m."""
+    fastest: float | None = None
+    """Over ground, m/s."""
+    lat_min: float | None = None
+    """South end, deg."""
+    lat_max: float | None = None
+    """North end, deg."""
+    lon_min: float | None = None
+    """West end, deg."""
+    lon_max: float | None = None
+    """East end; below lon_min across 180 degrees, deg."""
+    takeoff_lat: float | None = None
+    """Where it left the ground, deg."""
+    takeoff_lon: float | None = None
+    """Where it left the ground, deg."""
+    gps_outages: int | None = None
+    """Silences of the GPS."""
+    gps_lost: float | None = None
+    """All of them together, s."""
+    faults: int | None = None
+    """Bus errors and failed sensors of the nodes; texts of severity ERROR."""
+    loss: float | None = None
+    """Share of the samples lost on the radio, 0 to 1."""
+    damaged: int | None = None
+    """Damaged bytes of the file."""
+    version: str | None = None
+    """Of mavgate, or of the autopilot's firmware."""
+    settings: str | None = None
+    """Checksum of settings and calibration."""
+
+
+UNITS: Final = {
+    "duration": "s", "distance": "m", "highest": "m", "fastest": "m/s", "gps_lost": "s",
+    **dict.fromkeys(("lat_min", "lat_max", "lon_min", "lon_max"), "deg"),
+    "takeoff_lat": "deg", "takeoff_lon": "deg", "damaged": "bytes", "size": "bytes",
+}  # fmt: skip
+"""Of the columns that have one; `size` is that of the file."""
+
+
+class FlightTally:
+    """Gathers what is known of one vehicle while its recording goes by."""
+
+    def __init__(self) -> None:
+        self.way = GroundDistance()
+        self.points: list[tuple[int, float, float, float, float]] = []
+        self._gps_us: list[int] = []
+        self._fixed: list[bool] = []
+        self.faults = 0
+
+    def add_position(self, time_us: int, place: Place, speed_mps: float) -> None:
+        """Take a position in: latitude and longitude in deg, height in m, ground speed in m/s."""
+        self.way.add(time_us, place[0], place[1])
+        if self.points and 0 <= time_us - self.points[-1][0] < POINT_US:
+            return
+        self.points.append((time_us, *place, speed_mps))
+
+    def prefer_positions_of(self, other: "FlightTally") -> None:
+        """Use the positions of another tally, if it has any."""
+        if other.points:
+            self.points, self.way = other.points, other.way
+
+    def add_gps(self, time_us: int, *, fixed: bool) -> None:
+        """Note that the receiver sent something, and whether it had a fix."""
+        self._gps_us.append(time_us)
+        self._fixed.append(fixed)
+
+    def facts(self, end_us: int | None) -> FlightFacts:
+        """Sum up, with all that depends on positions and fixes alone."""
+        outages, lost_s = self._outages(end_us)
+        known = FlightFacts(gps_outages=outages, gps_lost=lost_s, faults=self.faults)
+        if not self.points:
+            return known
+        points = np.array(self.points, np.float64)
+        lat, lon, alt, speed = points[:, 1:].T
+        height = alt - alt[0]
+        west, east = _longitudes(lon)
+        flying = np.flatnonzero((speed > AIRBORNE_MPS) & (height > AIRBORNE_M))
+        takeoff = max(int(flying[0]) - 1, 0) if len(flying) else None
+        return msgspec.structs.replace(
+            known,
+            distance=self.way.distance_m,
+            highest=_greatest(height),
+            fastest=_greatest(speed),
+            lat_min=float(lat.min()),
+            lat_max=float(lat.max()),
+            lon_min=west,
+            lon_max=east,
+            takeoff_lat=None if takeoff is None else float(lat[takeoff]),
+            takeoff_lon=None if takeoff is None else float(lon[takeoff]),
+        )
+
+    def track(self) -> list[Place]:
+        """Return the way as few places as show it."""
+        return simplified([(lat, lon, alt) for _, lat, lon, alt, _ in self.points])
+
+    def _outages(self, end_us: int | None) -> tuple[int | None, float | None]:
+        times = np.array(self._gps_us, np.int64)
+        fixed = times[np.array(self._fixed, np.bool_)]
+        if not len(fixed):
+            return None, None
+        usual_s = float(np.median(np.diff(times))) / US_PER_S if len(times) > 1 else 0.0
+        longest_s = max(OUTAGE_S, SILENCE_STEPS * usual_s)
+        last_us = max(end_us or 0, int(fixed[-1]))
+        silences_s = np.diff(np.append(fixed, last_us)) / US_PER_S
+        # A clock that leaps by days is no silence.
+        outages = silences_s[(silences_s > longest_s) & (silences_s <= DAY_US / US_PER_S)]
+        return len(outages), float(outages.sum())
+
+
+def began_text(unix_us: int | None) -> str | None:
+    """Write a civil time as the catalogue does; None if it can be none."""
+    moment = None if unix_us is None or unix_us < EARLIEST_US else civil_time(unix_us)
+    return None if moment is None else f"{moment:%Y-%m-%d %H:%M:%S}"
+
+
+def lost_share(times_us: NDArray[np.int64]) -> float | None:
+    """Estimate which share of samples is missing between those that came at a steady rate.
+
+    Parameters
+    ----------
+    times_us : ndarray, shape (N,)
+        Of the samples, on the clock of who sampled them; a restart sets it back.
+    """
+    steps = np.diff(times_us)
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    counts = steps / np.median(steps)
+    lost = float((np.rint(counts[counts > LOST_STEP]) - 1.0).sum())
+    return lost / (lost + len(times_us))
+
+
+def _greatest(values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else None
+
+
+def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the west and the east end, the short way round."""
+    turned = lon_deg[0] + wrap_180(lon_deg - lon_deg[0])
+    west, east = float(turned.min()), float(turned.max())
+    return (wrap_180(west), wrap_180(east))
+
 
 SYS_STATUS_ID: Final = 1
 PARAM_VALUE_ID: Final = 22

@@ -6,11 +6,16 @@ import pandas as pd
 import pytest
 from typer.testing import CliRunner
 
+from gateway.batch.statistics import (
+    FlightErrors,
+    choose,
+    errors_by_group,
+    folds_of,
+    lead_of,
+    versus,
+)
 from gateway.cli.app import app
 from gateway.config import load
-from gateway.season.statistics.chance import lead_of
-from gateway.season.statistics.cross_validation import choose, folds_of
-from gateway.season.statistics.season_errors import FlightErrors, errors_by_group, versus
 
 GROUPS = [f"{1 + k % 2} 2026-06-{1 + k // 4:02d}" for k in range(40)]
 

@@ -14,10 +14,10 @@ from typing import Any, Final
 
 import msgspec
 
+from gateway.batch.catalogue import ENDINGS, digest_of, recordings_below
+from gateway.batch.executors import WorkError
 from gateway.recordings.files import CHUNK, GZIP
 from gateway.recordings.index import parts_together, recording_name
-from gateway.season.catalogue.indexing import ENDINGS, digest_of, recordings_below
-from gateway.season.executors import WorkError
 
 MARK: Final = "://"
 """What makes a name a URL."""

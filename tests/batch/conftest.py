@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.season.season_flights import write_flight
+from tests.batch.season_flights import write_flight
 
 
 @pytest.fixture(scope="session")

@@ -11,12 +11,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
-from gateway.cli.app import app
-from gateway.pipeline import PipelineSettings
-from gateway.recordings.reading import ReadOptions
-from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
-from gateway.season.catalogue import indexing
-from gateway.season.catalogue.catalogue_file import (
+from gateway.batch import catalogue as indexing
+from gateway.batch.catalogue import (
     CATALOGUE_NAME,
     COLUMNS,
     Catalogue,
@@ -24,13 +20,18 @@ from gateway.season.catalogue.catalogue_file import (
     CatalogueError,
     find_flights,
     geojson_of,
+    index_folder,
+    read_file,
+    recordings_below,
 )
-from gateway.season.catalogue.indexing import index_folder, read_file, recordings_below
-from gateway.season.executors import LocalProcesses
-from gateway.season.statistics.flight_facts import FlightFacts, FlightTally, lost_share
-from gateway.season.statistics.track_shape import feature, simplified
+from gateway.batch.executors import LocalProcesses
+from gateway.batch.facts import FlightFacts, FlightTally, feature, lost_share, simplified
+from gateway.cli.app import app
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S
-from tests.season.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
+from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 
 pytestmark = pytest.mark.io
 

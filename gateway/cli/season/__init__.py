@@ -1,1 +1,0 @@
-"""What the commands over many recordings share."""

@@ -1,1 +1,0 @@
-"""Thousands of recordings: a catalogue of them, and work on all of them at once."""

@@ -1,1 +1,0 @@
-"""One work on many recordings, in processes here or on other machines."""

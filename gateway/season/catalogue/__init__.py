@@ -1,1 +1,0 @@
-"""The catalogue of the recordings under a folder."""

@@ -1,1 +1,0 @@
-"""What is computed from many flights: facts of each, comparisons, cross-validation; pure."""
