@@ -41,15 +41,15 @@ from gateway.vehicle.actions import (
     WARNING,
     CalibrationMeasured,
     RecordingRequest,
-    SavePlaces,
+    SavePlan,
     SaveSettings,
     SettingsChange,
     StatusText,
 )
 from gateway.vehicle.actions import Action as VehicleAction
-from gateway.vehicle.location import Home, Place
-from gateway.vehicle.plan import StoredPlaces
-from gateway.vehicle.signing import SigningClock, StampBook
+from gateway.vehicle.location import Home, Location
+from gateway.vehicle.plan import StoredPlan
+from gateway.vehicle.signing import SigningClock, SigningTimestamps
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -62,7 +62,7 @@ class SettingsChanged:
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
-Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlaces | Recorded
+Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlan | Recorded
 """Frames to send, clients' rates, and records for a recording, in the order of its fusion."""
 
 
@@ -86,9 +86,9 @@ class Aircraft:
         Of all stages.
     clock : SigningClock, optional
         Civil time.
-    stamps : StampBook, optional
-        The signing time stamps accepted before.
-    stored : StoredPlaces, optional
+    stamps : SigningTimestamps, optional
+        The signing timestamps accepted before.
+    stored : StoredPlan, optional
         Missions, mark and home kept from an earlier run.
     correct : callable, optional
         Changes the states before they are sent: for a playback, which knows the future.
@@ -100,8 +100,8 @@ class Aircraft:
         settings: AircraftSettings,
         *,
         clock: SigningClock | None = None,
-        stamps: StampBook | None = None,
-        stored: StoredPlaces | None = None,
+        stamps: SigningTimestamps | None = None,
+        stored: StoredPlan | None = None,
         correct: Callable[[NavState], NavState] | None = None,
     ) -> None:
         self.vehicle_id = vehicle_id
@@ -130,7 +130,7 @@ class Aircraft:
             fits=_fits(self.settings),
             sensing=self._chain.snapshot(),
             estimation=self._estimator.snapshot(),
-            home=None if home is None else (*astuple(home.place), home.set_time_us),
+            home=None if home is None else (*astuple(home.location), home.set_time_us),
         )
 
     def restore(self, state: FusionState) -> None:
@@ -139,8 +139,8 @@ class Aircraft:
         Home is restored even if the rest does not fit.
         """
         if state.home is not None:
-            *place, since_us = state.home
-            self.vehicle.telemetry.set_home(Home(Place(*place), since_us))
+            *location, since_us = state.home
+            self.vehicle.telemetry.set_home(Home(Location(*location), since_us))
         self._chain, self._estimator = make_fusion(self.settings, state)
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
@@ -169,32 +169,32 @@ class Aircraft:
         return self._chain
 
     def fuse(
-        self, log: ImuLog, heard: Sequence[tuple[int, BaroRaw | GpsFix]]
+        self, log: ImuLog, aiding: Sequence[tuple[int, BaroRaw | GpsFix]]
     ) -> NDArray[np.float64]:
-        """Let a recording's samples run through estimation alone: the vehicle hears nothing.
+        """Run a recording's samples through estimation alone, without the vehicle.
 
         Parameters
         ----------
         log : ImuLog
             From the sensing stage.
-        heard : sequence of tuple
+        aiding : sequence of tuple
             Heights and fixes in their order, each with the number of the sample before which it
-            came.
+            arrived.
 
         Returns
         -------
         ndarray, shape (n, NAV_COLUMNS)
             The states that `take` records; see `gateway.estimation.columns`.
         """
-        told = [
+        samples = [
             (k, self._chain.baro(record) if isinstance(record, BaroRaw) else record)
-            for k, record in heard
+            for k, record in aiding
         ]
         if isinstance(self._estimator, KernelEstimator):
             imu = imu_rows(log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.flags)
-            states = self._estimator.run_as_heard(log.time_us, imu, told)
+            states = self._estimator.run_as_heard(log.time_us, imu, samples)
         else:
-            states = fuse_singly(self._estimator, log.samples(), told)
+            states = fuse_singly(self._estimator, log.samples(), samples)
         if self._correct is not None:
             known = map(nav_state, log.time_us.tolist(), states)
             states = np.array([nav_row(self._correct(state)) for state in known])
@@ -324,22 +324,22 @@ def make_fusion(
 def fuse_singly(
     estimator: Estimator,
     samples: Sequence[ImuSample],
-    heard: Iterable[tuple[int, BaroSample | GpsFix]],
+    aiding: Iterable[tuple[int, BaroSample | GpsFix]],
 ) -> NDArray[np.float64]:
-    """Run any estimator over samples and what came between them, one by one.
+    """Run any estimator over samples and the heights and fixes between them, one by one.
 
     Parameters
     ----------
     estimator : Estimator
     samples : sequence of ImuSample
-    heard : iterable of tuple
+    aiding : iterable of tuple
         See `Aircraft.fuse`.
 
     Returns
     -------
     ndarray, shape (n, NAV_COLUMNS)
     """
-    waiting = deque(heard)
+    waiting = deque(aiding)
     rows = []
     for number, sample in enumerate([*samples, None]):
         while waiting and waiting[0][0] <= number:

@@ -4,7 +4,7 @@ import math
 
 from gateway.aircraft import Aircraft
 from gateway.status import AircraftStatus, Way
-from gateway.vehicle.location import Place, distance_and_bearing
+from gateway.vehicle.location import Location, distance_and_bearing
 
 
 def status_of(aircraft: Aircraft) -> AircraftStatus:
@@ -12,21 +12,21 @@ def status_of(aircraft: Aircraft) -> AircraftStatus:
     vehicle, state = aircraft.vehicle, aircraft.state
     home, here = vehicle.telemetry.home, None
     if state is not None and math.isfinite(state.lat_deg + state.lon_deg):
-        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
     return AircraftStatus(
         aircraft.vehicle_id,
         vehicle.telemetry.fix,
-        _way(here, None if home is None else home.place),
-        _way(here, vehicle.places.mark.place),
+        _way(here, None if home is None else home.location),
+        _way(here, vehicle.plan.mark.location),
         vehicle.health.boards.statuses,
     )
 
 
-def _way(here: Place | None, there: Place | None) -> Way | None:
+def _way(here: Location | None, there: Location | None) -> Way | None:
     if there is None:
         return None
-    place = (there.lat_deg, there.lon_deg, there.alt_amsl_m)
+    location = (there.lat_deg, there.lon_deg, there.alt_amsl_m)
     if here is None:
-        return Way(*place, None, None)
+        return Way(*location, None, None)
     distance_m, bearing_rad = distance_and_bearing(here, there)
-    return Way(*place, distance_m, math.degrees(bearing_rad) % 360.0)
+    return Way(*location, distance_m, math.degrees(bearing_rad) % 360.0)

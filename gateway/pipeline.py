@@ -28,10 +28,10 @@ from gateway.records import (
 )
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import StatusText
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import StoredPlan
 from gateway.vehicle.requests import BAD_SIGNATURE
-from gateway.vehicle.signing import SigningClock, StampBook, Stamps
+from gateway.vehicle.signing import KeptTimestamps, SigningClock, SigningTimestamps
 from gateway.wire.gps_time import GpsTime
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import FrameSigner
@@ -52,10 +52,10 @@ class PipelineSettings:
     """Civil time at the gateway clock's zero, as far as known."""
     correct: Callable[[NavState], NavState] | None = None
     """Changes the states before they are sent: for a playback, which knows the future."""
-    places: Mapping[int, StoredPlaces] = field(default_factory=dict)
+    places: Mapping[int, StoredPlan] = field(default_factory=dict)
     """Missions, marks and homes kept from an earlier run, by vehicle id."""
     stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
-    """Signing time stamps kept from an earlier run, by vehicle id; see `StampBook`."""
+    """Signing timestamps kept from an earlier run, by vehicle id; see `SigningTimestamps`."""
 
 
 class Pipeline:
@@ -73,7 +73,7 @@ class Pipeline:
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
         """Signs the frames of every aircraft with a passphrase where they are sent."""
-        self._stamps = {key: StampBook(kept) for key, kept in settings.stamps.items()}
+        self._stamps = {key: SigningTimestamps(kept) for key, kept in settings.stamps.items()}
         self._gps_time = GpsTime()
         self._connected = False
         self._port = ""
@@ -98,7 +98,7 @@ class Pipeline:
         if isinstance(record, GpsFix) and record.utc_us is not None:
             at_zero_us = self._gps_time.hear(vehicle_id, record.utc_us, record.time_us)
             if at_zero_us is not None:
-                self._signing_clock.hear_gps(at_zero_us)
+                self._signing_clock.set_gps_time(at_zero_us)
         self._heard_us[vehicle_id] = now_us
         aircraft = self.aircraft.get(vehicle_id)
         if aircraft is not None:
@@ -121,7 +121,7 @@ class Pipeline:
             vehicle_id,
             known.aircraft.get(vehicle_id, known.default),
             clock=self._signing_clock,
-            stamps=self._stamps.setdefault(vehicle_id, StampBook()),
+            stamps=self._stamps.setdefault(vehicle_id, SigningTimestamps()),
             stored=known.places.get(vehicle_id),
             correct=known.correct,
         )
@@ -182,14 +182,14 @@ class Pipeline:
             self._set_key(each)
         return actions
 
-    def stamps_to_keep(self) -> dict[int, Stamps] | None:
-        """Return the signing time stamps of all aircraft if they must be written now."""
+    def stamps_to_keep(self) -> dict[int, KeptTimestamps] | None:
+        """Return the signing timestamps of all aircraft if they must be written now."""
         if not any(book.is_due for book in self._stamps.values()):
             return None
         return {key: book.to_keep() for key, book in self._stamps.items()}
 
-    def newest_stamps(self) -> dict[int, Stamps]:
-        """Return the signing time stamps of all aircraft, for a clean shutdown."""
+    def newest_stamps(self) -> dict[int, KeptTimestamps]:
+        """Return the signing timestamps of all aircraft, for a clean shutdown."""
         return {key: found for key, book in self._stamps.items() if (found := book.exact())}
 
     def connect(self, port: str) -> None:
@@ -210,10 +210,10 @@ class Pipeline:
             actions += aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us)
         return actions
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
         for aircraft in self._ever():
-            aircraft.vehicle.forget_client(client_id)
+            aircraft.vehicle.remove_client(client_id)
 
     def say(self, status: StatusText, now_us: int) -> list[Action]:
         """Send a text from every aircraft."""
@@ -222,7 +222,7 @@ class Pipeline:
             actions += aircraft.perform(aircraft.vehicle.say(status, now_us), now_us)
         return actions
 
-    def mark(self, place: Place | None, vehicle_id: int | None, now_us: int) -> list[Action]:
+    def mark(self, place: Location | None, vehicle_id: int | None, now_us: int) -> list[Action]:
         """Mark a place for one aircraft, or for all, or clear the mark.
 
         Raises

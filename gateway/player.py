@@ -163,7 +163,7 @@ class PlayerDaemon:
 
     def _on_gone(self, client_id: int) -> None:
         for vehicle in self._vehicles:
-            vehicle.forget_client(client_id)
+            vehicle.remove_client(client_id)
 
     def _perform(self, actions: Iterable[RecordedAction]) -> None:
         answers: list[Outgoing] = []

@@ -20,7 +20,7 @@ from gateway.records import (
     Outgoing,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
@@ -108,7 +108,7 @@ def test_a_single_frame_makes_no_aircraft(pipeline: Pipeline) -> None:
 def test_an_aircraft_goes_after_a_long_silence_and_comes_back_as_it_was(pipeline: Pipeline) -> None:
     tracker = Tracker()
     pipeline.feed(tracker.frame(0, LEVEL), 5_000)
-    pipeline.mark(Place(-7.0, 110.0, 0.0), 1, 5_000)
+    pipeline.mark(Location(-7.0, 110.0, 0.0), 1, 5_000)
     aircraft = pipeline.aircraft[1]
     pipeline.poll(GONE_US)
     assert list(pipeline.aircraft) == [1]
@@ -193,7 +193,7 @@ def test_a_mark_shows_distance_and_bearing(pipeline: Pipeline) -> None:
     tracker = Tracker()
     pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
     pipeline.feed(tracker.frame(0, LEVEL), 0)
-    pipeline.mark(Place(-7.7656 + 0.001, 110.3728, math.nan), 1, 1_000)
+    pipeline.mark(Location(-7.7656 + 0.001, 110.3728, math.nan), 1, 1_000)
     actions = [a for t in range(10_000, 3_000_000, 10_000) for a in pipeline.poll(t)]
     actions += pipeline.feed(tracker.frame(3_000_000, LEVEL), 3_000_000)
     message = named(actions, "NAV_CONTROLLER_OUTPUT")[-1]
@@ -207,7 +207,7 @@ def test_marks_that_cannot_be_are_refused(
 ) -> None:
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     with pytest.raises(ValueError, match=r"earth|heard so far: 1|nowhere|91"):
-        pipeline.mark(Place(lat_deg, 0.0, 0.0), vehicle_id, 0)
+        pipeline.mark(Location(lat_deg, 0.0, 0.0), vehicle_id, 0)
 
 
 def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> None:

@@ -81,7 +81,7 @@ async def main():
             elif isinstance(action, ClientInterval):
                 hub.set_interval(action)
     hub = Hub(calm, lambda incoming: perform(vehicle.handle(incoming, clock())), clock,
-              on_gone=vehicle.forget_client)
+              on_gone=vehicle.remove_client)
     hub.start()
     loop = asyncio.get_running_loop()
     def poll():

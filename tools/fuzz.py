@@ -40,7 +40,7 @@ from gateway.recordings.table import TableHeader, TableReader, encode_head, enco
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import Link
@@ -156,7 +156,7 @@ def vehicle(frame: bytes, trusted: bool, now_us: int) -> None:
     """Any message to a vehicle: answers or none."""
     _vehicles().handle(Incoming(7, frame, trusted), now_us)
     _vehicles().poll(now_us)
-    _vehicles().forget_client(7)
+    _vehicles().remove_client(7)
 
 
 JSON: Final = st.recursive(
@@ -171,7 +171,7 @@ KEYS: Final = ("lat_deg", "lon_deg", "alt_amsl_m", "vehicle_id", "name", "text",
 def _control() -> ControlServer:
     server = ControlServer(Path("unused.sock"))
 
-    def mark(place: Place | None, vehicle_id: int | None) -> None:
+    def mark(place: Location | None, vehicle_id: int | None) -> None:
         _vehicles().mark(place, vehicle_id, 0)
 
     def moment(params: To) -> str:

@@ -22,7 +22,7 @@ from gateway.recordings.index import (
 from gateway.recordings.moment import parse_moment
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE
 from gateway.status import RecorderStatus, Snapshot
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 
 
 class Named(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -150,7 +150,7 @@ class AircraftVerbs:
         Marks a place for one aircraft or all, or clears the mark; raises ValueError.
     """
 
-    def __init__(self, mark: Callable[[Place | None, int | None], None]) -> None:
+    def __init__(self, mark: Callable[[Location | None, int | None], None]) -> None:
         self._mark = mark
 
     def register(self, server: ControlServer) -> None:
@@ -161,7 +161,7 @@ class AircraftVerbs:
         place = None
         if params.lat_deg is not None and params.lon_deg is not None:
             alt_amsl_m = math.nan if params.alt_amsl_m is None else params.alt_amsl_m
-            place = Place(params.lat_deg, params.lon_deg, alt_amsl_m)
+            place = Location(params.lat_deg, params.lon_deg, alt_amsl_m)
         elif (params.lat_deg, params.lon_deg) != (None, None):
             raise ControlError("a mark needs both latitude and longitude")
         try:

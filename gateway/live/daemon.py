@@ -60,11 +60,11 @@ from gateway.vehicle.actions import (
     WARNING,
     RecordingRequest,
     Request,
-    SavePlaces,
+    SavePlan,
     SaveSettings,
     StatusText,
 )
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)
@@ -288,7 +288,7 @@ class Daemon:
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
 
-    def _mark(self, place: Place | None, vehicle_id: int | None) -> None:
+    def _mark(self, place: Location | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
 
     def _announce(self, is_trouble: bool, text: str) -> None:
@@ -334,8 +334,8 @@ class Daemon:
             self._recorder.frame(frame)
 
     def _on_gone(self, client_id: int) -> None:
-        self._pipeline.forget_client(client_id)
-        self._budget.forget_client(client_id)
+        self._pipeline.remove_client(client_id)
+        self._budget.remove_client(client_id)
 
     def _send(self, frames: Sequence[Outgoing]) -> None:
         self._hub.send_all([each for each in frames if each.client_id != RECORDED_ONLY])
@@ -399,8 +399,8 @@ class Daemon:
                 self._hub.set_interval(action)
             case SaveSettings():
                 self._save(action)
-            case SavePlaces():
-                self._places.save(action.vehicle_id, action.places)
+            case SavePlan():
+                self._places.save(action.vehicle_id, action.plan)
             case RecordingRequest():
                 (self._recorder.record if action.start else self._recorder.stop)()
             case SettingsChanged():

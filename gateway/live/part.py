@@ -165,7 +165,7 @@ class RecordingBudget:
         elif client_id not in self._trusted:
             self._trusted[client_id] = _Bucket(TRUSTED_BPS, now_us)
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Forget a client that has gone."""
         self._trusted.pop(client_id, None)
 

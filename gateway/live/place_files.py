@@ -16,7 +16,7 @@ from typing import Final
 from gateway.live.worker import begin_worker
 from gateway.output import write_new
 from gateway.reasons import reason_of
-from gateway.vehicle.plan import StoredPlaces, decode_places, encode_places
+from gateway.vehicle.plan import StoredPlan, decode_plan, encode_plan
 
 log = logging.getLogger(__name__)
 
@@ -35,23 +35,23 @@ class PlaceFiles:
         """Why the places of an aircraft could not be loaded, by vehicle id."""
         self._folder = folder
         self._report = report
-        self._pending: dict[int, StoredPlaces] = {}
-        self._failed: dict[int, StoredPlaces] = {}
+        self._pending: dict[int, StoredPlan] = {}
+        self._failed: dict[int, StoredPlan] = {}
         """Places whose last write failed."""
         self._worker = begin_worker("places")
         self._task: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
 
-    def load(self) -> dict[int, StoredPlaces]:
+    def load(self) -> dict[int, StoredPlan]:
         """Read all files that can be read."""
-        found: dict[int, StoredPlaces] = {}
+        found: dict[int, StoredPlan] = {}
         for file in sorted(self._folder.glob("*.places.json")):
             named = NAME.fullmatch(file.name)
             if named is None:
                 continue
             vehicle_id = int(named[1])
             try:
-                found[vehicle_id] = decode_places(file.read_text(encoding="utf-8"))
+                found[vehicle_id] = decode_plan(file.read_text(encoding="utf-8"))
             except (OSError, ValueError) as error:
                 self.broken[vehicle_id] = _broken(file)
                 log.warning(
@@ -63,7 +63,7 @@ class PlaceFiles:
                 )
         return found
 
-    def save(self, vehicle_id: int, places: StoredPlaces) -> None:
+    def save(self, vehicle_id: int, places: StoredPlan) -> None:
         """Store the places of an aircraft; returns at once, only the newest are written."""
         self._pending[vehicle_id] = places
         self._start()
@@ -94,7 +94,7 @@ class PlaceFiles:
             self._retry.cancel()
             self._retry = None
         loop = asyncio.get_running_loop()
-        tried: dict[int, StoredPlaces] = {}
+        tried: dict[int, StoredPlan] = {}
         while left := [item for item in self._pending.items() if tried.get(item[0]) is not item[1]]:
             vehicle_id, places = left[0]
             tried[vehicle_id] = places
@@ -107,7 +107,7 @@ class PlaceFiles:
         if self._pending:
             self._retry = loop.call_later(RETRY_S, self._start)
 
-    def _note_failure(self, vehicle_id: int, places: StoredPlaces, reason: str) -> None:
+    def _note_failure(self, vehicle_id: int, places: StoredPlan, reason: str) -> None:
         if self._failed.get(vehicle_id) is places:
             return
         self._failed[vehicle_id] = places
@@ -115,7 +115,7 @@ class PlaceFiles:
         log.warning("places of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
         self._report(vehicle_id, reason)
 
-    def _note_success(self, vehicle_id: int, places: StoredPlaces) -> None:
+    def _note_success(self, vehicle_id: int, places: StoredPlan) -> None:
         # It stays until it is written, so that a shutdown in between loses nothing.
         if self._pending[vehicle_id] is places:
             del self._pending[vehicle_id]
@@ -123,12 +123,12 @@ class PlaceFiles:
             log.info("places of aircraft %d are kept again", vehicle_id)
             self._report(vehicle_id, None)
 
-    def _write(self, vehicle_id: int, places: StoredPlaces) -> None:
+    def _write(self, vehicle_id: int, places: StoredPlan) -> None:
         file = self._folder / f"{vehicle_id}.places.json"
         if vehicle_id in self.broken and file.exists():
             raise OSError(None, _broken(file))
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_new(file, [encode_places(places).encode()], overwrite=True)
+        write_new(file, [encode_plan(places).encode()], overwrite=True)
 
 
 def _broken(file: Path) -> str:

@@ -1,4 +1,4 @@
-"""The newest signing time stamps in one file, written by a separate thread."""
+"""The newest signing timestamps in one file, written by a separate thread."""
 
 import logging
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ NAME: Final = "signing-stamps.json"
 _Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
 _Stamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
 Kept = Mapping[int, dict[str, dict[str, int]]]
-"""By vehicle id; see `StampBook`."""
+"""By vehicle id; see `SigningTimestamps`."""
 
 
 class StampFile:

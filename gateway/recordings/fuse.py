@@ -516,12 +516,12 @@ class RowFusion:
             cells = block.cells
             held = np.any([has_group(cells, group) for group in (BARO, GPS, RAW, SI)], axis=0)
             cells = cells[held]
-            place_of = np.concatenate([[0], np.cumsum(held)]).tolist()
+            location_of = np.concatenate([[0], np.cumsum(held)]).tolist()
             fused: list[FloatArray] = []
             comments: list[tuple[int, TableComment]] = []
             begin = 0
             for row, comment in block.comments:
-                place = place_of[row]
+                place = location_of[row]
                 if isinstance(comment, TableHeader | FusionState):
                     fused.append(self._fused(cells[begin:place]))
                     begin = place

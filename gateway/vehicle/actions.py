@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import ClientInterval, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.plan import StoredPlan
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -73,11 +73,11 @@ class SaveSettings:
 
 
 @dataclass(frozen=True, slots=True)
-class SavePlaces:
+class SavePlan:
     """Keep missions, mark and home for the next start."""
 
     vehicle_id: int
-    places: StoredPlaces
+    plan: StoredPlan
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +111,7 @@ Action = (
     | ClientInterval
     | SettingsChange
     | SaveSettings
-    | SavePlaces
+    | SavePlan
     | RecordingRequest
     | CalibrationMeasured
 )

@@ -11,6 +11,8 @@ from gateway.records import GpsFix, GpsFixType
 from gateway.settings import Settings, setting
 
 DEGE7: Final = 1e7
+MAX_LAT_DEG: Final = 90.0
+MAX_LON_DEG: Final = 180.0
 
 ABSOLUTE_FRAMES: Final = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 RELATIVE_FRAMES: Final = frozenset(
@@ -27,7 +29,14 @@ GLOBAL_FRAMES: Final = ABSOLUTE_FRAMES | RELATIVE_FRAMES
 
 def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
     """Return whether a latitude and a longitude are valid."""
-    return abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0
+    return abs(lat_deg) <= MAX_LAT_DEG and abs(lon_deg) <= MAX_LON_DEG
+
+
+def describe_location_fault(location: "Location") -> str:
+    """Return what is wrong with the coordinates of a location that is not on earth."""
+    if not abs(location.lat_deg) <= MAX_LAT_DEG:
+        return f"latitude must be between -90 and 90, not {location.lat_deg}"
+    return f"longitude must be between -180 and 180, not {location.lon_deg}"
 
 
 def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
@@ -58,8 +67,8 @@ HomeSource = Literal["none", "gps", "operator"]
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A point on the earth."""
+class Location:
+    """A location on the earth."""
 
     lat_deg: float
     lon_deg: float
@@ -68,9 +77,9 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Home:
-    """The place that heights and distances refer to."""
+    """The location that heights and distances refer to."""
 
-    place: Place
+    location: Location
     set_time_us: int
     source: HomeSource = "gps"
 
@@ -82,7 +91,7 @@ class HomeParameters(Settings, frozen=True):
         HomeSource,
         setting(
             "Who set home: none yet, the GPS, or an operator. Set 2 to keep a home of the GPS as "
-            "the operator's; set 0 to forget home and let the GPS measure it again."
+            "the operator's; set 0 to clear home and let the GPS measure it again."
         ),
     ] = "none"
     lat_deg: Annotated[
@@ -101,13 +110,13 @@ class HomeParameters(Settings, frozen=True):
     ] = 0.0
 
 
-HAS_PLACE = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
+LOCATED_FIXES = frozenset({GpsFixType.FIX_3D, GpsFixType.GNSS_AND_DEAD_RECKONING})
 """Fix types whose latitude, longitude and height all come from satellites."""
 
 
 def is_3d(fix: GpsFix) -> bool:
     """Return whether the receiver reports a three-dimensional fix."""
-    return fix.fix_ok and fix.fix_type in HAS_PLACE
+    return fix.fix_ok and fix.fix_type in LOCATED_FIXES
 
 
 def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
@@ -118,12 +127,12 @@ def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
     return is_3d(fix) and somewhere and accurate
 
 
-def place_of(fix: GpsFix) -> Place:
-    """Take the place out of a fix."""
-    return Place(fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7, fix.alt_amsl_m)
+def location_of(fix: GpsFix) -> Location:
+    """Return the location of a fix."""
+    return Location(fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7, fix.alt_amsl_m)
 
 
-def distance_and_bearing(here: Place, there: Place) -> tuple[float, float]:
+def distance_and_bearing(here: Location, there: Location) -> tuple[float, float]:
     """Measure distance and bearing between two locations.
 
     Returns

@@ -13,7 +13,14 @@ from typing import Any, Final, Literal
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.location import DEGE7, GLOBAL_FRAMES, Place, height_amsl_m, is_on_earth
+from gateway.vehicle.location import (
+    DEGE7,
+    GLOBAL_FRAMES,
+    Location,
+    describe_location_fault,
+    height_amsl_m,
+    is_on_earth,
+)
 
 MISSION: Final[int] = mavlink.MAV_MISSION_TYPE_MISSION
 FENCE: Final[int] = mavlink.MAV_MISSION_TYPE_FENCE
@@ -33,7 +40,7 @@ FENCE_COMMANDS: Final = frozenset(
 )
 RALLY_COMMANDS: Final = frozenset({mavlink.MAV_CMD_NAV_RALLY_POINT})
 
-PLACED_COMMANDS: Final = (
+LOCATED_COMMANDS: Final = (
     frozenset(
         {
             mavlink.MAV_CMD_NAV_WAYPOINT,
@@ -54,7 +61,7 @@ PLACED_COMMANDS: Final = (
     | FENCE_COMMANDS
     | RALLY_COMMANDS
 )
-"""Commands whose parameters 5 to 7 are a place, if their frame is a global one."""
+"""Commands whose parameters 5 to 7 are a location, if their frame is a global one."""
 
 ACCEPTED: Final[int] = mavlink.MAV_MISSION_ACCEPTED
 
@@ -78,13 +85,13 @@ class Item:
     y: int
     z: float
 
-    def place(self, home_alt_m: float) -> Place | None:
+    def location(self, home_alt_m: float) -> Location | None:
         """Return its position, or None; 0, 0 means "here" to autopilots."""
-        placed = self.command in PLACED_COMMANDS and self.frame in GLOBAL_FRAMES
-        if not placed or (self.x, self.y) == (0, 0):
+        located = self.command in LOCATED_COMMANDS and self.frame in GLOBAL_FRAMES
+        if not located or (self.x, self.y) == (0, 0):
             return None
         height = height_amsl_m(self.z, self.frame, home_alt_m)
-        return Place(self.x / DEGE7, self.y / DEGE7, height)
+        return Location(self.x / DEGE7, self.y / DEGE7, height)
 
 
 def read_item(message: Any) -> Item:
@@ -171,7 +178,7 @@ def check_item(item: Item, kind: int) -> int:
     result: int = ACCEPTED
     if item.command not in known:
         result = mavlink.MAV_MISSION_UNSUPPORTED
-    elif item.command in PLACED_COMMANDS:
+    elif item.command in LOCATED_COMMANDS:
         if item.frame not in GLOBAL_FRAMES:
             result = mavlink.MAV_MISSION_UNSUPPORTED_FRAME
         elif not is_on_earth(item.x / DEGE7, 0.0):
@@ -191,13 +198,13 @@ def _integer(value: float) -> int:
 KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally"}
 
 
-class StoredPlaces(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """All places of one vehicle that are kept over a restart."""
+class StoredPlan(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Missions, mark and home of one vehicle, as kept over a restart."""
 
     version: Literal[1] = 1
-    home: Place | None = None
+    home: Location | None = None
     """Where an operator set it; a home that the GPS measured is not kept."""
-    mark: Place | None = None
+    mark: Location | None = None
     mark_of: int | None = None
     """MAV_MISSION_TYPE of the items that the mark follows; None if it was set by itself."""
     current: int = 0
@@ -207,22 +214,22 @@ class StoredPlaces(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     rally: tuple[Item, ...] = ()
 
 
-def encode_places(places: StoredPlaces) -> str:
-    """Encode places as a text that `decode_places` reads back equal."""
-    return json.dumps(msgspec.to_builtins(places), indent=1) + "\n"
+def encode_plan(plan: StoredPlan) -> str:
+    """Encode a plan as a text that `decode_plan` reads back equal."""
+    return json.dumps(msgspec.to_builtins(plan), indent=1) + "\n"
 
 
-def decode_places(text: str) -> StoredPlaces:
-    """Read places.
+def decode_plan(text: str) -> StoredPlan:
+    """Read plan.
 
     Parameters
     ----------
     text : str
-        JSON of `encode_places`.
+        JSON of `encode_plan`.
 
     Returns
     -------
-    StoredPlaces
+    StoredPlan
 
     Raises
     ------
@@ -231,27 +238,27 @@ def decode_places(text: str) -> StoredPlaces:
         what.
     """
     try:
-        places = msgspec.convert(json.loads(text), StoredPlaces)
+        plan = msgspec.convert(json.loads(text), StoredPlan)
     except (msgspec.ValidationError, RecursionError) as error:
         raise ValueError(str(error)) from error
-    fault = next(_faults(places), None)
+    fault = next(_faults(plan), None)
     if fault is not None:
         raise ValueError(fault)
-    return places
+    return plan
 
 
-def _faults(places: StoredPlaces) -> Iterator[str]:
-    for name, place in (("home", places.home), ("mark", places.mark)):
-        if place is not None and not is_on_earth(place.lat_deg, place.lon_deg):
-            yield f"{name}: no place on earth"
-    if places.home is not None and not math.isfinite(places.home.alt_amsl_m):
-        yield "home: its height is no number"
+def _faults(plan: StoredPlan) -> Iterator[str]:
+    for name, location in (("home", plan.home), ("mark", plan.mark)):
+        if location is not None and not is_on_earth(location.lat_deg, location.lon_deg):
+            yield f"{name}: {describe_location_fault(location)}"
+    if plan.home is not None and not math.isfinite(plan.home.alt_amsl_m):
+        yield "home: the height is not a number"
     for kind, name in KINDS.items():
-        items = getattr(places, name)
+        items = getattr(plan, name)
         if len(items) > MAX_ITEMS[kind]:
             yield f"{name}: more than {MAX_ITEMS[kind]} items"
         for number, item in enumerate(items):
             if check_item(item, kind) != ACCEPTED:
                 yield f"{name}: item {number} cannot be stored"
-    if places.current not in range(max(1, len(places.mission))):
-        yield f"current: there is no item {places.current}"
+    if plan.current not in range(max(1, len(plan.mission))):
+        yield f"current: no item {plan.current}"

@@ -153,10 +153,10 @@ class RecordedVehicle:
         due = (self._due_us, self._ftp.next_due_us())
         return min((time_us for time_us in due if time_us is not None), default=None)
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
         self._lists.pop(client_id, None)
-        self._ftp.forget_client(client_id)
+        self._ftp.remove_client(client_id)
 
     def _finish(self, answers: Sequence[Answer]) -> list[RecordedAction]:
         found: list[RecordedAction] = []
@@ -225,15 +225,15 @@ class RecordedVehicle:
 
     def _thin(self, command: Command) -> list[Answer]:
         """Grant a rate up to the recorded one; 0 means the default and -1 none, as in MAVLink."""
-        message_id, wish = whole(command.params[0]), command.params[1]
+        message_id, requested_us = whole(command.params[0]), command.params[1]
         if not self._answers.has_message(message_id):
             return [command.ack(UNSUPPORTED)]
-        kept = message_id != HEARTBEAT or 0 <= wish <= KEEPS_CLIENTS_US
-        if not math.isfinite(wish) or not kept:
+        kept = message_id != HEARTBEAT or 0 <= requested_us <= KEEPS_CLIENTS_US
+        if not math.isfinite(requested_us) or not kept:
             return [command.ack(DENIED)]
-        wish_us = max(round(wish), NONE)
+        interval_us = max(round(requested_us), NONE)
         client_id = command.request.client_id
-        interval = ClientInterval(client_id, self.system_id, message_id, wish_us)
+        interval = ClientInterval(client_id, self.system_id, message_id, interval_us)
         return [command.ack(ACCEPTED), interval]
 
     def _refuse_mode(self, request: Request, _now_us: int) -> list[Answer]:

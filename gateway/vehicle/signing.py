@@ -27,21 +27,21 @@ TICKS_PER_S: Final = 100_000
 RESERVE_TICKS: Final = 5 * TICKS_PER_S
 MAX_KEYS: Final = 16
 MAX_STREAMS: Final = 256
-"""Only holders of the key make streams, so this is never reached by strangers."""
+"""Only holders of the key make streams, so untrusted clients never reach this."""
 
 Stream = tuple[int, int, int]
 """Link, system, component."""
-Stamps = dict[str, dict[str, int]]
-"""By the mark of the key, then by the stream as `link.system.component`."""
+KeptTimestamps = dict[str, dict[str, int]]
+"""By the id of the key, then by the stream as `link.system.component`."""
 
 
-def mark_of(key: bytes) -> str:
+def key_id_of(key: bytes) -> str:
     """Return an identifier of a key that does not reveal it."""
     return hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
 
 
-class StampBook:
-    """The time stamps that one vehicle has accepted.
+class SigningTimestamps:
+    """The timestamps that one vehicle has accepted.
 
     Parameters
     ----------
@@ -51,48 +51,48 @@ class StampBook:
 
     def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
         self._newest = {
-            mark: {_stream(text): stamp for text, stamp in streams.items()}
-            for mark, streams in (kept or {}).items()
+            key_id: {_stream(text): timestamp for text, timestamp in streams.items()}
+            for key_id, streams in (kept or {}).items()
         }
-        self._kept = {mark: dict(streams) for mark, streams in self._newest.items()}
+        self._kept = {key_id: dict(streams) for key_id, streams in self._newest.items()}
         self.is_due = False
         """Whether `to_keep` has something that must be written."""
 
-    def newest(self, mark: str, stream: Stream) -> int | None:
-        """Return the newest stamp of a stream under a key; None if it was never heard."""
-        return self._newest.get(mark, {}).get(stream)
+    def newest(self, key_id: str, stream: Stream) -> int | None:
+        """Return the newest timestamp of a stream under a key; None if it is new."""
+        return self._newest.get(key_id, {}).get(stream)
 
-    def has_room(self, mark: str) -> bool:
+    def has_room(self, key_id: str) -> bool:
         """Return whether one more stream can be followed under a key."""
-        return len(self._newest.get(mark, {})) < MAX_STREAMS
+        return len(self._newest.get(key_id, {})) < MAX_STREAMS
 
-    def note(self, mark: str, stream: Stream, stamp: int) -> None:
-        """Note an accepted stamp."""
-        streams = self._newest.pop(mark, {})
+    def add(self, key_id: str, stream: Stream, timestamp: int) -> None:
+        """Add an accepted timestamp."""
+        streams = self._newest.pop(key_id, {})
         # The key that was used last comes last.
-        self._newest[mark] = streams
-        streams[stream] = stamp
-        for forgotten in list(self._newest)[:-MAX_KEYS]:
-            del self._newest[forgotten]
-            self._kept.pop(forgotten, None)
-        if stamp > self._kept.get(mark, {}).get(stream, -1):
-            self._kept.setdefault(mark, {})[stream] = stamp + RESERVE_TICKS
+        self._newest[key_id] = streams
+        streams[stream] = timestamp
+        for removed in list(self._newest)[:-MAX_KEYS]:
+            del self._newest[removed]
+            self._kept.pop(removed, None)
+        if timestamp > self._kept.get(key_id, {}).get(stream, -1):
+            self._kept.setdefault(key_id, {})[stream] = timestamp + RESERVE_TICKS
             self.is_due = True
 
-    def to_keep(self) -> Stamps:
+    def to_keep(self) -> KeptTimestamps:
         """Return what to write now, so that no frame accepted so far is accepted again."""
         self.is_due = False
         return _texts(self._kept)
 
-    def exact(self) -> Stamps:
-        """Return the stamps without the reserve, for a clean shutdown."""
+    def exact(self) -> KeptTimestamps:
+        """Return the timestamps without the reserve, for a clean shutdown."""
         return _texts(self._newest)
 
 
-def _texts(found: Mapping[str, Mapping[Stream, int]]) -> Stamps:
+def _texts(found: Mapping[str, Mapping[Stream, int]]) -> KeptTimestamps:
     return {
-        mark: {".".join(map(str, stream)): stamp for stream, stamp in streams.items()}
-        for mark, streams in found.items()
+        key_id: {".".join(map(str, stream)): timestamp for stream, timestamp in streams.items()}
+        for key_id, streams in found.items()
     }
 
 
@@ -115,7 +115,7 @@ def key_from_passphrase(passphrase: str) -> bytes:
 
 
 class SigningClock:
-    """The time stamps of one signer.
+    """The timestamps of one signer.
 
     Parameters
     ----------
@@ -126,13 +126,13 @@ class SigningClock:
     def __init__(self, unix_us_at_zero: int) -> None:
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
-    def hear_gps(self, unix_us_at_zero: int) -> None:
+    def set_gps_time(self, unix_us_at_zero: int) -> None:
         """Use GPS time if the machine's differs from it by more than the latency."""
         offset_us = unix_us_at_zero - EPOCH_2015_US
         if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
             self._offset_us = offset_us
 
-    def stamp(self, now_us: int) -> int:
+    def timestamp(self, now_us: int) -> int:
         """Return the time in signing ticks."""
         return max(0, self._offset_us + now_us) // TICK_US
 
@@ -146,17 +146,19 @@ class Verifier:
         32 bytes.
     clock : SigningClock
         Of the gateway.
-    book : StampBook, optional
-        The time stamps accepted so far; updated with every accepted frame.
+    book : SigningTimestamps, optional
+        The timestamps accepted so far; updated with every accepted frame.
     """
 
-    def __init__(self, key: bytes, clock: SigningClock, book: StampBook | None = None) -> None:
+    def __init__(
+        self, key: bytes, clock: SigningClock, book: SigningTimestamps | None = None
+    ) -> None:
         if len(key) != KEY_BYTES:
             raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
         self._key = key
-        self._mark = mark_of(key)
+        self._key_id = key_id_of(key)
         self._clock = clock
-        self._book = StampBook() if book is None else book
+        self._book = SigningTimestamps() if book is None else book
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
         """Return whether a whole frame is signed by a holder of the key, and not a replay.
@@ -177,14 +179,14 @@ class Verifier:
         if not hmac.compare_digest(signature, wanted):
             return False
         stream = (frame[-SIGNATURE_BYTES], frame[5], frame[6])
-        stamp = int.from_bytes(frame[-12:-6], "little")
-        newest = self._book.newest(self._mark, stream)
+        timestamp = int.from_bytes(frame[-12:-6], "little")
+        newest = self._book.newest(self._key_id, stream)
         if newest is None:
-            if stamp < self._clock.stamp(now_us) - NEW_STREAM_TICKS:
+            if timestamp < self._clock.timestamp(now_us) - NEW_STREAM_TICKS:
                 return False
-            if not self._book.has_room(self._mark):
+            if not self._book.has_room(self._key_id):
                 return False
-        elif stamp <= newest:
+        elif timestamp <= newest:
             return False
-        self._book.note(self._mark, stream, stamp)
+        self._book.add(self._key_id, stream, timestamp)
         return True

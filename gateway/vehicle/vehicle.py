@@ -36,8 +36,8 @@ from gateway.vehicle.encoding import (
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
     Encoder,
 )
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import StoredPlan
 from gateway.vehicle.requests import RequestLog, RequestReader
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW, Calibrator
 from gateway.vehicle.services.commands import (
@@ -55,9 +55,9 @@ from gateway.vehicle.services.parameters import (
     Metadata,
     ParameterTable,
 )
-from gateway.vehicle.services.places import PlaceService
+from gateway.vehicle.services.plan_service import PlanService
 from gateway.vehicle.services.queries import QueryService
-from gateway.vehicle.signing import SigningClock, StampBook, Verifier, key_from_passphrase
+from gateway.vehicle.signing import SigningClock, SigningTimestamps, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
@@ -104,8 +104,8 @@ class Vehicle:
         *,
         sections: Mapping[str, Settings] | None = None,
         clock: SigningClock | None = None,
-        stamps: StampBook | None = None,
-        stored: StoredPlaces | None = None,
+        stamps: SigningTimestamps | None = None,
+        stored: StoredPlan | None = None,
     ) -> None:
         """Start without any data.
 
@@ -120,9 +120,9 @@ class Vehicle:
             key under which the change comes back.
         clock : SigningClock, optional
             Civil time; needed for signing only.
-        stamps : StampBook, optional
-            The signing time stamps accepted before.
-        stored : StoredPlaces, optional
+        stamps : SigningTimestamps, optional
+            The signing timestamps accepted before.
+        stored : StoredPlan, optional
             What was kept from an earlier run.
         """
         self.system_id = system_id
@@ -132,26 +132,26 @@ class Vehicle:
         self.health = Health(system_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = clock or SigningClock(0)
-        self._stamps = stamps or StampBook()
+        self._stamps = stamps or SigningTimestamps()
         self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
         self.signing_key: bytes | None = None
         """The key that signs this vehicle's frames as they leave the gateway, if any."""
         self._sign_by(settings.signing_passphrase)
         self._announcements = Announcements(self.health)
-        # Separate, so that strangers cannot use up the quota of other events.
+        # Separate, so that untrusted clients cannot use up the quota of other events.
         self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
-        self.places = PlaceService(
-            system_id, self.telemetry, self._announcements.say, stored or StoredPlaces()
+        self.plan = PlanService(
+            system_id, self.telemetry, self._announcements.say, stored or StoredPlan()
         )
-        self._told_home = self.telemetry.home
-        home = self.places.home.parameters()
+        self._published_home = self.telemetry.home
+        home = self.plan.home.parameters()
         self._make_services({OWN_SECTION: settings, **(sections or {}), HOME_SECTION: home})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
         self._intervals = IntervalService(self.system_id, self.telemetry)
         self._parameters = ParameterService(
-            self.system_id, ParameterTable(sections), {HOME_SECTION: self.places}
+            self.system_id, ParameterTable(sections), {HOME_SECTION: self.plan}
         )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService({**self._metadata.files(), PACKED_PATH: self._parameters.packed})
@@ -179,7 +179,7 @@ class Vehicle:
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         commands.register(FIXED_MAG_CAL_YAW, self._calibrator.start_by_yaw)
-        self.places.register(commands)
+        self.plan.register(commands)
         self._recording.register(commands)
         commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)
         self._route(commands)
@@ -190,7 +190,7 @@ class Vehicle:
             commands,
             self._intervals,
             self._parameters,
-            self.places.missions,
+            self.plan.missions,
             self._ftp,
             QueryService(self._build, self._explain),
             self._control,
@@ -199,7 +199,7 @@ class Vehicle:
         self._timed = (
             self._intervals,
             self._parameters,
-            self.places.missions,
+            self.plan.missions,
             self._ftp,
             self._calibrator,
             self._recording,
@@ -242,7 +242,7 @@ class Vehicle:
             found += self._replies(
                 self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
             )
-        found += self.places.on_fix(fix, now_us)
+        found += self.plan.on_fix(fix, now_us)
         found += self._replies(self._announcements.on_fix(now_us))
         return self._finish(found)
 
@@ -343,14 +343,14 @@ class Vehicle:
         due += [service.next_due_us() for service in self._timed]
         return min(time_us for time_us in due if time_us is not None)
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
-        self._intervals.forget_client(client_id)
-        self._parameters.forget_client(client_id)
-        self.places.missions.forget_client(client_id)
-        self._ftp.forget_client(client_id)
-        self._control.forget_client(client_id)
-        self._recording.forget_client(client_id)
+        self._intervals.remove_client(client_id)
+        self._parameters.remove_client(client_id)
+        self.plan.missions.remove_client(client_id)
+        self._ftp.remove_client(client_id)
+        self._control.remove_client(client_id)
+        self._recording.remove_client(client_id)
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; the armed bit may follow it."""
@@ -381,15 +381,15 @@ class Vehicle:
         status = saved if stored else StatusText(WARNING, f"Settings not saved: {text}")
         return self._finish([ack, *self._replies(self._announcements.say(status, now_us))])
 
-    def put_mark(self, place: Place | None, now_us: int) -> list[Action]:
-        """Mark a place (its height may be NaN), or clear the mark.
+    def put_mark(self, location: Location | None, now_us: int) -> list[Action]:
+        """Mark a location (its height may be NaN), or clear the mark.
 
         Raises
         ------
         ValueError
-            If it is no place on earth.
+            If its coordinates are out of range.
         """
-        return self._finish(self.places.put_mark(place, now_us))
+        return self._finish(self.plan.put_mark(location, now_us))
 
     def say(self, text: StatusText, now_us: int) -> list[Action]:
         """Announce an event of the gateway, such as a recording that stopped."""
@@ -420,7 +420,7 @@ class Vehicle:
         self._sign_by(settings.signing_passphrase)
 
     def _sign_by(self, passphrase: str) -> None:
-        """Sign and check with another key; the old one's stamps are kept against replays."""
+        """Sign and check with another key; the old one's timestamps are kept against replays."""
         key = key_from_passphrase(passphrase) if passphrase else None
         if key == self.signing_key:
             return
@@ -433,9 +433,9 @@ class Vehicle:
     def _finish(self, answers: Iterable[Answer]) -> list[Action]:
         """Encode the messages, and apply the actions that concern the vehicle itself."""
         actions: list[Action] = []
-        if self.telemetry.home is not self._told_home:
-            self._told_home = self.telemetry.home
-            home = self._parameters.take(HOME_SECTION, self.places.home.parameters())
+        if self.telemetry.home is not self._published_home:
+            self._published_home = self.telemetry.home
+            home = self._parameters.take(HOME_SECTION, self.plan.home.parameters())
             answers = [*answers, *home]
         for answer in answers:
             if isinstance(answer, Reply):

@@ -32,7 +32,7 @@ HASH_BYTES: Final = 6
 class Clock(Protocol):
     """Time for signing timestamps."""
 
-    def stamp(self, now_us: int) -> int:
+    def timestamp(self, now_us: int) -> int:
         """Return gateway time in units of 10 us since 2015."""
 
 
@@ -75,7 +75,7 @@ class FrameSigner:
             if frame.sequence == sequence:
                 return frame
             return frame_of(with_sequence(frame.data, sequence))
-        self._newest = max(self._newest + 1, self._clock.stamp(now_us))
+        self._newest = max(self._newest + 1, self._clock.timestamp(now_us))
         return frame_of(sign(frame.data, sequence, key, self._newest))
 
 

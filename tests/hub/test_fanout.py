@@ -94,7 +94,7 @@ def test_clients_get_frames_from_add_to_remove(fanout: Fanout, vehicle: Sender) 
 
 def test_clients_with_the_same_number_share_one_signed_copy(vehicle: Sender) -> None:
     class Clock:
-        def stamp(self, now_us: int) -> int:
+        def timestamp(self, now_us: int) -> int:
             return 1000
 
     signer = FrameSigner(Clock())

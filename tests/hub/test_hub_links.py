@@ -28,7 +28,7 @@ class Gateway:
         self.rig = rig
         self.vehicle = Vehicle(VehicleSettings(), system)
         settings = HubSettings(endpoints=endpoints, ping_interval_s=1.0)
-        self.hub = Hub(settings, self.handle, rig.clock, on_gone=self.vehicle.forget_client)
+        self.hub = Hub(settings, self.handle, rig.clock, on_gone=self.vehicle.remove_client)
         rig.closing.append(self.hub.close)
         self.hub.start()
 

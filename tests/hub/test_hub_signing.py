@@ -35,7 +35,7 @@ class Strict:
 
 
 class Clock:
-    def stamp(self, now_us: int) -> int:
+    def timestamp(self, now_us: int) -> int:
         return STAMP
 
 

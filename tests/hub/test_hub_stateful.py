@@ -114,7 +114,7 @@ class HubMachine(RuleBasedStateMachine):
             self.handle,
             self.rig.clock,
             lambda _: None,
-            on_gone=self.vehicle.forget_client,
+            on_gone=self.vehicle.remove_client,
         )
         self.rig.closing.append(self.hub.close)
         self.hub.start()

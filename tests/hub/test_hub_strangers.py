@@ -77,7 +77,7 @@ class Gateway:
             self.handle,
             self.clock,
             lambda _: None,
-            on_gone=self.vehicle.forget_client,
+            on_gone=self.vehicle.remove_client,
         )
         rig.closing.append(self.hub.close)
         self.hub.start()
@@ -149,5 +149,5 @@ async def test_ten_thousand_unknown_addresses(
     steps = {(b - a) % 256 for a, b in itertools.pairwise(gateway.sequence)}
     assert steps == {1}, "nothing lost, and no gap from what others were answered"
     assert gateway.vehicle.refusals > 500
-    assert gateway.vehicle.places.missions.items[0] == ()
+    assert gateway.vehicle.plan.missions.items[0] == ()
     assert gateway.vehicle.telemetry.settings == VehicleSettings()

@@ -12,7 +12,7 @@ import pytest
 from gateway.live.control_socket import ControlServer
 from gateway.live.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
 from gateway.recordings.index import Recording
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from tests.conftest import ManualClock
 from tests.live.test_player_edge import Played
 from tests.live.test_recorder import Bench
@@ -76,9 +76,9 @@ async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
 
 
 async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
-    marked: list[tuple[Place | None, int | None]] = []
+    marked: list[tuple[Location | None, int | None]] = []
 
-    def mark(place: Place | None, vehicle_id: int | None) -> None:
+    def mark(place: Location | None, vehicle_id: int | None) -> None:
         if vehicle_id == 9:
             raise ValueError("no such aircraft; heard so far: 1")
         marked.append((place, vehicle_id))
@@ -91,7 +91,7 @@ async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None
     assert not (await ask(server, "mark", lat_deg=1.0))["ok"]
     refused = await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=9)
     assert refused["error"] == "no such aircraft; heard so far: 1"
-    assert marked[0] == (Place(-7.5, 110.0, 90.0), None)
+    assert marked[0] == (Location(-7.5, 110.0, 90.0), None)
     assert marked[1][0] is not None
     assert math.isnan(marked[1][0].alt_amsl_m)
     assert marked[1][1] == 3

@@ -172,7 +172,7 @@ async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def note(sent: Outgoing) -> None:
-        message = mavlink.MAVLink(None).decode(bytearray(sent.frame))
+        message = mavlink.MAVLink(None).decode(bytearray(sent.frame.data))
         if message.get_type() == "COMMAND_ACK":
             seen.append((message.result, file.read_text() if file.exists() else ""))
         elif message.get_type() == "STATUSTEXT" and message.text.startswith("Settings"):

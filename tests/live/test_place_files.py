@@ -11,13 +11,13 @@ import pytest
 
 from gateway.live import place_files
 from gateway.live.place_files import PlaceFiles
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import StoredPlan
 
 pytestmark = pytest.mark.io
 
-FIRST = StoredPlaces(mark=Place(1.0, 2.0, 3.0))
-SECOND = StoredPlaces(mark=Place(4.0, 5.0, 6.0))
+FIRST = StoredPlan(mark=Location(1.0, 2.0, 3.0))
+SECOND = StoredPlan(mark=Location(4.0, 5.0, 6.0))
 
 
 class Bench:
@@ -26,11 +26,11 @@ class Bench:
         self.told: list[tuple[int, str | None]] = []
         self.files = PlaceFiles(folder, lambda *told: self.told.append(told))
 
-    async def save(self, vehicle_id: int, places: StoredPlaces) -> None:
+    async def save(self, vehicle_id: int, places: StoredPlan) -> None:
         self.files.save(vehicle_id, places)
         await self.files.settle()
 
-    def read(self) -> dict[int, StoredPlaces]:
+    def read(self) -> dict[int, StoredPlan]:
         return PlaceFiles(self.folder, lambda *_: None).load()
 
 

@@ -44,5 +44,5 @@ def test_one_that_is_trusted_no_longer_is_a_stranger() -> None:
     budget.note(1, 0, trusted=False)
     assert taken(budget, [1], 1) <= STRANGERS_BPS * (BURST_S + 1)
     budget.note(2, 0, trusted=True)
-    budget.forget_client(2)
+    budget.remove_client(2)
     assert not budget.takes(2, 60_000, SECOND_US)

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
 from gateway.vehicle.encoding import Encoder
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle
@@ -59,7 +59,7 @@ def scrambled(record: Any, rng: np.random.Generator) -> Any:
 def test_no_record_stops_the_telemetry(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vehicle = Vehicle(VehicleSettings(home_satellites=4), 1)
-    frames = vehicle.put_mark(Place(47.0, -8.0, math.nan), 0)
+    frames = vehicle.put_mark(Location(47.0, -8.0, math.nan), 0)
     for n in range(400):
         time_us = n * 20_000
 

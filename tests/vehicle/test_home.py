@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import SavePlaces, SettingsChange
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.actions import SavePlan, SettingsChange
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import StoredPlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
@@ -18,7 +18,7 @@ from tests.vehicle.services.test_parameters import set_message, values
 
 NAMES = ("HOME_SOURCE", "HOME_LAT", "HOME_LON", "HOME_ALT")
 NONE, GPS, OPERATOR = 0.0, 1.0, 2.0
-FIELD = Place(47.123_456_7, -8.765_432_1, 520.25)
+FIELD = Location(47.123_456_7, -8.765_432_1, 520.25)
 """Where the fix of the samples is."""
 
 
@@ -36,8 +36,8 @@ def float32(value: float) -> float:
     return struct.unpack("<f", struct.pack("<f", value))[0]
 
 
-def kept(station: GroundStation) -> list[Place | None]:
-    return [save.places.home for save in station.of(SavePlaces)]
+def kept(station: GroundStation) -> list[Location | None]:
+    return [save.plan.home for save in station.of(SavePlan)]
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_the_home_of_the_gps_is_shown_as_parameters(nowhere: GroundStation) -> N
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
     assert set(NAMES) <= {m.param_id for m in nowhere.inbox if m.get_type() == "PARAM_VALUE"}
     assert home(nowhere) == [GPS, *map(float32, (47.123_456_7, -8.765_432_1, 520.25))]
-    assert nowhere.of(SavePlaces) == [], "it is measured anew at every start"
+    assert nowhere.of(SavePlan) == [], "it is measured anew at every start"
 
 
 def test_one_number_moves_home_and_leaves_the_others_exact(station: GroundStation) -> None:
@@ -71,7 +71,7 @@ def test_a_latitude_is_as_fine_as_a_float_can_be(station: GroundStation) -> None
 def test_numbers_sent_back_as_they_were_shown_change_nothing(station: GroundStation) -> None:
     for name, value in zip(NAMES, home(station), strict=True):
         assert told_homes(station.send(set_message(name, value))) == []
-    assert station.vehicle.telemetry.home.place == pytest.approx(FIELD)
+    assert station.vehicle.telemetry.home.location == pytest.approx(FIELD)
     assert home(station)[0] == GPS
 
 
@@ -110,21 +110,21 @@ def test_what_is_no_place_is_refused(station: GroundStation, name: str, value: f
 
 def test_it_is_kept_when_the_parameters_are_stored(station: GroundStation) -> None:
     station.send(set_message("HOME_LAT", 47.5))
-    assert station.of(SavePlaces) == []
+    assert station.of(SavePlan) == []
     station.vehicle.put_mark(None, 0)
     station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 1)
-    assert kept(station)[-1] == pytest.approx(Place(47.5, -8.765_432_1, 520.25))
+    assert kept(station)[-1] == pytest.approx(Location(47.5, -8.765_432_1, 520.25))
 
 
 def test_another_save_does_not_keep_what_was_not_stored(station: GroundStation) -> None:
     station.send(set_message("HOME_LAT", 47.5))
-    station.receive(station.vehicle.put_mark(Place(1.0, 2.0, 3.0), 0))
+    station.receive(station.vehicle.put_mark(Location(1.0, 2.0, 3.0), 0))
     assert kept(station) == [None]
 
 
 def test_a_command_keeps_it_at_once(station: GroundStation) -> None:
     station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
-    assert kept(station) == [pytest.approx(Place(47.5, -8.5, 400.0))]
+    assert kept(station) == [pytest.approx(Location(47.5, -8.5, 400.0))]
 
 
 def test_the_home_of_the_gps_can_be_kept(station: GroundStation) -> None:
@@ -134,7 +134,7 @@ def test_the_home_of_the_gps_can_be_kept(station: GroundStation) -> None:
 
 
 def test_it_is_forgotten_and_measured_anew(clock: ManualClock) -> None:
-    stored = StoredPlaces(home=Place(10.0, 20.0, 30.0))
+    stored = StoredPlan(home=Location(10.0, 20.0, 30.0))
     station = GroundStation(Vehicle(VehicleSettings(), 1, stored=stored), clock)
     assert home(station) == [OPERATOR, 10.0, 20.0, 30.0]
     told = texts(station.vehicle.on_gps(FIX, 0))

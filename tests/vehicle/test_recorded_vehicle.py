@@ -203,6 +203,6 @@ def test_a_list_ends_with_its_client(asking: Asking) -> None:
     request = mavlink.MAVLink_param_request_list_message(SYSTEM, 1)
     frame = bytes(request.pack(asking.mav))
     asking.vehicle.handle(Incoming(CLIENT, frame, trusted=True), 0)
-    asking.vehicle.forget_client(CLIENT)
+    asking.vehicle.remove_client(CLIENT)
     assert asking.vehicle.poll(0) == []
     assert asking.vehicle.next_due_us() is None

@@ -12,7 +12,7 @@ from gateway.vehicle.signing import (
     MAX_STREAMS,
     RESERVE_TICKS,
     SigningClock,
-    StampBook,
+    SigningTimestamps,
     Verifier,
     key_from_passphrase,
 )
@@ -161,14 +161,14 @@ def ping(at_us: int = NOW_UNIX_US, key: bytes = KEY) -> bytes:
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_a_command_cannot_be_sent_again_after_a_restart(orderly: bool) -> None:
-    clock, book = SigningClock(NOW_UNIX_US), StampBook()
+    clock, book = SigningClock(NOW_UNIX_US), SigningTimestamps()
     verifier, kept = Verifier(KEY, clock, book), book.to_keep()
     taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
     for frame in taken:
         assert verifier.accepts(frame, 0)
         if book.is_due:
             kept = book.to_keep()
-    again = StampBook(book.exact() if orderly else kept)
+    again = SigningTimestamps(book.exact() if orderly else kept)
     verifier = Verifier(KEY, SigningClock(NOW_UNIX_US - 86_400_000_000), again)
     assert not any(verifier.accepts(frame, 0) for frame in taken)
     reserve_us = 0 if orderly else RESERVE_TICKS * 10
@@ -176,7 +176,7 @@ def test_a_command_cannot_be_sent_again_after_a_restart(orderly: bool) -> None:
 
 
 def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
-    book = StampBook()
+    book = SigningTimestamps()
     verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), book), 0
     for n in range(600):
         assert verifier.accepts(ping(NOW_UNIX_US + n * 100_000), 0)
@@ -203,14 +203,17 @@ def test_a_recording_of_yesterday_is_old_once_gps_tells_the_day() -> None:
     day_us = 86_400_000_000
     clock = SigningClock(NOW_UNIX_US - day_us)
     assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
-    clock.hear_gps(NOW_UNIX_US)
+    clock.set_gps_time(NOW_UNIX_US)
     assert not Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)
     assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
 
 
 def test_keys_are_bounded_and_the_oldest_goes() -> None:
-    book = StampBook()
+    book = SigningTimestamps()
     for n in range(2 * MAX_KEYS):
-        book.note(f"{n}", (0, 1, 1), n)
+        book.add(f"{n}", (0, 1, 1), n)
     assert list(book.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
-    assert StampBook(book.to_keep()).newest(f"{MAX_KEYS}", (0, 1, 1)) == MAX_KEYS + RESERVE_TICKS
+    assert (
+        SigningTimestamps(book.to_keep()).newest(f"{MAX_KEYS}", (0, 1, 1))
+        == MAX_KEYS + RESERVE_TICKS
+    )

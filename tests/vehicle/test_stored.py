@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import SavePlaces
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import MAX_ITEMS, Item, StoredPlaces, decode_places, encode_places
+from gateway.vehicle.actions import SavePlan
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import MAX_ITEMS, Item, StoredPlan, decode_plan, encode_plan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
@@ -22,9 +22,9 @@ from tests.vehicle.services.test_missions import content, download, item, upload
 NAN = math.nan
 ITEM = Item(3, 16, 1, (0.0, NAN, -math.inf, 0.1), 471_234_567, -87_654_321, 50.5)
 VERTEX = Item(0, 5001, 1, (3.0, 0.0, 0.0, 0.0), 470_000_000, 80_000_000, 0.0)
-FULL = StoredPlaces(
-    home=Place(47.123_456_7, -8.765_432_1, 520.25),
-    mark=Place(1.0, 2.0, NAN),
+FULL = StoredPlan(
+    home=Location(47.123_456_7, -8.765_432_1, 520.25),
+    mark=Location(1.0, 2.0, NAN),
     mark_of=2,
     current=1,
     mission=(ITEM, ITEM),
@@ -33,9 +33,9 @@ FULL = StoredPlaces(
 )
 
 
-@pytest.mark.parametrize("places", [StoredPlaces(), FULL])
-def test_round_trip(places: StoredPlaces) -> None:
-    again = decode_places(encode_places(places))
+@pytest.mark.parametrize("places", [StoredPlan(), FULL])
+def test_round_trip(places: StoredPlan) -> None:
+    again = decode_plan(encode_plan(places))
     # NaN is not equal to itself.
     assert repr(again) == repr(places)
 
@@ -49,8 +49,8 @@ def test_round_trip_of_random_items(seed: int) -> None:
         Item(3, 16, 1, tuple(f[:4]), int(x), int(y), float(f[4]))
         for (x, y), f in zip(numbers, floats.tolist(), strict=True)
     )
-    places = StoredPlaces(mission=items)
-    assert decode_places(encode_places(places)) == places
+    places = StoredPlan(mission=items)
+    assert decode_plan(encode_plan(places)) == places
 
 
 def changed(**values: object) -> str:
@@ -61,14 +61,14 @@ def changed(**values: object) -> str:
     ("text", "why"),
     [
         ("", "Expecting value"),
-        (encode_places(FULL)[:200], "Unterminated"),
+        (encode_plan(FULL)[:200], "Unterminated"),
         ("[1, 2]", "Expected `object`"),
         ("[" * 100_000, "recursion"),
         (changed(version=2), "version"),
         (changed(extra=1), "unknown field `extra`"),
-        (changed(home={"lat_deg": 91.0, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "home: no place"),
-        (changed(home={"lat_deg": 9.0, "lon_deg": 0.0, "alt_amsl_m": NAN}), "home: its height"),
-        (changed(mark={"lat_deg": NAN, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "mark: no place"),
+        (changed(home={"lat_deg": 91.0, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "home: latitude"),
+        (changed(home={"lat_deg": 9.0, "lon_deg": 0.0, "alt_amsl_m": NAN}), "home: the height"),
+        (changed(mark={"lat_deg": NAN, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "mark: latitude"),
         (changed(current=2), "no item 2"),
         (changed(current=-1), "no item -1"),
         (changed(mission=[{"frame": 3}]), "missing required field"),
@@ -78,13 +78,13 @@ def changed(**values: object) -> str:
 )
 def test_a_text_that_nobody_could_have_stored_is_refused(text: str, why: str) -> None:
     with pytest.raises(ValueError, match=why):
-        decode_places(text)
+        decode_plan(text)
 
 
 def restarted(station: GroundStation) -> GroundStation:
     """Begin anew with what was kept last, as it comes out of a file."""
-    text = encode_places(station.of(SavePlaces)[-1].places)
-    vehicle = Vehicle(VehicleSettings(), 1, stored=decode_places(text))
+    text = encode_plan(station.of(SavePlan)[-1].plan)
+    vehicle = Vehicle(VehicleSettings(), 1, stored=decode_plan(text))
     now_us = station.clock.now_us
     vehicle.on_gps(FIX, now_us)
     vehicle.on_state(state_at(now_us), sample_at(now_us), now_us)
@@ -95,7 +95,7 @@ def restarted(station: GroundStation) -> GroundStation:
 def test_items_survive_a_restart(station: GroundStation, kind: int) -> None:
     items = [item(seq, kind) for seq in range(5)]
     upload(station, items, kind)
-    [save] = station.of(SavePlaces)
+    [save] = station.of(SavePlan)
     assert save.vehicle_id == 1
     found = download(restarted(station), kind)
     assert list(map(content, found)) == list(map(content, items))
@@ -105,27 +105,27 @@ def test_nothing_is_kept_of_an_upload_that_is_not_complete(station: GroundStatio
     station.send(mavlink.MAVLink_mission_count_message(1, 1, 5, 0))
     for seq in range(4):
         station.send(item(seq))
-    assert station.of(SavePlaces) == []
+    assert station.of(SavePlan) == []
 
 
 def test_the_current_item_and_its_mark_survive(station: GroundStation) -> None:
     upload(station, [item(seq) for seq in range(5)])
     station.send(mavlink.MAVLink_mission_set_current_message(1, 1, 3))
-    marked = station.vehicle.places.mark.place
+    marked = station.vehicle.plan.mark.location
     after = restarted(station)
     assert after.request(42)[1].seq == 3
-    assert after.vehicle.places.mark.place == marked
+    assert after.vehicle.plan.mark.location == marked
     after.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 0))
-    assert after.vehicle.places.mark.place is None, "it still follows the mission"
-    assert restarted(after).vehicle.places.missions.items[0] == ()
+    assert after.vehicle.plan.mark.location is None, "it still follows the mission"
+    assert restarted(after).vehicle.plan.missions.items[0] == ()
 
 
 def test_a_mark_of_its_own_survives_and_a_cleared_one_does_not(station: GroundStation) -> None:
-    station.receive(station.vehicle.put_mark(Place(47.0, 8.0, NAN), 0))
+    station.receive(station.vehicle.put_mark(Location(47.0, 8.0, NAN), 0))
     after = restarted(station)
-    assert repr(after.vehicle.places.mark.place) == repr(Place(47.0, 8.0, NAN))
+    assert repr(after.vehicle.plan.mark.location) == repr(Location(47.0, 8.0, NAN))
     after.receive(after.vehicle.put_mark(None, 0))
-    assert restarted(after).vehicle.places.mark.place is None
+    assert restarted(after).vehicle.plan.mark.location is None
 
 
 def test_a_home_that_was_set_survives(station: GroundStation, clock: ManualClock) -> None:

@@ -7,8 +7,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
 from gateway.vehicle.actions import INFO
-from gateway.vehicle.location import Place
-from gateway.vehicle.plan import StoredPlaces
+from gateway.vehicle.location import Location
+from gateway.vehicle.plan import StoredPlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock
@@ -178,7 +178,7 @@ def test_home_is_the_first_good_fix() -> None:
 
 def test_a_home_elsewhere_does_not_make_it_fly() -> None:
     """One that was kept of another field, two hundred metres lower."""
-    stored = StoredPlaces(home=Place(46.0, 8.0, 300.0))
+    stored = StoredPlan(home=Location(46.0, 8.0, 300.0))
     vehicle = Vehicle(VehicleSettings(), 1, stored=stored)
     fly(vehicle, 0, 10, vel_n_mps=(0.0, 0.0, 0.0))
     assert vehicle.telemetry.motion.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND

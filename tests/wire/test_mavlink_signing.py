@@ -30,7 +30,7 @@ class Clock:
 
     ticks = STAMP
 
-    def stamp(self, now_us: int) -> int:
+    def timestamp(self, now_us: int) -> int:
         return self.ticks
 
 

@@ -20,7 +20,7 @@ from gateway.recordings.table import REMARK, TableMark
 from gateway.recordings.tlog import TlogRecord, payload_of
 from gateway.records import FusionState, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
-from gateway.vehicle.location import is_good_enough, place_of
+from gateway.vehicle.location import is_good_enough, location_of
 from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
@@ -393,7 +393,7 @@ def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[Ve
                 limits = aircraft.vehicle
                 has_home = is_good_enough(row.gps, limits.home_accuracy_m, limits.home_satellites)
                 if has_home:
-                    place = place_of(row.gps)
+                    place = location_of(row.gps)
                     at = TrackPoint(
                         zero_us + row.gps.time_us, place.lat_deg, place.lon_deg, place.alt_amsl_m
                     )

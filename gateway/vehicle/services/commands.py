@@ -190,7 +190,7 @@ class CommandService:
     def _request_message(self, command: Command, now_us: int) -> Outcome:
         message_id = whole(command.params[0])
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-            return self._tell_interval(command, whole(command.params[1]))
+            return self._report_interval(command, whole(command.params[1]))
         if not self._knows(message_id):
             return UNSUPPORTED, []
         messages = self._build(message_id, now_us)
@@ -211,27 +211,27 @@ class CommandService:
 
     def _set_interval(self, command: Command, _now_us: int) -> Outcome:
         message_id = whole(command.params[0])
-        wish = command.params[1]
-        if not math.isfinite(wish):
+        interval_us = command.params[1]
+        if not math.isfinite(interval_us):
             return DENIED, []
         if not self._knows(message_id):
             return UNSUPPORTED, []
         try:
-            return ACCEPTED, self._intervals.set_interval(command.request, message_id, wish)
+            return ACCEPTED, self._intervals.set_interval(command.request, message_id, interval_us)
         except ValueError:
             return DENIED, []
 
     def _get_interval(self, command: Command, _now_us: int) -> Outcome:
-        return self._tell_interval(command, whole(command.params[0]))
+        return self._report_interval(command, whole(command.params[0]))
 
-    def _tell_interval(self, command: Command, message_id: int) -> Outcome:
+    def _report_interval(self, command: Command, message_id: int) -> Outcome:
         client_id = command.request.client_id
         interval_us = self._intervals.interval_us(client_id, message_id)
         answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
         return ACCEPTED, [command.request.reply(answer)]
 
 
-PATIENCE_US: Final = 10 * US_PER_S
+RECORDER_TIMEOUT_US: Final = 10 * US_PER_S
 MAX_WAITING: Final = 16
 """Ground stations that may wait for the recorder."""
 
@@ -292,8 +292,8 @@ class RecordingService:
         """Return when to give up."""
         return self._due_us
 
-    def forget_client(self, client_id: int) -> None:
-        """Forget the requests of a client that has gone."""
+    def remove_client(self, client_id: int) -> None:
+        """Discard the requests of a client that has gone."""
         self._waiting.pop(client_id, None)
         self._due_us = self._due_us if self._waiting else None
 
@@ -305,7 +305,7 @@ class RecordingService:
         if client_id not in self._waiting and len(self._waiting) >= MAX_WAITING:
             return NOT_NOW, []
         self._waiting[client_id] = command
-        self._due_us = self._due_us or now_us + PATIENCE_US
+        self._due_us = self._due_us or now_us + RECORDER_TIMEOUT_US
         return IN_PROGRESS, order
 
     def _stop(self, _command: Command, _now_us: int) -> Outcome:

@@ -27,7 +27,7 @@ MAX_DATA: Final = PAYLOAD_BYTES - HEADER.size
 MAX_SESSIONS: Final = 255
 MAX_SESSIONS_OF_ONE: Final = 4
 """A client reads one file after the other; its oldest session gives way, and nobody else's."""
-MAX_REMEMBERED: Final = 512
+MAX_ANSWERS: Final = 512
 """Clients whose last answer is kept."""
 BURST: Final = 10
 BURST_INTERVAL_US: Final = 10_000
@@ -140,7 +140,7 @@ class _Session:
 class _Burst:
     request: Request
     packet: Packet
-    """The next packet's sequence and offset, and the client's wish for the size."""
+    """The next packet's sequence and offset, and the size that the client requested."""
 
 
 FileMaker = Callable[[Request, str], bytes]
@@ -179,7 +179,7 @@ class FtpService:
         return False
 
     def refuse(self, _request: Request) -> list[Answer]:
-        """Say nothing."""
+        """Return no answer; never called."""
         return []
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
@@ -195,7 +195,7 @@ class FtpService:
         except _RefusedError as refused:
             answer = _answer(packet, NAK, packet.session, bytes([refused.error]))
         reply = _reply(request, answer)
-        self._remember(request.client_id, packet, reply)
+        self._keep_answer(request.client_id, packet, reply)
         return [reply]
 
     def poll(self, now_us: int) -> list[Answer]:
@@ -212,7 +212,7 @@ class FtpService:
         """Return when `poll` has something to send."""
         return self._due_us if self._bursts else None
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Close the sessions of a client that has gone."""
         self._last.pop(client_id, None)
         for number in [n for n, s in self._sessions.items() if s.client_id == client_id]:
@@ -247,17 +247,17 @@ class FtpService:
         return number, struct.pack("<I", len(content))
 
     def _make_room(self, request: Request) -> None:
-        """Close sessions left open: the client's own, or for a trusted client a stranger's."""
+        """Close a session left open: the client's own, or for a trusted client an untrusted one."""
         own = [n for n, s in self._sessions.items() if s.client_id == request.client_id]
         if len(own) >= MAX_SESSIONS_OF_ONE:
             self._drop(own[0])
         if len(self._sessions) < MAX_SESSIONS:
             return
-        strangers = (n for n, s in self._sessions.items() if not s.may_change)
-        leaver = next(strangers, None) if request.may_change else None
-        if leaver is None:
+        untrusted = (n for n, s in self._sessions.items() if not s.may_change)
+        oldest = next(untrusted, None) if request.may_change else None
+        if oldest is None:
             raise _RefusedError(FtpError.NO_SESSIONS)
-        self._drop(leaver)
+        self._drop(oldest)
 
     def _terminate(self, request: Request, packet: Packet) -> bytes:
         self._session(request, packet)
@@ -266,7 +266,7 @@ class FtpService:
 
     def _reset(self, request: Request, _packet: Packet) -> bytes:
         # One client's reset must not close another's files.
-        self.forget_client(request.client_id)
+        self.remove_client(request.client_id)
         return b""
 
     def _list(self, request: Request, packet: Packet) -> bytes:
@@ -334,8 +334,8 @@ class FtpService:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
         return make(request, query)
 
-    def _remember(self, client_id: int, packet: Packet, reply: Reply) -> None:
-        if client_id not in self._last and len(self._last) >= MAX_REMEMBERED:
+    def _keep_answer(self, client_id: int, packet: Packet, reply: Reply) -> None:
+        if client_id not in self._last and len(self._last) >= MAX_ANSWERS:
             self._last.pop(next(iter(self._last)))
         self._last[client_id] = (packet, reply)
 

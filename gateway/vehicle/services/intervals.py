@@ -20,8 +20,8 @@ MAX_FAST_STREAMS: Final = 64
 MIN_INTERVAL_US: Final = 1000
 MIN_TIMED_INTERVAL_US: Final = 20_000
 """Of messages that no sample carries: faster they would only repeat themselves."""
-MAX_WISHES: Final = 1024
-"""Clients come and go; the oldest wishes are forgotten first."""
+MAX_REQUESTED: Final = 1024
+"""Clients come and go; the oldest requested intervals are discarded first."""
 KEEPS_CLIENTS_US: Final = 1_000_000
 """A client that gets fewer heartbeats loses the vehicle."""
 
@@ -60,7 +60,7 @@ class IntervalService:
     def __init__(self, system_id: int, telemetry: Telemetry) -> None:
         self._system_id = system_id
         self._telemetry = telemetry
-        self._wishes: dict[tuple[int, int], int] = {}
+        self._requested: dict[tuple[int, int], int] = {}
         self._fast: dict[tuple[int, int], Stream] = {}
 
     def changes_state(self, _request: Request) -> bool:
@@ -68,7 +68,7 @@ class IntervalService:
         return False
 
     def refuse(self, _request: Request) -> list[Answer]:
-        """Say nothing."""
+        """Return no answer: the message has none."""
         return []
 
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
@@ -114,19 +114,19 @@ class IntervalService:
         stream = self._telemetry.streams.get(message_id)
         if stream is None:
             raise ValueError("this message is not streamed")
-        wish = round(interval_us)
-        if message_id == HEARTBEAT and wish != DEFAULT:
-            if not 0 < wish <= KEEPS_CLIENTS_US:
-                raise ValueError("a vehicle without heartbeats is lost")
-            wish = DEFAULT
-        if wish < 0:
-            wish = NONE
-        elif wish != DEFAULT:
+        requested_us = round(interval_us)
+        if message_id == HEARTBEAT and requested_us != DEFAULT:
+            if not 0 < requested_us <= KEEPS_CLIENTS_US:
+                raise ValueError("a vehicle without heartbeats disappears from ground stations")
+            requested_us = DEFAULT
+        if requested_us < 0:
+            requested_us = NONE
+        elif requested_us != DEFAULT:
             carried = message_id in CARRIED_MESSAGES
-            wish = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, wish)
-        if _is_faster(wish, stream.interval_us) and not request.may_change:
+            requested_us = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, requested_us)
+        if _is_faster(requested_us, stream.interval_us) and not request.may_change:
             raise ValueError("more than the settings' rate is not for every client")
-        return self._take(request.client_id, message_id, wish)
+        return self._take(request.client_id, message_id, requested_us)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
         """Return how often a client gets a message, as in MESSAGE_INTERVAL.
@@ -139,11 +139,11 @@ class IntervalService:
         stream = self._telemetry.streams.get(message_id)
         if stream is None:
             return DEFAULT
-        return self._wishes.get((client_id, message_id), stream.interval_us)
+        return self._requested.get((client_id, message_id), stream.interval_us)
 
-    def forget_client(self, client_id: int) -> None:
-        """Forget the rates of a client that has gone."""
-        for table in (self._wishes, self._fast):
+    def remove_client(self, client_id: int) -> None:
+        """Discard the rates of a client that has gone."""
+        for table in (self._requested, self._fast):
             for key in [key for key in table if key[0] == client_id]:
                 del table[key]
 
@@ -163,19 +163,19 @@ class IntervalService:
         due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in CARRIED_MESSAGES]
         return min(due, default=None)
 
-    def _take(self, client_id: int, message_id: int, wish: int) -> list[Answer]:
+    def _take(self, client_id: int, message_id: int, requested_us: int) -> list[Answer]:
         key = (client_id, message_id)
         self._fast.pop(key, None)
-        self._wishes.pop(key, None)
+        self._requested.pop(key, None)
         common_us = self._telemetry.streams[message_id].interval_us
-        if wish != DEFAULT:
-            if len(self._wishes) >= MAX_WISHES:
-                self._wishes.pop(next(iter(self._wishes)))
-            self._wishes[key] = wish
-        if _is_faster(wish, common_us) and len(self._fast) < MAX_FAST_STREAMS:
-            self._fast[key] = Stream(wish)
-            wish = NONE
-        return [ClientInterval(client_id, self._system_id, message_id, wish)]
+        if requested_us != DEFAULT:
+            if len(self._requested) >= MAX_REQUESTED:
+                self._requested.pop(next(iter(self._requested)))
+            self._requested[key] = requested_us
+        if _is_faster(requested_us, common_us) and len(self._fast) < MAX_FAST_STREAMS:
+            self._fast[key] = Stream(requested_us)
+            requested_us = NONE
+        return [ClientInterval(client_id, self._system_id, message_id, requested_us)]
 
     def _due(self, wanted: Container[int], time_us: int, ask: Any) -> list[Answer]:
         found: list[Answer] = []
@@ -187,5 +187,5 @@ class IntervalService:
         return found
 
 
-def _is_faster(wish_us: int, common_us: int) -> bool:
-    return wish_us > 0 and (common_us == OFF or wish_us < common_us)
+def _is_faster(requested_us: int, common_us: int) -> bool:
+    return requested_us > 0 and (common_us == OFF or requested_us < common_us)

@@ -180,7 +180,7 @@ class MissionService:
         done = self._finished
         return done if done is not None and done.checks else self._upload
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Give up an upload whose client has gone."""
         for upload in (self._upload, self._finished):
             if upload is not None and upload.request.client_id == client_id:

@@ -165,7 +165,7 @@ class OperatorControl:
         """Return when `poll` has something to send."""
         return self._due_us if self.exclusive else None
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Release the control of a station whose link has closed."""
         if self._operator is not None and self._operator.client_id == client_id:
             self._operator = None

@@ -132,7 +132,7 @@ class ParameterService:
         """Return when `poll` has something to send."""
         return self._due_us if self._lists else None
 
-    def forget_client(self, client_id: int) -> None:
+    def remove_client(self, client_id: int) -> None:
         """Stop the list and the changes for a client that has gone."""
         self._lists.pop(client_id, None)
         self._listeners.pop(client_id, None)

@@ -194,7 +194,7 @@ UNCALIBRATED_SENSORS: Final = (
 UNCALIBRATED: Final = sum(int(flag) for flag, _ in UNCALIBRATED_SENSORS)
 
 LATENCY_SETTLED_US: Final = 5_000_000
-"""A latency that has not moved for so long is the one that the motion shows."""
+"""A latency that has not changed for so long has converged."""
 RESTART_REPORTS: Final = 10
 """Reports of the link, one a second, in which restarts of a node are counted."""
 MANY_RESTARTS: Final = 3
@@ -228,7 +228,7 @@ class Announcements:
         return found
 
     def on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
-        """Announce sensors that were never calibrated; of the compass, once it tells a field."""
+        """Announce sensors that were never calibrated; the compass once it has measured a field."""
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if sample.mag_b_ut is None:
             changed &= ~ImuFlags.MAG_UNCALIBRATED
@@ -252,9 +252,9 @@ class Announcements:
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
-        """Announce once that fixes come later or sooner than is set, when it is known by how much.
+        """Announce once that the estimated latency of fixes differs from the setting.
 
-        The latency in use moves slowly to what the motion shows, and stands where fixes are lost.
+        The latency in use approaches the estimate slowly, and stays constant while fixes are lost.
         """
         if used_s != self._latency_s:
             self._latency_s, self._latency_since_us = used_s, now_us

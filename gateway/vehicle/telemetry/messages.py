@@ -24,7 +24,7 @@ from gateway.records import (
 from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
 from gateway.vehicle import encoding
 from gateway.vehicle.identity import CUSTOM_MODES
-from gateway.vehicle.location import Home, Place, distance_and_bearing, is_3d
+from gateway.vehicle.location import Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
@@ -198,14 +198,14 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
     )
 
 
-def local_position_ned(state: NavState, origin: Place) -> Any:
+def local_position_ned(state: NavState, origin: Location) -> Any:
     """Encode position and velocity in the local frame; for states that have a position."""
     return mavlink.MAVLink_local_position_ned_message(
         boot_ms(state.time_us), *local_position_m(state, origin), *state.vel_n_mps
     )
 
 
-def local_position_m(state: NavState, origin: Place) -> Vec3:
+def local_position_m(state: NavState, origin: Location) -> Vec3:
     """Project a position onto the plane that touches the ellipsoid at the origin.
 
     The projection is azimuthal equidistant, as autopilots use: distance and bearing from the origin
@@ -216,13 +216,13 @@ def local_position_m(state: NavState, origin: Place) -> Vec3:
     tuple of 3 floats
         North, east and down in metres.
     """
-    here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+    here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
     distance_m, bearing_rad = distance_and_bearing(origin, here)
     north_m, east_m = distance_m * math.cos(bearing_rad), distance_m * math.sin(bearing_rad)
     return (north_m, east_m, origin.alt_amsl_m - state.alt_amsl_m)
 
 
-def odometry(state: NavState, origin: Place) -> Any:
+def odometry(state: NavState, origin: Location) -> Any:
     """Encode pose in the local frame and velocity in the body frame, with their variances.
 
     The state has no correlations: these elements of the covariances are 0. The variances of the
@@ -280,7 +280,7 @@ def _body_velocity_variances(state: NavState) -> Vec3:
     return (x, y, z)
 
 
-def altitude(state: NavState, baro: BaroSample | None, home_alt_m: float, origin: Place) -> Any:
+def altitude(state: NavState, baro: BaroSample | None, home_alt_m: float, origin: Location) -> Any:
     """Encode the altitudes; the terrain and the clearance below, which are unknown, are not."""
     return mavlink.MAVLink_altitude_message(
         state.time_us,
@@ -323,7 +323,7 @@ def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
     return mavlink.MAVLink_raw_imu_message(sample.time_us, *values, 0, _temperature_cdegc(sample))
 
 
-def gps_global_origin(origin: Place, time_us: int) -> Any:
+def gps_global_origin(origin: Location, time_us: int) -> Any:
     """Encode the origin of the local frame."""
     return mavlink.MAVLink_gps_global_origin_message(
         encoding.int32(origin.lat_deg * DEGE7),
@@ -425,9 +425,9 @@ def estimator_status(state: NavState) -> Any:
 def home_position(home: Home) -> Any:
     """Encode home; its local position, the slope and the approach are not known."""
     return mavlink.MAVLink_home_position_message(
-        encoding.int32(home.place.lat_deg * DEGE7),
-        encoding.int32(home.place.lon_deg * DEGE7),
-        encoding.int32(home.place.alt_amsl_m * MM),
+        encoding.int32(home.location.lat_deg * DEGE7),
+        encoding.int32(home.location.lon_deg * DEGE7),
+        encoding.int32(home.location.alt_amsl_m * MM),
         0.0,
         0.0,
         0.0,

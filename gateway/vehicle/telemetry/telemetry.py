@@ -3,7 +3,7 @@
 Every message has one builder, which works from the newest records; the streams and the answer to
 a request for a single message share it.
 
-The landed state is judged from the motion alone:
+The landed state depends on the motion alone:
 
 | state     | becomes   | when                            |
 | --------- | --------- | ------------------------------- |
@@ -37,7 +37,7 @@ from gateway.records import (
 )
 from gateway.units import US_PER_S
 from gateway.vehicle.identity import AUTOPILOTS, CUSTOM_MODES
-from gateway.vehicle.location import Home, Place, is_good_enough, place_of
+from gateway.vehicle.location import Home, Location, is_good_enough, location_of
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.messages import high_latency2
@@ -68,7 +68,7 @@ class Motion:
         self.takeoff_speed_mps = takeoff_speed_mps
         self.takeoff_height_m = takeoff_height_m
         self.landed_state: int = UNDEFINED
-        self._leaning = UNDEFINED
+        self._candidate = UNDEFINED
         self._since_us = 0
 
     def update(self, state: NavState, ground_alt_m: float) -> None:
@@ -81,16 +81,16 @@ class Motion:
         ground_alt_m : float
             Height of the ground above mean sea level, NaN while it is not known.
         """
-        leaning = self._lean(state, ground_alt_m)
-        if leaning != self._leaning:
-            self._leaning, self._since_us = leaning, state.time_us
-        if leaning in (UNDEFINED, self.landed_state):
+        candidate = self._candidate_of(state, ground_alt_m)
+        if candidate != self._candidate:
+            self._candidate, self._since_us = candidate, state.time_us
+        if candidate in (UNDEFINED, self.landed_state):
             return
         hold_us = LANDING_US if self.landed_state == IN_AIR else HOLD_US
         if state.time_us - self._since_us >= hold_us:
-            self.landed_state = leaning
+            self.landed_state = candidate
 
-    def _lean(self, state: NavState, ground_alt_m: float) -> int:
+    def _candidate_of(self, state: NavState, ground_alt_m: float) -> int:
         if not state.flags & NavFlags.VELOCITY_VALID:
             return UNDEFINED
         north, east, _ = state.vel_n_mps
@@ -294,7 +294,7 @@ class Telemetry:
         if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
             self._ground_alt_m = fix.alt_amsl_m
             if self.home is None:
-                found += self.set_home(Home(place_of(fix), fix.time_us))
+                found += self.set_home(Home(location_of(fix), fix.time_us))
         return found
 
     def on_node_status(self, status: NodeStatus) -> list[Any]:
@@ -310,10 +310,10 @@ class Telemetry:
         """Set home, and return HOME_POSITION at once."""
         self.home = home
         self._origin = self._origin or home
-        self._reference_alt_m = home.place.alt_amsl_m
+        self._reference_alt_m = home.location.alt_amsl_m
         return [messages.home_position(home)]
 
-    def forget_home(self) -> None:
+    def clear_home(self) -> None:
         """Let the next good fix set home; heights stay relative to the old one until then."""
         self.home = None
 
@@ -362,21 +362,21 @@ class Telemetry:
     def _of_sample(self, build: Callable[[ImuSample, Vec3], Any]) -> Builder:
         return lambda _: None if self._sample is None else build(self._sample, self._mag_b_ut)
 
-    def _of_origin(self, build: Callable[[NavState, Place], Any]) -> Builder:
+    def _of_origin(self, build: Callable[[NavState, Location], Any]) -> Builder:
         def builder(_now_us: int) -> Any:
             state, origin = self.state, self._origin
             if state is None or origin is None or not messages.has_position(state):
                 return None
-            return build(state, origin.place)
+            return build(state, origin.location)
 
         return builder
 
-    def _altitude(self, state: NavState, origin: Place) -> Any:
+    def _altitude(self, state: NavState, origin: Location) -> Any:
         return messages.altitude(state, self._baro, self._reference_alt_m, origin)
 
     def _global_origin(self, _now_us: int) -> Any:
         origin = self._origin
-        return origin and messages.gps_global_origin(origin.place, origin.set_time_us)
+        return origin and messages.gps_global_origin(origin.location, origin.set_time_us)
 
     def _global_position(self, _now_us: int) -> Any:
         if self.state is None or not messages.has_position(self.state):

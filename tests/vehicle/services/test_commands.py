@@ -3,7 +3,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.location import Place
+from gateway.vehicle.location import Location
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation, kinds
@@ -36,7 +36,7 @@ def test_home_is_set_to_a_place_and_sent_to_all(station: GroundStation) -> None:
     assert (found[1].latitude, found[1].altitude) == (475_000_000, 400_000)
     [_, position] = station.request(33)
     assert position.relative_alt == pytest.approx(123_456, abs=1)
-    assert station.vehicle.places.mark.place == pytest.approx(Place(47.5, -8.5, 400.0))
+    assert station.vehicle.plan.mark.location == pytest.approx(Location(47.5, -8.5, 400.0))
 
 
 def test_home_by_integers_relative_to_the_old_one(station: GroundStation) -> None:
@@ -116,18 +116,18 @@ def test_odd_parameters_do_no_harm(station: GroundStation, number: int, bad: flo
 def test_a_mark_that_is_nowhere_is_a_fault_of_the_caller(
     vehicle: Vehicle, place: tuple[float, float]
 ) -> None:
-    with pytest.raises(ValueError, match="no place on earth"):
-        vehicle.put_mark(Place(*place, 0.0), 0)
+    with pytest.raises(ValueError, match="must be between"):
+        vehicle.put_mark(Location(*place, 0.0), 0)
 
 
 def test_a_mark_on_the_other_side_of_the_earth(station: GroundStation) -> None:
     state = station.vehicle.telemetry.state
-    opposite = Place(-state.lat_deg, state.lon_deg + 180.0, 0.0)
+    opposite = Location(-state.lat_deg, state.lon_deg + 180.0, 0.0)
     station.vehicle.put_mark(opposite, 0)
     assert results(station.request(62)) in ([ACCEPTED], [NOT_NOW])
 
 
 def test_the_mark_of_the_command_line(station: GroundStation) -> None:
-    found = station.receive(station.vehicle.put_mark(Place(47.0, 8.0, math.nan), 0))
+    found = station.receive(station.vehicle.put_mark(Location(47.0, 8.0, math.nan), 0))
     assert [m.text for m in found] == ["Marked 47.000000, 8.000000"]
     assert results(station.request(62)) == [ACCEPTED]

@@ -94,7 +94,7 @@ def test_messages_that_no_sample_carries_are_bounded(station: GroundStation) -> 
 
 def test_a_client_that_goes_takes_its_wishes_along(station: GroundStation) -> None:
     station.command(SET, QUATERNION, 10_000)
-    station.vehicle.forget_client(7)
+    station.vehicle.remove_client(7)
     assert fly(station, 2.0)["ATTITUDE_QUATERNION"] == pytest.approx(100, abs=2)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.location import Place, distance_and_bearing
+from gateway.vehicle.location import Location, distance_and_bearing
 from gateway.vehicle.plan import MAX_ITEMS
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.samples import STATE
@@ -444,7 +444,7 @@ class TestMark:
 
     def test_the_other_end_of_the_earth_has_a_distance_too(self) -> None:
         """From Karney's article, where Vincenty's iteration does not converge."""
-        way = distance_and_bearing(Place(0.0, 0.0, 0.0), Place(0.5, 179.7, 0.0))
+        way = distance_and_bearing(Location(0.0, 0.0, 0.0), Location(0.5, 179.7, 0.0))
         assert way == pytest.approx((19_944_127.421, math.radians(15.556883)), abs=1e-3)
 
     @pytest.mark.parametrize(

@@ -113,7 +113,7 @@ def test_control_ends_with_the_link_of_the_station(
 ) -> None:
     control(first)
     if how == "gone":
-        first.vehicle.forget_client(first.client_id)
+        first.vehicle.remove_client(first.client_id)
     else:
         second.wait(33.0)
         assert "System 255 lost control: timeout" in [

@@ -129,7 +129,7 @@ def test_change_is_only_recorded_while_no_client_has_requested_parameters(
 
 def test_no_change_is_sent_to_a_client_that_has_gone(station: GroundStation) -> None:
     station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"TUNING_ORDER", -1))
-    station.vehicle.forget_client(station.client_id)
+    station.vehicle.remove_client(station.client_id)
     changed = VehicleSettings(takeoff_speed_mps=7.0)
     assert station.receive(station.vehicle.take_settings("vehicle", changed)) == []
 

@@ -5,7 +5,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.actions import RecordingRequest
-from gateway.vehicle.services.commands import MAX_WAITING, PATIENCE_US
+from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from tests.vehicle.ground_station import GroundStation
 
 ACCEPTED, NOT_NOW, FAILED, IN_PROGRESS = 0, 1, 4, 5
@@ -48,7 +48,7 @@ def test_trouble_that_nobody_asked_about_is_the_recorders_to_tell(station: Groun
 
 def test_a_disk_that_never_answers(station: GroundStation) -> None:
     station.command(START)
-    assert results(station.wait(PATIENCE_US / 1e6 - 0.001)) == []
+    assert results(station.wait(RECORDER_TIMEOUT_US / 1e6 - 0.001)) == []
     found = station.wait(0.002)
     assert results(found) == [(START, FAILED)]
     assert texts(found) == ["Cannot record: no answer from the disk"]
@@ -81,7 +81,7 @@ def test_each_station_gets_its_own_answer(station: GroundStation) -> None:
     ]
     found = [results(each.command(START)) for each in stations]
     assert found == [[(START, IN_PROGRESS)]] * MAX_WAITING + [[(START, NOT_NOW)]]
-    station.vehicle.forget_client(100)
+    station.vehicle.remove_client(100)
     actions = station.vehicle.on_recorder("", station.clock.now_us, recording=True)
     assert [results(each.receive(actions)) for each in stations[:3]] == [
         [],

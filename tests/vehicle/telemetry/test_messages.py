@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.geometry.quaternion import from_euler
 from gateway.records import GpsFixType, NavFlags
 from gateway.vehicle.encoding import Encoder
-from gateway.vehicle.location import Home, Place
+from gateway.vehicle.location import Home, Location
 from gateway.vehicle.telemetry import messages
 from tests.vehicle.samples import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
 
@@ -151,7 +151,7 @@ def test_fix_types(fix_type: GpsFixType, fix_ok: bool, expected: int) -> None:
     assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
 
 
-ORIGIN = Place(47.123_456_7, -8.765_432_1 - 0.001, 500.0)
+ORIGIN = Location(47.123_456_7, -8.765_432_1 - 0.001, 500.0)
 
 
 def test_local_position_is_north_east_down_of_the_origin() -> None:
@@ -255,7 +255,7 @@ def test_estimator_status_of_nothing() -> None:
 
 
 def test_home_position() -> None:
-    home = Home(Place(47.5, -8.25, 432.1), 7_000_000)
+    home = Home(Location(47.5, -8.25, 432.1), 7_000_000)
     found = through_the_wire(messages.home_position(home))
     assert (found.latitude, found.longitude, found.altitude) == (475_000_000, -82_500_000, 432_100)
     assert (found.x, found.y, found.z) == (0.0, 0.0, 0.0)

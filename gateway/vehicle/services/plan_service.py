@@ -15,19 +15,20 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import NAN, GpsFix, NavState
 from gateway.settings import Settings
 from gateway.vehicle import encoding
-from gateway.vehicle.actions import INFO, Answer, Reply, SavePlaces, StatusText
+from gateway.vehicle.actions import INFO, Answer, Reply, SavePlan, StatusText
 from gateway.vehicle.location import (
     GLOBAL_FRAMES,
     Home,
     HomeParameters,
-    Place,
+    Location,
+    describe_location_fault,
     distance_and_bearing,
     height_amsl_m,
     is_3d,
     is_on_earth,
-    place_of,
+    location_of,
 )
-from gateway.vehicle.plan import FENCE, KINDS, MISSION, RALLY, Item, StoredPlaces
+from gateway.vehicle.plan import FENCE, KINDS, MISSION, RALLY, Item, StoredPlan
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -46,24 +47,24 @@ class Mark:
     """The marked location of one vehicle."""
 
     def __init__(self) -> None:
-        self.place: Place | None = None
+        self.location: Location | None = None
         self.of: int | None = None
         """Kind of the stored items that it follows; None if it was put by itself."""
 
-    def put(self, place: Place | None) -> None:
-        """Mark a place, or none.
+    def put(self, location: Location | None) -> None:
+        """Mark a location, or none.
 
         Raises
         ------
         ValueError
-            If it is no place on earth; its height may be NaN.
+            If its coordinates are out of range; its height may be NaN.
         """
-        if place is not None and not is_on_earth(place.lat_deg, place.lon_deg):
-            raise ValueError(f"no place on earth: {place.lat_deg}, {place.lon_deg}")
-        self.place, self.of = place, None
+        if location is not None and not is_on_earth(location.lat_deg, location.lon_deg):
+            raise ValueError(describe_location_fault(location))
+        self.location, self.of = location, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
-        """Mark the first place among stored items; without one, clear a mark that they had set.
+        """Mark the first location among stored items; without one, clear a mark that they had set.
 
         Parameters
         ----------
@@ -74,10 +75,10 @@ class Mark:
         home_alt_m : float
             Height of home above mean sea level, NaN while there is none.
         """
-        places = (item.place(home_alt_m) for item in items)
-        place = next((place for place in places if place is not None), None)
-        if place is not None:
-            self.place, self.of = place, kind
+        locations = (item.location(home_alt_m) for item in items)
+        location = next((location for location in locations if location is not None), None)
+        if location is not None:
+            self.location, self.of = location, kind
         elif self.of == kind:
             self.put(None)
 
@@ -95,10 +96,10 @@ class Mark:
             Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
             None without a mark or a position.
         """
-        if self.place is None or not is_on_earth(state.lat_deg, state.lon_deg):
+        if self.location is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
-        here = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        return distance_and_bearing(here, self.place)
+        here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        return distance_and_bearing(here, self.location)
 
     def nav_controller_output(self, state: NavState | None) -> Any:
         """Encode distance and bearing to the mark; None without a mark or a position.
@@ -108,7 +109,7 @@ class Mark:
         is 0, since none is desired; clients print it as an integer, so NaN would fail.
         """
         way = None if state is None else self.way(state)
-        if state is None or self.place is None or way is None:
+        if state is None or self.location is None or way is None:
             return None
         distance_m, bearing_rad = way
         bearing_deg = (encoding.compass_deg(bearing_rad) + 180) % 360 - 180
@@ -118,18 +119,18 @@ class Mark:
             nav_bearing=bearing_deg,
             target_bearing=bearing_deg,
             wp_dist=encoding.uint16(distance_m, unknown=0),
-            alt_error=self.place.alt_amsl_m - state.alt_amsl_m,
+            alt_error=self.location.alt_amsl_m - state.alt_amsl_m,
             aspd_error=0.0,
             xtrack_error=NAN,
         )
 
 
 NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
-"""The parameters' keys, and the parts of a place that they are."""
+"""Parameters of home, and the fields of `Location` that they set."""
 
 
 class HomeService:
-    """Set and forget home, and decide which home is kept over a restart.
+    """Set and clear home, and decide which home is kept over a restart.
 
     A home that the GPS measured is measured again at every start, which may be at another field;
     one that an operator set is kept. A command keeps it at once, a parameter when the parameters
@@ -137,7 +138,7 @@ class HomeService:
     """
 
     def __init__(self, telemetry: Telemetry) -> None:
-        self.kept: Place | None = None
+        self.kept: Location | None = None
         self._telemetry = telemetry
         self._entered: set[str] = set()
         """Numbers that were set while there was no home."""
@@ -147,27 +148,27 @@ class HomeService:
         """The present home."""
         return self._telemetry.home
 
-    def put(self, place: Place, now_us: int) -> list[Answer]:
+    def put(self, location: Location, now_us: int) -> list[Answer]:
         """Set home for an operator, and send HOME_POSITION."""
         self._entered.clear()
-        return [Reply(m) for m in self._telemetry.set_home(Home(place, now_us, "operator"))]
+        return [Reply(m) for m in self._telemetry.set_home(Home(location, now_us, "operator"))]
 
-    def restore(self, place: Place) -> None:
+    def restore(self, location: Location) -> None:
         """Start with the home that was kept."""
-        self.kept = place
-        self._telemetry.set_home(Home(place, 0, "operator"))
+        self.kept = location
+        self._telemetry.set_home(Home(location, 0, "operator"))
 
     def keep(self) -> None:
         """Keep the present home over a restart if an operator set it; else keep none."""
         home = self.home
-        self.kept = home.place if home is not None and home.source == "operator" else None
+        self.kept = home.location if home is not None and home.source == "operator" else None
 
     def parameters(self) -> HomeParameters:
         """Return home as parameters."""
         home = self.home
         if home is None:
             return HomeParameters()
-        numbers = {key: getattr(home.place, part) for key, part in NUMBERS.items()}
+        numbers = {key: getattr(home.location, part) for key, part in NUMBERS.items()}
         return HomeParameters(source=home.source, **numbers)
 
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
@@ -196,25 +197,25 @@ class HomeService:
             return self._change_source(value, now_us)
         part, home = NUMBERS[key], self.home
         if home is not None:
-            if _same(value, getattr(home.place, part)):
+            if _same(value, getattr(home.location, part)):
                 # A parameter is less precise than home; a list that is written back must not round
                 # it.
                 return []
-            return self.put(replace(home.place, **{part: value}), now_us)
+            return self.put(replace(home.location, **{part: value}), now_us)
         self._entered.add(key)
         if self._entered < set(NUMBERS):
             return []
-        return self.put(Place(*(getattr(settings, each) for each in NUMBERS)), now_us)
+        return self.put(Location(*(getattr(settings, each) for each in NUMBERS)), now_us)
 
     def _change_source(self, source: str, now_us: int) -> list[Answer]:
         home = self.home
         if source == "none":
             self._entered.clear()
-            self._telemetry.forget_home()
+            self._telemetry.clear_home()
             return []
         if home is None or (source, home.source) == ("gps", "operator"):
             raise ValueError("there is no such home")
-        return [] if source == home.source else self.put(home.place, now_us)
+        return [] if source == home.source else self.put(home.location, now_us)
 
 
 def _same(a: float, b: float) -> bool:
@@ -227,7 +228,7 @@ USE_CURRENT: Final = 1
 """First parameter of MAV_CMD_DO_SET_HOME."""
 
 
-class PlaceService:
+class PlanService:
     """Set home, set and clear the mark, and store them and the missions.
 
     Parameters
@@ -238,20 +239,18 @@ class PlaceService:
         Knows where the vehicle is, and sends home and the way to the mark.
     say : callable
         Announces an event to all.
-    stored : StoredPlaces
-        The places kept from the last run.
+    stored : StoredPlan
+        The plan kept from the last run.
     """
 
-    def __init__(
-        self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlaces
-    ) -> None:
+    def __init__(self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlan) -> None:
         self._vehicle_id = vehicle_id
         self.mark = Mark()
-        self.mark.place, self.mark.of = stored.mark, stored.mark_of
+        self.mark.location, self.mark.of = stored.mark, stored.mark_of
         self.home = HomeService(telemetry)
         if stored.home is not None:
             self.home.restore(stored.home)
-        self._home_untold = stored.home is not None
+        self._announces_home = stored.home is not None
         self.missions = MissionService(self._on_items, self._explain)
         self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
         self.missions.current = stored.current
@@ -276,19 +275,19 @@ class PlaceService:
     def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
         """Announce once how far a kept home is: it may be that of another field."""
         home = self.home.kept
-        if home is None or not self._home_untold or not is_3d(fix):
+        if home is None or not self._announces_home or not is_3d(fix):
             return []
-        self._home_untold = False
-        distance_m, _ = distance_and_bearing(place_of(fix), home)
+        self._announces_home = False
+        distance_m, _ = distance_and_bearing(location_of(fix), home)
         text = f"Stored home is used, {distance_m:.0f} m from here"
         return self._explain(text, now_us)
 
-    def put_mark(self, place: Place | None, now_us: int) -> list[Answer]:
-        """Mark a place, or none, and announce it."""
-        self.mark.put(place)
+    def put_mark(self, location: Location | None, now_us: int) -> list[Answer]:
+        """Mark a location, or none, and announce it."""
+        self.mark.put(location)
         text = "Mark cleared"
-        if place is not None:
-            text = f"Marked {place.lat_deg:.6f}, {place.lon_deg:.6f}"
+        if location is not None:
+            text = f"Marked {location.lat_deg:.6f}, {location.lon_deg:.6f}"
         return [self._save(), *self._explain(text, now_us)]
 
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
@@ -300,23 +299,23 @@ class PlaceService:
         self.home.keep()
         return [self._save()]
 
-    def _save(self) -> SavePlaces:
+    def _save(self) -> SavePlan:
         items = self.missions.items
-        stored = StoredPlaces(
+        stored = StoredPlan(
             home=self.home.kept,
-            mark=self.mark.place,
+            mark=self.mark.location,
             mark_of=self.mark.of,
             current=self.missions.current,
             mission=items[MISSION],
             fence=items[FENCE],
             rally=items[RALLY],
         )
-        return SavePlaces(self._vehicle_id, stored)
+        return SavePlan(self._vehicle_id, stored)
 
     @property
     def _home_alt_m(self) -> float:
         home = self._telemetry.home
-        return home.place.alt_amsl_m if home else NAN
+        return home.location.alt_amsl_m if home else NAN
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
         return [Reply(message) for message in self._say(StatusText(INFO, text), now_us)]
@@ -327,28 +326,28 @@ class PlaceService:
             self.mark.follow(kind, self.missions.items[kind][first:], self._home_alt_m)
         return [self._save()]
 
-    def _place(self, command: Command) -> Place | None:
+    def _location(self, command: Command) -> Location | None:
         """Read the position of a command; None if it is invalid."""
         if command.frame not in GLOBAL_FRAMES:
             return None
         if not is_on_earth(command.lat_deg, command.lon_deg):
             return None
         height = height_amsl_m(command.height_m, command.frame, self._home_alt_m)
-        return Place(command.lat_deg, command.lon_deg, height)
+        return Location(command.lat_deg, command.lon_deg, height)
 
     def _set_home(self, command: Command, now_us: int) -> Outcome:
         if whole(command.params[0]) == USE_CURRENT:
             state = self._telemetry.state
             if state is None or not has_position(state):
                 return NOT_NOW, []
-            place: Place | None = Place(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+            location: Location | None = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
         else:
-            place = self._place(command)
-        if place is None or not math.isfinite(place.alt_amsl_m):
+            location = self._location(command)
+        if location is None or not math.isfinite(location.alt_amsl_m):
             return DENIED, []
-        announced = self.home.put(place, now_us)
+        announced = self.home.put(location, now_us)
         self.home.keep()
-        self.mark.put(place)
+        self.mark.put(location)
         said = self._explain("Home set by a ground station", now_us)
         return ACCEPTED, [*announced, *said, self._save()]
 
@@ -361,8 +360,8 @@ class PlaceService:
         return self._set_roi_location(command, now_us)
 
     def _set_roi_location(self, command: Command, now_us: int) -> Outcome:
-        place = self._place(command)
-        return (DENIED, []) if place is None else (ACCEPTED, self.put_mark(place, now_us))
+        location = self._location(command)
+        return (DENIED, []) if location is None else (ACCEPTED, self.put_mark(location, now_us))
 
     def _clear_roi(self, _command: Command, now_us: int) -> Outcome:
         return ACCEPTED, self.put_mark(None, now_us)
