@@ -325,7 +325,7 @@ class Vehicle:
         )
         known = [message for number in asked for message in self._build(number, 0)]
         known += [each.message for each in self._parameters.values() if isinstance(each, Reply)]
-        known += self.places.missions.download()
+        known += self.plan.missions.download()
         return [encoder.encode(message, RECORDED_ONLY) for message in known]
 
     def poll(self, now_us: int) -> list[Action]:
