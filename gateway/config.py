@@ -1,6 +1,6 @@
 """The settings file: read from TOML, checked, and written as a documented file.
 
-Every section is the settings of one stage or edge, declared beside its code. A wrong file is
+Every section is the settings of one stage or edge, declared with its code. A wrong file is
 refused with all its errors at once, each with file, key, value and what is allowed.
 """
 
@@ -51,7 +51,7 @@ class GatewaySettings(Settings, frozen=True):
             "Folder of the aircraft's own settings: one file each, named by its vehicle id "
             '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
             "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
-            'Missions, mark and home are kept beside it ("1.places.json").',
+            'Missions, mark and home are kept in the same folder ("1.places.json").',
             path=True,
         ),
     ] = "~/.config/mavgate/aircraft"

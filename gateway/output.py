@@ -1,7 +1,7 @@
 """The only writer of output files: whole or not at all.
 
 No file is replaced without permission, none that is not a regular file, and none that is being
-read. A file is written beside the target and gets its name once it is whole, so nobody finds half
+read. A file is written next to the target and gets its name once it is whole, so nobody finds half
 of it or nothing under that name: not after a power loss, and not after it was killed.
 """
 
@@ -19,7 +19,7 @@ READABLE: Final = 0o666
 PRIVATE: Final = 0o600
 """For files with a passphrase."""
 LETTERS: Final = 40
-"""Of a file's name that the one beside it has too: four bytes each, of 255 that a name may have."""
+"""Of a file's name that its temporary file shares: four bytes each, of 255 that a name may have."""
 
 
 def check_output(
@@ -97,9 +97,9 @@ def write_new(
     check_output(path, inputs, overwrite=overwrite)
     if rights is None:
         rights = stat.S_IMODE(path.stat().st_mode) if path.exists() else READABLE & ~_mask()
-    beside, size = f".{path.name[:LETTERS]}.", 0
-    with _named(path, beside):
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=beside)
+    prefix, size = f".{path.name[:LETTERS]}.", 0
+    with _named(path, prefix):
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=prefix)
         fresh = Path(name)
         try:
             with os.fdopen(handle, "wb") as file:
@@ -153,12 +153,12 @@ def _remove_if_empty(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def _named(path: Path, beside: str) -> Iterator[None]:
-    """Name the file that the disk refuses, not the one beside it; others keep their names."""
+def _named(path: Path, prefix: str) -> Iterator[None]:
+    """Name the file that the disk refuses, not the temporary one; others keep their names."""
     try:
         yield
     except OSError as error:
-        if error.filename is None or Path(error.filename).name.startswith(beside):
+        if error.filename is None or Path(error.filename).name.startswith(prefix):
             error.filename = str(path)
         raise
 

@@ -1,6 +1,6 @@
 """Base of every stage's settings: frozen, strict, and documented where they are declared.
 
-A stage declares its own `…Settings(Settings)` beside the code that uses it; each field is
+A stage declares its own `…Settings(Settings)` in the file of the code that uses it; each field is
 `Annotated` with `Setting(...)`, which carries its unit, meaning and range. `config.py` only fills
 them from TOML. The documented `config/gateway.toml` and the MAVLink parameters are derived from
 the same annotations, so a range is written once.

@@ -14,9 +14,9 @@ AIRBORNE_M: Final = 3.0
 HELD_S: Final = 2.0
 """Least time in the air, or on the ground, to count."""
 OUTAGE_S: Final = 1.0
-"""A longer silence of the GPS is an outage."""
+"""A longer gap between fixes is an outage."""
 LINK_LOSS_S: Final = 0.5
-"""A longer silence of the IMU is a loss of the link."""
+"""A longer gap between IMU samples is a loss of the link."""
 LONGEST_STEP_M: Final = 200.0
 """Between two samples; more is a jump of the position, not a flown distance."""
 

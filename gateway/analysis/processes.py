@@ -48,7 +48,7 @@ def _send(
     sender: Connection,
     receiver: Connection,
 ) -> None:
-    # So that the pipe tells once nobody receives.
+    # So that the pipe reports when no process receives.
     receiver.close()
     threading.Thread(target=_end_unheard, args=(sender,), daemon=True).start()
     with suppress(BrokenPipeError):
@@ -79,7 +79,7 @@ def keep_inherited() -> None:
 
 @contextmanager
 def no_warning_of_threads() -> Iterator[None]:
-    """Silence Python's warning about forking with threads: those of linear algebra are idle."""
+    """Suppress Python's warning about forking with threads: those of linear algebra are idle."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         yield

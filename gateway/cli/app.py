@@ -54,7 +54,7 @@ def _options(
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
     logging.basicConfig(level=level, handlers=[handler])
-    # It tells of each font that it finds.
+    # It logs each font that it finds.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 

@@ -25,7 +25,7 @@ class MagneticField(NamedTuple):
 
 @cache
 def _model() -> pygeomag.GeoMag:
-    # The coefficients come as Python data: reading the .COF file would be I/O in a pure room.
+    # The coefficients come as Python data: reading the .COF file would be I/O in a pure package.
     return pygeomag.GeoMag(coefficients_data=wmm_2025.WMM_2025)
 
 

@@ -42,7 +42,7 @@ class ClientTable:
     max_clients : int
         Most clients at once.
     idle_timeout_us : int
-        Silence after which a client is gone.
+        Time without a frame after which a client is gone.
     """
 
     def __init__(self, max_clients: int, idle_timeout_us: int) -> None:

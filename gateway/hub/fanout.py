@@ -341,7 +341,7 @@ class RouteCache:
             routes.clear()
 
     def remove(self, client_id: int) -> None:
-        """Discard all routes, and forget a client that has gone."""
+        """Discard all routes, and those of a client that has gone."""
         self.clear()
         self._by_source.pop(client_id, None)
 

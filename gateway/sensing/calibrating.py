@@ -61,7 +61,7 @@ MAX_ACCEL_RESIDUAL_MPS2: Final = 0.5
 FIELD_UT: Final = (15.0, 100.0)
 """Strength of the field: the Earth's is 22 to 67 uT, the sensor's scale may be off by a third."""
 MAX_HARD_IRON_UT: Final = 200.0
-IRON_ADVICE: Final = "keep away from iron and currents"
+IRON_ADVICE: Final = "keep away from steel and currents"
 MAX_SOFT_IRON: Final = 2.0
 """Longest axis of the ellipsoid over the shortest."""
 MAX_MAG_RESIDUAL: Final = 0.1

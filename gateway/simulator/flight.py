@@ -1,4 +1,4 @@
-"""Simulated aircraft: exact truth and the sensors' samples beside it, for scoring.
+"""Simulated aircraft: exact truth and the sensors' samples, for scoring.
 
 `fly` gives a whole flight as arrays; `SimulatedFlight.records` gives the same samples as the raw
 records that the wire stage returns, without clock errors and losses. The samplers of a

@@ -114,7 +114,7 @@ class Node(ABC):
         yield from map(self._report, times)
 
     def _after_restart(self, sent: Sent) -> Sent | None:
-        """Silence a node while it restarts, with its clock from zero then."""
+        """Stop a node while it restarts, with its clock from zero then."""
         if not 0.0 < self.restart_s <= sent.time_s:
             return sent
         node_time_us = sent.node_time_us - self._clock.at(self.restart_s)

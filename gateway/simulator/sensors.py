@@ -146,7 +146,7 @@ class Mpu6050:
 
 
 class Hmc5883l:
-    """Magnetometer in the field of the Earth and of the aircraft's own iron."""
+    """Magnetometer in the field of the Earth and of the aircraft's hard and soft iron."""
 
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         field = magnetic_field(

@@ -330,7 +330,7 @@ def _attitude(commands: _Commands) -> FloatArray:
     bank = np.arctan2(sideways, STANDARD_GRAVITY_MPS2)
     climb_angle = np.arctan2(commands.climb_mps, np.maximum(speed, 1.0))
     load = np.hypot(sideways, STANDARD_GRAVITY_MPS2) / STANDARD_GRAVITY_MPS2
-    # The constant beside the speed keeps the quotient smooth on the ground, where no lift is.
+    # The constant added to the speed keeps the quotient smooth on the ground, where no lift is.
     carrying = (CRUISE_MPS**2 + 25.0) / (speed**2 + 25.0)
     attack = ATTACK_RAD * load * carrying * commands.airborne
     path = Rotation.from_euler("ZYX", np.column_stack([commands.heading_rad, climb_angle, bank]))

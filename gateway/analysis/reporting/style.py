@@ -33,7 +33,7 @@ CSS_NAMES: Final = {
     BLUE: "blue", ORANGE: "orange", GREEN: "green", RED: "red", PINK: "pink", SKY: "sky",
     INK: "ink", MUTED: "muted", GRID: "grid",
 }  # fmt: skip
-"""The palette of Okabe and Ito, which colour-blind readers can tell apart, and the page's greys."""
+"""The palette of Okabe and Ito, distinguishable for colour-blind readers, and the page's greys."""
 
 REFERENCE: Final = INK
 """Truth or reference is always drawn in the colour of the text."""

@@ -205,7 +205,7 @@ def live_step(
             return calibrate_accelerometer(_six_sides(capture), calibration)
         case Step.MAG:
             _ask(
-                "Away from iron, turn the aircraft slowly about all its axes, upside down too, "
+                "Away from steel, turn the aircraft slowly about all its axes, upside down too, "
                 "until most sides were seen."
             )
             samples = capture(MAG_S, turned=True)

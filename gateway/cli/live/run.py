@@ -97,7 +97,7 @@ async def serve(
 ) -> None:
     """Run a daemon until SIGINT or SIGTERM, showing its status.
 
-    SIGHUP tells that the terminal has gone, which ends the daemon as well; without a terminal, as
+    SIGHUP reports the end of the terminal, which ends the daemon as well; without a terminal, as
     in a service, it reloads the settings.
 
     Parameters

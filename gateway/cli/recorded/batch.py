@@ -106,7 +106,7 @@ def info(
     scheduler: SchedulerOption = None,
     config: ConfigOption = None,
 ) -> None:
-    """Tell what each of many files holds, one by one, as `mavgate info` does."""
+    """Describe many files, one by one, as `mavgate info` does."""
     from gateway.batch.page import flight_table
     from gateway.batch.tasks import InfoTask
 

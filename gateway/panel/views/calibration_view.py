@@ -35,7 +35,7 @@ GUIDE: Final = {
     "sides below 0.05 m/s².",
     CalibrationStep.LEVEL: "When: the board was mounted or moved in the aircraft, after the "
     "accelerometer. Good: a tilt when level below 0.5°.",
-    CalibrationStep.MAG: "When: anything of iron or a power wire was moved, or in another region. "
+    CalibrationStep.MAG: "When: anything of steel or a power wire was moved, or in another region. "
     "Good: a spread of the field's strength below 1.5 µT.",
 }
 SIDE_NAMES: Final = {
@@ -59,7 +59,7 @@ WHAT_TO_DO: Final = {
     CalibrationStep.ACCEL: "Rest it on each of its six sides in turn, for two seconds each, in any "
     "order. A wall or a box helps; small tilts do no harm.",
     CalibrationStep.LEVEL: "Set the aircraft as it flies straight and level, and let go of it.",
-    CalibrationStep.MAG: "Away from iron, turn it slowly about all its axes, upside down too, "
+    CalibrationStep.MAG: "Away from steel, turn it slowly about all its axes, upside down too, "
     "until the sphere is covered.",
 }
 

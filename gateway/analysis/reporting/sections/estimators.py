@@ -124,7 +124,7 @@ def _reference(case: Case) -> Reference | None:
 
 
 def _smoothed_story(case: Case) -> str:
-    """Tell how the smoothed track came about, if there is one."""
+    """Describe the origin of the smoothed track, if there is one."""
     set_s, used_s = case.fusion.estimation.reference.gps_latency_s, case.smoothed_latency_s
     if used_s is None:
         return ""

@@ -126,7 +126,8 @@ def magnetometer(case: Case) -> Section | None:
     return Section(
         "Magnetometer before and after calibration",
         "A magnetometer that turns in the Earth's field alone measures points on a sphere about "
-        "zero. The aircraft's own iron shifts and squeezes it; the calibration undoes that.",
+        "zero. Hard iron of the aircraft shifts it, soft iron deforms it; the calibration corrects "
+        "both.",
         [
             Picture(
                 "magnetometer_sphere",

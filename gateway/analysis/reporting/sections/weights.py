@@ -1,4 +1,4 @@
-"""Alpha and beta: the paper's Table I on this flight, beside the paper's own figures."""
+"""Alpha and beta: the paper's Table I on this flight, next to the paper's own figures."""
 
 from typing import Final
 
