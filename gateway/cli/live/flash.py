@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final, get_args
 
 import msgspec
 import typer
+from intelhex import IntelHex
 
 from gateway.cli.support.errors import refuse
 from gateway.cli.support.terminal import console_of, table_of
@@ -31,6 +32,7 @@ from gateway.flashing.upload import (
 )
 from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
 from gateway.output import write_new
+from gateway.reasons import reason_of
 from gateway.settings import Field, fields_of
 
 FIELDS: Final = {field.name: field for field in fields_of(BoardSettings)}
@@ -98,6 +100,7 @@ def flash(
         Path | None,
         typer.Option("--output", "-o", help="Write the image to this file, not to a board."),
     ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     vehicle: Annotated[int | None, _option("vehicle_id")] = None,
     node: Annotated[int | None, _option("node_id")] = None,
     pipe: Annotated[int | None, _option("radio_pipe")] = None,
@@ -120,14 +123,27 @@ def flash(
     sensors = (send_rate, raw, accel_range, gyro_range, gps_rate, gps_model)
     given: tuple[object, ...] = (vehicle, node, *radio, *sensors)
     changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
+    if clock not in CLOCKS_MHZ:
+        refuse(f"--clock {clock}: 16 or 8")
     try:
         if show:
             _show(port)
         elif board is None:
             _list()
         else:
-            _write(Program[board.name], changes, port=port, keep=keep, clock=clock, output=output)
-    except (FlashError, PortNotFoundError, OSError) as error:
+            program = Program[board.name]
+            _check(program, changes)
+            image = read_image(image_path(program, clock))
+            if output is None:
+                _write(program, image, changes, port=port, keep=keep)
+            else:
+                settings = _changed(program, block_of(image).settings, changes)
+                write_new(output, [with_settings(image, settings)], overwrite=force)
+    except FileExistsError:
+        refuse(f"{output} is there already; --force replaces it")
+    except OSError as error:
+        refuse(f"{error.filename or port}: {reason_of(error)}")
+    except (FlashError, PortNotFoundError) as error:
         refuse(str(error))
 
 
@@ -169,27 +185,13 @@ def _show(port: str) -> None:
 
 
 def _write(
-    program: Program,
-    changes: dict[str, Any],
-    *,
-    port: str,
-    keep: bool,
-    clock: int,
-    output: Path | None,
+    program: Program, image: IntelHex, changes: dict[str, Any], *, port: str, keep: bool
 ) -> None:
-    """Patch an image and write it to a board or a file."""
-    if clock not in CLOCKS_MHZ:
-        refuse(f"--clock {clock}: 16 or 8")
-    image = read_image(image_path(program, clock))
-    block = block_of(image)
-    if output is not None:
-        settings = _changed(program, block.settings, changes)
-        write_new(output, [with_settings(image, settings)])
-        return
+    """Patch an image and write it to a board."""
     device = find_port(port, list_serial_ports())
     with reserved(device):
         loader = require_bootloader(device)
-        before = block.settings
+        before = block_of(image).settings
         if keep:
             before = _kept(block_of(read_flash(device, loader)), program)
         before = msgspec.structs.replace(before, soft_restart=loader.leaves_watchdog_on)
@@ -204,8 +206,8 @@ def _kept(block: SettingsBlock, program: Program) -> BoardSettings:
     return block.settings
 
 
-def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -> BoardSettings:
-    """Check and apply the options that were given."""
+def _check(program: Program, changes: dict[str, Any]) -> None:
+    """End the command if an option does not concern the program, or has an invalid value."""
     for name, value in changes.items():
         option = OPTIONS[name]
         if name not in USED_BY[program]:
@@ -214,6 +216,10 @@ def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -
             msgspec.convert(value, FIELDS[name].type)
         except msgspec.ValidationError:
             refuse(f"{option} {value}: must be {_allowed(FIELDS[name])}")
+
+
+def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -> BoardSettings:
+    """Apply the options; another vehicle gets its own pipe."""
     after = msgspec.structs.replace(before, **changes)
     if "vehicle_id" in changes and "radio_pipe" not in changes:
         pipe = default_pipe(program, after.vehicle_id)

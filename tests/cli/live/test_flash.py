@@ -48,6 +48,10 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
     after = IntelHex(str(out)).tobinstr()
     assert before[:104] == after[:104]
     assert before[138:] == after[138:]
+    again = flash("imu", "-o", str(out))
+    assert again.exit_code == 2
+    assert f"{out} is there already; --force replaces it" in again.output
+    assert flash("imu", "-o", str(out), "--force").exit_code == 0
 
 
 @pytest.mark.parametrize(
@@ -69,6 +73,8 @@ def test_wrong_option_ends_with_the_reason(
     images: Path, tmp_path: Path, words: list[str], message: str
 ) -> None:
     out = [] if not words or words[0] == "--show" else ["-o", str(tmp_path / "out.hex")]
+    if out:
+        assert message in flash(*words).output, "before any port is looked for"
     done = flash(*words, *out)
     assert done.exit_code == 2
     assert message in done.output
