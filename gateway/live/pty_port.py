@@ -17,6 +17,8 @@ MAX_LATE_S: Final = 1.0
 the loop even more, and pausing the clocks of the nodes would look like a restart of them."""
 SUSPENDED_S: Final = 60.0
 """A loop delayed for longer, as by a suspended machine, continues where it was."""
+CATCH_UP_S: Final = 2.0
+"""Frames that are late for longer are made too slowly: dropping more of them would leave none."""
 DROPS_AT_ONCE: Final = 64
 """Dropped frames cost little more than the generator that makes them."""
 
@@ -57,6 +59,7 @@ class PtyPort:
         self._next = next(frames, None)
         self._rest = b""
         self._start_s = 0.0
+        self._late_since_s: float | None = None
         self._timer: asyncio.Handle | None = None
         self._master, self._slave = os.openpty()
         # Our own end of the slave stays open, so a reader that leaves causes no hang-up.
@@ -97,15 +100,29 @@ class PtyPort:
             if late_s < 0.0:
                 self._timer = loop.call_at(due_s, self._advance)
                 return
-            if MAX_LATE_S < late_s <= SUSPENDED_S:
+            if late_s <= MAX_LATE_S:
+                self._late_since_s = None
+            elif self._is_dropped(late_s):
                 self.dropped += 1
                 budget -= MAX_BATCH
+                self._next = None
+                continue
             else:
-                self._start_s += late_s if late_s > SUSPENDED_S else 0.0
-                self._write(self._next.data)
-                budget -= DROPS_AT_ONCE
+                self._start_s += late_s
+            self._write(self._next.data)
+            budget -= DROPS_AT_ONCE
             self._next = None
         self._timer = loop.call_soon(self._advance)
+
+    def _is_dropped(self, late_s: float) -> bool:
+        """Return whether to drop a late frame to catch up, or else to continue where it was."""
+        now_s = asyncio.get_running_loop().time()
+        if self._late_since_s is None:
+            self._late_since_s = now_s
+        if late_s <= SUSPENDED_S and now_s - self._late_since_s <= CATCH_UP_S:
+            return True
+        self._late_since_s = None
+        return False
 
     def _write(self, data: bytes) -> None:
         """Write one frame whole, or keep its end for the next time, or drop it."""

@@ -301,7 +301,7 @@ class HubMachine(RuleBasedStateMachine):
     @invariant()
     def nothing_has_changed(self) -> None:
         assert self.vehicle.telemetry.settings == VehicleSettings()
-        assert self.vehicle.places.missions.items[0] == ()
+        assert self.vehicle.plan.missions.items[0] == ()
 
     @invariant()
     def strangers_are_in_no_table(self) -> None:

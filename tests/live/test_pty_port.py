@@ -174,6 +174,28 @@ async def test_goes_on_after_a_standstill(
     assert port.written <= 20 + 100 * (clock() - begin_s)
 
 
+async def test_frames_that_are_made_too_slowly_are_not_all_dropped(
+    play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each takes twice its interval to be made, as on a computer without processor time."""
+    loop = asyncio.get_running_loop()
+    clock, made_s = loop.time, [0.0]
+
+    def slowly() -> Iterator[TimedFrame]:
+        for frame in frames(2000, rate_hz=100.0):
+            made_s[0] += 0.02
+            yield frame
+
+    monkeypatch.setattr(loop, "time", lambda: clock() + made_s[0])
+    port = play(slowly(), 1.0)
+    reader = Reader(port.path)
+    port.start()
+    await reader.until(300)
+    reader.close()
+    port.close()
+    assert port.dropped < 10 * port.written
+
+
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
 def test_speed_is_checked(speed: float) -> None:
     with pytest.raises(ValueError, match="speed"):
