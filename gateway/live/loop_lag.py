@@ -16,6 +16,8 @@ STALL_US: Final = 500_000
 SPAN_US: Final = 10 * US_PER_S
 MAX_SHARE: Final = 0.3
 """Delays that add up to more of the span mean that the loop cannot keep up."""
+WARM_UP_US: Final = 10 * US_PER_S
+"""After the start, machine code is loaded and the first samples take longer."""
 RECOVERED_US: Final = 60 * US_PER_S
 MAX_DELAYS: Final = 1000
 """In a span; the timer fires at most every millisecond, but only delays are kept."""
@@ -45,6 +47,7 @@ class LoopLag:
         self.stalled_after_us = NEVER_US
         """After this time the timer, if it has not been called, is late by a stall."""
         self._due_us: int | None = None
+        self._begin_us: int | None = None
 
     def expect(self, due_us: int) -> None:
         """Set when the timer is to be called next."""
@@ -64,6 +67,8 @@ class LoopLag:
         LagReport
         """
         self.stalled_after_us = NEVER_US
+        if self._begin_us is None:
+            self._begin_us = now_us
         delay_us = 0 if self._due_us is None else now_us - self._due_us
         self._due_us = None
         if delay_us >= LEAST_DELAY_US:
@@ -73,7 +78,8 @@ class LoopLag:
         total_us = sum(delay for _, delay in self._delays)
         stalled_us = delay_us if delay_us >= STALL_US else 0
         before = self.is_slow
-        if stalled_us or total_us > MAX_SHARE * SPAN_US:
+        is_warm = now_us - self._begin_us >= WARM_UP_US
+        if is_warm and (stalled_us or total_us > MAX_SHARE * SPAN_US):
             self.longest_us = max(delay_us, self.longest_us if before else 0)
             self.is_slow, self._slow_us = True, now_us
         elif now_us - self._slow_us > RECOVERED_US:
