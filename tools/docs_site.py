@@ -18,12 +18,14 @@ PAGES: Final = (
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages and files that pages link to."""
-    pictures = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("firmware/*.svg"))
-    for name in (*PAGES, *pictures):
-        if (ROOT / name).exists():
+    """Add pages of the repository, and the pictures and files that pages link to."""
+    texts = [path.read_text() for path in (ROOT / "docs").glob("*.md")]
+    linked = {name for text in texts for name in re.findall(r"\]\(\.\./([^)#\s]+)", text)}
+    pictures = {str(path.relative_to(ROOT)) for path in ROOT.glob("firmware/*.svg")}
+    for name in sorted({*PAGES, *pictures, *linked}):
+        if (ROOT / name).is_file():
             target = "repository.md" if name == "README.md" else name
-            files.append(File.generated(config, target, content=(ROOT / name).read_text()))
+            files.append(File.generated(config, target, abs_src_path=str(ROOT / name)))
     return files
 
 
