@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from gateway.cli.app import app
 from gateway.cli.live import calibrate
-from gateway.live.control_socket import ControlServer, socket_path
+from gateway.live.control_socket import ControlServer, NoParams, socket_path
 from gateway.live.imu_tap import IDLE_US, MAX_SAMPLES, ImuParams, ImuTap, raw_of, values_of
 from gateway.records import FusedSample
 from gateway.sensing.calibration import NodeCalibration
@@ -69,6 +69,10 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
         return take(params)
 
     server.register("imu.samples", ImuParams, taken)
+    board = {"sensors_present": 7, "chips": ["MPU6500", "QMC5883L", "BMP280"]}
+    server.register(
+        "status", NoParams, lambda _: {"aircraft": [{"vehicle_id": 3, "boards": [board]}]}
+    )
     await server.start()
     try:
         words = ["calibrate", "gyro", "--vehicle", "3"]
@@ -77,5 +81,6 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
         server.close()
     assert result.exit_code == 0, result.output
     assert "the gateway uses it, and saves it" in result.output
+    assert "sensors: MPU6500, QMC5883L, BMP280" in result.output
     assert kept[-1].gyro_bias_radps[0] == pytest.approx(np.radians(100 / 65.5), rel=0.01)
     assert kept[-1].mag_hard_iron_ut == (1.0, 2.0, 3.0)
