@@ -45,7 +45,7 @@ from gateway.recordings.reading import ReadOptions, open_rows
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
 SCHEMA: Final = 1
-"""Of another one, the catalogue is made anew."""
+"""A catalogue of another schema is made again."""
 BUSY_S: Final = 10.0
 """How long a writer waits for another one to end."""
 MAX_STEPS: Final = 20_000_000
@@ -77,7 +77,7 @@ _PLACE: Final = struct.Struct("<iii")
 """Latitude and longitude in 1e-7 deg, height in cm."""
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
 _DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
-_NOT_WRITABLE: Final = "it stands beside the recordings: make their folder writable, or copy them"
+_NOT_WRITABLE: Final = "make the folder of the recordings writable, or copy them"
 _WAYS_OUT: Final = {
     sqlite3.SQLITE_FULL: "make room on the disk and index again",
     sqlite3.SQLITE_BUSY: "another indexing is at work; wait for its end",
@@ -261,7 +261,7 @@ def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
         try:
             if db.execute("PRAGMA user_version").fetchone()[0] != SCHEMA:
                 raise CatalogueError(
-                    f"{path} is of another version; `mavgate catalogue {folder}` makes it anew"
+                    f"{path} is of another version; `mavgate catalogue {folder}` makes it again"
                 )
             yield db
         finally:
@@ -318,7 +318,7 @@ def _told(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        # The lowest byte; the others tell more precisely what failed.
+        # The lowest byte; the others are more specific.
         code = getattr(error, "sqlite_errorcode", 0) & 0xFF
         raise CatalogueError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
 

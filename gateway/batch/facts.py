@@ -456,7 +456,7 @@ class TlogTally:
 
     def __init__(self) -> None:
         self._index, self._span = TlogIndex(), TimesSpan()
-        self._vehicles: dict[int, _Told] = {}
+        self._vehicles: dict[int, _Sent] = {}
 
     def add(self, batch: Batch) -> None:
         """Take in the next batch of the file."""
@@ -467,10 +467,10 @@ class TlogTally:
             origin = int(batch.origins[i])
             if is_station(origin, self._index.stations):
                 continue
-            told = self._vehicles.setdefault(origin >> 8, _Told())
+            sent = self._vehicles.setdefault(origin >> 8, _Sent())
             time_us = int(batch.time_us[i])
-            told.see(time_us)
-            told.take(int(batch.message_ids[i]), time_us, batch.frame(i))
+            sent.see(time_us)
+            sent.take(int(batch.message_ids[i]), time_us, batch.frame(i))
 
     def flown(self) -> list[Flown]:
         """Return a flight for each vehicle; one without a vehicle where there is none."""
@@ -485,12 +485,12 @@ class TlogTally:
             )
             return [(known, [])]
         return [
-            told.flown(system, index.damaged_bytes)
-            for system, told in sorted(self._vehicles.items())
+            sent.flown(system, index.damaged_bytes)
+            for system, sent in sorted(self._vehicles.items())
         ]
 
 
-class _Told:
+class _Sent:
     """What one vehicle sent."""
 
     def __init__(self) -> None:
@@ -527,7 +527,7 @@ class _Told:
 
     def flown(self, system_id: int, damaged: int) -> Flown:
         drops = [drop for drop in self._drops if drop <= 10_000]
-        told = sorted(self._parameters.items())
+        sent = sorted(self._parameters.items())
         known = msgspec.structs.replace(
             self._tally.facts(self._last_us),
             vehicle=system_id,
@@ -536,7 +536,7 @@ class _Told:
             loss=float(np.mean(drops)) / 10_000.0 if drops else None,
             damaged=damaged,
             version=self._firmware,
-            settings=_digits(b"".join(name + value for name, value in told)) if told else None,
+            settings=_digits(b"".join(name + value for name, value in sent)) if sent else None,
         )
         return known, self._tally.track()
 

@@ -38,13 +38,13 @@ class Lead:
         """Say it in one sentence."""
         change = f"{_percent(self.ratio)} error over {counted(self.flights, 'flight')}"
         if self.p is None or self.low is None or self.high is None:
-            return f"{change}, all of one aircraft and day: nothing tells it from chance"
+            return f"{change}, all of one aircraft and day: it cannot be separated from chance"
         if self.low == self.high == self.ratio == 1.0:
             return f"the same error on all {self.flights} flights"
-        told = "more than chance" if self.p < CHANCE else "it may be chance"
+        verdict = "more than chance" if self.p < CHANCE else "it may be chance"
         return (
             f"{change} on {self.units} aircraft-days, 95 % between {_percent(self.low)} and "
-            f"{_percent(self.high)}; p = {self.p:.2g}: {told}"
+            f"{_percent(self.high)}; p = {self.p:.2g}: {verdict}"
         )
 
 

@@ -35,7 +35,7 @@ PACKAGES: Final = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko",
     "ssh": "paramiko", "az": "adlfs", "abfs": "adlfs", "http": "aiohttp", "https": "aiohttp",
 }  # fmt: skip
-"""What fsspec needs beside itself, by the scheme of the URL."""
+"""What fsspec needs in addition, by the scheme of the URL."""
 _USER: Final = re.compile(r"(?<=://)[^/@]*@")
 
 
@@ -106,9 +106,9 @@ def stamp_of_item(item: BatchItem) -> str:
     fetched for it; raises OSError and StorageError.
     """
     if item.is_fetched:
-        told = [_told_by_storage(part) for part in item.parts]
-        if all(told):
-            return sha256("\n".join(told).encode()).hexdigest()
+        stamps = [_stamp_of(part) for part in item.parts]
+        if all(stamps):
+            return sha256("\n".join(stamps).encode()).hexdigest()
     with local_files(item) as paths:
         return digest_of_files(paths)
 
@@ -184,7 +184,7 @@ def _part(place: str) -> StoredFile:
         return StoredFile(place, storage.cat_file(remote) if OF_ONE_PROCESS in protocols else None)
 
 
-def _told_by_storage(part: StoredFile) -> str:
+def _stamp_of(part: StoredFile) -> str:
     """Return a file's place, size and change as its storage reports them, or nothing."""
     if part.data is not None or not is_url(part.place):
         return ""

@@ -186,8 +186,8 @@ class SweepTask(_ReadingTask):
         trials = Trials(contest)
         scores = [trials.run(values)[self.metric_column] for values in grid(self.axes)]
         base = base_score(contest, flight.fusion)[self.metric_column]
-        told = [None if score != score else score for score in (base, *scores)]
-        return Worked(read.vehicle, read.began, {"base": told[0], "scores": told[1:]})
+        values = [None if score != score else score for score in (base, *scores)]
+        return Worked(read.vehicle, read.began, {"base": values[0], "scores": values[1:]})
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ class InfoTask(_ReadingTask):
 
 @dataclass(frozen=True, slots=True)
 class ReadFlight:
-    """A flight, and what its file holds beside the samples."""
+    """A flight, and what its file holds in addition to the samples."""
 
     flight: Flight
     header: Any
@@ -271,14 +271,14 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
 def options_bytes(options: ReadOptions) -> bytes:
     """Write down how flights are read, so that it can be compared later."""
     current = options.current
-    told = {
+    values = {
         "default": current.default,
         "aircraft": {str(number): own for number, own in sorted(current.aircraft.items())},
         "choice": options.choice,
         "columns": options.columns,
         "system": options.system_id,
     }
-    return msgspec.json.encode(told, order="sorted")
+    return msgspec.json.encode(values, order="sorted")
 
 
 def without_secrets(options: ReadOptions) -> ReadOptions:
@@ -409,7 +409,7 @@ def _read(path: Path) -> FlightResult | None:
         return None
 
 
-Tell = Callable[[str, int, int], None]
+Report = Callable[[str, int, int], None]
 """Called with what was done last, how many are done, and of how many."""
 LOOKING: Final = "looking for changes"
 """What is done first: it decides which recordings are to be worked on."""
@@ -420,13 +420,13 @@ def run_season(
     items: Sequence[BatchItem],
     executor: Executor,
     folder: ResultFolder | None,
-    tell: Tell,
+    report: Report,
 ) -> list[FlightResult]:
     """Do a task on every recording that it is not done on yet."""
     found: list[FlightResult | None] = [None] * len(items)
     todo: list[tuple[BatchItem, str, str, str]] = []
     numbers: list[int] = []
-    stamps = _stamps(items, executor, tell)
+    stamps = _stamps(items, executor, report)
     names = _names(items, stamps)
     for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
         if isinstance(stamp, WorkFailed):
@@ -453,15 +453,17 @@ def run_season(
                 folder.keep(result, files)
         found[numbers[place]] = result
         done += 1
-        tell(item.place, done, len(items))
+        report(item.place, done, len(items))
     return [result for result in found if result is not None]
 
 
-def _stamps(items: Sequence[BatchItem], executor: Executor, tell: Tell) -> list[str | WorkFailed]:
+def _stamps(
+    items: Sequence[BatchItem], executor: Executor, report: Report
+) -> list[str | WorkFailed]:
     found: list[str | WorkFailed] = [""] * len(items)
     for done, (number, outcome) in enumerate(executor.run(stamp_of_item, items), 1):
         found[number] = outcome
-        tell(LOOKING, done, len(items))
+        report(LOOKING, done, len(items))
     return found
 
 
@@ -476,8 +478,8 @@ def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> li
 
 
 def _key(task: FlightTask, stamp: str) -> str:
-    told = "\n".join((task.name, stamp, __version__)).encode()
-    return sha256(told + b"\n" + task.fingerprint).hexdigest()[:32]
+    values = "\n".join((task.name, stamp, __version__)).encode()
+    return sha256(values + b"\n" + task.fingerprint).hexdigest()[:32]
 
 
 def _failed(

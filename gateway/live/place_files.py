@@ -1,4 +1,4 @@
-"""The stored places of each aircraft: one JSON file each, beside its settings.
+"""The stored places of each aircraft: one JSON file each, next to its settings.
 
 A file is replaced whole or not at all, by a separate thread, since writing to a disk may block. A
 failed write is retried until it succeeds. A file that cannot be read is reported and left as it

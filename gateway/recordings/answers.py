@@ -328,7 +328,7 @@ def _encode(message_id: int, system_id: int, payload: bytes) -> bytes:
 
 
 def _key_of(frame: bytes) -> bytes:
-    """Tell frames of one message apart that hold different items."""
+    """Return a key of frames of one message that hold different items."""
     message_id = message_id_of(frame)
     if message_id == PARAM_VALUE_ID:
         return bytes(_VALUE.unpack(payload_of(frame, _VALUE.size))[3])

@@ -360,7 +360,7 @@ _LEAST_LARGE: Final = 1e16
 
 
 def has_group(cells: FloatArray, group: slice) -> BoolArray:
-    """Tell which rows hold a group of columns, such as `RAW`."""
+    """Return which rows hold a group of columns, such as `RAW`."""
     return ~np.isnan(cells[:, group.start])
 
 
@@ -383,7 +383,7 @@ def read_lines(text: bytes, width: int) -> FloatArray | None:
     Returns
     -------
     ndarray, shape (n, width), or None
-        None if one of the lines is not so many numbers; `read_cells` tells which.
+        None if one of the lines is not so many numbers; `read_cells` finds which.
     """
     # JSON's whole zero has no sign, a float's has one.
     if text.translate(None, _OF_NUMBERS) or b"-0," in text or b"-0\n" in text:
@@ -419,7 +419,7 @@ def read_cells(line: bytes, width: int, places: Sequence[int] | None) -> list[fl
 
 
 def settle(cells: FloatArray) -> dict[int, str]:
-    """Leave of each row what its groups hold, and tell which rows cannot be.
+    """Leave of each row what its groups hold, and return which rows are invalid.
 
     Parameters
     ----------

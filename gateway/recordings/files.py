@@ -54,7 +54,7 @@ ERASED: Final = b"\xff"
 MAX_ERASED: Final = 1 << 20
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
-"""The first bytes tell that a file is packed, whatever its name."""
+"""The first bytes show that a file is packed, whatever its name."""
 
 Progress = Callable[[int], None]
 """Called with how many more bytes were read."""

@@ -284,7 +284,7 @@ def smooth_blocks(
 
 
 def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
-    """Tell a GPS latency that a flight was smoothed with, and that was not set."""
+    """Describe a GPS latency that a flight was smoothed with, and that was not set."""
     return (
         f"smoothed with a GPS latency of {used_s:.2f} s, which its manoeuvres show; "
         f"gps_latency_s is {set_s:.2f} s"
@@ -392,7 +392,7 @@ def aircraft_for(
         The parts of one flight.
     table : RecordedTable
         Their rows. Where the latency has to be estimated they are read here, and kept for the
-        next reader; a remark tells what was found.
+        next reader; a remark states the result.
     options : ReadOptions
         Current settings that differ from the defaults take precedence over the log.
     given_s : float, optional
@@ -445,7 +445,7 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
 def note_smoothed_latency(
     file: Path, table: RecordedTable, aircraft: AircraftSettings, used_s: float
 ) -> AircraftSettings:
-    """Return the settings that a flight was smoothed with; a remark tells a latency not set."""
+    """Return the settings that a flight was smoothed with; a remark states a latency not set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     if used_s == set_s:
         return aircraft
@@ -677,7 +677,7 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
 
 
 def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:
-    """Read all once more, before the rows or beside them."""
+    """Read all once more, before the rows or along with them."""
     quiet = replace(options, progress=None)
     return joined_tables([open_rows(file, quiet) for file in files]).blocks
 

@@ -82,7 +82,7 @@ def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us
 
 
 def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
-    """Return how far two clocks are apart by civil time; None where that does not tell."""
+    """Return how far two clocks are apart by civil time; None where it is unknown."""
     zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
     if header.session != "" and header.session == first.session:
         return 0  # parts of a recording, whose time GPS may have corrected in between

@@ -84,7 +84,7 @@ class RecordedTable:
 
     header: TableHeader
     blocks: Iterator[TableBlock]
-    """A header among the rows tells of settings that were changed in flight, a state of what the
+    """A header among the rows holds settings that were changed in flight, a state of what the
     fusion remembered there, a mark of what somebody remarked."""
     remarks: list[str] = field(default_factory=list)
     """Remarks about the file for the user; complete once the rows are read."""
@@ -267,7 +267,7 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
 
-    def told() -> Iterator[TableRow]:
+    def lines() -> Iterator[TableRow]:
         yield from rows
         if reader.skipped:
             text = counted(reader.skipped, "line")
@@ -277,13 +277,13 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
                 f"{path}: left out {counted(reader.faults, 'line')} that cannot be read"
             )
 
-    table = table_of_rows(chain([first], told()), options, options.system_id or 1)
+    table = table_of_rows(chain([first], lines()), options, options.system_id or 1)
     table.blocks = _going_on(table.blocks, path, table.remarks)
     return table
 
 
 def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
-    """Let a clock that goes back, as one that starts anew, go on from where it was."""
+    """Let a clock that goes back, as after a restart, go on from where it was."""
     last_us, shift_us, restarts = -math.inf, 0.0, 0
     for block in blocks:
         times_us = block.cells[:, 0]

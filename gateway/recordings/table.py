@@ -218,7 +218,7 @@ class TableReader:
 
     @property
     def vehicle_id(self) -> int:
-        """The aircraft of the table; 1 where it does not tell."""
+        """The aircraft of the table; 1 where it has none."""
         return 1 if self.header is None else self.header.vehicle_id
 
     def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
@@ -309,7 +309,7 @@ class TableReader:
         return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._places]
 
     def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
-        """Read rows of which some are none: those are told, and stay empty."""
+        """Read rows of which some are none: those are reported, and stay empty."""
         cells = np.full((len(rows), len(COLUMNS)), np.nan)
         faults: dict[int, str] = {}
         for row, line in enumerate(rows):

@@ -46,7 +46,7 @@ Times = TypeVar("Times", int, NDArray[np.int64])
 
 
 def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
-    """Return whether a time is not between those beside it, which are in order.
+    """Return whether a time is not between its neighbours, which are in order.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ MAX_JUMPS: Final = 1000
 
 HEARTBEAT_ID: Final = 0
 UNRECORDED: Final = frozenset({235})
-"""HIGH_LATENCY2, for links too narrow for the rest: beside these in a recording a ground station
+"""HIGH_LATENCY2, for links too narrow for the rest: next to these in a recording a ground station
 would take each one for another state of the vehicle."""
 
 

@@ -1,19 +1,34 @@
 """Records out of bytes, whatever has happened to the bytes."""
 
+import itertools
+import time
+
 import numpy as np
 import pytest
 from pymavlink.dialects.v10 import common as dialect_v1
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.clock import GatewayClock
 from gateway.recordings.tlog import (
+    DAY_US,
+    JUMP_US,
+    ORDER_US,
     STRIDE,
     Batch,
+    CivilClock,
     Damage,
+    Stamper,
     TlogIndex,
     TlogRecord,
     TlogScanner,
     encode_record,
+    is_damaged,
+    readdress,
 )
+from gateway.recordings.tlog import (
+    STEP_US as STAMP_STEP_US,
+)
+from gateway.wire.gps_time import ENOUGH
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
@@ -216,3 +231,153 @@ def test_an_empty_file_is_an_empty_index() -> None:
     index = index_of(scan(b""))
     assert (index.count, index.first_us, index.last_us) == (0, None, None)
     assert index.offset_before(START_US) == 0
+
+
+UTC_US = 1_781_000_000_000_000
+MINUTE_US = 60_000_000
+
+
+def test_the_machine_counts_until_gps_tells_better() -> None:
+    clock = CivilClock()
+    assert clock.offset_us is None
+    clock.hear_machine(5_000_000, 1_000_000)
+    assert clock.offset_us == 4_000_000
+    for second in range(ENOUGH):
+        assert clock.offset_us == 4_000_000
+        clock.hear_gps(1, UTC_US + second * 1_000_000, (3 + second) * 1_000_000)
+    clock.hear_machine(9_000_000, 4_000_000)
+    assert clock.offset_us == UTC_US - 3_000_000
+
+
+def test_a_right_machine_keeps_its_finer_time() -> None:
+    clock = CivilClock()
+    clock.hear_machine(UTC_US, 0)
+    for _ in range(ENOUGH):
+        clock.hear_gps(1, UTC_US + 800_000, 1_000_000)
+    assert clock.offset_us == UTC_US
+
+
+@pytest.mark.parametrize("jump_us", [-MINUTE_US, -JUMP_US - 1, JUMP_US + 1, 50 * MINUTE_US])
+def test_a_jump_asks_for_a_new_file(jump_us: int) -> None:
+    clock = CivilClock()
+    clock.hear_machine(UTC_US, 0)
+    stamper = Stamper(UTC_US)
+    assert not stamper.has_jumped(clock)
+    for _ in range(ENOUGH):
+        clock.hear_gps(1, UTC_US + jump_us, 0)
+    assert stamper.has_jumped(clock)
+
+
+def test_one_aircraft_among_three_that_errs_by_an_hour_changes_nothing() -> None:
+    clock = CivilClock()
+    clock.hear_machine(UTC_US, 0)
+    for n in range(30):
+        for vehicle_id, error_us in ((1, 3_600_000_000), (2, 0), (3, 100_000)):
+            clock.hear_gps(vehicle_id, UTC_US + n * 200_000 + error_us, n * 200_000)
+        assert clock.offset_us == UTC_US
+
+
+def test_single_fixes_that_err_change_nothing() -> None:
+    clock = CivilClock()
+    clock.hear_machine(UTC_US, 0)
+    for n in range(60):
+        clock.hear_gps(1, UTC_US + n * 200_000 + 7_000_000 * (n % 3 == 2), n * 200_000)
+        assert clock.offset_us == UTC_US
+
+
+def sleepless(monkeypatch: pytest.MonkeyPatch) -> dict[int, int]:
+    """Put the kernel's clocks under the test's control."""
+    clocks = {time.CLOCK_BOOTTIME: 10**12, time.CLOCK_MONOTONIC: 10**12}
+    monkeypatch.setattr(time, "clock_gettime_ns", clocks.__getitem__)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: clocks[time.CLOCK_MONOTONIC])
+    return clocks
+
+
+@pytest.mark.parametrize("set_by_us", [0, 3_600_000_000])
+def test_a_machine_that_slept_is_distinguished_from_one_whose_clock_was_set(
+    monkeypatch: pytest.MonkeyPatch, set_by_us: int
+) -> None:
+    clocks = sleepless(monkeypatch)
+    now_us, clock = GatewayClock(), CivilClock()
+    clock.hear_machine(UTC_US, now_us())
+    stamper = Stamper(UTC_US)
+    clocks[time.CLOCK_BOOTTIME] += 3_600 * 10**9
+    clock.hear_machine(UTC_US + 3_600_000_000 + set_by_us, now_us())
+    assert stamper.has_jumped(clock) == bool(set_by_us)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_stamps_grow_whatever_the_order_of_calls(seed: int) -> None:
+    times = np.random.default_rng(seed).integers(0, 1000, 300).tolist()
+    stamper = Stamper(UTC_US)
+    stamps = [stamper.stamp(time) for time in times]
+    assert all(b - a >= STAMP_STEP_US for a, b in itertools.pairwise(stamps))
+    assert all(stamp % STAMP_STEP_US == 0 for stamp in stamps)
+
+
+def test_a_stamp_is_never_later_than_its_moment() -> None:
+    stamper = Stamper(UTC_US)
+    for now_us in range(0, 100_000, 997):
+        assert 0 <= now_us + UTC_US - stamper.stamp(now_us) < STAMP_STEP_US
+
+
+def test_a_clock_before_1970_gives_zero_and_grows() -> None:
+    stamper = Stamper(-1_000_000)
+    assert [stamper.stamp(0), stamper.stamp(1)] == [STAMP_STEP_US, 2 * STAMP_STEP_US]
+
+
+def decode(frame: bytes) -> mavlink.MAVLink_message:
+    (message,) = mavlink.MAVLink(None).parse_buffer(frame)
+    return message
+
+
+@pytest.mark.parametrize("frame", make_frames(3))
+def test_only_the_sender_changes(frame: bytes) -> None:
+    before, after = decode(frame), decode(readdress(frame, 42))
+    assert after.get_srcSystem() == 42
+    assert after.get_srcComponent() == before.get_srcComponent()
+    assert after.to_dict() == before.to_dict()
+
+
+def test_mavlink_1() -> None:
+    mav = mavlink.MAVLink(None, 1, 1)
+    frame = bytes(
+        mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(mav, force_mavlink1=True)
+    )
+    assert decode(readdress(frame, 9)).get_srcSystem() == 9
+
+
+def test_a_signature_that_cannot_hold_is_taken_off() -> None:
+    mav = mavlink.MAVLink(None, 1, 1)
+    mav.signing.secret_key = bytes(32)
+    mav.signing.sign_outgoing = True
+    frame = bytes(mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(mav))
+    after = readdress(frame, 9)
+    assert len(after) == len(frame) - 13
+    assert decode(after).get_srcSystem() == 9
+
+
+def test_an_unknown_message_is_left_alone() -> None:
+    frame = b"\xfd\x00\x00\x00\x00\x01\x01\xff\xff\xff\x00\x00"
+    assert readdress(frame, 9) == frame
+
+
+@pytest.mark.parametrize(
+    ("before", "time", "after", "is_odd"),
+    [
+        (0, 5, 10, False),
+        (0, -ORDER_US, 10, False),
+        (0, -ORDER_US - 1, 10, True),
+        (0, 10 + ORDER_US, 10, False),
+        (0, 11 + ORDER_US, 10, True),
+        (0, 11 + ORDER_US, -ORDER_US - 1, False),
+        (0, -DAY_US, DAY_US, True),
+        (0, -DAY_US, DAY_US + 1, False),
+    ],
+)
+def test_numbers_and_arrays_are_judged_alike(
+    before: int, time: int, after: int, is_odd: bool
+) -> None:
+    assert is_damaged(before, time, after) is is_odd
+    columns = [np.array([value, 0]) for value in (before, time, after)]
+    assert is_damaged(*columns).tolist() == [is_odd, False]

@@ -88,7 +88,7 @@ class CsvReader:
         self.skipped = 0
         """Lines of text before that with the names of the columns."""
         self.faults = 0
-        """Lines that could not be read, or whose time is not between those beside them."""
+        """Lines that could not be read, or whose time is not between its neighbours."""
 
     def rows(self, lines: Iterable[str]) -> Iterator[TableRow]:
         """Read a whole file."""

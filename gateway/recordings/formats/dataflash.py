@@ -47,9 +47,9 @@ LATE_US: Final = US_PER_S
 """Messages of one loop are not quite in order; one later than this has a damaged time."""
 AHEAD_US: Final = 3_600 * US_PER_S
 """And so has one that jumps ahead by more."""
-BELIEVED: Final = 50
+AGREEING: Final = 50
 """So many messages in a row that agree about another time are right: the clock has leaped."""
-LEAST_BELIEVED: Final = 3
+LEAST_AGREEING: Final = 3
 """And so many that nothing follows."""
 FIX_2D: Final = 2
 SENSOR_NUMBERS: Final = ("I", "C")
@@ -141,11 +141,11 @@ class ArdupilotReader:
         if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
             self._drop_held()
         self._held.append((own_us, kind, message))
-        return self._follow() if len(self._held) == BELIEVED else []
+        return self._follow() if len(self._held) == AGREEING else []
 
     def flush(self) -> list[Imported]:
         """Return what still waits at the end of the log."""
-        held = self._follow() if len(self._held) >= LEAST_BELIEVED else []
+        held = self._follow() if len(self._held) >= LEAST_AGREEING else []
         self._drop_held()
         return [*held, *self._flush_fix()]
 

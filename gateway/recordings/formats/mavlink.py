@@ -145,9 +145,9 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     place_at : ndarray of int, shape (n,)
         Which of them was known at each fix; -1 for none.
     """
-    told = np.minimum(values["fix_type"], FIX_3D)
+    reported = np.minimum(values["fix_type"], FIX_3D)
     fix_type = np.select(
-        [told == FIX_2D, told == FIX_3D],
+        [reported == FIX_2D, reported == FIX_3D],
         [int(GpsFixType.FIX_2D), int(GpsFixType.FIX_3D)],
         int(GpsFixType.NONE),
     )
@@ -155,7 +155,7 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     satellites = values["satellites_visible"]
     utc_us = values["time_usec"]
     is_civil = (utc_us > UNIX_YEAR_2000_US) & (utc_us <= LARGEST_WHOLE)
-    down_mps = _of_place(places, np.where(told == FIX_3D, place_at, -1), "vz", CENTI)
+    down_mps = _of_place(places, np.where(reported == FIX_3D, place_at, -1), "vz", CENTI)
     north_mps, east_mps = _velocity(values, has_fix)
     return np.column_stack(
         [
@@ -276,7 +276,7 @@ class AutopilotReader:
         self._places_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
         self._state = np.full((1, NAV.stop - NAV.start), np.nan)
-        """What the autopilot believed last; NaN once a sample has it."""
+        """The newest estimate of the autopilot; NaN once a sample has it."""
         self._open = np.empty((0, len(COLUMNS)))
         """The row that waits for its sample, if any."""
 
@@ -335,8 +335,8 @@ class AutopilotReader:
         own_us = np.zeros(len(message_ids), np.int64)
         for message_id, values in fields.items():
             if "time_usec" in (values.dtype.names or ()):
-                told = values["time_usec"]
-                own = np.where(told > UNIX_YEAR_2000_US, 0, told).astype(np.int64)
+                sent = values["time_usec"]
+                own = np.where(sent > UNIX_YEAR_2000_US, 0, sent).astype(np.int64)
             else:
                 own = values["time_boot_ms"].astype(np.int64) * 1000
             own_us[message_ids == message_id] = own
@@ -376,7 +376,7 @@ class AutopilotReader:
         places: tuple[NDArray[np.void], IntArray],
         fields: dict[int, NDArray[np.void]],
     ) -> FloatArray:
-        """Return what the autopilot believed at each sample; NaN where it told nothing new."""
+        """Return the estimate of the autopilot at each sample; NaN where there is none."""
         is_state, is_imu = message_ids == ATTITUDE, np.isin(message_ids, [*IMU_RANK])
         newest = np.cumsum(is_state)
         # Of states that come one behind another the last counts; the end of all is a sample too.

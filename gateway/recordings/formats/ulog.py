@@ -54,7 +54,7 @@ TOPICS: Final = (
 LEAST_PA: Final = 2000.0
 """A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
 AROUND: Final = 5
-"""Rows whose median time is believed."""
+"""Rows whose median time is used."""
 FAR_US: Final = 60 * US_PER_S
 """A row so far from that has a damaged time."""
 NOT_THERE: Final = 0x7FFFFFFF
@@ -271,7 +271,7 @@ _NEEDED: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "vehicle_gps_position": _GPS_FIELDS,
     "sensor_gps": _GPS_FIELDS,
 }
-"""One of each is needed of a topic, beside its time."""
+"""One of each is needed of a topic, in addition to its time."""
 
 
 def _sound_columns(topic: Topic) -> Topic:
@@ -322,7 +322,7 @@ BROKEN: Final = (
     *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
     *(struct.error, RecursionError),
 )
-"""What damage makes pyulog raise, beside its own error."""
+"""What damage makes pyulog raise, in addition to its own error."""
 
 
 class _Content(io.BufferedReader):

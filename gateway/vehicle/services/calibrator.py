@@ -109,7 +109,7 @@ class _Run:
         return sample.time_us - self.times_us[0]
 
     def samples(self) -> NodeSamples:
-        """Return what was collected, in body axes, and collect anew."""
+        """Return what was collected, in body axes, and start again."""
         found = NodeSamples(
             time_s=np.array(self.times_us) / US_PER_S,
             accel=np.array(self.accel),

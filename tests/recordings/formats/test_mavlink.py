@@ -8,7 +8,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.columns import Imported, RowBuilder, TableRow, row_of_cells
+from gateway.recordings.columns import Imported, TableRow, row_of_cells
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import (
@@ -21,7 +21,6 @@ from gateway.records import (
     NavState,
 )
 from tests.recordings.frames import START_US
-from tests.recordings.single_reader import SingleReader
 
 G = 9.80665
 Message = Any
@@ -257,16 +256,15 @@ def recorded(seed: int) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_batch_gives_the_rows_that_single_frames_give(seed: int) -> None:
+def test_rows_do_not_depend_on_the_size_of_the_batches(seed: int) -> None:
     records = recorded(seed)
-    singly, builder = SingleReader(), RowBuilder()
-    expected = [
-        repr(row)
-        for time_us, frame in records
-        for item in singly.feed(frame, time_us)
-        for row in builder.add(item)
-    ] + [repr(row) for row in builder.flush()]
-    reader = AutopilotReader()
+    whole = AutopilotReader()
+    expected = [repr(row) for row in rows_of(whole, records, 1 << 20)]
     assert len(expected) > 20
-    assert [repr(row) for row in rows_of(reader, records, 5000)] == expected
-    assert (reader.system_id, reader.unix_us_at_zero) == (singly.system_id, singly.unix_us_at_zero)
+    for size in (60, 300, 5000):
+        reader = AutopilotReader()
+        assert [repr(row) for row in rows_of(reader, records, size)] == expected
+        assert (reader.system_id, reader.unix_us_at_zero) == (
+            whole.system_id,
+            whole.unix_us_at_zero,
+        )

@@ -1,0 +1,257 @@
+"""Tracks for maps, read back by an XML parser."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import msgspec
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.config import GatewaySettings
+from gateway.recordings.formats.maps import (
+    MapPlace,
+    PlaceKind,
+    TrackPoint,
+    VehicleTrack,
+    to_geojson,
+    to_gpx,
+    to_kml,
+    tracks_of_frames,
+    tracks_of_table,
+)
+from gateway.recordings.reading import RecordedTable
+from gateway.recordings.table import TableMark, block_of
+from gateway.recordings.tlog import TlogRecord
+from gateway.records import NavFlags
+from tests.recordings.frames import START_US
+from tests.recordings.test_replay import fly, make_flight, read
+
+POINTS = [
+    TrackPoint(1_760_000_000_123_000 + i * 100_000, 47.1 + 1e-6 * i, -8.5, 430.25) for i in range(5)
+]
+ATTITUDE = TrackPoint(POINTS[-1].time_us + 10**6, 47.2, -8.5, 431.0, (-10.0, 5.0, -90.0))
+VEHICLES = [
+    VehicleTrack("wood & <field>", [*POINTS, ATTITUDE], [
+        MapPlace(PlaceKind.HOME, "Home", POINTS[0]),
+        MapPlace(PlaceKind.MARK, "over <the> gate", POINTS[2]),
+        MapPlace(PlaceKind.EVENT, "GPS fix lost", POINTS[3]),
+    ]),
+    VehicleTrack("system 7", POINTS[:2]),
+]  # fmt: skip
+KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
+GPX = {"g": "http://www.topografix.com/GPX/1/1", "a": "urn:mavgate:attitude:1"}
+
+
+def test_kml_holds_every_vehicle_with_times_and_attitude() -> None:
+    root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
+    assert [e.text for e in root.findall(".//k:Folder/k:name", KML)] == [
+        "wood & <field>", "system 7",
+    ]  # fmt: skip
+    first, second = root.findall(".//gx:Track", KML)
+    places = [e.text for e in first.findall("gx:coord", KML)]
+    assert places[1] == "-8.5000000 47.1000010 430.25"
+    times = [e.text for e in first.findall("k:when", KML)]
+    assert times[0] == "2025-10-09T08:53:20.123Z"
+    angles = [e.text for e in first.findall("gx:angles", KML)]
+    assert angles == [None] * 5 + ["270.0 5.0 -10.0"]
+    assert len(times) == len(places) == len(angles) == 6
+    assert len(second.findall("gx:coord", KML)) == 2
+    assert second.findall("gx:angles", KML) == []
+    styles = {e.get("id") for e in root.findall(".//k:Style", KML)}
+    used = [e.text for e in root.findall(".//k:styleUrl", KML)]
+    assert len(set(used)) == 2
+    assert {(style or "#")[1:] for style in used} <= styles
+
+
+def test_kml_holds_home_marks_and_events() -> None:
+    root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
+    found = [
+        (p.findtext("k:description", namespaces=KML), p.findtext("k:name", namespaces=KML),
+         p.findtext("k:Point/k:coordinates", namespaces=KML))
+        for p in root.findall(".//k:Placemark", KML) if p.find("k:Point", KML) is not None
+    ]  # fmt: skip
+    assert found == [
+        ("home", "Home", "-8.5000000,47.1000000,430.25"),
+        ("mark", "over <the> gate", "-8.5000000,47.1000020,430.25"),
+        ("event", "GPS fix lost", "-8.5000000,47.1000030,430.25"),
+    ]
+
+
+def test_gpx_holds_the_same() -> None:
+    root = ET.fromstring("".join(to_gpx("flight", VEHICLES)))
+    # GPX wants waypoints before tracks.
+    assert [e.tag.rpartition("}")[2] for e in root] == ["metadata", *["wpt"] * 3, *["trk"] * 2]
+    names = [e.findtext("g:name", namespaces=GPX) for e in root.findall("g:wpt", GPX)]
+    assert names == ["Home", "over <the> gate", "GPS fix lost"]
+    points = root.findall("g:trk", GPX)[0].findall(".//g:trkpt", GPX)
+    assert (points[1].get("lat"), points[1].get("lon")) == ("47.1000010", "-8.5000000")
+    assert points[1].findtext("g:ele", namespaces=GPX) == "430.25"
+    assert points[1].findtext("g:time", namespaces=GPX) == "2025-10-09T08:53:20.223Z"
+    attitude = points[5].find("g:extensions/a:attitude", GPX)
+    assert attitude is not None
+    assert attitude.attrib == {"roll": "-10.0", "pitch": "5.0", "yaw": "270.0"}
+
+
+def test_no_points_is_still_a_file() -> None:
+    ET.fromstring("".join(to_kml("x", [])))
+    ET.fromstring("".join(to_gpx("x", [])))
+
+
+@pytest.mark.parametrize("write", [to_kml, to_gpx])
+def test_texts_that_xml_cannot_hold_leave_it_readable(write: Callable[..., Iterator[str]]) -> None:
+    odd = "".join(map(chr, range(0x20))) + "\x7f\ud800\udcff\ufffe\uffff]]>\N{HELICOPTER}"
+    vehicles = [VehicleTrack(odd, POINTS, [MapPlace(PlaceKind.MARK, odd, POINTS[0])])]
+    text = "".join(write(odd, vehicles))
+    names = [e.text or "" for e in ET.fromstring(text.encode()).iter() if e.tag.endswith("name")]
+    assert len(names) >= 3
+    assert sum("\N{HELICOPTER}" in name for name in names) >= 3
+
+
+def written(vehicles: list[VehicleTrack]) -> dict:
+    return json.loads("".join(to_geojson('a "flight"', vehicles)))
+
+
+def test_it_holds_every_vehicle_with_times_home_marks_and_events() -> None:
+    found = written(VEHICLES)
+    assert (found["type"], found["name"]) == ("FeatureCollection", 'a "flight"')
+    assert {feature["type"] for feature in found["features"]} == {"Feature"}
+    kinds = [(f["geometry"]["type"], f["properties"]["kind"]) for f in found["features"]]
+    assert kinds == [
+        ("LineString", "track"), ("Point", "home"), ("Point", "mark"), ("Point", "event"),
+        ("LineString", "track"),
+    ]  # fmt: skip
+    line, home, mark = found["features"][:3]
+    assert line["geometry"]["coordinates"][0] == [-8.5, 47.1, 430.25]
+    assert len(line["geometry"]["coordinates"]) == len(line["properties"]["coordTimes"]) == 6
+    assert line["properties"]["coordTimes"][0] == "2025-10-09T08:53:20.123Z"
+    assert line["properties"]["name"] == "wood & <field>"
+    assert home["geometry"]["coordinates"] == [-8.5, 47.1, 430.25]
+    assert mark["properties"]["name"] == "over <the> gate"
+    assert mark["properties"]["vehicle"] == "wood & <field>"
+
+
+def test_a_track_is_cut_at_the_antimeridian() -> None:
+    lons = (179.0, 179.8, -179.8, -179.0, 179.9)
+    points = [TrackPoint(1_000_000 * k, 10.0 + k, lon, 100.0) for k, lon in enumerate(lons)]
+    (track,) = written([VehicleTrack("x", points)])["features"]
+    assert track["geometry"]["type"] == "MultiLineString"
+    parts = track["geometry"]["coordinates"]
+    assert [len(part) for part in parts] == [3, 4, 2]
+    assert parts[0][-1] == [180.0, 11.5, 100.0]
+    assert parts[1][0] == [-180.0, 11.5, 100.0]
+    assert parts[1][-1][0] == -180.0
+    assert parts[2][0][0] == 180.0
+    assert [len(times) for times in track["properties"]["coordTimes"]] == [3, 4, 2]
+    for part in parts:
+        assert len({math.copysign(1.0, lon) for lon, *_ in part}) == 1
+
+
+@pytest.mark.parametrize(("alt_m", "length"), [(math.nan, 2), (5.0, 3)])
+def test_one_point_is_a_point_and_an_unknown_height_is_left_out(alt_m: float, length: int) -> None:
+    (track,) = written([VehicleTrack("x", [TrackPoint(0, 47.0, 8.0, alt_m)])])["features"]
+    assert track["geometry"]["type"] == "Point"
+    assert len(track["geometry"]["coordinates"]) == length
+
+
+SECOND_US = 1_000_000
+ONE, TWO, STATION, OLD_STATION = (1, 1), (7, 1), (255, 190), (42, 190)
+
+
+def position(lat: int) -> Any:
+    return mavlink.MAVLink_global_position_int_message(0, lat, 85_000_000, 430_000, 0, 0, 0, 0, 0)
+
+
+def text(words: str, severity: int = 6, number: int = 0, chunk: int = 0) -> Any:
+    return mavlink.MAVLink_statustext_message(severity, words.encode(), number, chunk)
+
+
+def home(lat: int) -> Any:
+    return mavlink.MAVLink_home_position_message(
+        lat, 85_000_000, 400_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
+    )
+
+
+SAID: list[tuple[tuple[int, int], Any]] = [
+    (ONE, text("Attitude valid")),
+    (OLD_STATION, mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)),
+    (ONE, mavlink.MAVLink_attitude_message(0, 0.1, -0.2, 1.5, 0, 0, 0)),
+    (ONE, mavlink.MAVLink_global_position_int_message(0, 0, 0, 0, 0, 0, 0, 0, 0)),
+    (ONE, home(470_000_000)),
+    (ONE, position(470_000_001)),
+    (TWO, position(480_000_000)),
+    (ONE, home(470_000_000)),
+    (ONE, text("Mark: over the gate")),
+    (ONE, text("Marked 47.500000, 8.600000")),
+    (ONE, text("for programmers", severity=7)),
+    (TWO, mavlink.MAVLink_attitude_quaternion_message(0, 1.0, 0, 0, 0, 0, 0, 0)),
+    (TWO, position(480_000_001)),
+    (ONE, text("A" * 50, number=3, chunk=0)),
+    (ONE, text("B", number=3, chunk=1)),
+    (STATION, text("hello")),
+    (STATION, position(10)),
+    (OLD_STATION, position(20)),
+]
+
+
+def records() -> list[TlogRecord]:
+    return [
+        TlogRecord(START_US + i * SECOND_US, bytes(m.pack(mavlink.MAVLink(None, *who))))
+        for i, (who, m) in enumerate(SAID)
+    ]
+
+
+def places(track: VehicleTrack) -> list[tuple[PlaceKind, str]]:
+    return [(place.kind, place.name) for place in track.places]
+
+
+def test_every_vehicle_and_nobody_else() -> None:
+    one, two = tracks_of_frames(records(), None)
+    assert (one.name, two.name) == ("system 1", "system 7")
+    assert [round(p.lat_deg * 1e7) for p in two.points] == [480_000_000, 480_000_001]
+    assert [track.name for track in tracks_of_frames(records(), 7)] == ["system 7"]
+    assert tracks_of_frames(records(), 9) == []
+
+
+def test_attitude_stands_with_the_points() -> None:
+    one, two = tracks_of_frames(records(), None)
+    assert one.points[0].attitude_deg == pytest.approx(
+        (math.degrees(0.1), math.degrees(-0.2), math.degrees(1.5)), abs=1e-4
+    )
+    assert [p.attitude_deg for p in two.points] == [None, (0.0, 0.0, 0.0)]
+
+
+def test_home_marks_and_events() -> None:
+    one, _ = tracks_of_frames(records(), None)
+    assert places(one) == [
+        (PlaceKind.HOME, "Home"),
+        (PlaceKind.EVENT, "Attitude valid"),
+        (PlaceKind.MARK, "over the gate"),
+        (PlaceKind.MARK, "Marked 47.500000, 8.600000"),
+        (PlaceKind.EVENT, "A" * 50 + "B"),
+    ]
+    by_name = {place.name: place.at for place in one.places}
+    assert by_name["Marked 47.500000, 8.600000"].lat_deg == 47.5
+    assert by_name["over the gate"].lat_deg == pytest.approx(47.0000001)
+    assert by_name["Home"].alt_amsl_m == pytest.approx(400.0)
+
+
+def test_a_table_tells_the_same(rng: np.random.Generator) -> None:
+    settings = GatewaySettings().default_aircraft
+    header, rows = read(fly(settings, make_flight(rng, 12))[0])
+    rows = [
+        replace(row, gps=msgspec.structs.replace(row.gps, h_acc_m=1.0, satellites=12))
+        if row.gps
+        else row
+        for row in rows
+    ]
+    mark = TableMark(rows[-1].time_us, "over the gate")
+    (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
+    assert places(track) == [(PlaceKind.HOME, "Home"), (PlaceKind.MARK, "over the gate")]
+    assert len(track.points) > 10
+    known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]
+    assert any(point.attitude_deg is not None for point in track.points) == bool(known)
