@@ -297,6 +297,24 @@ class TestTrouble:
         assert rig.incoming[0].frame[4] == 7
         assert hub.clients()[0].bytes_garbage > 4000
 
+    @pytest.mark.parametrize(
+        ("locator", "trusted", "warns"),
+        [
+            ("tcp/192.0.2.1:7447", True, True),
+            ("ws/fleet.example:7447", True, True),
+            ("tcp/192.0.2.1:7447", False, False),
+            ("tls/fleet.example:7447", True, False),
+            ("tcp/127.0.0.1:7447", True, False),
+            ("tcp/localhost:7447", True, False),
+        ],
+    )
+    def test_trusted_fleet_over_a_network_without_tls_is_warned_of(
+        self, locator: str, trusted: bool, warns: bool, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        client = MagicMock(endpoint=MagicMock(host=locator), trusted=trusted)
+        zenoh_client.ZenohClient._warn_of_open_access(client)
+        assert ("trusted=yes without TLS" in caplog.text) == warns
+
     async def test_missing_router_is_reported(self, rig: Rig) -> None:
         place = f"tcp/127.0.0.1:{free_port()}"
         hub = rig.hub(f"zenoh:{place}?site=field")
