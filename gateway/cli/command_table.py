@@ -73,7 +73,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "page": CommandEntry(
         "recorded.page",
-        "Make one HTML file of a flight: instruments, 3D, plan, slider, plots; opens offline.",
+        "Make one HTML file of a flight, which opens offline in any browser.",
         RECORDINGS,
     ),
     "sweep": CommandEntry(
