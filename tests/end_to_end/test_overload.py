@@ -44,7 +44,7 @@ def test_stopped_process_blames_no_hardware(
     gateway = start_gateway("demo")
     client = connect(gateway.port)
     client.until(lambda seen: {"GLOBAL_POSITION_INT", "HEARTBEAT"} <= set(seen))
-    before = list(messages(client, 8.0))
+    before = list(messages(client, 14.0))
     gateway.process.send_signal(signal.SIGSTOP)
     time.sleep(STOPPED_S)
     gateway.process.send_signal(signal.SIGCONT)

@@ -144,7 +144,7 @@ class GroundStation:
         return [action for action in self.actions if isinstance(action, kind)]
 
     @property
-    def wishes(self) -> list[ClientInterval]:
+    def requested_intervals(self) -> list[ClientInterval]:
         return self.of(ClientInterval)
 
 

@@ -104,7 +104,7 @@ UNKNOWN = {
 
 
 @pytest.mark.parametrize("name", UNKNOWN)
-def test_what_is_not_known_is_sent_as_the_definition_says(name: str) -> None:
+def test_unknown_values_are_sent_as_the_definition_requires(name: str) -> None:
     [message] = decode([Encoder(1).encode(UNKNOWN[name]())])
     marks = invalid_marks(name)
     assert marks

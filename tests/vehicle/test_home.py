@@ -27,7 +27,7 @@ def home(station: GroundStation) -> list[float]:
     return [found[name] for name in NAMES]
 
 
-def told_homes(messages: list[Any]) -> list[tuple[int, int, int]]:
+def sent_homes(messages: list[Any]) -> list[tuple[int, int, int]]:
     found = [m for m in messages if m.get_type() == "HOME_POSITION"]
     return [(m.latitude, m.longitude, m.altitude) for m in found]
 
@@ -51,12 +51,12 @@ def test_the_home_of_the_gps_is_shown_as_parameters(nowhere: GroundStation) -> N
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
     assert set(NAMES) <= {m.param_id for m in nowhere.inbox if m.get_type() == "PARAM_VALUE"}
     assert home(nowhere) == [GPS, *map(float32, (47.123_456_7, -8.765_432_1, 520.25))]
-    assert nowhere.of(SavePlan) == [], "it is measured anew at every start"
+    assert nowhere.of(SavePlan) == [], "it is measured again at every start"
 
 
 def test_one_number_moves_home_and_leaves_the_others_exact(station: GroundStation) -> None:
     found = station.send(set_message("HOME_LAT", 47.5))
-    assert told_homes(found) == [(475_000_000, -87_654_321, 520_250)]
+    assert sent_homes(found) == [(475_000_000, -87_654_321, 520_250)]
     assert home(station)[:2] == [OPERATOR, 47.5]
     assert "HOME_POSITION" in station.broadcasts
     assert station.of(SettingsChange) == [], "it is no setting of another stage"
@@ -64,13 +64,13 @@ def test_one_number_moves_home_and_leaves_the_others_exact(station: GroundStatio
 
 def test_a_latitude_is_as_fine_as_a_float_can_be(station: GroundStation) -> None:
     sent = float32(-122.123_456)
-    [(_, lon, _)] = told_homes(station.send(set_message("HOME_LON", sent)))
+    [(_, lon, _)] = sent_homes(station.send(set_message("HOME_LON", sent)))
     assert lon / 1e7 == pytest.approx(sent, abs=4e-6)
 
 
 def test_numbers_sent_back_as_they_were_shown_change_nothing(station: GroundStation) -> None:
     for name, value in zip(NAMES, home(station), strict=True):
-        assert told_homes(station.send(set_message(name, value))) == []
+        assert sent_homes(station.send(set_message(name, value))) == []
     assert station.vehicle.telemetry.home.location == pytest.approx(FIELD)
     assert home(station)[0] == GPS
 
@@ -83,10 +83,10 @@ def test_a_home_begins_only_with_its_last_number(nowhere: GroundStation, first: 
     for name in names[:-1]:
         found = nowhere.send(set_message(name, wanted[name]))
         assert [m.param_value for m in found if m.get_type() == "PARAM_VALUE"] == [wanted[name]]
-        assert told_homes(found) == []
+        assert sent_homes(found) == []
     assert home(nowhere)[0] == NONE
     found = nowhere.send(set_message(names[-1], wanted[names[-1]]))
-    assert told_homes(found) == [(515_000_000, 0, 45_000)]
+    assert sent_homes(found) == [(515_000_000, 0, 45_000)]
     assert home(nowhere) == [OPERATOR, 51.5, 0.0, 45.0]
 
 
@@ -101,7 +101,7 @@ def test_a_fix_overrides_half_a_home(nowhere: GroundStation) -> None:
     ("name", "value"),
     [("HOME_LAT", 90.1), ("HOME_LON", -180.1), ("HOME_ALT", 1e6), ("HOME_SOURCE", 3.0)],
 )
-def test_what_is_no_place_is_refused(station: GroundStation, name: str, value: float) -> None:
+def test_invalid_coordinates_are_refused(station: GroundStation, name: str, value: float) -> None:
     before = home(station)
     error, echo = station.send(set_message(name, value))
     assert (error.get_type(), echo.param_value) == ("PARAM_ERROR", before[NAMES.index(name)])
@@ -116,7 +116,7 @@ def test_it_is_kept_when_the_parameters_are_stored(station: GroundStation) -> No
     assert kept(station)[-1] == pytest.approx(Location(47.5, -8.765_432_1, 520.25))
 
 
-def test_another_save_does_not_keep_what_was_not_stored(station: GroundStation) -> None:
+def test_saving_the_plan_does_not_keep_an_unstored_home(station: GroundStation) -> None:
     station.send(set_message("HOME_LAT", 47.5))
     station.receive(station.vehicle.put_mark(Location(1.0, 2.0, 3.0), 0))
     assert kept(station) == [None]
@@ -133,12 +133,12 @@ def test_the_home_of_the_gps_can_be_kept(station: GroundStation) -> None:
     assert kept(station) == [pytest.approx(FIELD)]
 
 
-def test_it_is_forgotten_and_measured_anew(clock: ManualClock) -> None:
+def test_cleared_home_is_measured_again(clock: ManualClock) -> None:
     stored = StoredPlan(home=Location(10.0, 20.0, 30.0))
     station = GroundStation(Vehicle(VehicleSettings(), 1, stored=stored), clock)
     assert home(station) == [OPERATOR, 10.0, 20.0, 30.0]
-    told = texts(station.vehicle.on_gps(FIX, 0))
-    assert told == ["Stored home is used, 4927564 m from here", "GPS fix"]
+    reported = texts(station.vehicle.on_gps(FIX, 0))
+    assert reported == ["Stored home is used, 4927564 m from here", "GPS fix"]
     assert texts(station.vehicle.on_gps(FIX, 1)) == [], "once"
     [echo] = [m for m in station.send(set_message("HOME_SOURCE", NONE)) if m.param_id == NAMES[0]]
     assert echo.param_value == NONE

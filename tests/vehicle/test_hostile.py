@@ -140,7 +140,9 @@ def _size_of(root: object) -> int:
     return total
 
 
-def test_every_command_is_acknowledged_once_to_the_one_who_asked(station: GroundStation) -> None:
+def test_every_command_is_acknowledged_once_to_the_requesting_client(
+    station: GroundStation,
+) -> None:
     known = set(mavlink.enums["MAV_CMD"]) - {mavlink.MAV_CMD_LOGGING_START}
     asked = sorted((known | set(range(0, 65_536, 37))) & set(range(65_536)))
     for number in asked:
@@ -152,8 +154,8 @@ def test_every_command_is_acknowledged_once_to_the_one_who_asked(station: Ground
     ended = [m.command for m in acks if m.result != mavlink.MAV_RESULT_IN_PROGRESS]
     assert sorted({*ended, *begun}) == asked
     assert len(ended) + len(begun) == len(acks) == len(asked)
-    told = {frame.client_id for frame in station.frames if frame.message_id == 77}
-    assert told == {station.client_id}
+    reported = {frame.client_id for frame in station.frames if frame.message_id == 77}
+    assert reported == {station.client_id}
 
 
 def test_a_flood_for_the_parameters_is_one_list_and_not_a_thousand(

@@ -82,7 +82,7 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "metadata/deprecated": (command(512, 395), ACK, UNSUPPORTED),
     "modes/available": (command(512, 435, 0), "AVAILABLE_MODES", {}),
     "modes/current": (command(512, 436), "CURRENT_MODE", {}),
-    # parameter.html: read by name or index, set and told, unknown ones refused.
+    # parameter.html: read by name or index, set and reported, unknown ones refused.
     "parameter/list": (
         lambda: mavlink.MAVLink_param_request_list_message(*ME), "PARAM_VALUE", {},
     ),
@@ -223,7 +223,7 @@ def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
     assert {field: answers(answer, field) for field in fields} == fields
 
 
-TOLD_TO_ALL = {
+SENT_TO_ALL = {
     "command/int": {"HOME_POSITION", "STATUSTEXT"},
     "command/denied": {"STATUSTEXT"},
     "command/long-running": {"STATUSTEXT"},
@@ -237,11 +237,13 @@ TOLD_TO_ALL = {
 
 
 @pytest.mark.parametrize("row", TABLE)
-def test_it_is_given_once_and_to_the_one_who_asked(station: GroundStation, row: str) -> None:
+def test_answer_is_sent_once_and_to_the_requesting_client_only(
+    station: GroundStation, row: str
+) -> None:
     request, kind, _ = TABLE[row]
     found = station.send(request())
     # A list comes in tens; with home's height goes who set it.
     expected = {"parameter/list": 10, "parameter/set-of-home": 2, "signing/setup": 3}.get(row, 1)
     assert sum(m.get_type() == kind for m in found) == expected
     assert {frame.client_id for frame in station.frames} <= {7, None, RECORDED_ONLY}
-    assert station.broadcasts == TOLD_TO_ALL.get(row, set())
+    assert station.broadcasts == SENT_TO_ALL.get(row, set())

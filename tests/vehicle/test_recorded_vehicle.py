@@ -55,11 +55,11 @@ class Told:
 class Asking:
     """A ground station that speaks to a recorded vehicle on a clock of its own."""
 
-    def __init__(self, told: Told) -> None:
-        self.vehicle = RecordedVehicle(SYSTEM, told)
+    def __init__(self, reported: Told) -> None:
+        self.vehicle = RecordedVehicle(SYSTEM, reported)
         self.mav = mavlink.MAVLink(None, 255, 190)
         self.now_us = 0
-        self.wishes: list[ClientInterval] = []
+        self.requested_intervals: list[ClientInterval] = []
 
     def ask(self, message: Any, *, trusted: bool = True) -> list[Any]:
         frame = bytes(message.pack(self.mav))
@@ -74,7 +74,7 @@ class Asking:
         return self.ask(mavlink.MAVLink_command_long_message(SYSTEM, 1, number, 0, *padded))
 
     def _read(self, actions: list[Any]) -> list[Any]:
-        self.wishes += [a for a in actions if isinstance(a, ClientInterval)]
+        self.requested_intervals += [a for a in actions if isinstance(a, ClientInterval)]
         frames = [a for a in actions if isinstance(a, Outgoing)]
         assert {f.client_id for f in frames} <= {CLIENT}
         return [mavlink.MAVLink(None).decode(bytearray(f.frame)) for f in frames]
@@ -158,7 +158,7 @@ def test_a_message_that_the_log_lacks_is_unsupported(asking: Asking) -> None:
         mavlink.MAV_CMD_NAV_TAKEOFF,
     ],
 )
-def test_what_is_over_cannot_be_commanded(asking: Asking, number: int) -> None:
+def test_recorded_vehicle_denies_commands(asking: Asking, number: int) -> None:
     (ack,) = asking.command(number, 1)
     assert ack.result == mavlink.MAV_RESULT_DENIED
 
@@ -168,7 +168,7 @@ def test_modes_are_denied(asking: Asking) -> None:
     assert ack.result == mavlink.MAV_RESULT_DENIED
 
 
-def test_a_client_may_thin_what_is_played(asking: Asking) -> None:
+def test_client_may_reduce_the_rate_of_a_played_message(asking: Asking) -> None:
     number, attitude = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE
     results = [
         asking.command(number, message_id, wish)[0].result
@@ -176,7 +176,7 @@ def test_a_client_may_thin_what_is_played(asking: Asking) -> None:
     ]
     accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
     assert results == [accepted, accepted, mavlink.MAV_RESULT_UNSUPPORTED, denied, accepted]
-    assert [(w.message_id, w.interval_us) for w in asking.wishes] == [
+    assert [(w.message_id, w.interval_us) for w in asking.requested_intervals] == [
         (attitude, 1_000_000), (HOME, -1), (0, 0),
     ]  # fmt: skip
 

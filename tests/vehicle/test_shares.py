@@ -46,7 +46,7 @@ def test_lists_of_parameters_for_a_crowd_are_no_more_work_than_for_one(
     assert sent <= 2 * FRAMES_A_SECOND + 10
 
 
-def test_who_asks_for_the_list_beside_a_crowd_gets_it(
+def test_parameter_list_arrives_while_many_other_clients_request_it(
     station: GroundStation, crowd: list[GroundStation]
 ) -> None:
     for each in crowd:
@@ -75,7 +75,7 @@ def test_bursts_of_single_bytes_for_a_crowd_are_no_more_work_than_for_one(
     assert frames_of([station, *crowd], kind) <= 2 * FRAMES_A_SECOND + 10
 
 
-def test_a_strangers_files_close_nobody_elses(station: GroundStation) -> None:
+def test_sessions_of_an_untrusted_client_close_no_others(station: GroundStation) -> None:
     mine = Ftp(station)
     session = mine.ask(Opcode.OPEN_FILE_RO, b"/general.json").session
     stranger = Ftp(GroundStation(station.vehicle, station.clock, client_id=8, trusted=False))
@@ -84,7 +84,7 @@ def test_a_strangers_files_close_nobody_elses(station: GroundStation) -> None:
     assert mine.ask(Opcode.READ_FILE, session=session, size=9).opcode == ACK
 
 
-def test_strangers_who_hold_every_session_make_room_for_the_trusted(
+def test_untrusted_sessions_give_way_to_a_trusted_client(
     station: GroundStation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ftp_service, "MAX_SESSIONS", 12)
@@ -110,10 +110,14 @@ def test_only_the_trusted_may_have_an_answer_sent_to_all(
     assert to_all == [trusted]
 
 
-def test_what_strangers_are_refused_is_reported_now_and_then(station: GroundStation) -> None:
+def test_refusals_of_untrusted_clients_are_reported_at_a_limited_rate(
+    station: GroundStation,
+) -> None:
     stranger = GroundStation(station.vehicle, station.clock, client_id=8, trusted=False)
     for _ in range(60 * 20):
         stranger.command(mavlink.MAV_CMD_LOGGING_START)
         stranger.wait(0.05)
-    told = [f for f in stranger.frames if isinstance(f, Outgoing) and f.message_id == STATUSTEXT]
-    assert 3 <= len(told) <= 8
+    reported = [
+        f for f in stranger.frames if isinstance(f, Outgoing) and f.message_id == STATUSTEXT
+    ]
+    assert 3 <= len(reported) <= 8

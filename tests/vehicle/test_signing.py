@@ -199,7 +199,7 @@ def test_another_passphrase_and_back_forgets_no_replay(station: GroundStation) -
     assert station.send_bytes(frame) == []
 
 
-def test_a_recording_of_yesterday_is_old_once_gps_tells_the_day() -> None:
+def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
     day_us = 86_400_000_000
     clock = SigningClock(NOW_UNIX_US - day_us)
     assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US - day_us), 0)

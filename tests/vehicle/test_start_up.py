@@ -193,7 +193,7 @@ def test_ping_and_timesync(station: GroundStation) -> None:
     assert station.send(mavlink.MAVLink_timesync_message(5, 777)) == []
 
 
-def test_unknown_commands_are_refused_once_to_the_one_who_asked(station: GroundStation) -> None:
+def test_unknown_command_is_refused_once_to_the_requesting_client(station: GroundStation) -> None:
     incoming = station.command(31_999)
     assert [(m.command, m.result) for m in incoming] == [(31_999, UNSUPPORTED)]
     assert station.broadcasts == set()

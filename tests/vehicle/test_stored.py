@@ -130,5 +130,9 @@ def test_a_mark_of_its_own_survives_and_a_cleared_one_does_not(station: GroundSt
 
 def test_a_home_that_was_set_survives(station: GroundStation, clock: ManualClock) -> None:
     station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
-    [_, told] = restarted(station).request(242)
-    assert (told.latitude, told.longitude, told.altitude) == (475_000_000, -85_000_000, 400_000)
+    [_, reported] = restarted(station).request(242)
+    assert (reported.latitude, reported.longitude, reported.altitude) == (
+        475_000_000,
+        -85_000_000,
+        400_000,
+    )

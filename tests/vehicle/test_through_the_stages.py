@@ -37,7 +37,7 @@ class Bench:
         self.pipeline = Pipeline(PipelineSettings(settings))
         self.mav = mavlink.MAVLink(None, 255, 190)
         self.time_us = 0
-        self.told: list[Any] = []
+        self.reported: list[Any] = []
 
     def run(self, seconds: float, **changes: Any) -> FusedSample:
         """Let raw samples come at 100 Hz; the last one fused."""
@@ -65,10 +65,10 @@ class Bench:
     def read(self, actions: list[Any]) -> None:
         parser = mavlink.MAVLink(None)
         frames = (action.frame for action in actions if isinstance(action, Outgoing))
-        self.told += [parser.decode(bytearray(frame)) for frame in frames]
+        self.reported += [parser.decode(bytearray(frame)) for frame in frames]
 
     def parameters(self) -> dict[str, float]:
-        return {m.param_id: m.param_value for m in self.told if m.get_type() == "PARAM_VALUE"}
+        return {m.param_id: m.param_value for m in self.reported if m.get_type() == "PARAM_VALUE"}
 
 
 @pytest.fixture
@@ -107,8 +107,8 @@ def test_the_mounting_is_set_angle_by_angle(bench: Bench) -> None:
     np.testing.assert_allclose(mounting, expected, atol=1e-6)
     turned = np.array(expected) @ (0.0, 0.0, 9.80665)
     assert bench.run(0.1).sample.accel_b_mps2 == pytest.approx(tuple(turned), abs=1e-5)
-    told = bench.parameters()
-    assert [told[f"CAL_MNT_{angle}"] for angle in ("ROLL", "PIT", "YAW")] == [30.0, 90.0, -45.0]
+    reported = bench.parameters()
+    assert [reported[f"CAL_MNT_{angle}"] for angle in ("ROLL", "PIT", "YAW")] == [30.0, 90.0, -45.0]
 
 
 def test_angles_follow_a_mounting_that_was_measured(bench: Bench) -> None:
@@ -124,7 +124,7 @@ def test_an_angle_out_of_range_changes_nothing(bench: Bench) -> None:
     before = bench.pipeline.aircraft[1].settings.calibration
     for name, angle in (("CAL_MNT_PIT", 91.0), ("CAL_MNT_YAW", -181.0), ("CAL_MNT_ROLL", math.nan)):
         bench.set(name, angle)
-        assert bench.told[-2].get_type() == "PARAM_ERROR"
+        assert bench.reported[-2].get_type() == "PARAM_ERROR"
     assert bench.pipeline.aircraft[1].settings.calibration == before
 
 
@@ -163,7 +163,7 @@ def test_every_estimator_goes_on_when_retuned(estimator: str, name: str, value: 
     assert after.flags == before.flags
 
 
-def test_another_estimator_begins_anew(bench: Bench) -> None:
+def test_changed_estimator_starts_without_state(bench: Bench) -> None:
     for choice in (1.0, 2.0, 0.0, 1.0):
         bench.set("EST_ESTIMATOR", choice)
         assert abs(bench.run(3.0).state.q_nb[1]) < 1e-3

@@ -75,18 +75,18 @@ def test_every_message_at_its_own_rate() -> None:
 
 def test_messages_are_not_due_all_at_once() -> None:
     vehicle = make()
-    told = []
+    reported = []
     # A minute is missing, after which all that was missed is due.
     for start_s in (0, 60):
         for ms in range(start_s * 1000, (start_s + 10) * 1000, 10):
             time_us = 1000 * ms
-            told.append(names(vehicle.on_state(state_at(time_us), sample_at(time_us), time_us)))
+            reported.append(names(vehicle.on_state(state_at(time_us), sample_at(time_us), time_us)))
             if ms % 200 == 0:
                 vehicle.on_gps(fix_at(time_us), time_us)
-            told.append(names(vehicle.poll(time_us)))
-        told[-2000:-1900] = []
-    assert max(map(len, told)) <= 2
-    assert len({name for each in told for name in each}) > 12
+            reported.append(names(vehicle.poll(time_us)))
+        reported[-2000:-1900] = []
+    assert max(map(len, reported)) <= 2
+    assert len({name for each in reported for name in each}) > 12
 
 
 def test_a_rate_of_zero_is_silence() -> None:
@@ -263,25 +263,25 @@ def test_a_node_that_restarts_is_reported() -> None:
 
 def test_a_node_that_keeps_restarting_is_reported_once() -> None:
     """As with two trackers of one id, whose stamps disagree with each sample."""
-    vehicle, told = make(), []
+    vehicle, reported = make(), []
     for second in range(60):
         restarts = 100 * min(second, 20)
         now_us = (second + 1) * ONE_S
         alive = link(restarts=restarts, last_time_us=now_us)
-        told += texts(vehicle.on_link(report(alive), now_us))
-    assert told == [
+        reported += texts(vehicle.on_link(report(alive), now_us))
+    assert reported == [
         "Receiver connected: /dev/ttyUSB0",
         "Node 0 keeps restarting, or two nodes share id 0",
         "Node 0 no longer restarts",
     ]
 
 
-def test_a_compass_with_wrong_axes_is_reported_once_with_what_to_do() -> None:
-    vehicle, told = make(), []
+def test_compass_with_wrong_axes_is_reported_once_with_the_remedy() -> None:
+    vehicle, reported = make(), []
     for time_us in range(0, 20 * ONE_S, ONE_S // 10):
         state = state_at(time_us, flags=NavFlags.MAG_MISPLACED | NavFlags.MAG_DISTURBED)
-        told += texts(vehicle.on_state(state, sample_at(time_us), time_us))
-    assert told == [
+        reported += texts(vehicle.on_state(state, sample_at(time_us), time_us))
+    assert reported == [
         "Compass axes wrong, not used: check CAL_MAG_MNT",
         "Magnetic field disturbed",
     ]
@@ -297,28 +297,28 @@ def test_a_compass_with_wrong_axes_is_reported_once_with_what_to_do() -> None:
 def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
     flag: ImuFlags, sensor: str
 ) -> None:
-    vehicle, told = make(), []
+    vehicle, reported = make(), []
     for time_us in range(0, 20 * ONE_S, ONE_S // 10):
         flags = flag if time_us < 10 * ONE_S else ImuFlags(0)
         field = None if time_us % ONE_S else (20.0, 0.0, 43.0)
         sample = replace(sample_at(time_us), flags=flags, mag_b_ut=field)
-        told += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
-    assert told == [f"{sensor} not calibrated", f"{sensor} calibrated"]
+        reported += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
+    assert reported == [f"{sensor} not calibrated", f"{sensor} calibrated"]
 
 
 def test_a_latency_that_stands_for_a_lost_fix_is_not_announced_yet() -> None:
     """It moves on until it is what the motion shows."""
-    vehicle, told = make(), []
+    vehicle, reported = make(), []
     for n in range(200):
         time_us, moved = n * ONE_S // 5, min(n - n // 10, 70)
-        told += texts(vehicle.on_latency(0.3 - 0.002 * moved, 0.3, time_us))
-    assert told == ["GPS is 0.16 s late, not 0.30: set gps_latency_s"]
+        reported += texts(vehicle.on_latency(0.3 - 0.002 * moved, 0.3, time_us))
+    assert reported == ["GPS is 0.16 s late, not 0.30: set gps_latency_s"]
 
 
 def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
     vehicle = make()
-    told = texts(fly(vehicle, 0, 2))
-    assert {"Attitude valid", "Heading valid", "GPS fix"} <= set(told)
+    reported = texts(fly(vehicle, 0, 2))
+    assert {"Attitude valid", "Heading valid", "GPS fix"} <= set(reported)
     flood = []
     for n in range(2000):
         time_us = 2 * ONE_S + n * 5_000
@@ -331,8 +331,8 @@ def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
 
 def test_system_time_follows_gps() -> None:
     vehicle = make()
-    told = decode([*vehicle.poll(0), *vehicle.poll(ONE_S)])
-    before = [m for m in told if m.get_type() == "SYSTEM_TIME"]
+    reported = decode([*vehicle.poll(0), *vehicle.poll(ONE_S)])
+    before = [m for m in reported if m.get_type() == "SYSTEM_TIME"]
     assert before[0].time_unix_usec == 0
     vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
     after = [m for m in decode(vehicle.poll(3 * ONE_S)) if m.get_type() == "SYSTEM_TIME"]

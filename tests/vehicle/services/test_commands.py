@@ -58,7 +58,9 @@ def test_home_cannot_be_here_without_a_position(vehicle: Vehicle, clock: ManualC
 @pytest.mark.parametrize(
     "place", [(91.0, 0.0, 0.0), (0.0, 181.0, 0.0), (math.nan, 0.0, 0.0), (47.0, 8.0, math.nan)]
 )
-def test_home_cannot_be_nowhere(station: GroundStation, place: tuple[float, ...]) -> None:
+def test_home_with_invalid_coordinates_is_denied(
+    station: GroundStation, place: tuple[float, ...]
+) -> None:
     before = station.vehicle.telemetry.home
     assert results(station.command(SET_HOME, 0, 0, 0, 0, *place)) == [DENIED]
     assert station.vehicle.telemetry.home == before
@@ -98,9 +100,9 @@ def test_refusals_are_reported_but_cannot_flood(station: GroundStation) -> None:
     station.trusted = False
     found = [m for _ in range(200) for m in station.command(mavlink.MAV_CMD_LOGGING_START)]
     assert len(results(found)) == 200
-    told = [m.text for m in found if m.get_type() == "STATUSTEXT"]
-    assert 1 <= len(told) <= 20
-    assert set(told) == {"Refused LOGGING_START of system 255"}
+    reported = [m.text for m in found if m.get_type() == "STATUSTEXT"]
+    assert 1 <= len(reported) <= 20
+    assert set(reported) == {"Refused LOGGING_START of system 255"}
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])

@@ -26,25 +26,25 @@ def fly(station: GroundStation, seconds: float) -> Counter:
 def test_a_slower_rate_is_the_hubs_work(station: GroundStation) -> None:
     [ack] = station.command(SET, ATTITUDE, 200_000)
     assert ack.result == ACCEPTED
-    assert station.wishes == [ClientInterval(7, 1, ATTITUDE, 200_000)]
-    [_, told] = station.command(GET, ATTITUDE)
-    assert (told.message_id, told.interval_us) == (ATTITUDE, 200_000)
+    assert station.requested_intervals == [ClientInterval(7, 1, ATTITUDE, 200_000)]
+    [_, reported] = station.command(GET, ATTITUDE)
+    assert (reported.message_id, reported.interval_us) == (ATTITUDE, 200_000)
 
 
 def test_off_and_back_to_the_settings_rate(station: GroundStation) -> None:
     station.command(SET, ATTITUDE, -1)
-    [_, told] = station.command(GET, ATTITUDE)
-    assert told.interval_us == -1
+    [_, reported] = station.command(GET, ATTITUDE)
+    assert reported.interval_us == -1
     station.command(SET, ATTITUDE, 0)
-    [_, told] = station.command(GET, ATTITUDE)
-    assert told.interval_us == 20_000
-    assert [wish.interval_us for wish in station.wishes] == [-1, 0]
+    [_, reported] = station.command(GET, ATTITUDE)
+    assert reported.interval_us == 20_000
+    assert [wish.interval_us for wish in station.requested_intervals] == [-1, 0]
 
 
-def test_a_faster_rate_goes_to_the_one_who_wants_it_alone(station: GroundStation) -> None:
+def test_faster_rate_is_sent_to_the_requesting_client_only(station: GroundStation) -> None:
     other = GroundStation(station.vehicle, station.clock, client_id=8)
     station.command(SET, QUATERNION, 10_000)
-    assert station.wishes == [ClientInterval(7, 1, QUATERNION, -1)]
+    assert station.requested_intervals == [ClientInterval(7, 1, QUATERNION, -1)]
     common = fly(other, 2.0)["ATTITUDE_QUATERNION"]
     assert common == pytest.approx(100, abs=2)
     both = fly(station, 2.0)["ATTITUDE_QUATERNION"]
@@ -84,7 +84,7 @@ def test_a_faster_rate_is_not_for_every_client(station: GroundStation) -> None:
     station.trusted = False
     assert station.command(SET, QUATERNION, 10_000)[0].result == DENIED
     assert station.command(SET, QUATERNION, 100_000)[0].result == ACCEPTED
-    assert station.wishes == [ClientInterval(7, 1, QUATERNION, 100_000)]
+    assert station.requested_intervals == [ClientInterval(7, 1, QUATERNION, 100_000)]
 
 
 def test_messages_that_no_sample_carries_are_bounded(station: GroundStation) -> None:
@@ -92,14 +92,14 @@ def test_messages_that_no_sample_carries_are_bounded(station: GroundStation) -> 
     assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(100 + 2, abs=4)
 
 
-def test_a_client_that_goes_takes_its_wishes_along(station: GroundStation) -> None:
+def test_requested_intervals_end_with_the_client(station: GroundStation) -> None:
     station.command(SET, QUATERNION, 10_000)
     station.vehicle.remove_client(7)
     assert fly(station, 2.0)["ATTITUDE_QUATERNION"] == pytest.approx(100, abs=2)
 
 
 @pytest.mark.parametrize("wish", [-1, 2_000_000])
-def test_heartbeats_cannot_be_taken_away(station: GroundStation, wish: int) -> None:
+def test_heartbeats_cannot_be_switched_off(station: GroundStation, wish: int) -> None:
     assert station.command(SET, 0, wish)[0].result == DENIED
     assert station.command(SET, 0, 1_000_000)[0].result == ACCEPTED
 
@@ -107,13 +107,13 @@ def test_heartbeats_cannot_be_taken_away(station: GroundStation, wish: int) -> N
 @pytest.mark.parametrize("message_id", [77, 148, 9999])
 def test_messages_that_are_not_streamed(station: GroundStation, message_id: int) -> None:
     assert station.command(SET, message_id, 100_000)[0].result in (DENIED, UNSUPPORTED)
-    [_, told] = station.command(GET, message_id)
-    assert told.interval_us == 0
+    [_, reported] = station.command(GET, message_id)
+    assert reported.interval_us == 0
 
 
 def test_the_interval_by_request_message(station: GroundStation) -> None:
-    [ack, told] = station.request(244, ATTITUDE)
-    assert (ack.result, told.message_id, told.interval_us) == (ACCEPTED, ATTITUDE, 20_000)
+    [ack, reported] = station.request(244, ATTITUDE)
+    assert (ack.result, reported.message_id, reported.interval_us) == (ACCEPTED, ATTITUDE, 20_000)
 
 
 def stream_request(
@@ -124,7 +124,7 @@ def stream_request(
 
 def test_data_streams_thin_their_groups_for_one_client(station: GroundStation) -> None:
     assert station.send(stream_request(10, 4, 1)) == []
-    assert {(w.message_id, w.interval_us) for w in station.wishes} == {
+    assert {(w.message_id, w.interval_us) for w in station.requested_intervals} == {
         (ATTITUDE, 250_000),
         (QUATERNION, 250_000),
     }
@@ -132,7 +132,7 @@ def test_data_streams_thin_their_groups_for_one_client(station: GroundStation) -
 
 def test_all_data_streams_never_make_anything_faster(station: GroundStation) -> None:
     station.send(stream_request(0, 4, 1))
-    wishes = {w.message_id: w.interval_us for w in station.wishes}
+    wishes = {w.message_id: w.interval_us for w in station.requested_intervals}
     assert wishes[33] == wishes[74] == 250_000
     assert wishes[1] == 0, "SYS_STATUS is slower than that by itself"
     assert 0 not in wishes
@@ -140,10 +140,10 @@ def test_all_data_streams_never_make_anything_faster(station: GroundStation) -> 
 
 def test_data_streams_stop(station: GroundStation) -> None:
     station.send(stream_request(6, 4, 0))
-    assert [(w.message_id, w.interval_us) for w in station.wishes] == [(33, -1)]
+    assert [(w.message_id, w.interval_us) for w in station.requested_intervals] == [(33, -1)]
 
 
-def test_wishes_are_bounded(station: GroundStation) -> None:
+def test_requested_intervals_are_bounded(station: GroundStation) -> None:
     for client_id in range(6000):
         client = GroundStation(station.vehicle, station.clock, client_id=client_id)
         client.send(mavlink.MAVLink_command_long_message(1, 1, SET, 0, QUATERNION, 9000, *[0] * 5))

@@ -126,5 +126,5 @@ def test_of_twenty_uploads_one_after_the_other(
     station: GroundStation, loss: float, shortest_s: float, longest_s: float, stored: int
 ) -> None:
     link = Link(station, loss, shortest_s, longest_s)
-    told = [Upload(link).run() for _ in range(20)]
-    assert told.count("stored") >= stored, told
+    reported = [Upload(link).run() for _ in range(20)]
+    assert reported.count("stored") >= stored, reported

@@ -87,7 +87,7 @@ def content(message: Any) -> tuple[Any, ...]:
 
 
 @pytest.mark.parametrize("kind", [MISSION, FENCE, RALLY])
-def test_what_goes_up_comes_down(station: GroundStation, kind: int) -> None:
+def test_downloaded_items_equal_the_uploaded_ones(station: GroundStation, kind: int) -> None:
     items = [item(seq, kind) for seq in range(12)]
     assert upload(station, items, kind) == ACCEPTED
     assert [content(m) for m in download(station, kind)] == [content(m) for m in items]
@@ -269,7 +269,7 @@ def test_a_failed_upload_leaves_the_old_mission(station: GroundStation) -> None:
         (MISSION, {"command": 178, "frame": MISSION_FRAME, "x": -1, "y": 2**31 - 1}, ACCEPTED),
     ],
 )
-def test_items_are_judged(
+def test_items_are_checked(
     station: GroundStation, kind: int, changes: dict[str, Any], result: int
 ) -> None:
     assert upload(station, [item(0, kind, **changes)], kind) == result
@@ -383,7 +383,7 @@ def test_an_upload_that_stands_still_gives_way(station: GroundStation) -> None:
     assert upload(other, [item(0)]) == ACCEPTED
 
 
-def test_a_count_that_comes_again_begins_anew(station: GroundStation) -> None:
+def test_repeated_count_restarts_the_upload(station: GroundStation) -> None:
     station.send(count(2))
     station.send(item(0))
     [wanted] = station.send(count(2))

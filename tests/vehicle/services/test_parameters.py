@@ -63,7 +63,9 @@ def test_the_list_has_every_setting_once(station: GroundStation) -> None:
     assert not any("SHAPE" in name or "PASS" in name for name in found), "texts are none"
 
 
-def test_the_list_is_paced_and_goes_to_the_one_who_asked(station: GroundStation) -> None:
+def test_parameter_list_is_paced_and_sent_to_the_requesting_client_only(
+    station: GroundStation,
+) -> None:
     first = station.send(mavlink.MAVLink_param_request_list_message(1, 1))
     assert len(first) == 10
     assert station.vehicle.next_due_us() <= station.clock.now_us + 10_000
@@ -206,14 +208,14 @@ def test_an_untrusted_client_changes_nothing_and_is_reported(station: GroundStat
 
 
 @pytest.mark.parametrize(
-    ("stored", "text", "result", "told"),
+    ("stored", "text", "result", "reported"),
     [
         (True, "1.toml", mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml"),
         (False, "disk full", mavlink.MAV_RESULT_FAILED, "Settings not saved: disk full"),
     ],
 )
 def test_storage_is_acknowledged_when_the_disk_has_answered(
-    station: GroundStation, stored: bool, text: str, result: int, told: str
+    station: GroundStation, stored: bool, text: str, result: int, reported: str
 ) -> None:
     station.send(set_message("TUNING_ORDER", 5.0))
     assert station.of(SaveSettings) == []
@@ -223,7 +225,7 @@ def test_storage_is_acknowledged_when_the_disk_has_answered(
     found = station.receive(station.vehicle.on_saved(save.request, text, 0, stored=stored))
     assert kinds(found) == ["COMMAND_ACK", "STATUSTEXT"]
     assert (found[0].command, found[0].result) == (mavlink.MAV_CMD_PREFLIGHT_STORAGE, result)
-    assert (found[0].target_system, found[1].text) == (255, told)
+    assert (found[0].target_system, found[1].text) == (255, reported)
     assert station.frames[-2].client_id == station.client_id, "only who asked"
 
 
@@ -231,13 +233,13 @@ def test_storage_goes_back_to_the_defaults(station: GroundStation) -> None:
     station.send(set_message("TUNING_ORDER", 5.0))
     station.send(set_message("RATE_ATT", 1.0))
     found = station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 2)
-    told = {m.param_id: m.param_value for m in found if m.get_type() == "PARAM_VALUE"}
-    assert told == {"TUNING_ORDER": 2.0, "RATE_ATT": 50.0}
+    reported = {m.param_id: m.param_value for m in found if m.get_type() == "PARAM_VALUE"}
+    assert reported == {"TUNING_ORDER": 2.0, "RATE_ATT": 50.0}
     assert station.vehicle.telemetry.streams[30].interval_us == 20_000
     assert station.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, 0)[0].result == 3
 
 
-def test_the_defaults_leave_alone_what_is_no_parameter() -> None:
+def test_defaults_do_not_change_settings_that_are_no_parameters() -> None:
     settings = VehicleSettings(signing_passphrase="correct horse", node_silent_s=9.0)
     table = ParameterTable({"vehicle": settings})
     fresh = table.reset("vehicle")
@@ -267,7 +269,7 @@ def test_every_rate_is_named_as_its_message() -> None:
         assert hasattr(mavlink, f"MAVLINK_MSG_ID_{field.removesuffix('_hz').upper()}")
 
 
-def test_the_gateways_own_settings_have_names_that_tell() -> None:
+def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
     settings = GatewaySettings()
     sections = {
         "vehicle": settings.vehicle,
@@ -290,5 +292,5 @@ def test_the_gateways_own_settings_have_names_that_tell() -> None:
 def test_an_angle_of_a_mounting_is_described_by_the_first_sentence_of_the_mounting() -> None:
     table = ParameterTable({"calibration": NodeCalibration()})
     meaning = table.parameters[table.index["CAL_MNT_ROLL"]].field.meaning
-    told = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]
-    assert f" of the {told[0].lower()}{told[1:]}. Yaw is turned first" in meaning
+    reported = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]
+    assert f" of the {reported[0].lower()}{reported[1:]}. Yaw is turned first" in meaning

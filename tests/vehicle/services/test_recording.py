@@ -42,7 +42,7 @@ def test_a_start_that_fails_is_reported_and_why(station: GroundStation) -> None:
     assert recorder(station, "Read-only file system") == []
 
 
-def test_trouble_that_nobody_asked_about_is_the_recorders_to_tell(station: GroundStation) -> None:
+def test_recorder_trouble_without_a_request_is_not_answered(station: GroundStation) -> None:
     assert recorder(station, "Read-only file system") == []
 
 

@@ -21,15 +21,15 @@ def test_a_change_is_reported_once() -> None:
 
 def test_flapping_cannot_flood_and_the_last_text_is_true() -> None:
     announcer = Announcer()
-    told = []
+    reported = []
     for n in range(10_000):
         now_us = n * 1000
-        told += track(announcer, n % 2 == 0, now_us)
-        told += [m.text for m in announcer.poll(now_us)]
+        reported += track(announcer, n % 2 == 0, now_us)
+        reported += [m.text for m in announcer.poll(now_us)]
     track(announcer, False, 10_000_000)
-    told += [m.text for m in announcer.poll(10_000_000 + HOLD_US)]
-    assert len(told) <= 4
-    assert told[-1] == "bad"
+    reported += [m.text for m in announcer.poll(10_000_000 + HOLD_US)]
+    assert len(reported) <= 4
+    assert reported[-1] == "bad"
 
 
 def test_a_change_while_held_is_reported_when_the_hold_ends() -> None:

@@ -38,20 +38,20 @@ def healthy() -> Health:
     return health
 
 
-def test_nothing_is_present_before_it_is_heard() -> None:
+def test_sensor_is_absent_before_its_first_sample() -> None:
     present, _, well = Health(1, 2.0).sensors(0)
     assert not present & ALL
     assert well == GEOFENCE
 
 
-def test_all_well_is_ready_to_fly() -> None:
+def test_healthy_sensors_are_ready_to_fly() -> None:
     present, enabled, well = healthy().sensors(1_500_000)
     assert present == ALL | LOGGING | PREARM
     assert enabled == ALL | PREARM
     assert well == ALL | PREARM | GEOFENCE
 
 
-def test_a_silent_sensor_is_present_but_unhealthy() -> None:
+def test_sensor_that_timed_out_is_present_but_unhealthy() -> None:
     health = healthy()
     assert health.sensors(3_000_000)[2] & ALL == ALL
     present, _, well = health.sensors(3_000_001)
@@ -90,7 +90,7 @@ def test_no_fix_is_an_unhealthy_gps() -> None:
     assert not health.has_fix(1_500_000)
 
 
-def test_a_node_tells_of_its_failed_sensor() -> None:
+def test_failed_sensor_in_a_node_status_is_unhealthy() -> None:
     health = healthy()
     health.on_node_status(status(sensors_failed=0b010))
     assert not health.sensors(1_500_000)[2] & MAG

@@ -1,4 +1,4 @@
-"""How the boards fare: told when it gets worse, and in MAVLink's own fields."""
+"""State of the boards: announced when it gets worse, and in the fields of MAVLink messages."""
 
 from typing import Any
 
@@ -38,7 +38,7 @@ class Flying:
     def __init__(self, **settings: Any) -> None:
         self.vehicle = Vehicle(VehicleSettings(**settings), 1)
         self.status = WELL
-        self.told: list[tuple[int, str]] = []
+        self.reported: list[tuple[int, str]] = []
         self.messages = self._take()
 
     def report(self, **changes: Any) -> list[Any]:
@@ -50,7 +50,7 @@ class Flying:
 
     def _take(self) -> list[Any]:
         found = decode(self.vehicle.on_node_status(self.status, self.status.time_us))
-        self.told += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
+        self.reported += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
         return found
 
     def link(self, overruns: int) -> None:
@@ -60,7 +60,7 @@ class Flying:
         receiver = ReceiverStatus(now_us, now_us, 76, 4, 0, 1, pipes)
         report = LinkReport(now_us, True, "port", 0, 0, 0, (), (node,), receiver)
         found = decode(self.vehicle.on_link(report, now_us))
-        self.told += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
+        self.reported += [(m.severity, m.text) for m in found if m.get_type() == "STATUSTEXT"]
 
 
 @pytest.fixture
@@ -68,83 +68,83 @@ def flying() -> Flying:
     return Flying()
 
 
-def test_a_board_that_is_well_says_nothing(flying: Flying) -> None:
+def test_healthy_board_is_not_announced(flying: Flying) -> None:
     for _ in range(20):
         flying.report()
-    assert flying.told == []
+    assert flying.reported == []
 
 
 def test_a_supply_that_sags_and_recovers(flying: Flying) -> None:
     for supply_mv in (3000, 2980, 2960, 3050, 3090, 3000, 2990, *(3100,) * 6):
         flying.report(supply_mv=supply_mv)
-    assert flying.told == [
+    assert flying.reported == [
         (WARNING, "IMU node 0: supply low, 2.98 V"),
         (INFO, "IMU node 0: supply OK again, 3.10 V"),
     ]
 
 
-def test_no_limit_and_no_measurement_tell_nothing() -> None:
+def test_supply_without_limit_or_measurement_is_not_announced() -> None:
     unlimited = Flying(supply_low_v=0.0)
     unlimited.report(supply_mv=1000)
     blind = Flying()
     assert not any(m.get_type() == "BATTERY_STATUS" for m in blind.report(supply_mv=0))
-    assert unlimited.told == blind.told == []
+    assert unlimited.reported == blind.reported == []
 
 
-def test_bus_errors_are_reported_once_also_where_the_counter_begins_anew(flying: Flying) -> None:
+def test_bus_errors_are_reported_once_even_after_the_counter_restarts(flying: Flying) -> None:
     for errors in (65_535, 0, 1, 2):
         flying.report(bus_errors=errors)
-    assert flying.told == [(WARNING, "IMU node 0: bus errors, 65535 so far")]
+    assert flying.reported == [(WARNING, "IMU node 0: bus errors, 65535 so far")]
     for _ in range(QUIET_REPORTS):
         flying.report()
-    assert flying.told[1:] == [(INFO, "IMU node 0: bus OK again")]
+    assert flying.reported[1:] == [(INFO, "IMU node 0: bus OK again")]
 
 
 def test_a_radio_that_is_not_heard(flying: Flying) -> None:
     flying.report(radio_failed=50)
     flying.report(radio_failed=109)
-    assert flying.told == []
+    assert flying.reported == []
     flying.report(radio_failed=110)
-    assert flying.told == [(WARNING, "IMU node 0: radio sends failed, 100 in 10 s")]
+    assert flying.reported == [(WARNING, "IMU node 0: radio sends failed, 100 in 10 s")]
     for _ in range(RADIO_SPAN_US // SECOND_US - 1):
         flying.report()
-    assert flying.told[1:] == [(INFO, "IMU node 0: radio OK again")]
+    assert flying.reported[1:] == [(INFO, "IMU node 0: radio OK again")]
 
 
 def test_few_lost_payloads_of_a_slow_node_are_no_trouble(flying: Flying) -> None:
     for second in range(60):
         flying.report(sample_rate_hz=10, radio_failed=10 + second // 3)
-    assert flying.told == []
+    assert flying.reported == []
 
 
-def test_a_radio_that_is_bad_again_soon_is_announced_later_with_what_failed(flying: Flying) -> None:
+def test_radio_trouble_within_the_hold_time_is_announced_at_its_end(flying: Flying) -> None:
     flying.report(radio_failed=110)
     for _ in range(RADIO_SPAN_US // SECOND_US):
         flying.report()
     flying.report(radio_failed=250)
     flying.report()
-    assert flying.told[1:] == [(INFO, "IMU node 0: radio OK again")]
+    assert flying.reported[1:] == [(INFO, "IMU node 0: radio OK again")]
     found = decode(flying.vehicle.poll(flying.status.time_us + HOLD_US))
     texts = [message.text for message in found if message.get_type() == "STATUSTEXT"]
     assert texts == ["IMU node 0: radio sends failed, 140 in 10 s"]
 
 
-def test_a_node_without_samples_is_not_judged_by_its_reports(flying: Flying) -> None:
+def test_node_without_samples_raises_no_radio_trouble(flying: Flying) -> None:
     for failed in range(11, 20):
         flying.report(sample_rate_hz=0, radio_failed=failed)
-    assert flying.told == []
+    assert flying.reported == []
 
 
 def test_a_restart_is_no_error(flying: Flying) -> None:
     flying.report(node_time_us=5, bus_errors=0, radio_failed=0)
-    assert flying.told == []
+    assert flying.reported == []
 
 
 def test_overruns_of_the_receiver(flying: Flying) -> None:
     # What was lost before the gateway came is no news.
     flying.link(2)
     flying.link(3)
-    assert flying.told == [
+    assert flying.reported == [
         (INFO, "Receiver connected: port"),
         (WARNING, "IMU node 0: receiver overrun, 3 so far"),
     ]
