@@ -1,4 +1,4 @@
-"""Notifications to systemd, and the scheduler's priority.
+"""The process of a gateway: its event loop, the scheduler's priority, notifications to systemd.
 
 The notification protocol is one datagram of text to a socket that the environment names; see
 sd_notify(3). Without that variable nothing happens.
@@ -9,7 +9,8 @@ import logging
 import os
 import socket
 import time
-from typing import Final
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
 
 from gateway.units import US_PER_S
 
@@ -64,6 +65,20 @@ class ServiceNotifier:
                 sock.sendto(text.encode(), place)
         except OSError as error:
             log.debug("systemd does not listen: %s", error)
+
+
+def run_event_loop(main: Coroutine[Any, Any, None], kind: str) -> None:
+    """Run a coroutine on an event loop of `hub.event_loop`, on asyncio's if uvloop is missing."""
+    make: Callable[[], asyncio.AbstractEventLoop] = asyncio.new_event_loop
+    if kind == "uvloop":
+        try:
+            import uvloop
+        except ModuleNotFoundError:
+            log.warning("uvloop is not installed (pip install 'mavgate[fast]'): using asyncio")
+        else:
+            make = uvloop.new_event_loop
+    with asyncio.Runner(loop_factory=make) as runner:
+        runner.run(main)
 
 
 def set_realtime_priority(priority: int) -> None:

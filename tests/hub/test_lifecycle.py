@@ -351,3 +351,24 @@ async def test_closing_leaves_no_reader_and_no_task_behind(link: Link) -> None:
     assert link.hub.clients() == ()
     others = asyncio.all_tasks() - {asyncio.current_task()}
     assert not [task for task in others if "gateway" in repr(task)]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_uvloop_serves_every_transport_too(kind: str) -> None:
+    uvloop = pytest.importorskip("uvloop")
+
+    async def live() -> None:
+        rig = Rig()
+        try:
+            link = Link(rig, kind)
+            await link.until_open()
+            await test_frames_are_sent_and_received(link)
+            if kind in NOTICES_THE_END:
+                await test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link)
+        finally:
+            for close in rig.closing:
+                close()
+            await asyncio.sleep(0)
+
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        runner.run(live())

@@ -20,6 +20,7 @@ from gateway.hub.endpoint import SITE_NAME
 from gateway.live.attachment import on_end_signals
 from gateway.live.control_socket import ControlError, request
 from gateway.live.detached_output import detached_output
+from gateway.live.service import run_event_loop
 from gateway.recordings.index import NEWEST
 from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted
@@ -73,7 +74,7 @@ def fleet(
         wanted = msgspec.structs.replace(wanted, router=connect)
     if site:
         wanted = msgspec.structs.replace(wanted, sites=tuple(site))
-    asyncio.run(_serve(wanted, settings.hub))
+    run_event_loop(_serve(wanted, settings.hub), settings.hub.event_loop)
 
 
 @group.command()

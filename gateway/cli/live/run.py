@@ -27,6 +27,7 @@ from gateway.live.daemon import Daemon
 from gateway.live.detached_output import detached_output
 from gateway.live.keyboard import Keyboard
 from gateway.live.log_line import summary_line
+from gateway.live.service import run_event_loop
 
 if TYPE_CHECKING:
     from gateway.live.console import LiveView
@@ -75,7 +76,8 @@ def run_gateway(
     aircraft = read_aircraft(settings)
     load_entry_points()
     page = PanelProcess(config) if panel or settings.panel.enabled else None
-    asyncio.run(serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page))
+    daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
+    run_event_loop(daemon, settings.hub.event_loop)
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:

@@ -1,5 +1,6 @@
 """Base of datagram transports: one socket per peer, a short backlog, optional packing."""
 
+import asyncio
 import socket
 import struct
 from collections import deque
@@ -171,6 +172,10 @@ class DatagramClient(Client):
         self.become("refused")
         self.reason = NOBODY_LISTENS
         self.refused_us = self.context.now_us()
+        if self._socket is not None and not isinstance(self.loop, asyncio.SelectorEventLoop):
+            # libuv stops watching a socket with an error.
+            self.loop.remove_reader(self._socket)
+            self.loop.add_reader(self._socket, self._on_readable, self._socket)
 
     def _wait(self, data: bytes) -> None:
         """Queue datagrams while the socket buffer is full; the oldest makes room."""
