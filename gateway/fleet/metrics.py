@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from prometheus_client.core import Metric
 
-from gateway.live.hub_metrics import counter, gauge
+from gateway.live.metrics import counter, gauge
 
 SITE_GAUGES: Final = (
     ("is_here", "here", "1 while a session of the site is present."),

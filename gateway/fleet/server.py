@@ -157,7 +157,7 @@ class FleetServer:
     def _metrics_text(self) -> Iterator[str]:
         # Imported late: most fleets serve no metrics.
         from gateway.fleet.metrics import fleet_families
-        from gateway.live.hub_metrics import hub_families, text_of
+        from gateway.live.metrics import hub_families, text_of
 
         status, hub = self.status(), self._hub
         clients = tuple(status["clients"])

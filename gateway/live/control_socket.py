@@ -1,8 +1,9 @@
-"""The control socket, by which the command line talks to a running gateway.
+"""The control socket, by which the command line and the panel talk to a running gateway.
 
 A Unix socket that only the user (and root) can open; a system service's, its group too. Each
 request and each reply is one line of JSON; docs/control.md describes every verb. Each verb has a
-registered handler and a parameter type, which is checked before the handler is called.
+registered handler and a parameter type, which is checked before the handler is called. A command
+uses the named socket, the only one of its user, or the system service's.
 """
 
 from __future__ import annotations
@@ -292,7 +293,7 @@ def request(
     Parameters
     ----------
     path : Path
-        See `control_finder.find_socket`.
+        See `find_socket`.
     verb : str
         What to do.
     params : dict, optional
@@ -332,3 +333,55 @@ def _plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
     raise NotImplementedError(f"{type(value).__name__} is no JSON")
+
+
+SOCKETS: Final = Path("/proc/net/unix")
+ACCEPTS: Final = "00010000"
+"""The flag of a socket that takes connections, see proc_net(5)."""
+
+
+def find_socket(name: str) -> Path:
+    """Find the gateway or player that a command is for.
+
+    Parameters
+    ----------
+    name : str
+        `run` for the gateway, `play` for a player.
+
+    Returns
+    -------
+    Path
+        The user's own if one runs, otherwise the system service's.
+
+    Raises
+    ------
+    ControlError
+        If none runs, several do, or the running one denies access.
+    """
+    own = live_sockets(name)
+    if len(own) > 1:
+        listed = ", ".join(map(str, own))
+        raise ControlError(f"several run: choose one by --socket: {listed}")
+    if own:
+        return own[0]
+    service = SERVICE_FOLDER / f"{name}.sock"
+    if service in _listening():
+        if os.access(service, os.W_OK):
+            return service
+        text = f"the service's socket {service} is for the group {GROUP}: "
+        raise ControlError(text + f"`sudo usermod -aG {GROUP} $USER`, then log in again")
+    starter = STARTERS[name]
+    raise ControlError(f"nothing runs here: start {starter} first (no socket {socket_path(name)})")
+
+
+def live_sockets(name: str) -> list[Path]:
+    """List the sockets of this user on which a process listens."""
+    listening = _listening()
+    return [path for path in numbered(socket_path(name)) if path in listening]
+
+
+def _listening() -> set[Path]:
+    """Read the listening sockets from the kernel; trying each would open a connection."""
+    lines = SOCKETS.read_text(encoding="utf-8", errors="replace").splitlines()[1:]
+    found = (line.split(maxsplit=7) for line in lines)
+    return {Path(words[7]) for words in found if len(words) == 8 and words[3] == ACCEPTS}

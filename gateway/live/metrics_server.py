@@ -30,7 +30,7 @@ class MetricsServer:
     Parameters
     ----------
     text : callable
-        Returns the present metrics in pieces, as `hub_metrics.text_of` writes them.
+        Returns the present metrics in pieces, as `metrics.text_of` writes them.
     """
 
     def __init__(self, text: Callable[[], Iterator[str]]) -> None:

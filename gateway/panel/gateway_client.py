@@ -5,8 +5,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.live.control_finder import find_socket
-from gateway.live.control_socket import ControlError, request
+from gateway.live.control_socket import ControlError, find_socket, request
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.vehicle import Spot
 from gateway.records import NAN

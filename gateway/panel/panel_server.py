@@ -24,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
-from gateway.live.attachment import on_end_signals, on_parent_gone
+from gateway.live.terminal import on_end_signals, on_parent_gone
 from gateway.panel.access import ROLE, AccessControl, Logins
 from gateway.panel.api.rest import RestApi
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer

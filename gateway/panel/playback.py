@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from gateway.live.attachment import own_command
 from gateway.live.control_socket import ControlError
+from gateway.live.terminal import own_command
 from gateway.panel.gateway_client import ControlClient
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import Uplink

@@ -20,7 +20,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 from fastapi import FastAPI
 from starlette.responses import FileResponse, PlainTextResponse, Response
 
-from gateway.live.attachment import own_command
+from gateway.live.terminal import own_command
 from gateway.recordings.index import Recording, find_recording
 
 log = logging.getLogger(__name__)

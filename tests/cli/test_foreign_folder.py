@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.live.attachment import own_command
+from gateway.live.terminal import own_command
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("msgspec", "typer", "numpy", "pickle", "selectors", "multiprocessing", "gateway")

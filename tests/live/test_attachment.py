@@ -9,13 +9,13 @@ import sys
 
 import pytest
 
-from gateway.live.attachment import on_end_signals
+from gateway.live.terminal import on_end_signals
 
 pytestmark = pytest.mark.io
 
 CHILD = """
 import asyncio
-from gateway.live.attachment import on_parent_gone
+from gateway.live.terminal import on_parent_gone
 
 async def main():
     gone = asyncio.Event()

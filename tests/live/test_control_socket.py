@@ -11,14 +11,14 @@ from typing import Any
 import msgspec
 import pytest
 
-from gateway.live import control_finder, control_socket
-from gateway.live.control_finder import find_socket
+from gateway.live import control_socket
 from gateway.live.control_socket import (
     MAX_CONNECTIONS,
     MAX_LINE,
     ControlError,
     ControlServer,
     NoParams,
+    find_socket,
     request,
     socket_path,
 )
@@ -235,7 +235,7 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
 
 def test_nobody_there_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
     with pytest.raises(ControlError, match="nobody listens at the socket"):
         request(tmp_path / "run.sock", "status")
     with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
@@ -248,7 +248,7 @@ async def test_a_command_finds_the_gateway_that_is_meant(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
+    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
     service = ControlServer(tmp_path / "service" / "run.sock")
     await service.start()
     assert find_socket("run") == service.path, "the service's, where the user has none"
@@ -268,8 +268,8 @@ async def test_a_service_that_may_not_be_asked_tells_how(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_finder, "SERVICE_FOLDER", tmp_path / "service")
-    monkeypatch.setattr(control_finder.os, "access", lambda *_: False)
+    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
+    monkeypatch.setattr(control_socket.os, "access", lambda *_: False)
     service = ControlServer(tmp_path / "service" / "run.sock")
     await service.start()
     with pytest.raises(ControlError, match="usermod -aG mavgate"):

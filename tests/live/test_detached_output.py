@@ -9,7 +9,7 @@ from typing import TextIO
 
 import pytest
 
-from gateway.live.detached_output import MAX_TEXTS, DetachedStream, detached_output
+from gateway.live.terminal import MAX_TEXTS, DetachedStream, detached_output
 
 pytestmark = pytest.mark.io
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.live import keyboard
-from gateway.live.keyboard import Keyboard, keys_of
+from gateway.live import terminal as terminal_module
+from gateway.live.terminal import Keyboard, keys_of
 
 pytestmark = pytest.mark.io
 
@@ -36,7 +36,7 @@ def test_keys_have_names(text: str, names: list[str]) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     """Both ends of a terminal, of which this process is taken for the one in front."""
     ours, theirs = pty.openpty()
-    monkeypatch.setattr(keyboard.os, "tcgetpgrp", lambda _: os.getpgrp())
+    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp())
     yield ours, theirs
     os.close(ours)
     os.close(theirs)
@@ -81,7 +81,7 @@ async def test_what_is_no_terminal_is_left_alone(tmp_path: object) -> None:
 async def test_a_job_in_the_background_leaves_the_terminal_alone(
     terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(keyboard.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
     before = termios.tcgetattr(terminal[1])
     board = Keyboard(lambda _: None, terminal[1])
     board.start()

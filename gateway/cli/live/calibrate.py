@@ -16,16 +16,14 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from gateway.cli.support.asking import ask, is_running
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.named_recordings import files_of, folder_of
-from gateway.cli.support.recording_options import refusing
+from gateway.cli.support.recording_options import files_of, folder_of, refusing
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_aircraft,
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.terminal import console_of, refuse
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.live.imu_tap import raw_of

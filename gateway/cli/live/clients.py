@@ -10,13 +10,13 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
     console_of,
     print_json,
+    refuse,
     table_of,
 )
 from gateway.reasons import receiver_state

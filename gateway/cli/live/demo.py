@@ -18,13 +18,11 @@ from gateway.cli.live.run import (
     serve,
     with_endpoints,
 )
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.firmware_bench import BenchError, firmware_line
-from gateway.cli.support.made_ahead import made_ahead
-from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.panel_process import PanelProcess, is_installed
 from gateway.cli.support.recording_options import (
     ColumnsOption,
+    files_of,
+    folder_of,
     progress_of,
     read_column_map,
     refusing,
@@ -35,6 +33,8 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_options,
 )
+from gateway.cli.support.simulated_line import BenchError, firmware_line, made_ahead
+from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings

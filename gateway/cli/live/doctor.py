@@ -1,12 +1,278 @@
-"""`mavgate doctor`: what is missing on this machine, and how to fix it."""
+"""`mavgate doctor`: check the installation, the settings, the ports and the disk."""
 
+import grp
+import os
+import pwd
+import shutil
+import socket
+import ssl
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from enum import StrEnum
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Final
 
 import typer
 
-from gateway.cli.support.checkup import Grade, check_machine
 from gateway.cli.support.settings_options import ConfigOption, read_settings
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.terminal import console_of, how_to_add
+from gateway.compiled.entry_point import LibraryError, load_entry_points
+from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
+from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.hub.transports.tls import valid_until_s
+from gateway.live.control_socket import live_sockets
+from gateway.live.part_files import free_bytes_near
+from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
+from gateway.reasons import reason_of
+
+TTY: Final = Path("/sys/class/tty")
+SLOW_LATENCY_MS: Final = 4
+"""FTDI's timer: how long bytes wait in the adapter; 16 is its default."""
+EXTRAS: Final = {
+    "plot": ("jinja2", "matplotlib"),
+    "panel": ("nicegui", "pmtiles"),
+    "fleet": ("zenoh",),
+    "formats": ("mcap", "pyarrow", "pyulog"),
+}
+ENOUGH_HOURS: Final = 4.0
+MB_PER_HOUR: Final = 100.0
+"""Of one aircraft, tlog and table together."""
+SOON_S: Final = 14 * 86_400
+"""A certificate that ends within this time should have been renewed."""
+
+
+class Grade(StrEnum):
+    """Result of a check."""
+
+    GOOD = "good"
+    NOTE = "note"
+    WRONG = "wrong"
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """One check and its result."""
+
+    grade: Grade
+    what: str
+    text: str
+    """The result, and how to fix it."""
+
+
+Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
+
+
+def check_machine(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check everything that a gateway with these settings needs, one after another."""
+    for check in CHECKS:
+        yield from check(settings)
+
+
+def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check the aircraft's files, and whether they can be written."""
+    folder = aircraft_folder(settings)
+    try:
+        found = load_aircraft(settings)
+    except ConfigError as error:
+        yield Diagnosis(Grade.WRONG, "aircraft", str(error))
+        return
+    yield _writable("aircraft", folder, f"{len(found)} with settings of their own in {folder}")
+
+
+def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check for the receiver's port, and whether it may be opened."""
+    try:
+        fitting = fitting_ports(settings.serial.port, list_serial_ports())
+    except PortNotFoundError as error:
+        yield Diagnosis(Grade.WRONG, "receiver", f"{error}; plug it in, or set serial.port")
+        return
+    if len(fitting) > 1:
+        text = f"several adapters fit, the gateway asks each: {', '.join(fitting)}"
+        yield Diagnosis(Grade.NOTE, "receiver", text)
+    for device in fitting:
+        yield from _check_port(device)
+
+
+def _check_port(device: str) -> Iterator[Diagnosis]:
+    path = Path(device)
+    if not path.exists():
+        yield Diagnosis(
+            Grade.WRONG, "receiver", f"{device} is not there; `mavgate ports` lists all"
+        )
+    elif not os.access(path, os.R_OK | os.W_OK):
+        yield Diagnosis(Grade.WRONG, "receiver", f"{device} may not be opened: {_membership(path)}")
+    else:
+        yield Diagnosis(Grade.GOOD, "receiver", device)
+    yield from _latency(path)
+
+
+def _membership(path: Path) -> str:
+    owner, user = path.stat().st_gid, pwd.getpwuid(os.getuid()).pw_name
+    try:
+        group = grp.getgrgid(owner)
+    except KeyError:
+        return f"it is for the group {owner}"
+    if user in group.gr_mem:
+        return f"{user} is in the group {group.gr_name} only from the next log-in on"
+    return f"`sudo usermod -aG {group.gr_name} {user}`, then log in again"
+
+
+def _latency(device: Path) -> Iterator[Diagnosis]:
+    timer = TTY / device.resolve().name / "device" / "latency_timer"
+    try:
+        latency_ms = int(timer.read_text())
+    except (OSError, ValueError):
+        return
+    if latency_ms <= SLOW_LATENCY_MS:
+        yield Diagnosis(Grade.GOOD, "latency timer", f"{latency_ms} ms")
+    else:
+        yield Diagnosis(
+            Grade.WRONG,
+            "latency timer",
+            f"the adapter holds bytes back for {latency_ms} ms: `echo 1 | sudo tee {timer}`, and "
+            "for good the rule of tools/debian/60-mavgate.rules",
+        )
+
+
+def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether the compiled kernels can be loaded."""
+    try:
+        load_entry_points()
+    except LibraryError as error:
+        yield Diagnosis(Grade.WRONG, "kernels", str(error))
+    else:
+        yield Diagnosis(Grade.GOOD, "kernels", "compiled")
+
+
+def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether the system time is right, after which recordings are named."""
+    if not shutil.which("timedatectl"):
+        yield Diagnosis(Grade.NOTE, "clock", "unknown whether it is right")
+        return
+    asked = ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
+    said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=10)
+    if said.stdout.strip() == "yes":
+        yield Diagnosis(Grade.GOOD, "clock", "synchronised")
+    else:
+        text = "not synchronised: recordings get their right times from GPS"
+        yield Diagnosis(Grade.NOTE, "clock", text)
+
+
+def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether there is room for recordings."""
+    folder = Path(settings.recording.folder).expanduser()
+    try:
+        free_mb = free_bytes_near(folder) / 1e6
+    except OSError as error:
+        yield Diagnosis(Grade.WRONG, "recordings", f"{folder}: {reason_of(error)}")
+        return
+    room = free_mb - settings.recording.free_floor_mb
+    if room < ENOUGH_HOURS * MB_PER_HOUR:
+        text = (
+            f"{folder}: {max(room, 0.0):.0f} MB of room, for {max(room, 0.0) / MB_PER_HOUR:.1f} h"
+        )
+        yield Diagnosis(
+            Grade.WRONG, "recordings", f"{text}; delete old ones or set recording.folder"
+        )
+    else:
+        yield _writable("recordings", folder, f"{folder}: {room / 1e3:.1f} GB of room")
+
+
+def _writable(what: str, folder: Path, text: str) -> Diagnosis:
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    if not existing.is_dir():
+        return Diagnosis(Grade.WRONG, what, f"{existing} is no folder")
+    if os.access(existing, os.W_OK):
+        return Diagnosis(Grade.GOOD, what, text)
+    return Diagnosis(
+        Grade.WRONG, what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}"
+    )
+
+
+def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether a gateway runs already, and otherwise whether its ports are free."""
+    if running := live_sockets("run"):
+        yield Diagnosis(
+            Grade.GOOD, "gateway", f"runs, and listens at {', '.join(map(str, running))}"
+        )
+        return
+    taken = False
+    for endpoint in map(parse_endpoint, settings.hub.endpoints):
+        if reason := _trouble_of(endpoint):
+            taken = True
+            yield Diagnosis(Grade.WRONG, "ports", f"{endpoint.location}: {reason}")
+    if not taken:
+        yield Diagnosis(Grade.GOOD, "ports", "free")
+
+
+def _trouble_of(endpoint: Endpoint) -> str:
+    """Return why a listening endpoint could not be bound now."""
+    if endpoint.kind is EndpointKind.SERIAL:
+        allowed = os.access(endpoint.host, os.R_OK | os.W_OK)
+        there = Path(endpoint.host).exists()
+        return "" if allowed else _membership(Path(endpoint.host)) if there else "is not there"
+    kinds: dict[str, socket.SocketKind] = {
+        EndpointKind.UDP_LISTEN: socket.SOCK_DGRAM,
+        EndpointKind.TCP_LISTEN: socket.SOCK_STREAM,
+    }
+    if endpoint.kind not in kinds:
+        return ""
+    family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
+    with socket.socket(family, kinds[endpoint.kind]) as probe:
+        if endpoint.kind is EndpointKind.TCP_LISTEN:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((endpoint.host, endpoint.port))
+        except OSError as error:
+            return reason_of(error)
+    return ""
+
+
+def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check whether the certificates of hub and panel can be used, and for how long."""
+    hub, panel = settings.hub, settings.panel
+    for what, certificate, key in (
+        ("hub.tls_certificate", hub.tls_certificate, hub.tls_key),
+        ("panel.certificate", panel.certificate, panel.certificate_key),
+    ):
+        if not certificate:
+            continue
+        file = Path(certificate).expanduser()
+        try:
+            end_s = valid_until_s(file, Path(key).expanduser() if key else file)
+        except ssl.SSLCertVerificationError as error:
+            yield Diagnosis(Grade.WRONG, what, f"{file}: {error.verify_message}")
+        except OSError as error:
+            yield Diagnosis(Grade.WRONG, what, f"{file}: {reason_of(error)}")
+        else:
+            grade = Grade.GOOD if end_s - time.time() > SOON_S else Grade.NOTE
+            until = datetime.fromtimestamp(end_s, UTC)
+            yield Diagnosis(grade, what, f"{file}, valid until {until:%Y-%m-%d}")
+
+
+def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
+    """Check which optional parts are installed."""
+    for extra, modules in EXTRAS.items():
+        missing = [name for name in modules if find_spec(name) is None]
+        if missing:
+            yield Diagnosis(Grade.NOTE, f"extra {extra}", f"not installed: {how_to_add(extra)}")
+
+
+CHECKS: Final[tuple[Check, ...]] = (
+    check_receiver,
+    check_ports,
+    check_aircraft,
+    check_disk,
+    check_kernels,
+    check_clock,
+    check_certificates,
+    check_extras,
+)
+
 
 STYLES: Final = {Grade.GOOD: "green", Grade.NOTE: "yellow", Grade.WRONG: "red"}
 

@@ -20,9 +20,8 @@ from gateway.cli.live.calibrate import (
     capture_from,
     live_step,
 )
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.settings_options import ConfigOption, read_aircraft, read_settings
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.live.pty_port import PtyPort

@@ -8,8 +8,7 @@ import msgspec
 import typer
 from intelhex import IntelHex
 
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing.settings_block import (
     USED_BY,
     BoardSettings,

@@ -12,15 +12,20 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
 from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
-from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
+from gateway.cli.support.terminal import (
+    JsonOption,
+    console_of,
+    how_to_add,
+    print_json,
+    refuse,
+    table_of,
+)
 from gateway.hub.endpoint import SITE_NAME
-from gateway.live.attachment import on_end_signals
 from gateway.live.control_socket import ControlError, request
-from gateway.live.detached_output import detached_output
 from gateway.live.service import run_event_loop
+from gateway.live.terminal import detached_output, on_end_signals
 from gateway.recordings.index import NEWEST
 from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted

@@ -10,12 +10,12 @@ import typer
 from msgspec.structs import replace
 
 from gateway.cli.support.asking import SocketOption
-from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.panel_process import LINK, OneLineFormatter
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_settings,
 )
+from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.hub.endpoint import parse_endpoint
 
 log = logging.getLogger(__name__)

@@ -9,13 +9,12 @@ import typer
 
 from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.asking import AskingTyper, ask, is_running
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.settings_options import (
     ConfigOption,
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,

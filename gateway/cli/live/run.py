@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.panel_process import PanelProcess
 from gateway.cli.support.settings_options import (
     ConfigOption,
@@ -20,14 +19,13 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_aircraft,
 )
+from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings
-from gateway.live.attachment import on_end_signals
 from gateway.live.daemon import Daemon
-from gateway.live.detached_output import detached_output
-from gateway.live.keyboard import Keyboard
 from gateway.live.log_line import summary_line
 from gateway.live.service import run_event_loop
+from gateway.live.terminal import Keyboard, detached_output, on_end_signals
 
 if TYPE_CHECKING:
     from gateway.live.console import LiveView

@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialSettings,

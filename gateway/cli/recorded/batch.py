@@ -14,7 +14,6 @@ from gateway.cli.recorded.batch_work import (
     failures,
     season_options,
 )
-from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -23,7 +22,7 @@ from gateway.cli.support.recording_options import (
     refusing,
 )
 from gateway.cli.support.settings_options import ConfigOption, read_settings
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
 from gateway.output import write_new
 from gateway.units import counted
 

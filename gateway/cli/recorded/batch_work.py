@@ -34,12 +34,16 @@ from gateway.batch.tasks import (
     run_season,
     without_secrets,
 )
-from gateway.cli.support.errors import how_to_add, refuse
-from gateway.cli.support.named_recordings import Wanted, files_of, recordings_folder
-from gateway.cli.support.recording_options import read_column_map, refusing
+from gateway.cli.support.recording_options import (
+    Wanted,
+    files_of,
+    read_column_map,
+    recordings_folder,
+    refusing,
+)
 from gateway.cli.support.settings_options import read_options, read_settings
 from gateway.cli.support.sweeping import HEADINGS, SHOWN, SweepOptions, parse_axes
-from gateway.cli.support.terminal import console_of, table_of
+from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
 from gateway.printable import printable

@@ -12,11 +12,15 @@ from typer.core import TyperGroup
 from gateway.batch.catalogue import CatalogueError, Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.named_recordings import folder_of
-from gateway.cli.support.recording_options import PANEL, ColumnsOption, read_column_map, refusing
+from gateway.cli.support.recording_options import (
+    PANEL,
+    ColumnsOption,
+    folder_of,
+    read_column_map,
+    refusing,
+)
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.units import counted
 

@@ -5,8 +5,6 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.named_recordings import Wanted, files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -18,11 +16,14 @@ from gateway.cli.support.recording_options import (
     SettingsOption,
     SmoothOption,
     ToOption,
+    Wanted,
+    files_of,
     print_remarks,
     progress_of,
     read_column_map,
     read_range,
     read_sensors,
+    recordings_folder,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -30,7 +31,7 @@ from gateway.cli.support.settings_options import (
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import write_new
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
 

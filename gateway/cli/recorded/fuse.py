@@ -9,17 +9,18 @@ import numpy as np
 import typer
 
 from gateway.aircraft import Aircraft, AircraftSettings
-from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     ForceOption,
     SensorOption,
     SmoothOption,
+    files_of,
     print_remarks,
     progress_of,
     read_column_map,
     read_sensors,
+    recordings_folder,
     refusing,
 )
 from gateway.cli.support.settings_options import (

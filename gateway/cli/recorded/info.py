@@ -11,18 +11,18 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     ForceOption,
+    files_of,
     progress_of,
     read_column_map,
+    recordings_folder,
     refusing,
 )
 from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
-from gateway.cli.support.terminal import console_of, print_json, table_of
+from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new
 from gateway.recordings.files import (
     NO_RECORDING,

@@ -6,13 +6,13 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.support.errors import how_to_add, refuse
-from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
     ForceOption,
     SettingsOption,
+    files_of,
+    folder_of,
     print_remarks,
     progress_of,
     read_column_map,
@@ -24,6 +24,7 @@ from gateway.cli.support.settings_options import (
     or_refuse,
     read_options,
 )
+from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.output import write_new
 
 

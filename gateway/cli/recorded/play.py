@@ -17,8 +17,6 @@ from gateway.cli.live.run import (
     with_endpoints,
 )
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.named_recordings import files_of, recordings_folder
 from gateway.cli.support.recording_options import (
     PANEL,
     ColumnsOption,
@@ -27,9 +25,11 @@ from gateway.cli.support.recording_options import (
     PositionOption,
     SettingsOption,
     ToOption,
+    files_of,
     progress_of,
     read_column_map,
     read_range,
+    recordings_folder,
     refusing,
 )
 from gateway.cli.support.settings_options import (
@@ -37,13 +37,11 @@ from gateway.cli.support.settings_options import (
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
+from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
 from gateway.config import GatewaySettings
-from gateway.live.attachment import on_end_signals, on_parent_gone
 from gateway.live.control_socket import ControlError
-from gateway.live.detached_output import detached_output
-from gateway.live.keyboard import Keyboard
 from gateway.live.player_edge import PlayerStatus
+from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
 from gateway.player import (
     PlayerDaemon,
     PlayPlan,

@@ -10,7 +10,6 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.flight_arrays import Flight
 from gateway.analysis.sources import with_latency
-from gateway.cli.support.errors import how_to_add, refuse
 from gateway.cli.support.loading import (
     FlightArgument,
     Loading,
@@ -32,7 +31,7 @@ from gateway.cli.support.settings_options import (
     load_settings,
     or_refuse,
 )
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.terminal import console_of, how_to_add, refuse
 from gateway.output import check_folder
 from gateway.recordings.fuse import smoothed_latency_in_words
 

@@ -6,7 +6,6 @@ from typing import Annotated, Literal
 import typer
 
 from gateway.batch.storage import is_url
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import Loading, ReferenceOption, SystemOption
 from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
 from gateway.cli.support.settings_options import (
@@ -14,6 +13,7 @@ from gateway.cli.support.settings_options import (
     load_settings,
     or_refuse,
 )
+from gateway.cli.support.terminal import refuse
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 

@@ -9,9 +9,8 @@ from typing import Annotated, Any, TypeVar, cast
 
 import typer
 
-from gateway.cli.support.errors import refuse
-from gateway.live.control_finder import find_socket, live_sockets
-from gateway.live.control_socket import ControlError, request
+from gateway.cli.support.terminal import refuse
+from gateway.live.control_socket import ControlError, find_socket, live_sockets, request
 
 SocketOption = Annotated[
     Path | None,

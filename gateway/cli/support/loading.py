@@ -9,8 +9,9 @@ import typer
 
 from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_blocks, judged_by, simulated_flight
-from gateway.cli.support.named_recordings import files_of, folder_of
 from gateway.cli.support.recording_options import (
+    files_of,
+    folder_of,
     print_remarks,
     progress_of,
     read_column_map,

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-from gateway.live.attachment import own_command
+from gateway.live.terminal import own_command
 from gateway.printable import LONGEST, PrintableFormatter
 
 log = logging.getLogger(__name__)

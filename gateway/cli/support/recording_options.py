@@ -1,9 +1,11 @@
-"""Shared by the commands on recordings: options, progress, and errors for bad files."""
+"""Arguments and options about recordings: by path or by name, and how they are read."""
+
+from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import msgspec
 import typer
@@ -16,11 +18,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from gateway.cli.support.errors import refuse
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.asking import ask, is_running
+from gateway.cli.support.settings_options import read_settings
+from gateway.cli.support.terminal import console_of, refuse
 from gateway.reasons import reason_of
 from gateway.recordings.files import FlightError, Position, SettingsChoice
 from gateway.recordings.formats.csv import ColumnMap
+from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
 
 PANEL: Final = "Recordings"
@@ -147,3 +151,58 @@ def refusing() -> Iterator[None]:
         refuse(f"{file}: {error.strerror or reason_of(error)}")
     except FlightError as error:
         refuse(str(error))
+
+
+if TYPE_CHECKING:
+    from gateway.config import GatewaySettings
+
+Wanted = Literal["tlogs", "tables", "all"]
+"""Which files of a recording a command uses; the others if it has none of these."""
+
+
+def recordings_folder(config: Path | None) -> Path:
+    """Return the folder of recordings: the running gateway's, unless settings are given."""
+    if config is None and is_running():
+        return Path(ask("record.status")["folder"])
+    return folder_of(read_settings(config))
+
+
+def folder_of(settings: GatewaySettings) -> Path:
+    """Return the folder of recordings in these settings."""
+    return Path(settings.recording.folder).expanduser()
+
+
+def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
+    """Replace names of recordings by their files; paths stay unchanged.
+
+    Parameters
+    ----------
+    names : iterable of Path
+        Files, or names of recordings; `last` is the newest.
+    folder : Path
+        Where the recordings are.
+    wanted : str
+        Which of a recording's files.
+
+    Raises
+    ------
+    FlightError
+        If there is neither such a file nor such a recording.
+    """
+    return [file for name in names for file in _files_of(name, folder, wanted)]
+
+
+def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
+    if name.exists() or name.name != str(name):
+        return [name]
+    try:
+        files = list(find_recording(folder, str(name)).files)
+    except RecordingError as error:
+        raise FlightError(
+            f"{name}: no such file, and no recording of that name in {folder}; "
+            "`mavgate record list` shows them"
+        ) from error
+    if wanted == "all":
+        return files
+    ending = ".tlog" if wanted == "tlogs" else ".csv"
+    return [file for file in files if file.suffix == ending] or files

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from gateway.cli.support.errors import refuse
+from gateway.cli.support.terminal import refuse
 
 if TYPE_CHECKING:
     from gateway.aircraft import AircraftSettings

@@ -22,10 +22,9 @@ from gateway.analysis.tuning import contest as sweeping
 from gateway.analysis.tuning.axis import ESTIMATOR_KEY, Axis, SweepError, Values, grid, parse_axis
 from gateway.analysis.tuning.contest import COLUMN_OF, Contest, Metric, Trial
 from gateway.analysis.tuning.workers import Run, pool
-from gateway.cli.support.errors import refuse
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.cli.support.recording_options import refusing
-from gateway.cli.support.terminal import console_of
+from gateway.cli.support.terminal import console_of, refuse
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
 from gateway.units import counted

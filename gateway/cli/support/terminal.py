@@ -1,8 +1,10 @@
-"""Output of the commands: a terminal, or a file or program that must get whole lines."""
+"""Texts of commands on the terminal: tables, warnings and errors."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Final
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
@@ -71,3 +73,27 @@ def table_of(*columns: str, left: int = 1) -> Table:
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number < left else "right", overflow="fold")
     return table
+
+
+DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
+"""Where `make deb` puts all; what is installed by pip is not found from there."""
+
+
+def refuse(text: str) -> NoReturn:
+    """End the command with an error.
+
+    Parameters
+    ----------
+    text : str
+        What was wrong, where, and what to do; one or more lines.
+    """
+    console = console_of(stderr=True)
+    console.print(text, style="red")
+    raise typer.Exit(2)
+
+
+def how_to_add(extra: str) -> str:
+    """Return the command line that installs an optional part, if one can."""
+    if Path(__file__).is_relative_to(DEBIAN_PACKAGE):
+        return "the Debian package does not have it: /usr/share/doc/mavgate/service.md, Elsewhere"
+    return f"{sys.executable} -m pip install 'mavgate[{extra}]'"

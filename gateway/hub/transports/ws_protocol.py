@@ -15,6 +15,9 @@ packed; received messages are read as a byte stream, so that message boundaries 
 | unmasked or compressed frames, wrong ones       | close 1002                               |
 | a close                                         | a close                                  |
 
+The `websockets` library would cost 3.0 instead of 0.3 us for each sent message, 1.45 times the
+present cost of a message in all.
+
 Compression is offered by browsers and never accepted: telemetry does not compress well, and each
 connection would need memory for its window.
 

@@ -12,9 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 from rich.console import Console
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.live import clients
 from gateway.config import load
 from gateway.hub.stats import HubCounters, ListenerStats
@@ -30,6 +28,7 @@ from gateway.records import (
 )
 from gateway.status import AircraftStatus, Snapshot, Way
 from tests.client_stats import TABLET
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -154,7 +153,7 @@ def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gateway
 
 
 def run(*words: str) -> Any:
-    return CliRunner().invoke(app, list(words))
+    return invoke(*words)
 
 
 def test_status_for_people(gateway: Gateway) -> None:

@@ -9,14 +9,13 @@ from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
-from gateway.cli.support import checkup
-from gateway.cli.support.checkup import Diagnosis, Grade
+from gateway.cli.live import doctor
+from gateway.cli.live.doctor import Diagnosis, Grade
 from gateway.compiled.entry_point import LibraryError
 from gateway.config import GatewaySettings
-from gateway.live import control_finder
+from gateway.live import control_socket
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -24,7 +23,7 @@ pytestmark = pytest.mark.io
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GatewaySettings:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(checkup, "TTY", tmp_path / "tty")
+    monkeypatch.setattr(doctor, "TTY", tmp_path / "tty")
     default = GatewaySettings(aircraft_folder=str(tmp_path / "aircraft"))
     return replace(
         default,
@@ -34,13 +33,13 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GatewaySettings
     )
 
 
-def one(check: checkup.Check, settings: GatewaySettings) -> Diagnosis:
+def one(check: doctor.Check, settings: GatewaySettings) -> Diagnosis:
     [found] = check(settings)
     return found
 
 
 def test_a_port_that_is_not_there(settings: GatewaySettings) -> None:
-    found = one(checkup.check_receiver, settings)
+    found = one(doctor.check_receiver, settings)
     assert (found.grade, "`mavgate ports`" in found.text) == (Grade.WRONG, True)
 
 
@@ -48,11 +47,11 @@ def test_a_port_that_may_not_be_opened(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path(settings.serial.port).touch()
-    assert one(checkup.check_receiver, settings).grade is Grade.GOOD
+    assert one(doctor.check_receiver, settings).grade is Grade.GOOD
     monkeypatch.setattr(os, "access", lambda *_: False)
     dialout = SimpleNamespace(gr_name="dialout", gr_mem=[])
-    monkeypatch.setattr(checkup.grp, "getgrgid", lambda _: dialout)
-    found = one(checkup.check_receiver, settings)
+    monkeypatch.setattr(doctor.grp, "getgrgid", lambda _: dialout)
+    found = one(doctor.check_receiver, settings)
     assert found.grade is Grade.WRONG
     assert "sudo usermod -aG dialout" in found.text
 
@@ -65,7 +64,7 @@ def test_an_adapter_that_holds_bytes_back(
     device = tmp_path / "tty" / "ttyUSB7" / "device"
     device.mkdir(parents=True)
     (device / "latency_timer").write_text(f"{latency_ms}\n")
-    _, timer = checkup.check_receiver(settings)
+    _, timer = doctor.check_receiver(settings)
     assert timer.grade is grade
     assert f"{latency_ms} ms" in timer.text
 
@@ -73,9 +72,9 @@ def test_an_adapter_that_holds_bytes_back(
 def test_wrong_files_of_aircraft(settings: GatewaySettings) -> None:
     folder = Path(settings.aircraft_folder)
     folder.mkdir()
-    assert one(checkup.check_aircraft, settings).grade is Grade.GOOD
+    assert one(doctor.check_aircraft, settings).grade is Grade.GOOD
     (folder / "3.toml").write_text("[vehicle]\nnope = 1\n")
-    found = one(checkup.check_aircraft, settings)
+    found = one(doctor.check_aircraft, settings)
     assert found.grade is Grade.WRONG
     assert "3.toml: vehicle.nope" in found.text
 
@@ -84,14 +83,14 @@ def test_folders_that_cannot_be_written(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert one(checkup.check_aircraft, settings).grade is Grade.WRONG
-    assert one(checkup.check_disk, settings).grade is Grade.WRONG
+    assert one(doctor.check_aircraft, settings).grade is Grade.WRONG
+    assert one(doctor.check_disk, settings).grade is Grade.WRONG
 
 
 def test_folders_below_a_file(settings: GatewaySettings, tmp_path: Path) -> None:
     (tmp_path / "aircraft").touch()
     below = replace(settings.recording, folder=str(tmp_path / "aircraft" / "recordings"))
-    for check in (checkup.check_aircraft, checkup.check_disk):
+    for check in (doctor.check_aircraft, doctor.check_disk):
         found = one(check, replace(settings, recording=below))
         assert (found.grade, found.text) == (Grade.WRONG, f"{tmp_path}/aircraft is no folder")
 
@@ -101,8 +100,8 @@ def test_room_for_recordings(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, room_mb: int, grade: Grade
 ) -> None:
     free = (settings.recording.free_floor_mb + room_mb) * 1e6
-    monkeypatch.setattr(checkup, "free_bytes_near", lambda _: free)
-    assert one(checkup.check_disk, settings).grade is grade
+    monkeypatch.setattr(doctor, "free_bytes_near", lambda _: free)
+    assert one(doctor.check_disk, settings).grade is grade
 
 
 @pytest.mark.parametrize(
@@ -117,18 +116,18 @@ def test_a_port_that_another_program_has(
             other.listen()
         url = f"{kind}-listen:127.0.0.1:{other.getsockname()[1]}"
         taken = replace(settings, hub=replace(settings.hub, endpoints=(url,)))
-        found = one(checkup.check_ports, taken)
+        found = one(doctor.check_ports, taken)
         assert found.grade is Grade.WRONG
         assert found.text == f"{url}: Address already in use"
-    assert one(checkup.check_ports, taken).grade is Grade.GOOD
+    assert one(doctor.check_ports, taken).grade is Grade.GOOD
 
 
 def test_a_gateway_that_runs_has_its_ports(
     settings: GatewaySettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = tmp_path / "mavgate" / "run.sock"
-    monkeypatch.setattr(control_finder, "_listening", lambda: {running})
-    found = one(checkup.check_ports, settings)
+    monkeypatch.setattr(control_socket, "_listening", lambda: {running})
+    found = one(doctor.check_ports, settings)
     assert (found.grade, found.what) == (Grade.GOOD, "gateway")
 
 
@@ -136,9 +135,9 @@ def test_a_gateway_that_runs_has_its_ports(
 def test_the_clock(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, said: str, grade: Grade
 ) -> None:
-    monkeypatch.setattr(checkup.shutil, "which", lambda _: "/usr/bin/timedatectl")
-    monkeypatch.setattr(checkup.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
-    assert one(checkup.check_clock, settings).grade is grade
+    monkeypatch.setattr(doctor.shutil, "which", lambda _: "/usr/bin/timedatectl")
+    monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
+    assert one(doctor.check_clock, settings).grade is grade
 
 
 @pytest.mark.parametrize("missing", [False, True])
@@ -149,8 +148,8 @@ def test_compiled_kernels(
         if missing:
             raise LibraryError(Path("kernels.so"), "is missing")
 
-    monkeypatch.setattr(checkup, "load_entry_points", load)
-    found = one(checkup.check_kernels, settings)
+    monkeypatch.setattr(doctor, "load_entry_points", load)
+    found = one(doctor.check_kernels, settings)
     assert found.grade is (Grade.WRONG if missing else Grade.GOOD)
     assert ("make kernels" in found.text) == missing
 
@@ -158,8 +157,8 @@ def test_compiled_kernels(
 def test_missing_extras_are_named(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(checkup, "find_spec", lambda name: None if name == "nicegui" else name)
-    found = one(checkup.check_extras, settings)
+    monkeypatch.setattr(doctor, "find_spec", lambda name: None if name == "nicegui" else name)
+    found = one(doctor.check_extras, settings)
     assert (found.grade, "mavgate[panel]" in found.text) == (Grade.NOTE, True)
 
 
@@ -169,8 +168,8 @@ def test_the_exit_code_tells_programs(monkeypatch: pytest.MonkeyPatch, grade: Gr
         return [Diagnosis(grade, "thing", "is so")]
 
     checks: tuple[Callable[..., object], ...] = (check,)
-    monkeypatch.setattr(checkup, "CHECKS", checks)
-    result = CliRunner().invoke(app, ["doctor"])
+    monkeypatch.setattr(doctor, "CHECKS", checks)
+    result = invoke("doctor")
     assert result.exit_code == (1 if grade is Grade.WRONG else 0)
     assert result.output == f"{grade:5} thing: is so\n"
 
@@ -193,17 +192,17 @@ def test_a_certificate_that_ends(
     signed = ("openssl", "x509", "-req", "-in", wish, "-signkey", key, "-days", str(days))
     subprocess.run([*signed, "-out", file], check=True, capture_output=True)
     panel = replace(settings.panel, certificate=str(file), certificate_key=str(key))
-    found = one(checkup.check_certificates, replace(settings, panel=panel))
+    found = one(doctor.check_certificates, replace(settings, panel=panel))
     assert (found.grade, word in found.text) == (grade, True)
 
 
 def test_a_certificate_that_is_none(settings: GatewaySettings, tmp_path: Path) -> None:
-    assert list(checkup.check_certificates(settings)) == []
+    assert list(doctor.check_certificates(settings)) == []
     file = tmp_path / "hub.pem"
     hub = replace(settings.hub, tls_certificate=str(file))
-    missing = one(checkup.check_certificates, replace(settings, hub=hub))
+    missing = one(doctor.check_certificates, replace(settings, hub=hub))
     file.write_text("no certificate")
-    broken = one(checkup.check_certificates, replace(settings, hub=hub))
+    broken = one(doctor.check_certificates, replace(settings, hub=hub))
     assert missing == Diagnosis(
         Grade.WRONG, "hub.tls_certificate", f"{file}: No such file or directory"
     )

@@ -15,7 +15,7 @@ from gateway.analysis.flight_arrays import Flight
 from gateway.cli.app import app
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
-from gateway.cli.support.named_recordings import files_of
+from gateway.cli.support.recording_options import files_of
 from gateway.config import GatewaySettings, load
 from gateway.player import PlayerDaemon
 from gateway.recordings.columns import row_to_line

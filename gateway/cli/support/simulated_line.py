@@ -1,13 +1,17 @@
-"""The frames of a simulated receiver, made by a process of their own."""
+"""The frames of a simulated receiver: made by a process of their own, or by simulated boards."""
 
+import importlib
 import logging
 import signal
+import sys
 from collections.abc import Iterator
 from itertools import islice
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Final
 
 from gateway.analysis.processes import begin_copy
+from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 
 log = logging.getLogger(__name__)
@@ -50,3 +54,42 @@ def _make(frames: Iterator[TimedFrame], sender: Connection) -> None:
         signal.signal(number, signal.SIG_IGN)
     while made := [(f.time_s, f.data, f.damaged) for f in islice(frames, AT_ONCE)]:
         sender.send(made)
+
+
+CHECKOUT: Final = Path(__file__).resolve().parents[3]
+
+
+class BenchError(RuntimeError):
+    """The bench is missing, or cannot be built."""
+
+
+def firmware_line(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
+    """Fly the simulated aircraft with the firmware on simulated chips.
+
+    Parameters
+    ----------
+    settings : SimulatorSettings
+        Of which the first aircraft flies.
+    start_unix_us : int
+        UTC at the start.
+
+    Returns
+    -------
+    iterator of TimedFrame
+        The receiver's frames, endless.
+
+    Raises
+    ------
+    BenchError
+        If this is no checkout, or a compiler or the chip simulator is missing.
+    """
+    if not (CHECKOUT / "firmware" / "rig").is_dir():
+        raise BenchError("--firmware needs a checkout of the project, not an installed package")
+    if str(CHECKOUT) not in sys.path:
+        sys.path.append(str(CHECKOUT))
+    line = importlib.import_module("firmware.rig.line")
+    try:
+        frames: Iterator[TimedFrame] = line.frames(settings, start_unix_us)
+    except (RuntimeError, OSError) as error:
+        raise BenchError(f"--firmware: {error}") from error
+    return frames

@@ -9,7 +9,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.hub.stats import HubCounters, ListenerStats
-from gateway.live import metrics_server as prometheus
+from gateway.live import metrics_server
 from gateway.live.metrics import prometheus_text
 from gateway.live.metrics_server import MetricsServer
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus
@@ -217,15 +217,15 @@ class TestServer:
         server.listen(free_port())
         idle = [
             await asyncio.open_connection("127.0.0.1", server.port)
-            for _ in range(prometheus.MAX_CONNECTIONS)
+            for _ in range(metrics_server.MAX_CONNECTIONS)
         ]
-        while server.listeners()[0].clients < prometheus.MAX_CONNECTIONS:
+        while server.listeners()[0].clients < metrics_server.MAX_CONNECTIONS:
             await asyncio.sleep(0)
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
         assert await asyncio.wait_for(reader.read(), LIMIT_S) == b"", "closed without a word"
         writer.close()
         idle[0][1].close()
-        while server.listeners()[0].clients == prometheus.MAX_CONNECTIONS:
+        while server.listeners()[0].clients == metrics_server.MAX_CONNECTIONS:
             await asyncio.sleep(0)
         assert (await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n")).startswith(b"HTTP/1.1 200")
         for _, other in idle[1:]:
@@ -237,7 +237,7 @@ class TestServer:
     async def test_a_taken_port_is_reported_and_used_when_it_is_free(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(prometheus, "RETRY_S", 0.0)
+        monkeypatch.setattr(metrics_server, "RETRY_S", 0.0)
         server = MetricsServer(lambda: prometheus_text(SNAPSHOT))
         port = free_port()
         with socket.create_server(("127.0.0.1", port)):

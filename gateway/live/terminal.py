@@ -1,0 +1,263 @@
+"""A process and its terminal: how it ends, keys, and output that never blocks.
+
+A parent process gives a child a pipe as standard input and keeps the other end open: the kernel
+closes that end even if the parent is killed. A terminal that is stopped (Ctrl-S, a hanging
+connection) and a pipe that is not read block a writing process, which in a gateway would be the
+event loop; so a thread writes, and output beyond a bound is dropped meanwhile.
+"""
+
+import asyncio
+import contextlib
+import io
+import logging
+import os
+import queue
+import re
+import select
+import signal
+import sys
+import termios
+import threading
+import tty
+from collections.abc import Callable, Iterator
+from typing import Any, Final, TextIO
+
+READ_BYTES: Final = 1024
+"""Nothing is meant to come; what comes is ignored."""
+
+
+def on_parent_gone(end: Callable[[], None]) -> None:
+    """Call back on the running event loop when standard input ends.
+
+    Parameters
+    ----------
+    end : callable
+        Called once.
+    """
+    loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
+
+    def read() -> None:
+        if not os.read(source, READ_BYTES):
+            loop.remove_reader(source)
+            end()
+
+    loop.add_reader(source, read)
+
+
+def on_end_signals(end: Callable[[], None]) -> None:
+    """Call back on the running event loop on SIGINT, SIGTERM, and SIGHUP, with a terminal's end.
+
+    SIGHUP stays ignored where it is at the start, as by `nohup`.
+
+    Parameters
+    ----------
+    end : callable
+        Called at each of them.
+    """
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            loop.add_signal_handler(number, end)
+
+
+def own_command(*words: str) -> list[str]:
+    """Return the command line that starts mavgate as a child process.
+
+    `-P` keeps the current folder off the child's module path: a `msgspec.py` among unpacked
+    recordings would be imported instead of the library.
+
+    Parameters
+    ----------
+    *words : str
+        Command and options, as after `mavgate`.
+
+    Returns
+    -------
+    list of str
+    """
+    return [sys.executable, "-P", "-m", "gateway.cli", *words]
+
+
+MAX_TEXTS: Final = 256
+"""Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
+LAST_WORDS_S: Final = 1.0
+"""Longest that the end waits for what is still to be written."""
+
+
+class DetachedStream(io.TextIOBase):
+    """A text stream whose `write` returns at once; a thread does the writing.
+
+    Parameters
+    ----------
+    stream : file object
+        What it stands for; must have a file descriptor.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        stream.flush()
+        self._stream = stream
+        self._file = stream.fileno()
+        self._is_terminal = stream.isatty()
+        self._waiting: queue.Queue[bytes | None] = queue.Queue(MAX_TEXTS)
+        self._thread = threading.Thread(target=self._write_all, name="output", daemon=True)
+        self._thread.start()
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """That of the stream."""
+        return self._stream.encoding
+
+    def fileno(self) -> int:
+        """Return the stream's file descriptor."""
+        return self._file
+
+    def isatty(self) -> bool:
+        """Return whether it is a terminal."""
+        return self._is_terminal
+
+    def writable(self) -> bool:
+        """Return True."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Pass a text on; it is dropped if too many wait."""
+        with contextlib.suppress(queue.Full):
+            self._waiting.put_nowait(text.encode(self.encoding, "backslashreplace"))
+        return len(text)
+
+    def finish(self) -> None:
+        """Wait for what is still to be written, but not for long."""
+        try:
+            self._waiting.put_nowait(None)
+        except queue.Full:
+            return
+        self._thread.join(LAST_WORDS_S)
+
+    def _write_all(self) -> None:
+        while (data := self._waiting.get()) is not None:
+            while data:
+                try:
+                    data = data[os.write(self._file, data) :]
+                except BlockingIOError:
+                    select.select([], [self._file], [])
+                except OSError:
+                    # The terminal has gone, or the disk is full: nobody reads this one.
+                    break
+
+
+@contextlib.contextmanager
+def detached_output() -> Iterator[None]:
+    """Detach standard output, standard error and the log's handlers from the event loop."""
+    before = sys.stdout, sys.stderr
+    detached = {stream: DetachedStream(stream) for stream in before if _has_file(stream)}
+    sys.stdout, sys.stderr = (detached.get(stream, stream) for stream in before)
+    handlers = [
+        handler
+        for handler in logging.getLogger().handlers
+        if isinstance(handler, logging.StreamHandler) and handler.stream is before[1]
+    ]
+    for handler in handlers:
+        handler.setStream(sys.stderr)
+    try:
+        yield
+    finally:
+        for handler in handlers:
+            handler.setStream(before[1])
+        sys.stdout, sys.stderr = before
+        for stream in detached.values():
+            stream.finish()
+
+
+def _has_file(stream: TextIO) -> bool:
+    try:
+        stream.fileno()
+    except (OSError, ValueError):
+        return False
+    return True
+
+
+KEY_BYTES: Final = 64
+
+_SEQUENCE: Final = re.compile(r"\x1b(?:[\[O]([0-9;]*)([A-Za-z~]))?")
+_NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home", "F": "end"}
+
+
+def keys_of(text: str) -> Iterator[str]:
+    """Yield the names of the keys that a terminal sent.
+
+    Parameters
+    ----------
+    text : str
+        What was read.
+
+    Yields
+    ------
+    str
+        A printable character, `space`, `up`, `down`, `left`, `right`, `home` or `end`; others are
+        left out.
+    """
+    at = 0
+    while at < len(text):
+        sequence = _SEQUENCE.match(text, at)
+        if sequence is not None:
+            at = sequence.end()
+            if name := _NAMES.get(sequence[2] or ""):
+                yield name
+            continue
+        if text[at] == " ":
+            yield "space"
+        elif text[at].isprintable():
+            yield text[at]
+        at += 1
+
+
+class Keyboard:
+    """The terminal of a command; without one, nothing happens.
+
+    Parameters
+    ----------
+    on_key : callable
+        Called with each key's name; see `keys_of`.
+    descriptor : int, optional
+        The terminal; standard input by default.
+    """
+
+    def __init__(self, on_key: Callable[[str], None], descriptor: int | None = None) -> None:
+        self._on_key = on_key
+        self._descriptor = descriptor
+        self._before: list[Any] | None = None
+
+    def start(self) -> None:
+        """Start reading keys; needs a running event loop."""
+        try:
+            fd = sys.stdin.fileno() if self._descriptor is None else self._descriptor
+            # A background job would be stopped for touching the terminal.
+            if not os.isatty(fd) or os.tcgetpgrp(fd) != os.getpgrp():
+                return
+            self._before = termios.tcgetattr(fd)
+            tty.setcbreak(fd)
+        except (OSError, ValueError, termios.error):
+            return
+        self._descriptor = fd
+        asyncio.get_running_loop().add_reader(fd, self._read, fd)
+
+    def close(self) -> None:
+        """Restore the terminal."""
+        if self._before is None or self._descriptor is None:
+            return
+        asyncio.get_running_loop().remove_reader(self._descriptor)
+        # The window may have been closed.
+        with contextlib.suppress(termios.error):
+            termios.tcsetattr(self._descriptor, termios.TCSANOW, self._before)
+        self._before = None
+
+    def _read(self, fd: int) -> None:
+        try:
+            data = os.read(fd, KEY_BYTES)
+        except OSError:
+            data = b""
+        if not data:
+            self.close()
+            return
+        for key in keys_of(data.decode(errors="ignore")):
+            self._on_key(key)
