@@ -32,7 +32,7 @@ LOSSES: Final = (0.0, 0.1, 0.3)
 STARTED_S: Final = 2.0
 """By then every board runs and the GPS receiver is configured."""
 SLICE_S: Final = 0.001
-START_UP_US: Final = 500
+START_UP_US: Final = 900
 """More than the clock starts behind the reset, less than a sample's interval."""
 FLASH_BYTES, RAM_BYTES = 32_768, 2_048
 SAMPLES: Final = {"imu_node": "IMU sample", "gps_node": "fix", "receiver": "packet"}
