@@ -152,7 +152,7 @@ class OperatorControl:
         return result, answers
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send CONTROL_STATUS, and release the control of a station that is not heard any more."""
+        """Send CONTROL_STATUS, and release the control of a station that timed out."""
         if not self.exclusive or now_us < self._due_us:
             return []
         operator = self._operator

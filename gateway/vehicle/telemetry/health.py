@@ -288,7 +288,7 @@ BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 
 
 class Health:
-    """When every sensor of one aircraft was last heard, and whether it is healthy."""
+    """Time of the newest sample of every sensor of one aircraft, and the health of each."""
 
     def __init__(self, vehicle_id: int, silent_s: float, supply_low_v: float = 0.0) -> None:
         self.vehicle_id = vehicle_id
@@ -374,7 +374,7 @@ class Health:
             self._excused_us[node_id] = now_us
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
-        """Return whether a sensor was heard recently."""
+        """Return whether a sensor has sent a sample recently."""
         seen = self._seen_us.get(sensor)
         return seen is not None and now_us - seen <= self.silent_us
 
@@ -393,7 +393,7 @@ class Health:
         Returns
         -------
         tuple of 3 ints
-            Present (ever heard, and not reported absent), enabled, healthy.
+            Present (has sent a sample, and is not reported absent), enabled, healthy.
         """
         present = 0
         healthy = 0
@@ -448,7 +448,7 @@ class Health:
         )
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:
-        """Return the nodes that were heard once and are silent now."""
+        """Return the nodes that have sent payloads before and have timed out."""
         newest_us = {
             link.node.node_id: max(
                 link.last_time_us, self._excused_us.get(link.node.node_id, link.last_time_us)
@@ -467,7 +467,7 @@ class Health:
         return {link.node.node_id: link.restarts for link in self._nodes}
 
     def known_nodes(self) -> frozenset[int]:
-        """Return the nodes that were ever heard."""
+        """Return the nodes that have sent a payload."""
         return frozenset(link.node.node_id for link in self._nodes if link.received)
 
 
