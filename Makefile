@@ -37,16 +37,17 @@ fuzz: .venv/.dev
 	.venv/bin/python -m tools.fuzz
 
 lock: .venv/.dev
-	$(COMPILE) --extra panel --output-file requirements.lock pyproject.toml
-	$(COMPILE) --all-extras --constraint requirements.lock $(HEADLESS) \
+	$(COMPILE) --extra panel --extra fleet --output-file requirements.lock pyproject.toml
+	$(COMPILE) --group build --constraint requirements.lock --output-file requirements-build.lock
+	$(COMPILE) --group linker --output-file requirements-linker.lock
+	$(COMPILE) --all-extras --group build --constraint requirements.lock $(HEADLESS) \
 		--output-file requirements-dev.lock pyproject.toml
-	$(LINKER) --output-file requirements-linker.lock
+	.venv/bin/python -m tools.third_party
 
-LINKER = .venv/bin/uv pip compile --quiet --upgrade --universal --no-header --no-emit-index-url \
-	--no-emit-find-links --group linker
-
-COMPILE = .venv/bin/uv pip compile --quiet --upgrade --universal --no-header \
-	--no-emit-index-url --no-emit-find-links --group build
+COMPILE = .venv/bin/uv pip compile --quiet $(UPGRADE) --universal --generate-hashes --no-header \
+	--no-emit-index-url --no-emit-find-links
+# UPGRADE= keeps the versions that are locked.
+UPGRADE = --upgrade
 
 # What MAVProxy draws windows and maps with: half a gigabyte that a test never opens.
 HEADLESS := $(foreach package,opencv-python vtk wxpython quantized-mesh-tile shapely, \
@@ -59,8 +60,8 @@ firmware:
 clean:
 	rm -rf .venv build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
 
-.venv/.run: requirements.lock pyproject.toml
-	@tools/set_up.sh requirements.lock
+.venv/.run: requirements.lock requirements-build.lock pyproject.toml
+	@tools/set_up.sh requirements.lock requirements-build.lock
 	@touch $@
 
 .venv/.dev: requirements-dev.lock pyproject.toml

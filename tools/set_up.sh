@@ -1,9 +1,10 @@
 #!/bin/sh
-# Make the virtual environment .venv and install the locked packages into it.
-# usage: tools/set_up.sh LOCK_FILE
-# Installs Debian's python3-venv if it is missing and this user may install packages.
+# Make the virtual environment .venv, install locked packages into it, and compile the kernels.
+# usage: tools/set_up.sh LOCK_FILE...
+# Prints one line a step, and the output of a step only if it fails. Installs Debian's python3-venv
+# if it is missing and this user may install packages.
 set -eu
-lock=$1
+
 python=${PYTHON:-}
 if [ -z "$python" ]; then
     for candidate in python3.11 python3 python3.12 python3.13; do
@@ -18,23 +19,44 @@ if [ -z "$python" ]; then
     echo "set-up: no Python 3.11 or newer found; install it or set PYTHON=/path/to/python3" >&2
     exit 1
 fi
+
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+
+# step TEXT COMMAND...: run a command silently, and print what it does and how long it took.
+step() {
+    text=$1
+    shift
+    begin=$(date +%s)
+    printf 'set-up: %s ... ' "$text"
+    if "$@" >"$log" 2>&1; then
+        echo "$(($(date +%s) - begin)) s"
+    else
+        echo "failed"
+        cat "$log" >&2
+        exit 1
+    fi
+}
+
+# The lock lists every package with its hashes: what it leaves out is not installed.
+install() {
+    .venv/bin/python -m pip install --disable-pip-version-check --no-deps "$@"
+}
+
 if [ ! -x .venv/bin/pip ]; then
     if ! "$python" -c 'import ensurepip' 2>/dev/null; then
         version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
-        tools/apt_install.sh "python$version-venv"
+        step "installing python$version-venv" tools/apt_install.sh "python$version-venv"
     fi
-    echo "set-up: making the virtual environment .venv with $("$python" --version)"
-    "$python" -m venv .venv
+    step "virtual environment .venv with $("$python" --version)" "$python" -m venv .venv
 fi
-echo "set-up: installing the packages of $lock (some minutes the first time)"
-# The lock lists every package: --no-deps keeps what it leaves out from coming in.
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps -r "$lock"
+for lock; do
+    count=$(grep -c '^[A-Za-z]' "$lock")
+    step "$count packages of $lock" install --require-hashes --requirement "$lock"
+done
 if ! command -v cc >/dev/null; then
-    echo "set-up: installing a linker, since there is no C compiler"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
-        -r requirements-linker.lock
+    step "a linker, as there is no C compiler" \
+        install --require-hashes --requirement requirements-linker.lock
 fi
-.venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps \
-    --no-build-isolation --editable .
-echo "set-up: compiling the kernels"
-.venv/bin/python -m tools.build_kernels
+step "mavgate itself" install --no-build-isolation --editable .
+step "compiling the kernels, for up to a minute" .venv/bin/python -m tools.build_kernels
