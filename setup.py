@@ -9,6 +9,9 @@ from setuptools.command.bdist_wheel import bdist_wheel
 from setuptools.command.build_py import build_py
 
 ROOT = Path(__file__).resolve().parent
+LIBRARY = Path("gateway", "compiled", "kernels.so")
+PORTABLE = "manylinux_2_17_"
+"""Begins the platform of a wheel that runs with this version of the C library, or a later one."""
 
 
 class BuildWithKernels(build_py):
@@ -18,12 +21,15 @@ class BuildWithKernels(build_py):
         """Copy the packages, and compile the kernels beside them."""
         super().run()
         if not self.editable_mode:
-            library = Path(self.build_lib).resolve() / "gateway" / "compiled" / "kernels.so"
+            library = Path(self.build_lib).resolve() / LIBRARY
             platform = self.get_finalized_command("bdist_wheel").plat_name or ""
-            words = [sys.executable, "-m", "tools.build_kernels", "--output", str(library)]
-            if platform.startswith("manylinux"):
-                words += ["--architecture", platform.partition("_2_17_")[2]]
-            subprocess.run(words, cwd=ROOT, check=True)
+            words = [sys.executable, "-m", "tools.build_kernels"]
+            if platform.startswith(PORTABLE):
+                words += ["--architecture", platform.removeprefix(PORTABLE)]
+                subprocess.run([*words, "--output", str(library)], cwd=ROOT, check=True)
+            else:
+                subprocess.run(words, cwd=ROOT, check=True)
+                self.copy_file(str(ROOT / LIBRARY), str(library))
 
 
 class PlatformWheel(bdist_wheel):

@@ -148,7 +148,7 @@ def test_systemd_understands_the_unit(unpacked: Path, tmp_path: Path) -> None:
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
 def test_systemd_finds_little_that_the_unit_may_do(unpacked: Path) -> None:
     """Of 10, as `systemd-analyze security` counts; a service without any restriction has 9.6."""
-    words = ("security", "--offline=true", "--threshold=30", str(unpacked / UNIT))
+    words = ("security", "--offline=true", "--threshold=20", str(unpacked / UNIT))
     done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
 

@@ -10,26 +10,39 @@ output=$1
 python=${PYTHON:-.venv/bin/python}
 lock=${LOCK-requirements.lock}
 work=$(mktemp -d)
-trap 'rm -rf "$work"' EXIT
 root=$work/root
 lib=$root/usr/lib/mavgate
 
-# From a copy: setuptools would also pack what an earlier build left in the tree.
-mkdir -p "$work/source"
-cp -r gateway config docs tools pyproject.toml README.md CHANGELOG.md LICENSE "$work/source"
-find "$work/source" -name __pycache__ -prune -exec rm -r {} +
+step_of=package
+. tools/steps.sh
+trap 'rm -rf "$work" "$step_log"' EXIT
 
 install() {
-    "$python" -m pip install --quiet --disable-pip-version-check --no-compile --no-deps \
-        --target "$lib" "$@"
+    "$python" -m pip install --disable-pip-version-check --no-compile --no-deps --target "$lib" "$@"
 }
-install --no-build-isolation "$work/source"
+
+# From a copy: setuptools would also pack what an earlier build left in the tree.
+mkdir -p "$work/source"
+cp -r gateway config docs tools pyproject.toml setup.py README.md CHANGELOG.md LICENSE "$work/source"
+find "$work/source" -name __pycache__ -prune -exec rm -r {} +
+step "mavgate and its compiled kernels" install --no-build-isolation "$work/source"
 mv "$lib/share" "$work/"
 rm -rf "$lib/bin" "$lib"/mavgate-*.dist-info/direct_url.json
-[ -z "$lock" ] || install --requirement "$lock"
+[ -z "$lock" ] || step "$(grep -c '^[A-Za-z]' "$lock") packages of $lock" \
+    install --require-hashes --requirement "$lock"
 rm -rf "$lib/bin" "$lib/share"
-# A seventh of all that it would install are the tests of other packages.
+# A third of all that would be installed are the tests of other packages, types, sources of C, and
+# MAVLink dialects that are parts of `all`.
 find "$lib" -type d -name tests -prune -exec rm -r {} +
+find "$lib" -type f \( -name "*.pyi" -o -name "*.pyx" -o -name "*.pxd" -o -name "*.[ch]" \) -delete
+dialects=$lib/pymavlink/dialects
+if [ -d "$dialects" ]; then
+    find "$dialects" -type f ! -name __init__.py ! -path "$dialects/v20/all.*" -delete
+fi
+# Not those in folders *.libs, which were changed after linking and would break.
+if command -v strip >/dev/null; then
+    find "$lib" -name "*.so" ! -path "*.libs/*" -exec strip --strip-unneeded {} +
+fi
 version=$(PYTHONPATH=$lib "$python" -c 'import gateway; print(gateway.__version__)')
 minor=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 next=${minor%.*}.$((${minor#*.} + 1))
@@ -39,7 +52,7 @@ mkdir -p "$root/usr/bin" "$root/usr/lib/systemd/system" "$root/usr/lib/sysusers.
 sed "s/@MINOR@/$minor/" tools/debian/mavgate > "$root/usr/bin/mavgate"
 chmod 755 "$root/usr/bin/mavgate"
 mv "$work/share/doc/mavgate" "$root/usr/share/doc/"
-cp LICENSE "$root/usr/share/doc/mavgate/copyright"
+"$python" -m tools.third_party --copyright "$root/usr/share/doc/mavgate/copyright" "$lib"
 mv "$work/share/mavgate/mavgate.service" "$root/usr/lib/systemd/system/"
 cp tools/debian/60-mavgate.rules "$root/usr/lib/udev/rules.d/"
 cp tools/debian/sysusers.conf "$root/usr/lib/sysusers.d/mavgate.conf"
@@ -55,7 +68,7 @@ for shell in bash zsh fish; do
         > "$root/$file"
 done
 # As Debian does it, so that nothing is compiled anew on a machine that cannot write there.
-"$python" -m compileall -q -s "$root" --invalidation-mode unchecked-hash "$lib"
+step "bytecode" "$python" -m compileall -q -s "$root" --invalidation-mode unchecked-hash "$lib"
 
 echo /etc/mavgate/gateway.toml > "$root/DEBIAN/conffiles"
 for script in postinst prerm postrm; do
@@ -67,4 +80,5 @@ sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$(dpkg --print-architecture)
     tools/debian/control > "$root/DEBIAN/control"
 chmod -R go=u-w "$root"
 mkdir -p "$output"
-dpkg-deb --root-owner-group -Zzstd -z6 --build "$root" "$output"
+step "compression" dpkg-deb --root-owner-group -Zzstd -z9 --build "$root" "$output"
+ls -l "$output"/mavgate_*.deb

@@ -20,23 +20,9 @@ if [ -z "$python" ]; then
     exit 1
 fi
 
-log=$(mktemp)
-trap 'rm -f "$log"' EXIT
-
-# step TEXT COMMAND...: run a command silently, and print what it does and how long it took.
-step() {
-    text=$1
-    shift
-    begin=$(date +%s)
-    printf 'set-up: %s ... ' "$text"
-    if "$@" >"$log" 2>&1; then
-        echo "$(($(date +%s) - begin)) s"
-    else
-        echo "failed"
-        cat "$log" >&2
-        exit 1
-    fi
-}
+step_of=set-up
+. tools/steps.sh
+trap 'rm -f "$step_log"' EXIT
 
 # The lock lists every package with its hashes: what it leaves out is not installed.
 install() {

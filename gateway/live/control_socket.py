@@ -335,7 +335,7 @@ def _plain(value: object) -> object:
     raise NotImplementedError(f"{type(value).__name__} is no JSON")
 
 
-SOCKETS: Final = Path("/proc/net/unix")
+SOCKETS: Final = Path("/proc/self/net/unix")
 ACCEPTS: Final = "00010000"
 """The flag of a socket that takes connections, see proc_net(5)."""
 

@@ -1,0 +1,81 @@
+"""The lock files and the list of third-party licences."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from tests.conftest import ROOT
+from tools import third_party
+
+LOCKS = sorted(ROOT.glob("requirements*.lock"))
+
+
+@pytest.mark.parametrize("lock", LOCKS, ids=lambda lock: lock.name)
+def test_each_locked_package_has_hashes(lock: Path) -> None:
+    entries = re.split(r"\n(?=[A-Za-z])", lock.read_text())
+    assert len(entries) > 0
+    for entry in entries:
+        assert re.match(r"[\w.-]+==[\w.]+", entry), entry
+        assert "--hash=sha256:" in entry, entry
+
+
+def test_installation_checks_hashes() -> None:
+    for script in ("set_up.sh", "make_deb.sh"):
+        text = (ROOT / "tools" / script).read_text()
+        assert text.count("--requirement") == text.count("--require-hashes --requirement") > 0
+
+
+def test_each_dependency_is_locked() -> None:
+    with (ROOT / "pyproject.toml").open("rb") as file:
+        project = tomllib.load(file)
+    extras = project["project"]["optional-dependencies"]
+    groups = project["dependency-groups"]
+    for lock, wanted in {
+        "requirements.lock": [
+            *project["project"]["dependencies"], *extras["panel"], *extras["fleet"]
+        ],
+        "requirements-build.lock": groups["build"],
+        "requirements-linker.lock": groups["linker"],
+        "requirements-dev.lock": [one for some in extras.values() for one in some],
+    }.items():  # fmt: skip
+        names = re.findall(r"^([\w.-]+)==", (ROOT / lock).read_text(), re.MULTILINE)
+        locked = {canonicalize_name(name) for name in names}
+        assert {canonicalize_name(Requirement(one).name) for one in wanted} <= locked, lock
+
+
+def test_the_list_of_licences_is_current() -> None:
+    """`python -m tools.third_party` writes it again."""
+    assert third_party.PAGE.read_text() == third_party.page()
+
+
+def test_the_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -> None:
+    names = third_party.locked_in(ROOT / "requirements.lock")
+    packages = [third_party.distribution(name) for name in names]
+    text = third_party.copyright_of(packages)
+    assert text.count("=" * 78) >= len(names)
+    assert "Chris Liechti" in text
+    assert "GNU LESSER GENERAL PUBLIC LICENSE" in text, "that of pymavlink"
+
+
+@pytest.mark.io
+@pytest.mark.slow
+def test_a_wheel_contains_the_kernels_for_its_platform(tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    skipped = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "tests", "firmware")
+    shutil.copytree(ROOT, source, ignore=skipped)
+    words = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "-w", tmp_path]
+    subprocess.run([sys.executable, *words, source], check=True)
+    [wheel] = tmp_path.glob("mavgate-*-py3-none-linux_*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        archive.extract("gateway/compiled/kernels.so", tmp_path)
+    assert (tmp_path / "gateway/compiled/kernels.so").read_bytes().startswith(b"\x7fELF")
+    assert not [name for name in names if name.startswith(("tests/", "tools/"))]
