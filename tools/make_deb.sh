@@ -52,6 +52,7 @@ mkdir -p "$root/usr/bin" "$root/usr/lib/systemd/system" "$root/usr/lib/sysusers.
 sed "s/@MINOR@/$minor/" tools/debian/mavgate > "$root/usr/bin/mavgate"
 chmod 755 "$root/usr/bin/mavgate"
 mv "$work/share/doc/mavgate" "$root/usr/share/doc/"
+gzip -9 --no-name --stdout CHANGELOG.md > "$root/usr/share/doc/mavgate/changelog.gz"
 "$python" -m tools.third_party --copyright "$root/usr/share/doc/mavgate/copyright" "$lib"
 mv "$work/share/mavgate/mavgate.service" "$root/usr/lib/systemd/system/"
 cp tools/debian/60-mavgate.rules "$root/usr/lib/udev/rules.d/"
@@ -67,9 +68,8 @@ for shell in bash zsh fish; do
     _MAVGATE_COMPLETE=source_$shell PYTHONPATH=$lib "$python" "$root/usr/bin/mavgate" \
         > "$root/$file"
 done
-# As Debian does it, so that nothing is compiled anew on a machine that cannot write there.
-step "bytecode" "$python" -m compileall -q -s "$root" --invalidation-mode unchecked-hash "$lib"
-
+# Python wrote it while this script ran the program; the installation writes it for its Python.
+find "$root" -name __pycache__ -prune -exec rm -r {} +
 echo /etc/mavgate/gateway.toml > "$root/DEBIAN/conffiles"
 for script in postinst prerm postrm; do
     cp "tools/debian/$script" "$root/DEBIAN/"
@@ -80,5 +80,5 @@ sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$(dpkg --print-architecture)
     tools/debian/control > "$root/DEBIAN/control"
 chmod -R go=u-w "$root"
 mkdir -p "$output"
-step "compression" dpkg-deb --root-owner-group -Zzstd -z9 --build "$root" "$output"
+step "compression" dpkg-deb --root-owner-group -Zxz --build "$root" "$output"
 ls -l "$output"/mavgate_*.deb
