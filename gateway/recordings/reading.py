@@ -262,7 +262,7 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     except ValueError as error:
         encoding = _encoding_of(path).removesuffix("-sig").upper()
         raise FlightError(
-            f"{path}, read as {encoding}: {error}; name its columns with --columns MAP"
+            f"{path}: {error} (as {encoding}); name its columns with --columns MAP"
         ) from error
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")

@@ -123,7 +123,7 @@ async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message
     assert len(frames) > 100 * FLIGHT_S
     assert frames_in(folder) == frames
     sources = [TlogFile(path) for path in sorted(folder.glob("*.tlog"))]
-    player = Player([Track(source) for source in sources], clock(), speed=10.0)
+    player = Player([Track(source, with_commands=True) for source in sources], clock(), speed=10.0)
     recording = Recording(tmp_path / "second", clock)
     async with recording as recorder:
         while (due_us := player.next_due_us()) is not None:

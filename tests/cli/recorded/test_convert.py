@@ -400,9 +400,9 @@ def test_record_without_a_gateway(tmp_path: Path) -> None:
     assert [recording["name"] for recording in listed] == ["a"]
     run("record", "save", "first flight", "-c", config)
     assert "aborted" in run("record", "delete", "last", "-c", config, code=1).lower()
-    assert [path.name for path in folder.iterdir()] == ["first flight_01.tlog"]
+    assert [path.name for path in folder.glob("*.tlog")] == ["first flight_01.tlog"]
     run("record", "delete", "last", "--yes", "-c", config)
-    assert list(folder.iterdir()) == []
+    assert list(folder.glob("*.tlog")) == []
 
 
 @pytest.mark.parametrize("options", [[], ["--fuse"]])

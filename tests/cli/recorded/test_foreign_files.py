@@ -303,7 +303,8 @@ def test_csv_without_the_needed_columns_names_those_found(tmp_path: Path) -> Non
     path = tmp_path / "log.csv"
     path.write_bytes(rows(";").replace("gz", "gyro_z").encode("utf-16"))
     printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
-    assert "read as UTF-16: the file has no column gz" in printed
+    assert "log.csv: the file has no column gz" in printed
+    assert "(as UTF-16)" in printed
     assert "found, separated by semicolons: time_s, ax, ay, az, gx, gy, gyro_z" in printed
 
 
