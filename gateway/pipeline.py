@@ -96,7 +96,7 @@ class Pipeline:
         """Process one raw record, from the link or from a recording."""
         vehicle_id = record.node.vehicle_id
         if isinstance(record, GpsFix) and record.utc_us is not None:
-            at_zero_us = self._gps_time.hear(vehicle_id, record.utc_us, record.time_us)
+            at_zero_us = self._gps_time.update(vehicle_id, record.utc_us, record.time_us)
             if at_zero_us is not None:
                 self._signing_clock.set_gps_time(at_zero_us)
         self._heard_us[vehicle_id] = now_us

@@ -448,7 +448,7 @@ class CivilClock:
 
         A machine that agrees within `JUMP_US` keeps its own, finer time.
         """
-        offset_us = self._gps.hear(vehicle_id, utc_us, time_us)
+        offset_us = self._gps.update(vehicle_id, utc_us, time_us)
         if offset_us is None:
             return
         if self._offset_us is None or abs(offset_us - self._offset_us) > JUMP_US:

@@ -117,7 +117,7 @@ class FrameDecoder:
         return events
 
     def reset(self) -> None:
-        """Forget a half-received frame, as after reopening the port."""
+        """Discard a half-received frame, as after reopening the port."""
         self._partial = b""
         self._skipped = 0
 

@@ -5,9 +5,9 @@ from statistics import median_low
 from typing import Final
 
 RECENT: Final = 15
-"""Fixes of an aircraft that count: some seconds."""
+"""Number of newest fixes used of each aircraft: some seconds."""
 ENOUGH: Final = 3
-"""Fixes of an aircraft before it counts: the first one may hold the time of the last flight."""
+"""Number of fixes before an aircraft is used: the first may hold the time of the last flight."""
 
 
 class GpsTime:
@@ -16,7 +16,7 @@ class GpsTime:
     def __init__(self) -> None:
         self._offsets_us: dict[int, deque[int]] = {}
 
-    def hear(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
+    def update(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
         """Note the time of a fix.
 
         The arrival is used as the time of the fix: late by the latency, so never in the future.
@@ -35,7 +35,7 @@ class GpsTime:
         int or None
             Civil time of gateway time zero in µs since 1970; None while there are too few fixes.
         """
-        heard = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
-        heard.append(utc_us - time_us)
+        offsets_us = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
+        offsets_us.append(utc_us - time_us)
         medians = [median_low(each) for each in self._offsets_us.values() if len(each) >= ENOUGH]
         return median_low(medians) if medians else None

@@ -34,13 +34,13 @@ SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
 """Payloads further back than any retry queue belong to another run of the node."""
 SLOWED: Final = 64
-"""A sixty-fourth: streams stay locked to samples that come so much closer."""
+"""Divisor of the elapsed time: by so little may samples follow each other sooner."""
 MOST_AHEAD_US: Final = 50_000
-"""Of where the clock's estimate puts a sample: more is no small correction."""
+"""A correction of the clock's estimate beyond this is applied at once."""
 RATE_SPAN_US: Final = US_PER_S
 FIRST_YEAR: Final = 2024
-"""Before it nobody spoke this protocol: the receiver has lost count of the weeks, which start anew
-every 1024, or tells the date of its firmware until the satellites have told theirs."""
+"""An earlier date is false: the receiver has lost count of the weeks, which start again every 1024,
+or reports the date of its firmware until it has received that of the satellites."""
 MAX_ARRIVALS: Final = 2048
 """Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
 
@@ -54,7 +54,7 @@ class Arrival(Enum):
 
 
 class SequenceCounter:
-    """Tell new payloads from duplicates and late ones, and count the gaps."""
+    """Distinguish new payloads from duplicates and late ones, and count the gaps."""
 
     def __init__(self) -> None:
         self.received = 0
@@ -64,8 +64,8 @@ class SequenceCounter:
         self._last: int | None = None
         self._seen = 0
 
-    def forget(self) -> None:
-        """Reset after a restart of the sender; the counts stay."""
+    def reset(self) -> None:
+        """Begin a new sequence after a restart of the sender; the counts stay."""
         self._last = None
 
     def count(self, seq: int) -> Arrival:
@@ -161,7 +161,7 @@ class Link:
         return records
 
     def reopened(self) -> None:
-        """Forget the cut frame and the frame sequence after the port was opened again."""
+        """Discard the cut frame and the frame sequence after the port was opened again."""
         self._decoder.reset()
         self._last_frame_seq = None
 
@@ -239,7 +239,7 @@ def _hear_node(
     restarts = node.clock.restarts
     time_us = node.clock.observe(header.node_time_us, heard_us)
     if node.clock.restarts != restarts:
-        node.sequence.forget()
+        node.sequence.reset()
         node.last_stamp_us = None
     # A late payload is counted but not used: every stage behind relies on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
@@ -260,8 +260,8 @@ def _is_later(stamp_us: int, last_us: int | None) -> bool:
 def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
     """Return the time of a sample where a better estimate of the clock may have set it back.
 
-    It then comes a little sooner after the last one than the node says, until the times agree:
-    samples all at once would be no motion for an estimator, and too many for a stream.
+    The sample then follows the last one a little sooner than the node's clock shows, until the
+    times agree: an estimator must not get many samples of one time, nor a stream send them at once.
     """
     if node.last_stamp_us is not None:
         elapsed_us = (stamp_us - node.last_stamp_us) % WRAP_US

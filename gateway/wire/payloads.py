@@ -60,7 +60,7 @@ _RECEIVER_HEAD: Final = struct.Struct("<BBHB")
 _PIPE: Final = struct.Struct("<IIH")
 
 _NODES: Final = tuple(NodeId(address >> 3, address & 0x7) for address in range(256))
-"""By the byte that stands for it."""
+"""Indexed by the address byte."""
 _imu_flags = cache(ImuFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
 
@@ -302,9 +302,9 @@ def _encode_body(payload: Payload) -> tuple[PayloadKind, bytes]:
             body = _BARO.pack(payload.pressure_centipa, payload.temperature_ddegc)
             return PayloadKind.BARO, body
         case GpsFixPayload():
-            place = (payload.itow_ms, payload.lat_dege7, payload.lon_dege7, payload.alt_amsl_mm)
+            position = (payload.itow_ms, payload.lat_dege7, payload.lon_dege7, payload.alt_amsl_mm)
             kind = payload.fix_type | payload.fix_ok << 7
-            body = _GPS_FIX.pack(*place, *payload.vel_n_cmps, kind, payload.satellites)
+            body = _GPS_FIX.pack(*position, *payload.vel_n_cmps, kind, payload.satellites)
             return PayloadKind.GPS_FIX, body
         case GpsQualityPayload():
             return PayloadKind.GPS_QUALITY, _encode_quality(payload)
@@ -375,7 +375,7 @@ def _read_baro(words: tuple[int, ...]) -> BaroPayload:
 def _read_gps_fix(words: tuple[int, ...]) -> GpsFixPayload:
     itow, lat, lon, alt, north, east, down, kind, satellites = words
     if not (-900_000_000 <= lat <= 900_000_000 and -1_800_000_000 <= lon <= 1_800_000_000):
-        raise ValueError("no place on earth")
+        raise ValueError("no coordinates of the Earth")
     return GpsFixPayload(
         itow_ms=itow,
         lat_dege7=lat,

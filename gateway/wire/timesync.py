@@ -103,7 +103,7 @@ class ClockTracker:
             elif self._is_stale(arrival_us):
                 self._restart()
                 remote_us, local_us = remote_u32, arrival_us
-        elif self._is_doubtful(arrival_us - remote_us):
+        elif self._is_unconfirmed(arrival_us - remote_us):
             return arrival_us
         if self._last_remote_us is None or remote_us > self._last_remote_us:
             self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
@@ -111,8 +111,8 @@ class ClockTracker:
             local_us = self._to_local(remote_us)
         return min(local_us, arrival_us)
 
-    def _is_doubtful(self, delta_us: int) -> bool:
-        """Return whether of packets that are far too early this is the first that says so."""
+    def _is_unconfirmed(self, delta_us: int) -> bool:
+        """Return whether a packet is far too early, and no other has confirmed its offset yet."""
         before_us, self._suspect_us = self._suspect_us, None
         if before_us is not None and abs(before_us - delta_us) <= AHEAD_US:
             return False
@@ -148,7 +148,7 @@ class ClockTracker:
         return arrival_us - self._late_since_us > DRAIN_US
 
     def _add(self, remote_us: int, delta_us: int) -> bool:
-        """Take in a point if beside the drift it is its bucket's soonest; tell whether it is."""
+        """Add a point if it is the soonest of its bucket, drift removed; return whether it is."""
         buckets = self._buckets
         if buckets:
             soonest = buckets[-1]
