@@ -47,7 +47,7 @@ def test_without_a_catalogue_names_are_searched_all_the_same(tmp_path: Path) -> 
     facts.look(tmp_path, "x")
     assert facts.of("x1") is None
     assert facts.shows("x1", "x")
-    assert "mavgate catalogue" in facts.trouble
+    assert "once the recordings are indexed" in facts.trouble
     catalogue(tmp_path, x1=5.0)
     facts.look(tmp_path, "x")
     assert facts.trouble == ""
