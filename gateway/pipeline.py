@@ -223,7 +223,7 @@ class Pipeline:
         return actions
 
     def mark(self, place: Location | None, vehicle_id: int | None, now_us: int) -> list[Action]:
-        """Mark a place for one aircraft, or for all, or clear the mark.
+        """Mark a location for one aircraft, or for all, or clear the mark.
 
         Raises
         ------

@@ -89,6 +89,14 @@ async def main():
 asyncio.run(main())
 """
 
+UVLOOP = "uvloop"
+"""The hub again, on the event loop of that name."""
+UVLOOP_HUB = HUB.replace(
+    "asyncio.run(main())",
+    "import uvloop\nwith asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:\n"
+    "    runner.run(main())",
+)
+
 WEB_HUB = """
 import asyncio, sys
 from gateway.clock import GatewayClock
@@ -594,6 +602,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0, help="of each single run")
     parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
+    parser.add_argument("--uvloop", action="store_true", help="compare the hub on uvloop")
     parser.add_argument("--mavlink-router", metavar="COMMAND", help="compare mavlink-routerd")
     parser.add_argument("--mavproxy", metavar="COMMAND", help="compare mavproxy.py")
     parser.add_argument("--systems", type=int, help="only command so many vehicles behind one link")
@@ -605,6 +614,8 @@ def main() -> None:
     forwarders = {
         "plain": python(PLAIN), "mavgate": hub(), PACKED: hub("?pack=1100"), WEB: python(WEB_HUB)
     }  # fmt: skip
+    if options.uvloop:
+        forwarders[UVLOOP] = python(UVLOOP_HUB % "")
     if options.mavlink_router:
         forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
     if options.mavproxy:

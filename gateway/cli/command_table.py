@@ -124,7 +124,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "clients": CommandEntry("live.clients", "List, add and remove clients and sources.", GATEWAY),
     "mark": CommandEntry(
         "live.clients",
-        "Mark a place: ground stations show distance and bearing to it. Without one, clear it.",
+        "Mark a location: ground stations show distance and bearing to it. Without one, clear it.",
         GATEWAY,
     ),
     "reload": CommandEntry(

@@ -38,7 +38,7 @@ class Url(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MarkParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A place to mark; without latitude and longitude the mark is cleared."""
+    """A location to mark; without latitude and longitude the mark is cleared."""
 
     lat_deg: float | None = None
     lon_deg: float | None = None
@@ -136,7 +136,7 @@ class RecorderVerbs:
 
     def _note(self, params: Text) -> RecorderStatus:
         if not params.text.strip():
-            raise ControlError("a remark of no words: say what happens now")
+            raise ControlError("the note is empty: describe what happens now")
         self._recorder.mark(params.text)
         return self._recorder.status()
 

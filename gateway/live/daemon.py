@@ -299,7 +299,7 @@ class Daemon:
         try:
             await self._control.start()
         except ControlError as error:
-            log.warning("no orders can be taken: %s", error)
+            log.warning("no control socket: %s", error)
         self._notifier.ready()
 
     def _introduction(self, vehicle_id: int) -> list[bytes]:

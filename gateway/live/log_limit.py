@@ -1,6 +1,6 @@
 """A rate limit for the log, so that no repeated error fills the disk.
 
-A kind of line is the place in the code that writes it and, for an unexpected error, the place that
+A kind of line is the code position that writes it and, for an unexpected error, the one that
 raised it. Of each kind a few lines at once are written and then one a second; the next one written
 says how many were not.
 """
@@ -14,7 +14,7 @@ BURST: Final = 20
 """Lines of a kind at once: a start with many endpoints writes one for each."""
 REFILL_S: Final = 1.0
 MAX_KINDS: Final = 1024
-"""Places in the code; there are fewer, so nothing is forgotten in practice."""
+"""Code positions; there are fewer, so none is discarded in practice."""
 
 Kind = tuple[str, int, str]
 

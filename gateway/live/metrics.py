@@ -395,7 +395,7 @@ def _vehicles(states: tuple[tuple[int, NavState], ...]) -> Iterator[Metric]:
     )
     yield gauge(
         "vehicle_trouble",
-        "1 while GPS is rejected, or the magnetometer disturbed (iron or currents near it).",
+        "1 while GPS is rejected, or the compass is disturbed (metal or currents nearby).",
         ("vehicle", "kind"),
         [
             ((str(vehicle_id), kind), float(flag in state.flags))

@@ -123,7 +123,7 @@ def mark(
         int | None, typer.Option("--aircraft", help="For this aircraft only; by default all.")
     ] = None,
 ) -> None:
-    """Mark a place: ground stations show distance and bearing to it. Without one, clear it."""
+    """Mark a location: ground stations show distance and bearing to it. Without one, clear it."""
     for name, value in (("LAT_DEG", lat_deg), ("LON_DEG", lon_deg), ("--alt", alt)):
         if value is not None and not math.isfinite(value):
             refuse(

@@ -47,7 +47,7 @@ async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
     assert "recording" in await run("start")
     gateway.send(make_frames(9))
     assert "recording" in await run("note", "over the wood")
-    assert "a remark of no words" in await run("note", " ", code=2)
+    assert "the note is empty" in await run("note", " ", code=2)
     # Also before anything of it is on the disk.
     assert "first" in await run("save", "first")
     await gateway.recorder.settle()
