@@ -107,9 +107,7 @@ class UsbSerial:
     def _hear(self) -> None:
         with contextlib.suppress(BlockingIOError):
             os.read(self._opened, READ_SIZE)
-            termios.tcflush(self._slave, termios.TCIFLUSH)  # what the last program left unread
-            self._opening += 1
-            self._board.reset(EXTERNAL)
+            self._open_anew()
         if not dict(self._poll.poll(0)).get(self._master, 0) & select.POLLIN:
             return
         data = os.read(self._master, READ_SIZE)
@@ -120,6 +118,15 @@ class UsbSerial:
         for byte in data:
             self._bench.at(self._line_free_ps, functools.partial(self._feed, byte, self._opening))
             self._line_free_ps += byte_ps
+
+    def _open_anew(self) -> None:
+        """Reset the board, and drop the bytes of the last program in both directions."""
+        termios.tcflush(self._slave, termios.TCIFLUSH)
+        with contextlib.suppress(BlockingIOError):
+            while os.read(self._master, READ_SIZE):
+                pass
+        self._opening += 1
+        self._board.reset(EXTERNAL)
 
     def _feed(self, byte: int, opening: int) -> None:
         if opening == self._opening:
