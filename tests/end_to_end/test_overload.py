@@ -49,8 +49,10 @@ def test_stopped_process_blames_no_hardware(
     time.sleep(STOPPED_S)
     gateway.process.send_signal(signal.SIGCONT)
     after = list(messages(client, 8.0))
-    texts = [m.text for m in after if m.get_type() == "STATUSTEXT"]
+    texts = [m.text for m in before + after if m.get_type() == "STATUSTEXT"]
+    # Once also on a busy machine, on which it is too slow before.
     assert sum(text.startswith("This computer is too slow") for text in texts) == 1
+    texts = [m.text for m in after if m.get_type() == "STATUSTEXT"]
     assert [text for text in texts if any(blame in text for blame in BLAMES)] == []
     track = [m for m in before + after if m.get_type() == "GLOBAL_POSITION_INT"]
     # The velocity changes over the gap itself, which the estimator bridges.
