@@ -1,13 +1,15 @@
 # make demo   the gateway on its built-in simulated receiver, until interrupted
 # make test   every test, the firmware's included
 # make kernels  the compiled kernels, if their sources have changed
+# make wheel  wheels for x86-64 and aarch64, in dist/
+# make image  an OCI image, with podman, buildah or docker
 # make lint   formatting, lint and types
 # make firmware   the ready-made images of `mavgate flash`; make deb builds them too
 # make deb    a Debian package with the service, in dist/
 # make fuzz   odd input to all that reads any, with new values, for five minutes
 # make lock   write the lock files anew from pyproject.toml
 
-.PHONY: demo kernels test lint deb fuzz lock firmware clean
+.PHONY: demo kernels test lint deb wheel image fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck avrdude arduino-core-avr
@@ -25,10 +27,23 @@ test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
-	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations 20
 
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
+
+# Of the library of kernels, each wheel has the one of its processor; Python's version is free.
+wheel: .venv/.run
+	@.venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps \
+		--requirement requirements-linker.lock
+	for machine in x86_64 aarch64; do \
+		.venv/bin/python -m pip wheel --disable-pip-version-check --no-deps --no-build-isolation \
+			--config-settings=--build-option=--plat-name=manylinux_2_17_$$machine \
+			--wheel-dir dist . || exit; \
+	done
+
+image:
+	$(firstword $(shell command -v podman buildah docker) podman) build --tag mavgate .
 
 deb: .venv/.run firmware
 	tools/make_deb.sh dist

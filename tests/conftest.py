@@ -1,6 +1,7 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -27,6 +28,13 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile the kernels if their sources have changed, before the workers start."""
     if not hasattr(session.config, "workerinput"):
         subprocess.run([sys.executable, "-m", "tools.build_kernels"], cwd=ROOT, check=True)
+
+
+def pytest_configure() -> None:
+    """Let children begin with the default action of SIGHUP, which `nohup` has pytest ignore."""
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        # A handler is not inherited by a new program; an ignored signal is.
+        signal.signal(signal.SIGHUP, lambda *_: None)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

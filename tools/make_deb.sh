@@ -70,6 +70,9 @@ for shell in bash zsh fish; do
 done
 # Python wrote it while this script ran the program; the installation writes it for its Python.
 find "$root" -name __pycache__ -prune -exec rm -r {} +
+find "$lib" -type f -name "*.so*" -exec chmod 644 {} +
+mkdir -p "$root/usr/share/lintian/overrides"
+cp tools/debian/lintian-overrides "$root/usr/share/lintian/overrides/mavgate"
 echo /etc/mavgate/gateway.toml > "$root/DEBIAN/conffiles"
 for script in postinst prerm postrm; do
     cp "tools/debian/$script" "$root/DEBIAN/"

@@ -93,6 +93,7 @@ class PanelProcess:
     async def _keep(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
         environment = os.environ | {"MAVGATE_SOCKET": str(await control_socket())}
         wait_s = RESTART_S
+        log.info("the panel is starting")
         while True:
             self._child = await asyncio.create_subprocess_exec(
                 *self._command,
