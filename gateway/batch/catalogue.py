@@ -146,7 +146,7 @@ class Catalogue:
         with _told(self.path), self._db:
             self._db.execute("UPDATE flights SET modified = ? WHERE path = ?", (modified_ns, path))
 
-    def forget(self, paths: Iterable[str]) -> None:
+    def discard(self, paths: Iterable[str]) -> None:
         """Drop files that are gone."""
         with _told(self.path), self._db:
             for path in paths:
@@ -371,7 +371,7 @@ def index_folder(
         known = catalogue.known()
         there = {as_text(str(path.relative_to(folder))): path for path in recordings_below(folder)}
         gone = known.keys() - there.keys()
-        catalogue.forget(gone)
+        catalogue.discard(gone)
         wanted = [
             (str(path.relative_to(folder)), known[name][2] if name in known else "")
             for name, path in there.items()

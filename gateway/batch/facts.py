@@ -242,7 +242,7 @@ class FlightTally:
         longest_s = max(OUTAGE_S, SILENCE_STEPS * usual_s)
         last_us = max(end_us or 0, int(fixed[-1]))
         silences_s = np.diff(np.append(fixed, last_us)) / US_PER_S
-        # A clock that leaps by days is no silence.
+        # A clock that jumps by days is no gap.
         outages = silences_s[(silences_s > longest_s) & (silences_s <= DAY_US / US_PER_S)]
         return len(outages), float(outages.sum())
 

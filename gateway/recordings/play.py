@@ -263,7 +263,7 @@ class Player:
     begin_us, end_us : int, optional
         Range of the recordings' time to play; the whole by default, the end included.
     max_gap_us : int, optional
-        Longest silence to keep; None keeps all.
+        Longest gap to keep; None keeps all.
     loop : bool
         Restart at the end.
     """

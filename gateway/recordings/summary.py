@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 
 
 GAP_US: Final = 2 * US_PER_S
-"""Every vehicle sends a heartbeat a second: a longer silence is a gap."""
+"""Every vehicle sends a heartbeat a second: a longer pause is a gap."""
 MAX_GAPS: Final = 1000
 STEP_US: Final = US_PER_S // 2
 """Interval of the positions between which the distance is summed."""

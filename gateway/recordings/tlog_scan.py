@@ -1,7 +1,7 @@
 """Find the records of a tlog in bytes, at memory speed.
 
 Theory of operation. A tlog is a sequence of records: eight bytes of time, most significant first,
-then one MAVLink frame, whose own length byte tells where the next record begins. While the file is
+then one MAVLink frame, whose own length byte gives the begin of the next record. While the file is
 intact, each record is confirmed by the header of the next one, and no checksum is needed:
 
 | state     | the record here                                      | what is done                |

@@ -364,7 +364,7 @@ class Health:
         return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
 
     def on_stall(self, stalled_us: int, now_us: int) -> None:
-        """Do not count a time in which the gateway was not running as silence of a sensor."""
+        """Do not count a time in which the gateway was not running as an outage of a sensor."""
         begin_us = now_us - stalled_us
         for sensor, seen_us in self._seen_us.items():
             if begin_us - seen_us <= self.silent_us:
