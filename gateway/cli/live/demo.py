@@ -1,6 +1,5 @@
 """`mavgate demo`: the whole gateway on a simulated receiver."""
 
-import asyncio
 import logging
 import tempfile
 from collections.abc import Callable, Iterator
@@ -39,6 +38,7 @@ from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
 from gateway.live.daemon import Daemon
+from gateway.live.service import run_event_loop
 from gateway.recordings.flown import open_flown
 from gateway.recordings.fuse import with_reference
 from gateway.sensing.calibration import NodeCalibration
@@ -113,7 +113,7 @@ def demo(
             return daemons[0]
 
         page = PanelProcess(config) if panel and is_installed() else None
-        asyncio.run(serve(daemon, plain=plain, panel=page))
+        run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
 
 
 def recorded_line(
