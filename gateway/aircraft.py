@@ -34,7 +34,7 @@ from gateway.records import (
 )
 from gateway.sensing.calibrating import corrected_by
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.sensing.imu_log import ImuLog
 from gateway.settings import Settings
 from gateway.vehicle.actions import (
@@ -70,7 +70,6 @@ class AircraftSettings(Settings, frozen=True):
     """The settings of one aircraft's stages; ground stations may change them as parameters."""
 
     vehicle: VehicleSettings = VehicleSettings()
-    sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
     calibration: NodeCalibration = NodeCalibration()
 
@@ -107,9 +106,7 @@ class Aircraft:
         self.vehicle_id = vehicle_id
         self.settings = settings
         self.state: NavState | None = None
-        sections = {
-            name: getattr(settings, name) for name in ("sensing", "estimation", "calibration")
-        }
+        sections = {name: getattr(settings, name) for name in ("estimation", "calibration")}
         self.vehicle = Vehicle(
             settings.vehicle,
             vehicle_id,
@@ -123,12 +120,11 @@ class Aircraft:
 
     @property
     def fusion_state(self) -> FusionState:
-        """State of filters and estimator, and home."""
+        """State of the estimator, and home."""
         home = self.vehicle.telemetry.home
         return FusionState(
             vehicle_id=self.vehicle_id,
             fits=_fits(self.settings),
-            sensing=self._chain.snapshot(),
             estimation=self._estimator.snapshot(),
             home=None if home is None else (*astuple(home.location), home.set_time_us),
         )
@@ -261,7 +257,7 @@ class Aircraft:
     def change(self, settings: AircraftSettings, now_us: int) -> list[Action]:
         """Apply what differs from the present settings, and send the parameters that differ."""
         actions: list[Action] = []
-        for section in ("sensing", "calibration", "estimation"):
+        for section in ("calibration", "estimation"):
             wanted = getattr(settings, section)
             if wanted != getattr(self.settings, section):
                 actions += self._change(section, wanted)
@@ -277,8 +273,8 @@ class Aircraft:
     def _change(self, section: str, settings: Settings) -> list[Action]:
         """Rebuild the stage whose settings changed; the others keep their state."""
         wanted = msgspec.structs.replace(self.settings, **{section: settings})
-        if section in ("sensing", "calibration"):
-            self._chain = SensorChain(wanted.sensing, wanted.calibration)
+        if section == "calibration":
+            self._chain = SensorChain(wanted.calibration)
         elif section == "estimation":
             fresh = make_estimator(wanted.estimation)
             if wanted.estimation.estimator == self.settings.estimation.estimator:
@@ -311,12 +307,11 @@ def make_fusion(
     ValueError
         If the state is of another version or other settings, or damaged.
     """
-    chain = SensorChain(settings.sensing, settings.calibration)
+    chain = SensorChain(settings.calibration)
     estimator = make_estimator(settings.estimation)
     if state is not None:
         if state.fits != _fits(settings):
             raise ValueError("it is of another version or other settings")
-        chain.restore(state.sensing)
         estimator.restore(state.estimation)
     return chain, estimator
 
@@ -355,7 +350,7 @@ def fuse_singly(
 
 def _fits(settings: AircraftSettings) -> str:
     """Return a short checksum of version and settings."""
-    fused_with = (settings.sensing, settings.estimation, settings.calibration)
+    fused_with = (settings.estimation, settings.calibration)
     return f"{__version__} {zlib.crc32(msgspec.json.encode(fused_with)):08x}"
 
 

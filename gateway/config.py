@@ -6,6 +6,7 @@ refused with all its errors at once, each with file, key, value and what is allo
 
 import difflib
 import errno
+import logging
 import stat
 import textwrap
 import tomllib
@@ -17,20 +18,21 @@ import msgspec
 import tomlkit
 
 from gateway.aircraft import AircraftSettings
-from gateway.estimation.select import EstimationSettings
+from gateway.estimation.select import EstimationSettings, migrate_sections
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
 from gateway.live.serial_port import SerialSettings
 from gateway.live.session import RecordingSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
-from gateway.sensing.chain import SensingSettings
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)
+
+log = logging.getLogger(__name__)
 
 
 class GatewaySettings(Settings, frozen=True):
@@ -39,7 +41,6 @@ class GatewaySettings(Settings, frozen=True):
     serial: SerialSettings = SerialSettings()
     hub: HubSettings = HubSettings()
     vehicle: VehicleSettings = VehicleSettings()
-    sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
     recording: RecordingSettings = RecordingSettings()
     panel: PanelSettings = PanelSettings()
@@ -49,7 +50,7 @@ class GatewaySettings(Settings, frozen=True):
         str,
         setting(
             "Folder of the aircraft's own settings: one file each, named by its vehicle id "
-            '("1.toml"), with the sections vehicle, sensing and estimation of this file and the '
+            '("1.toml"), with the sections vehicle and estimation of this file and the '
             "calibration of its IMU node. Ground stations and `mavgate calibrate` write it too. "
             'Missions, mark and home are kept in the same folder ("1.places.json").',
             path=True,
@@ -59,9 +60,7 @@ class GatewaySettings(Settings, frozen=True):
     @property
     def default_aircraft(self) -> AircraftSettings:
         """The settings of an aircraft without its own file."""
-        return AircraftSettings(
-            vehicle=self.vehicle, sensing=self.sensing, estimation=self.estimation
-        )
+        return AircraftSettings(vehicle=self.vehicle, estimation=self.estimation)
 
 
 class ConfigError(Exception):
@@ -247,6 +246,9 @@ def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # Also endless numbers, and endless brackets.
         raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+    table, remarks = migrate_sections(table)
+    for remark in remarks:
+        log.warning("%s: %s", path, remark)
     errors = [f"{path}: {error}" for error in _check(table, kind, "")]
     if errors:
         raise ConfigError("\n".join(errors))

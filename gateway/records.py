@@ -234,17 +234,12 @@ RawRecord = ImuRaw | BaroRaw | GpsFix | NodeStatus
 
 
 class ImuSample(msgspec.Struct, frozen=True, gc=False):
-    """One calibrated IMU sample in body FRD, unfiltered and filtered."""
+    """One calibrated IMU sample in body FRD."""
 
     time_us: int
     accel_b_mps2: Vec3
     """Specific force, calibrated, in the node's bandwidth; level at rest (0, 0, -9.81)."""
     gyro_b_radps: Vec3
-    accel_lowpass_b_mps2: Vec3
-    """Specific force after the second-order low-pass; equals `accel_b_mps2` if filtered on the
-    node."""
-    gyro_highpass_b_radps: Vec3
-    """Angular rate after the high-pass; equals `gyro_b_radps` if filtered on the node."""
     mag_b_ut: Vec3 | None
     """Calibrated magnetic field, None unless newly sampled."""
     temperature_degc: float
@@ -301,9 +296,8 @@ class FusionState(msgspec.Struct, frozen=True, gc=False):
     vehicle_id: int
     fits: str
     """Checksum of version and settings that it can be restored with."""
-    sensing: bytes
     estimation: bytes
-    """Private to the stages that write them."""
+    """Private to the stage that writes it."""
     home: tuple[float, float, float, int] | None = None
     """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
 

@@ -16,6 +16,7 @@ from gateway.config import (
     save_aircraft,
     save_endpoint,
 )
+from gateway.estimation.select import EstimationSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -130,10 +131,10 @@ def test_every_endpoint_is_reported_also_beside_other_errors(tmp_path: Path) -> 
 
 def test_a_choice_tells_what_may_be_chosen(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
-    file.write_text('[sensing]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n')
+    file.write_text('[estimation.paper]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n')
     with pytest.raises(ConfigError) as caught:
         load(file)
-    chosen, vehicle = str(caught.value).splitlines()
+    chosen, vehicle = sorted(str(caught.value).splitlines())
     assert "did you mean 'chebyshev'? allowed: " in chosen
     assert "butterworth" in chosen
     assert "allowed: " in vehicle
@@ -155,20 +156,21 @@ def settings(tmp_path: Path) -> GatewaySettings:
 
 
 def test_aircraft_files_lie_over_the_common_settings(settings: GatewaySettings) -> None:
-    sensing = msgspec.structs.replace(settings.sensing, accel_cutoff_hz=7.0)
-    settings = msgspec.structs.replace(settings, sensing=sensing)
+    estimation = msgspec.convert({"paper": {"accel_cutoff_hz": 7.0}}, EstimationSettings)
+    settings = msgspec.structs.replace(settings, estimation=estimation)
     folder = Path(settings.aircraft_folder)
     folder.mkdir()
     (folder / "3.toml").write_text(
         '[vehicle]\ntype = "quadrotor"\n[calibration]\ngyro_bias_radps = [0.1, 0.0, -0.1]\n'
-        '[sensing]\naccel_filter = "chebyshev"\n'
+        '[estimation.paper]\naccel_filter = "chebyshev"\n'
     )
     (folder / "99.toml").write_text("nonsense")
     found = load_aircraft(settings)
     assert list(found) == [3]
     assert found[3].calibration.gyro_bias_radps == (0.1, 0.0, -0.1)
     assert found[3].vehicle.type == "quadrotor"
-    assert (found[3].sensing.accel_cutoff_hz, found[3].sensing.accel_filter) == (7.0, "chebyshev")
+    paper = found[3].estimation.paper
+    assert (paper.accel_cutoff_hz, paper.accel_filter) == (7.0, "chebyshev")
 
 
 def test_no_folder_is_no_aircraft(settings: GatewaySettings) -> None:
@@ -204,9 +206,8 @@ def test_only_what_differs_is_saved_and_comments_stay(settings: GatewaySettings)
 
 def test_a_setting_put_back_leaves_the_file(settings: GatewaySettings) -> None:
     default = settings.default_aircraft
-    slow = msgspec.structs.replace(
-        default, sensing=msgspec.structs.replace(default.sensing, accel_cutoff_hz=4.0)
-    )
+    estimation = msgspec.convert({"paper": {"accel_cutoff_hz": 4.0}}, EstimationSettings)
+    slow = msgspec.structs.replace(default, estimation=estimation)
     save_aircraft(settings, 1, slow)
     save_aircraft(settings, 1, default)
     assert "accel_cutoff_hz" not in aircraft_file(settings, 1).read_text()

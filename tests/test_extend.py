@@ -174,7 +174,7 @@ def test_a_view_is_built_on_the_page(install: Install, monkeypatch: pytest.Monke
 
 
 def test_an_unknown_estimator_is_refused_by_name() -> None:
-    with pytest.raises(ValueError, match="'gyro_only', which is none of paper, complementary"):
+    with pytest.raises(ValueError, match="'gyro_only', which is none of eskf, paper"):
         EstimationSettings(estimator="gyro_only")
 
 

@@ -28,7 +28,7 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured, SettingsChange
 
-ESTIMATORS = ("paper", "complementary", "eskf")
+ESTIMATORS = ("paper", "eskf")
 IMU, GPS = NodeId(1, 0), NodeId(1, 1)
 DENORMAL = sys.float_info.min / 4.0
 SMALL = (0.0, 5e-324, DENORMAL, sys.float_info.min, 1e-300, 1e-15, 1e-9, 1e-6)

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 from gateway.analysis.case import make_case, with_estimator
+from gateway.analysis.fusion import imu_log
 from gateway.analysis.processes import cores
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.reporting.page import write_report
@@ -41,7 +42,7 @@ def main() -> None:
 
     estimator = make_estimator(with_estimator(case.fusion, "paper").estimation)
     fixes: list[GpsFix] = list(flight.fixes)
-    for sample in case.sensed.log.samples():
+    for sample in imu_log(case.flight).samples():
         while fixes and fixes[0].time_us <= sample.time_us:
             estimator.update_gps(fixes.pop(0))
         estimator.update_imu(sample)

@@ -370,7 +370,7 @@ def make_sample(i: int) -> FusedSample:
         *(10_000 * i, NodeId(1, 0), 10_000 * i, (i, -i, 4096), (i, i, i), (1, 2, 3)),
         *(500, 8, 500, 1090, ImuFlags.MAG_NEW),
     )
-    sample = ImuSample(10_000 * i, v, v, v, v, v, 21.5 + x, ImuFlags.MAG_NEW)
+    sample = ImuSample(10_000 * i, v, v, v, 21.5 + x, ImuFlags.MAG_NEW)
     q = (math.cos(x), math.sin(x), x, x)
     flags = NavFlags.ATTITUDE_VALID
     state = NavState(10_000 * i, q, v, 47.0 + x, 8.0 + x, 430.0 + x, v, v, v, v, flags)

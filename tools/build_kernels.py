@@ -34,16 +34,11 @@ from gateway.compiled.entry_point import (
 )
 
 KERNEL_MODULES: Final = (
-    "gateway.estimation.alignment.latency_of_log",
-    "gateway.estimation.complementary.complementary_kernels",
-    "gateway.estimation.eskf.eskf_kernels",
-    "gateway.estimation.paper.paper_kernels",
-    "gateway.estimation.paper.paper_entry",
-    "gateway.estimation.smoothing.forward",
+    "gateway.estimation.eskf.filter",
+    "gateway.estimation.smoother.forward",
     "gateway.recordings.stream_clock",
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",
-    "gateway.sensing.filters",
 )
 """The modules with entry points; to build a wheel, only numpy, msgspec and pygeomag are there."""
 ARCHITECTURES: Final = ("x86_64", "aarch64")

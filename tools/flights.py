@@ -15,20 +15,25 @@ from gateway.estimation.columns import (
     GPS_DIP,
     GPS_LAT,
     IMU_COLUMNS,
-    NAV_COLUMNS,
-    NAV_LAT,
-    NAV_VEL,
     gps_row,
     imu_row,
+    nav_row,
 )
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
-from gateway.estimation.rest import RestSettings
 from gateway.geometry.geodesy import radii_m
-from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuRaw, NodeId
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    GpsFixType,
+    ImuFlags,
+    ImuRaw,
+    ImuSample,
+    NodeId,
+)
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 
@@ -140,7 +145,7 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
     flown = fly(SimulatorSettings(seed=seed))
     ideal = asdict(flown.errors)
     known = ideal if calibrated else {k: v for k, v in ideal.items() if k.startswith("mag")}
-    chain = SensorChain(SensingSettings(), NodeCalibration(**known))
+    chain = SensorChain(NodeCalibration(**known))
     settings = ReferenceSettings(gps_latency_s=flown.settings.gps_latency_s)
     earth = EarthField(settings)
     imu_us, imu, baro_us, baro, gps_us, gps = [], [], [], [], [], []
@@ -173,21 +178,22 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
 
 def run_paper(flight: Flight) -> np.ndarray:
     """Run the paper's estimator over a flight."""
-    estimator = PaperEstimator(PaperSettings(), flight.reference, RestSettings())
-    chain = SensorChain(SensingSettings(), NodeCalibration())
+    estimator = PaperEstimator(PaperSettings(), flight.reference)
     log = flight.log
-    accel, gyro = chain.filter_log(log.imu_time_us, log.imu[:, :3], log.imu[:, 3:6])
-    samples = np.column_stack([accel, gyro, log.imu[:, 6:9]])
-    samples[~np.isfinite(log.imu[:, :6]).all(axis=1), :6] = np.nan
     fixes = [
         _fix_of(time_us, row)
         for time_us, row in zip(log.gps_time_us.tolist(), log.gps.tolist(), strict=True)
     ]
-    found = estimator.run(log.imu_time_us, samples, fixes)
-    out = np.full((len(log.imu_time_us), NAV_COLUMNS), np.nan)
-    out[:, :4], out[:, NAV_LAT : NAV_LAT + 3] = found[:, :4], found[:, 4:7]
-    out[:, NAV_VEL : NAV_VEL + 3] = found[:, 7:10]
-    return out
+    out, taken = [], 0
+    for time_us, row in zip(log.imu_time_us.tolist(), log.imu.tolist(), strict=True):
+        while taken < len(fixes) and fixes[taken].time_us <= time_us:
+            estimator.update_gps(fixes[taken])
+            taken += 1
+        mag = tuple(row[6:9]) if math.isfinite(row[6]) else None
+        flags = ImuFlags(0)
+        sample = ImuSample(time_us, tuple(row[:3]), tuple(row[3:6]), mag, math.nan, flags)
+        out.append(nav_row(estimator.update_imu(sample)))
+    return np.array(out)
 
 
 def _fix_of(time_us: int, row: list[float]) -> GpsFix:

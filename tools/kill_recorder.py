@@ -69,7 +69,7 @@ def make_sample(number: int) -> FusedSample:
         *(time_us, NodeId(1, 0), number, (1, 2, 3), (4, 5, 6), (7, 8, 9)),
         *(10, 8, 500, 1090, ImuFlags.MAG_NEW),
     )
-    sample = ImuSample(time_us, v, v, v, v, v, 20.0, ImuFlags.MAG_NEW)
+    sample = ImuSample(time_us, v, v, v, 20.0, ImuFlags.MAG_NEW)
     state = NavState(time_us, (1.0, *v), v, 47.0, 8.0, 4.0, v, v, v, v, NavFlags(0))
     return FusedSample(1, raw, sample, state)
 

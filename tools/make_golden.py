@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.cli.app import app
 from gateway.records import BaroRaw, GpsFix
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 
@@ -31,7 +31,7 @@ SECONDS = 75.0
 RATE_HZ = 25
 EVERY = 50
 """Of the fused rows, those that are kept."""
-ESTIMATORS = ("paper", "complementary", "eskf")
+ESTIMATORS = ("eskf", "paper")
 NAMES = (
     *("time_s", "ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz", "baro_alt_m"),
     *("gps_time_s", "gps_lat", "gps_lon", "gps_alt_m", "gps_vn", "gps_ve", "gps_vd"),
@@ -45,7 +45,6 @@ def write_log(path: Path) -> None:
     flown = fly(settings, duration_s=SECONDS)
     errors = flown.errors
     chain = SensorChain(
-        SensingSettings(),
         NodeCalibration(
             mag_hard_iron_ut=errors.mag_hard_iron_ut, mag_soft_iron=errors.mag_soft_iron
         ),

@@ -22,7 +22,7 @@ from gateway.analysis.flight_arrays import (
     FusionSettings,
     fixes_of,
 )
-from gateway.analysis.fusion import Sensed, fuse
+from gateway.analysis.fusion import fuse
 from gateway.analysis.interpolation import error_at_fixes_m, interpolate, split, thin
 from gateway.analysis.metrics import mean_abs, position_error_m, rms
 
@@ -90,14 +90,13 @@ def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
 def blend_table(
     flight: Flight,
     fusion: FusionSettings,
-    sensed: Sensed,
     interval_s: float,
 ) -> pd.DataFrame:
     """Fuse a flight with every pair of weights, as in Table I."""
     judge = make_judge(flight, thin(flight, interval_s))
     rows = []
     for alpha, beta in itertools.product(WEIGHTS, repeat=2):
-        track = fuse(judge.fused, with_weights(fusion, alpha, beta), sensed)
+        track = fuse(judge.fused, with_weights(fusion, alpha, beta))
         rows.append({"alpha": alpha, "beta": beta, **score(track, judge)})
     return pd.DataFrame(rows)
 

@@ -13,7 +13,7 @@ from gateway.analysis.flight_arrays import (
     LocalFrame,
     local_frame,
 )
-from gateway.analysis.fusion import Sensed, fuse, fuse_smoothed, sense
+from gateway.analysis.fusion import fuse, fuse_smoothed
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
@@ -31,7 +31,6 @@ class Case:
 
     flight: Flight
     fusion: FusionSettings
-    sensed: Sensed
     tracks: dict[str, FlightTrack]
     """By estimator, and `SMOOTHED` if requested."""
     frame: LocalFrame | None
@@ -67,9 +66,8 @@ def make_case(
 ) -> Case:
     """Fuse a flight with every estimator."""
     fusion = fusion or flight.fusion
-    sensed = sense(flight, fusion.sensing)
-    tracks = {name: fuse(flight, with_estimator(fusion, name), sensed) for name in ESTIMATORS}
+    tracks = {name: fuse(flight, with_estimator(fusion, name)) for name in ESTIMATORS}
     latency_s = None
     if smooth and not np.any(np.diff(flight.time_us) < 0):
         tracks[SMOOTHED], latency_s = fuse_smoothed(flight, fusion)
-    return Case(flight, fusion, sensed, tracks, local_frame(flight), latency_s)
+    return Case(flight, fusion, tracks, local_frame(flight), latency_s)

@@ -34,7 +34,7 @@ from gateway.sensing.calibration import (
     NodeCalibration,
     mag_from_counts,
 )
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.settings import Settings
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
@@ -49,7 +49,6 @@ SETTLING_US: Final = 5_000_000
 class FusionSettings(Settings, frozen=True):
     """All settings that affect the fusion of a flight."""
 
-    sensing: SensingSettings = SensingSettings()
     estimation: EstimationSettings = EstimationSettings()
 
 
@@ -235,7 +234,7 @@ def flight_of_records(
     fusion: FusionSettings,
 ) -> Flight:
     """Calibrate raw records into a flight."""
-    chain = SensorChain(fusion.sensing, calibration)
+    chain = SensorChain(calibration)
     turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
     samples: list[ImuSample] = []
     bare_mag: list[Vec3] = []

@@ -1,8 +1,6 @@
 """A flight fused again, with any settings: the same code as live, on arrays where possible."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -28,56 +26,33 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
-from gateway.estimation.paper.paper import PaperEstimator
 from gateway.estimation.select import make_estimator
-from gateway.estimation.smoothing.smoother import smooth
+from gateway.estimation.smoother.smoother import smooth
 from gateway.records import NAN, BaroSample, GpsFix, NavState
-from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings, SensorChain
 from gateway.sensing.imu_log import ImuLog
 
 
-@dataclass(frozen=True, slots=True)
-class Sensed:
-    """A flight's samples after the gateway's filters."""
-
-    log: ImuLog
-    table: FloatArray
-    """The same, shape (N, 9), as `gateway.estimation.paper.paper_kernels` takes it: specific force
-    and rate behind their filters, NaN where the unfiltered sample is not sound; magnetic field."""
-
-
-def sense(flight: Flight, settings: SensingSettings) -> Sensed:
-    """Filter a flight's samples as the gateway does live."""
-    unknown = np.full(len(flight.time_us), np.nan)
-    log = SensorChain(settings, NodeCalibration()).imu_si_log(
+def imu_log(flight: Flight) -> ImuLog:
+    """Return the samples of a flight."""
+    return ImuLog(
         flight.time_us,
         flight.accel_b_mps2,
         flight.gyro_b_radps,
         flight.mag_b_ut,
-        unknown,
+        np.full(len(flight.time_us), np.nan),
         flight.flags,
     )
-    table = np.column_stack([log.accel_lowpass_b_mps2, log.gyro_highpass_b_radps, log.mag_b_ut])
-    unsound = ~(np.isfinite(flight.accel_b_mps2) & np.isfinite(flight.gyro_b_radps)).all(axis=1)
-    table[unsound, :6] = np.nan
-    return Sensed(log, table)
 
 
-def fuse(flight: Flight, settings: FusionSettings, sensed: Sensed | None = None) -> FlightTrack:
+def fuse(flight: Flight, settings: FusionSettings) -> FlightTrack:
     """Fuse a flight with the estimator selected in the settings."""
     estimator = make_estimator(settings.estimation)
     if isinstance(estimator, KernelEstimator):
         return _fuse_at_once(flight, estimator)
-    if sensed is None:
-        sensed = sense(flight, settings.sensing)
-    if isinstance(estimator, PaperEstimator) and not np.any(np.diff(flight.time_us) < 0):
-        out = estimator.run(flight.time_us, sensed.table, flight.fixes)
-        return _track(flight, out[:, :4], out[:, 4:7], out[:, 7:10], out[:, 10])
-    return track_of_states(_states_by_sample(flight, estimator, sensed))
+    return track_of_states(_states_by_sample(flight, estimator))
 
 
-def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> FloatArray:
+def fuse_states(flight: Flight, settings: FusionSettings) -> FloatArray:
     """Fuse a flight, and return all outputs of the estimator.
 
     Returns
@@ -88,7 +63,7 @@ def fuse_states(flight: Flight, settings: FusionSettings, sensed: Sensed) -> Flo
     estimator = make_estimator(settings.estimation)
     if isinstance(estimator, KernelEstimator):
         return estimator.run(sample_log(flight, estimator.fix_row))
-    states = _states_by_sample(flight, estimator, sensed)
+    states = _states_by_sample(flight, estimator)
     return np.array([nav_row(state) for state in states], np.float64).reshape(-1, NAV_COLUMNS)
 
 
@@ -117,7 +92,7 @@ def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog
     )
 
 
-def _fuse_at_once(flight: Flight, estimator: KernelEstimator[Any, Any]) -> FlightTrack:
+def _fuse_at_once(flight: Flight, estimator: KernelEstimator) -> FlightTrack:
     return _track_of_rows(flight, estimator.run(sample_log(flight, estimator.fix_row)))
 
 
@@ -138,7 +113,7 @@ def _track(
     return track.where_valid(flags.astype(np.int64))
 
 
-def _states_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> list[NavState]:
+def _states_by_sample(flight: Flight, estimator: Estimator) -> list[NavState]:
     others: list[BaroSample | GpsFix] = [
         *flight.fixes,
         *(
@@ -152,7 +127,7 @@ def _states_by_sample(flight: Flight, estimator: Estimator, sensed: Sensed) -> l
     waiting = iter(others)
     record = next(waiting, None)
     states = []
-    for sample in sensed.log.samples():
+    for sample in imu_log(flight).samples():
         while record is not None and record.time_us <= sample.time_us:
             if isinstance(record, GpsFix):
                 estimator.update_gps(record)

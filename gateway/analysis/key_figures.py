@@ -6,6 +6,7 @@ import numpy as np
 
 from gateway.analysis.blending import make_judge, score
 from gateway.analysis.case import SMOOTHED, Case, with_estimator
+from gateway.analysis.filtering import apply
 from gateway.analysis.flight_arrays import FloatArray, FusionSettings, fixes_of
 from gateway.analysis.fusion import fuse, fuse_smoothed
 from gateway.analysis.interpolation import withhold
@@ -22,7 +23,9 @@ def summarise(case: Case) -> dict[str, float]:
     flight, track = case.flight, case.track
     fixes = fixes_of(flight)
     gap_s = np.diff(fixes.arrival_us) / US_PER_S
-    shaking = flight.accel_b_mps2 - case.sensed.table[:, :3]
+    filtering = case.fusion.estimation.paper
+    smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.accel_b_mps2)
+    shaking = flight.accel_b_mps2 - smooth
     speed = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
     found = {
         "duration, s": flight.duration_s,
@@ -53,7 +56,7 @@ def withheld_error_m(case: Case, estimator: str) -> float:
     if estimator == SMOOTHED:
         track, _ = fuse_smoothed(judge.fused, case.fusion)
     else:
-        track = fuse(judge.fused, with_estimator(case.fusion, estimator), case.sensed)
+        track = fuse(judge.fused, with_estimator(case.fusion, estimator))
     return score(track, judge)["held_m"]
 
 

@@ -35,7 +35,7 @@ from gateway.recordings.fuse import calibrated_of
 from gateway.recordings.table import TableBlock
 from gateway.records import GpsFix, RawRecord
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.sensors import SensorErrors
@@ -175,7 +175,7 @@ class _Arrays:
 def _arrays_of(cells: FloatArray, calibration: NodeCalibration) -> _Arrays:
     has_counts = has_group(cells, RAW)
     samples = cells[has_counts | has_group(cells, SI)]
-    chain = SensorChain(SensingSettings(), calibration)
+    chain = SensorChain(calibration)
     accel, gyro, mag, _, flags = calibrated_of(samples, chain)
     turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
     counts = samples[:, RAW]

@@ -133,7 +133,7 @@ class FuseTask(_JudgingTask):
     name: ClassVar[str] = "fuse"
 
     def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:
-        states = fuse_states(read.flight, case.fusion, case.sensed)
+        states = fuse_states(read.flight, case.fusion)
         lines = fused_lines(read.header, read.flight.time_us, states)
         return {f"fused/{name}.csv": b"".join(lines)}
 
@@ -222,7 +222,7 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)
-    fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+    fusion = FusionSettings(estimation=aircraft.estimation)
     flight = flight_of_blocks(
         table.blocks, aircraft.calibration, fusion, name=name, story="One of a season."
     )

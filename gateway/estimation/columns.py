@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from gateway.compiled import compiled
-from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
 from gateway.records import (
     NAN,
@@ -198,3 +198,50 @@ def nav_row(state: NavState) -> list[float]:
         *s.q_nb, *s.rate_b_radps, s.lat_deg, s.lon_deg, s.alt_amsl_m, *s.vel_n_mps,
         *s.attitude_std_rad, *s.vel_std_mps, *s.pos_std_m, float(s.flags),
     ]  # fmt: skip
+
+
+ATTITUDE_VALID: Final = int(NavFlags.ATTITUDE_VALID)
+HEADING_VALID: Final = int(NavFlags.HEADING_VALID)
+POSITION_VALID: Final = int(NavFlags.POSITION_VALID)
+VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
+ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
+AT_REST: Final = int(NavFlags.AT_REST)
+USING_GPS: Final = int(NavFlags.USING_GPS)
+USING_MAG: Final = int(NavFlags.USING_MAG)
+USING_BARO: Final = int(NavFlags.USING_BARO)
+MAG_DISTURBED: Final = int(NavFlags.MAG_DISTURBED)
+GPS_REJECTED: Final = int(NavFlags.GPS_REJECTED)
+DEAD_RECKONING: Final = int(NavFlags.DEAD_RECKONING)
+SENSOR_FAULT: Final = int(NavFlags.SENSOR_FAULT)
+DEGRADED: Final = int(NavFlags.DEGRADED)
+MAG_MISPLACED: Final = int(NavFlags.MAG_MISPLACED)
+
+HEADING_VALID_RAD: Final = 0.26
+"""A heading is valid up to this standard deviation."""
+BARO_STALE_S: Final = 2.0
+"""A barometer without readings for longer is not in use."""
+FRESH_GPS_S: Final = 1.5
+"""Without an accepted fix for longer than this, the estimate is dead reckoning."""
+
+
+@compiled
+def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
+    """Return the flags that follow from the age of the last accepted and rejected fix.
+
+    Parameters
+    ----------
+    since_fix_s, since_reject_s : float
+        Ages in s.
+    hold_s : float
+        Dead reckoning longer than this is no position any more.
+
+    Returns
+    -------
+    int
+        Bits of `NavFlags`.
+    """
+    flags = POSITION_VALID | VELOCITY_VALID if since_fix_s < hold_s else 0
+    flags |= USING_GPS if since_fix_s < FRESH_GPS_S else DEAD_RECKONING | DEGRADED
+    if since_reject_s < FRESH_GPS_S:
+        flags |= GPS_REJECTED | DEGRADED
+    return flags

@@ -1,17 +1,15 @@
 """What a compiled estimator looks like from outside: one sample live, or a whole log."""
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, Generic, TypeVar, cast
+from typing import Final
 
 import msgspec
 import numpy as np
 
 from gateway.compiled import address_of
-from gateway.compiled.entry_point import EntryPoint
-from gateway.estimation.alignment.gps_latency import LatencyState
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -21,7 +19,11 @@ from gateway.estimation.columns import (
     imu_row,
     nav_state,
 )
-from gateway.estimation.kernel_record import (
+from gateway.estimation.eskf import filter as kernels
+from gateway.estimation.eskf.latency import KNOWN_STD_S, latency_std, latency_to_use
+from gateway.estimation.eskf.settings import EskfSettings, Gains, make_gains
+from gateway.estimation.eskf.state import State
+from gateway.estimation.record import (
     FloatArray,
     IntArray,
     Packed,
@@ -38,9 +40,6 @@ _ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
 
 Heard = tuple[int, BaroSample | GpsFix]
 """A height or a fix, and the number of the IMU sample before which it arrived."""
-
-State = TypeVar("State")
-Gains = TypeVar("Gains")
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,47 +58,27 @@ class SampleLog:
 
 
 @dataclass(frozen=True, slots=True)
-class Kernels(Generic[State, Gains]):
-    """The compiled functions of one estimator; arrays and records by their addresses."""
+class FoundLatency:
+    """A GPS latency that manoeuvres have shown."""
 
-    declaration: type[State]
-    begin: EntryPoint[[int, int]]
-    """`(state, gains)`."""
-    imus: EntryPoint[[int, int, int, int, int, int]]
-    """`(state, gains, count, times_us, imu_rows, output_rows)`."""
-    baro: EntryPoint[[int, int, float]]
-    """`(state, gains, alt_m)`."""
-    gps: EntryPoint[[int, int, int, int]]
-    """`(state, gains, arrival_us, gps_row)`."""
-    run: EntryPoint[...]
-    """`(state, gains, count, imu_time_us, imu, count, baro_before, baro_alt_m, count, gps_before,
-    gps_time_us, gps, output_rows)`; before which sample each height and each fix is taken."""
-    earlier: Callable[..., None]
-    """`(state, gains, time_us, taken, *arrays of the barometer and the GPS)`, of compiled code."""
-
-    @property
-    def live(self) -> tuple[EntryPoint[...], ...]:
-        """What a gateway needs, the largest first."""
-        return (self.imus, self.gps, self.baro, self.begin)
+    latency_s: float
+    std_s: float
+    used_s: float
+    """The same, or the set one where both agree."""
 
 
-class KernelEstimator(Generic[State, Gains]):
+class KernelEstimator:
     """An estimator made of compiled kernels over one record of state.
 
     Parameters
     ----------
-    kernels : Kernels
-        The compiled functions.
     gains : Gains
         A record of constants.
     reference : ReferenceSettings
         GPS latency and declination.
     """
 
-    def __init__(
-        self, kernels: Kernels[State, Gains], gains: Gains, reference: ReferenceSettings
-    ) -> None:
-        self._kernels = kernels
+    def __init__(self, gains: Gains, reference: ReferenceSettings) -> None:
         self._gains = gains
         self._gains_at = address_of(gains)
         self._reference = reference
@@ -112,9 +91,9 @@ class KernelEstimator(Generic[State, Gains]):
         self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
         # A first call on a scrap state loads, or compiles, what a sample would wait for.
         self._begin()
-        kernels.imus(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
-        kernels.baro(self._at, self._gains_at, 0.0)
-        kernels.gps(self._at, self._gains_at, 0, self._fix_at)
+        kernels.imu_steps(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
+        kernels.baro_step(self._at, self._gains_at, 0.0)
+        kernels.gps_step(self._at, self._gains_at, 0, self._fix_at)
         self._begin()
 
     def reset(self) -> None:
@@ -123,8 +102,8 @@ class KernelEstimator(Generic[State, Gains]):
         self._begin()
 
     def _begin(self) -> None:
-        self._use(new_record(self._kernels.declaration))
-        self._kernels.begin(self._at, self._gains_at)
+        self._use(new_record(State))
+        kernels.begin_state(self._at, self._gains_at)
 
     def _use(self, record: State) -> None:
         self._state, self._at = record, address_of(record)
@@ -143,8 +122,24 @@ class KernelEstimator(Generic[State, Gains]):
     @property
     def gps_latency_s(self) -> tuple[float, float]:
         """The latency in use, which the motion may have corrected, and the one that is set."""
-        used_s = float(cast(LatencyState, self._state).gps_latency_s)
+        used_s = float(self._state.gps_latency_s)
         return used_s, self._reference.gps_latency_s
+
+    def latency_of(self, log: SampleLog) -> float:
+        """Return the GPS latency of a whole log: the set one, or what its manoeuvres show, s."""
+        other = KernelEstimator(self._gains, self._reference)
+        other.state = self._state
+        other.run(log)
+        found = other.found_latency()
+        return self._reference.gps_latency_s if found is None else found.used_s
+
+    def found_latency(self) -> "FoundLatency | None":
+        """Return the GPS latency that manoeuvres have shown so far; None where none has."""
+        std_s = latency_std(self._state)
+        if std_s > KNOWN_STD_S:
+            return None
+        found_s = float(self._state.latency_found[0])
+        return FoundLatency(found_s, std_s, latency_to_use(found_s, self._reference.gps_latency_s))
 
     @property
     def gains(self) -> Gains:
@@ -159,7 +154,7 @@ class KernelEstimator(Generic[State, Gains]):
         """Go on from a snapshot; raises ValueError if it is none of this estimator."""
         kind = tuple[Packed, EarthPlace | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._use(unpack_record(self._kernels.declaration, packed))
+        self._use(unpack_record(State, packed))
 
     def update_imu(self, sample: ImuSample) -> NavState:
         """Advance by one IMU sample.
@@ -176,9 +171,7 @@ class KernelEstimator(Generic[State, Gains]):
         """
         self._time_us[0] = sample.time_us
         _ROW.pack_into(self._row_view, 0, *imu_row(sample))
-        self._kernels.imus(
-            self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at
-        )
+        kernels.imu_steps(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
         return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
@@ -189,7 +182,7 @@ class KernelEstimator(Generic[State, Gains]):
         sample : BaroSample
             Its pressure altitude is used.
         """
-        self._kernels.baro(self._at, self._gains_at, sample.alt_pressure_m)
+        kernels.baro_step(self._at, self._gains_at, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
         """Take in one GPS fix at its arrival.
@@ -200,7 +193,7 @@ class KernelEstimator(Generic[State, Gains]):
             Fused as of the time it was valid.
         """
         self._fix[:] = gps_row(fix, self._reference, self._earth)
-        self._kernels.gps(self._at, self._gains_at, fix.time_us, self._fix_at)
+        kernels.gps_step(self._at, self._gains_at, fix.time_us, self._fix_at)
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""
@@ -226,7 +219,7 @@ class KernelEstimator(Generic[State, Gains]):
         )
 
     def _run(self, log: SampleLog, baro_before: IntArray, gps_before: IntArray) -> FloatArray:
-        """Run the compiled loop; see `Kernels.run`."""
+        """Run the compiled loop; see `filter.run`."""
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
         kinds = (
             (log.imu_time_us, log.imu),
@@ -236,7 +229,7 @@ class KernelEstimator(Generic[State, Gains]):
         # Their addresses hold only while the arrays are kept.
         arrays = [[*map(np.ascontiguousarray, kind)] for kind in kinds]
         arguments = [number for kind in arrays for number in (len(kind[0]), *map(address_of, kind))]
-        self._kernels.run(self._at, self._gains_at, *arguments, address_of(out))
+        kernels.run(self._at, self._gains_at, *arguments, address_of(out))  # type: ignore[call-arg]
         return out
 
     def run_as_heard(
@@ -300,3 +293,22 @@ def _taken_before(imu_time_us: IntArray, time_us: IntArray) -> IntArray:
     """Return before which IMU sample each of a queue is taken: the first that is not earlier."""
     reached = np.searchsorted(np.maximum.accumulate(imu_time_us), time_us)
     return np.maximum.accumulate(reached)
+
+
+def estimate_latency(log: SampleLog) -> FoundLatency | None:
+    """Estimate the time from the moment for which fixes are valid to their arrival.
+
+    Parameters
+    ----------
+    log : SampleLog
+        A whole flight; the velocities of its fixes are used.
+
+    Returns
+    -------
+    FoundLatency or None
+        None where no manoeuvre shows it, or the fixes have no velocity.
+    """
+    reference = ReferenceSettings()
+    estimator = KernelEstimator(make_gains(EskfSettings(), reference), reference)
+    estimator.run(log)
+    return estimator.found_latency()

@@ -25,7 +25,7 @@ class ReferenceSettings(Settings, frozen=True):
         float,
         setting(
             "From the moment a fix is valid to its arrival at the gateway. Where manoeuvres "
-            "contradict it by more than 0.07 s, complementary and eskf use what they show.",
+            "show another one by more than 0.07 s, eskf uses that.",
             "s",
             ge=0.0,
             le=2.0,
@@ -40,8 +40,7 @@ class ReferenceSettings(Settings, frozen=True):
     gps_relock_s: Annotated[
         float,
         setting(
-            "After this time of agreeing fixes that were all rejected, they are believed; for "
-            "complementary and eskf.",
+            "Rejected fixes that agree with one another are accepted after this time (eskf).",
             "s",
             ge=0.5,
             le=120.0,

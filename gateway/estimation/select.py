@@ -1,20 +1,13 @@
 """The choice of an estimator: the settings of all, and one made from them."""
 
-from collections.abc import Callable
-from typing import Annotated, Final
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any, Final
 
-from gateway.estimation.complementary.complementary_kernels import KERNELS as COMPLEMENTARY
-from gateway.estimation.complementary.complementary_state import ComplementarySettings
-from gateway.estimation.complementary.complementary_state import make_gains as complementary_gains
-from gateway.estimation.eskf.eskf_kernels import KERNELS as ESKF
-from gateway.estimation.eskf.eskf_settings import EskfSettings
-from gateway.estimation.eskf.eskf_settings import make_gains as eskf_gains
+from gateway.estimation.eskf.settings import EskfSettings, make_gains
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
-from gateway.estimation.magfield import CompassSettings
 from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.rest import RestSettings
 from gateway.settings import Settings, setting
 
 Maker = Callable[["EstimationSettings"], Estimator]
@@ -43,18 +36,17 @@ def add_estimator(name: str, make: Maker) -> None:
     ESTIMATORS[name] = make
 
 
+DEPRECATED: Final = {"complementary": "eskf"}
+"""Names of estimators that another one has replaced."""
+
+
 class EstimationSettings(Settings, frozen=True):
     """Which estimator runs, and the settings of each."""
 
-    estimator: Annotated[
-        str, setting("Estimator: complementary, eskf or paper.", choices=ESTIMATORS)
-    ] = "complementary"
+    estimator: Annotated[str, setting("Estimator: eskf or paper.", choices=ESTIMATORS)] = "eskf"
     reference: ReferenceSettings = ReferenceSettings()
-    rest: RestSettings = RestSettings()
-    compass: CompassSettings = CompassSettings()
-    paper: PaperSettings = PaperSettings()
-    complementary: ComplementarySettings = ComplementarySettings()
     eskf: EskfSettings = EskfSettings()
+    paper: PaperSettings = PaperSettings()
 
     def __post_init__(self) -> None:
         """Raise ValueError if there is no such estimator."""
@@ -79,25 +71,77 @@ def make_estimator(settings: EstimationSettings) -> Estimator:
     return ESTIMATORS[settings.estimator](settings)
 
 
-def _make_paper(settings: EstimationSettings) -> Estimator:
-    return PaperEstimator(settings.paper, settings.reference, settings.rest)
-
-
-def _make_complementary(settings: EstimationSettings) -> Estimator:
-    reference = settings.reference
-    gains = complementary_gains(settings.complementary, reference, settings.rest, settings.compass)
-    return KernelEstimator(COMPLEMENTARY, gains, reference)
-
-
 def _make_eskf(settings: EstimationSettings) -> Estimator:
-    reference = settings.reference
-    gains = eskf_gains(settings.eskf, reference, settings.rest, settings.compass)
-    return KernelEstimator(ESKF, gains, reference)
+    return KernelEstimator(make_gains(settings.eskf, settings.reference), settings.reference)
 
 
-add_estimator("paper", _make_paper)
-add_estimator("complementary", _make_complementary)
+def _make_paper(settings: EstimationSettings) -> Estimator:
+    return PaperEstimator(settings.paper, settings.reference)
+
+
 add_estimator("eskf", _make_eskf)
+add_estimator("paper", _make_paper)
+
+
+def migrate_sections(sections: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Convert settings of earlier versions to present ones.
+
+    The filter chain of `sensing` is part of the paper's estimator now, and `complementary` is
+    `eskf`. Settings of estimators that no longer exist are left out.
+
+    Parameters
+    ----------
+    sections : mapping
+        Settings as builtins, such as a TOML file or a recording contains them.
+
+    Returns
+    -------
+    sections : dict
+        The same with present names.
+    remarks : list of str
+        One sentence for each change.
+    """
+    present: dict[str, Any] = dict(sections)
+    remarks: list[str] = []
+    found = present.get("estimation", {})
+    if not isinstance(found, Mapping):
+        return present, remarks
+    estimation: dict[str, Any] = dict(found)
+    if (chain := present.pop("sensing", None)) is not None:
+        moved = {key: value for key, value in chain.items() if key in FILTER_KEYS}
+        estimation["paper"] = moved | dict(estimation.get("paper", {}))
+        remarks.append("[sensing] is [estimation.paper] now")
+    name = estimation.get("estimator")
+    if name in DEPRECATED:
+        estimation["estimator"] = DEPRECATED[name]
+        remarks.append(f"estimator {name} is deprecated, {DEPRECATED[name]} is used")
+    for section in [key for key in FORMER_SECTIONS if key in estimation]:
+        del estimation[section]
+        remarks.append(f"[estimation.{section}] has no effect any more")
+    own = estimation.get("eskf")
+    if isinstance(own, Mapping) and (former := FORMER_KEYS & own.keys()):
+        estimation["eskf"] = {key: value for key, value in own.items() if key not in former}
+        remarks.append(f"[estimation.eskf] {', '.join(sorted(former))} has no effect any more")
+    if estimation:
+        present["estimation"] = estimation
+    return present, remarks
+
+
+FORMER_SECTIONS: Final = ("complementary", "compass", "rest")
+FORMER_KEYS: Final = frozenset(
+    {
+        "accel_roughness",
+        "gps_height_wander_m",
+        "gps_wander_m",
+        "gps_wander_s",
+        "gyro_roughness",
+        "mag_bias_ut",
+        "mag_bias_walk_utprs",
+        "unaided_velocity_mps",
+    }
+)
+"""Sections and keys of earlier versions."""
+FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)
 
 OWN_ESTIMATORS: Final = tuple(ESTIMATORS)
 """Those of the package itself."""

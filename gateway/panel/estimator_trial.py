@@ -32,7 +32,6 @@ from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.services.parameters import ParameterTable
 
 LEAST_S: Final = 20.0
@@ -101,7 +100,7 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
     -------
     FusionSettings
     """
-    table = ParameterTable({"sensing": SensingSettings(), "estimation": EstimationSettings()})
+    table = ParameterTable({"estimation": EstimationSettings()})
     for name, value in parameters.items():
         index = table.index.get(name)
         if index is None:
@@ -111,10 +110,9 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
         except ValueError:
             # Out of range, as from another version: use the default.
             continue
-    sensing, estimation = table.sections["sensing"], table.sections["estimation"]
-    assert isinstance(sensing, SensingSettings)
+    estimation = table.sections["estimation"]
     assert isinstance(estimation, EstimationSettings)
-    return FusionSettings(sensing=sensing, estimation=estimation)
+    return FusionSettings(estimation=estimation)
 
 
 async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:

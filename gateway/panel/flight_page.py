@@ -181,7 +181,7 @@ def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadO
     try:
         table = joined_tables([open_rows(file, options) for file in files])
         aircraft = aircraft_for(files, table, options)
-        fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+        fusion = FusionSettings(estimation=aircraft.estimation)
         sensors = flight_of_blocks(
             table.blocks, aircraft.calibration, fusion, name=flight.name, story=""
         )

@@ -51,7 +51,7 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
 
 def _cells(rows: Iterable[TableRow], aircraft: AircraftSettings) -> list[list[float]]:
     """Return rows in the order of `COLUMNS`; records between two samples are in the later one."""
-    chain = SensorChain(aircraft.sensing, aircraft.calibration)
+    chain = SensorChain(aircraft.calibration)
     found: list[list[float]] = []
     cells = [math.nan] * len(COLUMNS)
     for row in rows:

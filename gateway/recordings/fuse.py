@@ -11,18 +11,22 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
 
 from gateway import __version__
 from gateway.aircraft import Action, Aircraft, AircraftSettings, make_fusion
-from gateway.estimation.alignment.latency_of_log import GpsLatency, estimate_latency
 from gateway.estimation.columns import GPS_COLUMNS, imu_rows, nav_state
-from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel import (
+    FoundLatency,
+    KernelEstimator,
+    SampleLog,
+    estimate_latency,
+)
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.smoothing.smoother import smooth
+from gateway.estimation.smoother.smoother import smooth
 from gateway.geometry.angle import wrap_180
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import (
@@ -170,7 +174,7 @@ def imu_log_of(cells: FloatArray, chain: SensorChain) -> ImuLog:
         Of their aircraft.
     """
     time_us = cells[:, 0].astype(np.int64)
-    return chain.imu_si_log(time_us, *calibrated_of(cells, chain))
+    return ImuLog(time_us, *calibrated_of(cells, chain))
 
 
 def calibrated_of(
@@ -316,7 +320,7 @@ class SmoothedStates:
 
 def gather_samples(
     blocks: Iterable[TableBlock], aircraft: AircraftSettings
-) -> tuple[SampleLog, KernelEstimator[Any, Any]]:
+) -> tuple[SampleLog, KernelEstimator]:
     """Lay a flight's rows out as arrays, calibrated, for the Kalman filter, which is fresh."""
     chain, estimator = make_fusion(with_smoothed_estimator(aircraft))
     if not isinstance(estimator, KernelEstimator):
@@ -353,9 +357,7 @@ def _in_order(log: SampleLog) -> SampleLog:
     )  # fmt: skip
 
 
-def _sample_log(
-    cells: FloatArray, chain: SensorChain, estimator: KernelEstimator[Any, Any]
-) -> SampleLog:
+def _sample_log(cells: FloatArray, chain: SensorChain, estimator: KernelEstimator) -> SampleLog:
     samples = cells[has_group(cells, RAW) | has_group(cells, SI)]
     accel, gyro, mag, _, flags = calibrated_of(samples, chain)
     heard = [record for _, record in heard_of(cells, 1)]
@@ -459,7 +461,7 @@ def _samples_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:
     return gather_samples(blocks, aircraft)[0]
 
 
-def _in_words(latency: GpsLatency) -> str:
+def _in_words(latency: FoundLatency) -> str:
     return f"{latency.latency_s:.3f} s +- {latency.std_s:.3f} s"
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from gateway import __version__
 from gateway.aircraft import AircraftSettings
+from gateway.estimation.select import migrate_sections
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TIMES, TableRow
 from gateway.recordings.files import (
@@ -178,7 +179,7 @@ def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
 def settings_of(header: TableHeader) -> AircraftSettings:
     """Return the settings with which a table was recorded."""
     sections = {**header.settings, "calibration": header.calibration}
-    return msgspec.convert(sections, AircraftSettings)
+    return msgspec.convert(migrate_sections(sections)[0], AircraftSettings)
 
 
 def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:

@@ -3,7 +3,7 @@
     # mavgate table 1
     # header: {"mavgate_version": …, "vehicle_id": …, "settings": {…}, "calibration": {…}, …}
     time_us,node_id,…
-    # state: {"vehicle_id": …, "fits": …, "sensing": …, "estimation": …}
+    # state: {"vehicle_id": …, "fits": …, "estimation": …}
     12000,0,…
     # mark: {"time_us": 12345, "text": "…"}
     # node: {"time_us": 12345, "supply_mv": 3290, "bus_errors": 0, …}

@@ -1,4 +1,4 @@
-"""A stretch of IMU samples as arrays: calibrated, and the same filtered."""
+"""A stretch of calibrated IMU samples as arrays."""
 
 from dataclasses import dataclass
 
@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.records import ImuFlags, ImuSample
-from gateway.sensing.filters import FloatArray
 
+FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
@@ -18,8 +18,6 @@ class ImuLog:
     time_us: IntArray
     accel_b_mps2: FloatArray
     gyro_b_radps: FloatArray
-    accel_lowpass_b_mps2: FloatArray
-    gyro_highpass_b_radps: FloatArray
     mag_b_ut: FloatArray
     """NaN unless sampled anew."""
     temperature_degc: FloatArray
@@ -33,13 +31,11 @@ class ImuLog:
         """Return them one by one."""
         has_mag = ~np.isnan(self.mag_b_ut[:, 0])
         return [
-            ImuSample(time_us, accel, gyro, lowpass, highpass, mag if new else None, degc, flags)
-            for time_us, accel, gyro, lowpass, highpass, mag, new, degc, flags in zip(
+            ImuSample(time_us, accel, gyro, mag if new else None, degc, flags)
+            for time_us, accel, gyro, mag, new, degc, flags in zip(
                 self.time_us.tolist(),
                 map(tuple, self.accel_b_mps2.tolist()),
                 map(tuple, self.gyro_b_radps.tolist()),
-                map(tuple, self.accel_lowpass_b_mps2.tolist()),
-                map(tuple, self.gyro_highpass_b_radps.tolist()),
                 map(tuple, self.mag_b_ut.tolist()),
                 has_mag.tolist(),
                 self.temperature_degc.tolist(),

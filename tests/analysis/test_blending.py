@@ -32,7 +32,7 @@ def test_a_table_that_falls_somewhere_does_not_grow() -> None:
 
 def test_the_table_has_the_papers_shape() -> None:
     case = short_case()
-    table = blend_table(case.flight, case.fusion, case.sensed, 1.0)
+    table = blend_table(case.flight, case.fusion, 1.0)
     assert isinstance(table, pd.DataFrame)
     assert grows(table, "north_m")
     assert grows(table, "east_m")

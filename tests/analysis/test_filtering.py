@@ -3,9 +3,9 @@ import pytest
 from scipy import signal
 
 from gateway.analysis.filtering import apply, compare, response
-from gateway.sensing.chain import SensingSettings
+from gateway.estimation.paper.paper import PaperSettings
 
-SETTINGS = SensingSettings()
+SETTINGS = PaperSettings()
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 1000.0])

@@ -10,8 +10,9 @@ from gateway.analysis.flight_arrays import (
     flight_of_samples,
     local_frame,
 )
+from gateway.analysis.fusion import imu_log
 from gateway.geometry.geodesy import displacement_m
-from tests.analysis.flights import DURATION_S, short_case, short_flight
+from tests.analysis.flights import DURATION_S, short_flight
 
 
 def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:
@@ -59,6 +60,6 @@ def test_a_flight_without_fixes_has_no_frame() -> None:
 
 
 def test_too_few_samples_are_no_flight() -> None:
-    samples = short_case().sensed.log.samples()[:1]
+    samples = imu_log(short_flight()).samples()[:1]
     with pytest.raises(ValueError, match="1 IMU samples are no flight"):
         flight_of_samples(samples, [], [], name="x", story="", fusion=FusionSettings())

@@ -4,20 +4,11 @@ import pytest
 
 from gateway.analysis.case import ESTIMATORS, with_estimator
 from gateway.analysis.flight_arrays import FlightTrack
-from gateway.analysis.fusion import fuse, sense
+from gateway.analysis.fusion import fuse, imu_log
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.estimation.select import make_estimator
 from gateway.records import BaroSample, NavFlags
 from tests.analysis.flights import short_case, short_flight
-
-
-def test_sensing_gives_the_chains_samples() -> None:
-    flight, sensed = short_flight(), short_case().sensed
-    assert len(sensed.log.samples()) == len(flight.time_us)
-    assert sensed.table[:, 6:] == pytest.approx(flight.mag_b_ut, nan_ok=True)
-    assert sensed.table[5, :3] == pytest.approx(sensed.log.samples()[5].accel_lowpass_b_mps2)
-    noisy = np.diff(flight.accel_b_mps2, axis=0).std()
-    assert np.diff(sensed.table[:, :3], axis=0).std() < 0.7 * noisy
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
@@ -31,7 +22,7 @@ def test_a_whole_flight_at_once_equals_sample_by_sample(name: str) -> None:
         )
     ]
     fixes = list(flight.fixes)
-    for k, sample in enumerate(case.sensed.log.samples()[:1500]):
+    for k, sample in enumerate(imu_log(flight).samples()[:1500]):
         # Between two IMU samples the barometer comes first, as in a log that is run at once.
         while baros and baros[0].time_us <= sample.time_us:
             estimator.update_baro(baros.pop(0))
@@ -66,10 +57,8 @@ def test_what_an_estimator_does_not_vouch_for_is_not_known() -> None:
 
 
 def test_another_cutoff_gives_another_track() -> None:
-    flight, case = short_flight(), short_case()
-    sensing = msgspec.structs.replace(case.fusion.sensing, accel_cutoff_hz=2.0)
-    settings = msgspec.structs.replace(with_estimator(case.fusion, "paper"), sensing=sensing)
-    changed = fuse(flight, settings)
-    assert not np.array_equal(changed.q_nb, case.tracks["paper"].q_nb)
-    same = fuse(flight, settings, sense(flight, sensing))
-    np.testing.assert_array_equal(changed.q_nb, same.q_nb)
+    flight, fusion = short_flight(), with_estimator(short_case().fusion, "paper")
+    paper = msgspec.structs.replace(fusion.estimation.paper, accel_cutoff_hz=2.0)
+    estimation = msgspec.structs.replace(fusion.estimation, paper=paper)
+    changed = fuse(flight, msgspec.structs.replace(fusion, estimation=estimation))
+    assert not np.array_equal(changed.q_nb, short_case().tracks["paper"].q_nb)

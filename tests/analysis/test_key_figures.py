@@ -28,12 +28,13 @@ def test_every_estimator_foretells_withheld_fixes_and_each_its_own_way() -> None
 
 def test_settings_that_differ_are_listed() -> None:
     a = short_case().fusion
-    sensing = msgspec.structs.replace(a.sensing, accel_cutoff_hz=5.0)
-    b = msgspec.structs.replace(with_estimator(a, "paper"), sensing=sensing)
+    paper = msgspec.structs.replace(a.estimation.paper, accel_cutoff_hz=5.0)
+    estimation = msgspec.structs.replace(a.estimation, estimator="paper", paper=paper)
+    b = msgspec.structs.replace(a, estimation=estimation)
     assert changed_settings(a, a) == []
     assert changed_settings(a, b) == [
-        ("sensing.accel_cutoff_hz", 10.0, 5.0),
-        ("estimation.estimator", a.estimation.estimator, "paper"),
+        ("estimation.estimator", "eskf", "paper"),
+        ("estimation.paper.accel_cutoff_hz", 10.0, 5.0),
     ]
 
 

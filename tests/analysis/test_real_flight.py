@@ -8,7 +8,6 @@ import pytest
 
 from gateway.analysis.blending import blend_table, grows
 from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.fusion import sense
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.axis import with_value
 from gateway.recordings.files import read_chunks
@@ -32,7 +31,7 @@ def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
         [block_of(CsvReader(columns).rows(text.splitlines()))],
         NodeCalibration(), fusion, name="arduplane", story="",
     )  # fmt: skip
-    table = blend_table(flight, fusion, sense(flight, fusion.sensing), 1.0)
+    table = blend_table(flight, fusion, 1.0)
     for error in ("north_m", "east_m", "held_m"):
         assert grows(table, error)
     assert np.argmin(table["held_m"]) == 0

@@ -27,7 +27,7 @@ SIMULATED: SimulatedFlight = fly(
 def rows(*, raw: bool) -> Iterator[TableRow]:
     """What the recorder would have written, with states."""
     fusion = short_case().fusion
-    chain = SensorChain(fusion.sensing, ideal_calibration(SIMULATED.errors))
+    chain = SensorChain(ideal_calibration(SIMULATED.errors))
     estimator = make_estimator(fusion.estimation)
     for record in SIMULATED.records():
         match record:

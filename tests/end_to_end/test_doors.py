@@ -195,7 +195,7 @@ def test_mavsdk(doors: Doors) -> None:
 
 
 def test_pymavlink(doors: Doors) -> None:
-    assert run_until(block("pymavlink", doors), r"PARAM_VALUE {param_id : SENS_ACC_CUTOFF,")
+    assert run_until(block("pymavlink", doors), r"PARAM_VALUE {param_id : PAPER_ACC_CUTOFF,")
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl on this machine")

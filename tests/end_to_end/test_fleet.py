@@ -135,7 +135,7 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
             first, second, third = (systems[ids[site]] for site in SITES)
             async with asyncio.timeout(START_LIMIT_S):
                 params = [ParamAsync(system) for system in (first, second, third)]
-                name = "SENS_ACC_CUTOFF"
+                name = "PAPER_ACC_CUTOFF"
                 before = [await answered(param.get_param_float, name) for param in params]
                 await answered(params[1].set_param_float, name, before[1] + 1.5)
                 after = [await answered(param.get_param_float, name) for param in params]

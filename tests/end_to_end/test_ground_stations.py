@@ -234,13 +234,13 @@ async def test_mavsdk_parameters(gateway: Gateway) -> None:
         assert version.flight_sw_minor > 0
         param = ParamAsync(system)
         names: set[str] = set()
-        while not {"SENS_ACC_CUTOFF", "RATE_ATT_QUAT"} <= names:
+        while not {"PAPER_ACC_CUTOFF", "RATE_ATT_QUAT"} <= names:
             everything = await param.get_all_params()
             names = {each.name for each in everything.float_params}
-        await answered(param.set_param_float, "SENS_ACC_CUTOFF", 12.5)
-        assert await answered(param.get_param_float, "SENS_ACC_CUTOFF") == 12.5
+        await answered(param.set_param_float, "PAPER_ACC_CUTOFF", 12.5)
+        assert await answered(param.get_param_float, "PAPER_ACC_CUTOFF") == 12.5
         with pytest.raises(ParamError) as refused:
-            await answered(param.set_param_float, "SENS_ACC_CUTOFF", 1e9)
+            await answered(param.set_param_float, "PAPER_ACC_CUTOFF", 1e9)
         assert refused.value.result == ParamResult.VALUE_OUT_OF_RANGE
         with pytest.raises(ParamError):
             await answered(param.get_param_float, "NO_SUCH")
@@ -278,7 +278,7 @@ async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -
             else:
                 break
         described = {p["name"]: p for p in json.loads(found.json_metadata)["parameters"]}
-        assert described["SENS_ACC_CUTOFF"]["units"] == "Hz"
+        assert described["PAPER_ACC_CUTOFF"]["units"] == "Hz"
 
     await with_mavsdk(gateway, use)
 
@@ -315,8 +315,8 @@ def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
     mavproxy = MavProxy(gateway.port, tmp_path)
     try:
         mavproxy.until(r"Received \d+ parameters")
-        mavproxy.type("param set SENS_ACC_CUTOFF 12.5")
-        mavproxy.until(r"SENS_ACC_CUTOFF\s+12\.5", asking="param show SENS_ACC_CUTOFF")
+        mavproxy.type("param set PAPER_ACC_CUTOFF 12.5")
+        mavproxy.until(r"PAPER_ACC_CUTOFF\s+12\.5", asking="param show PAPER_ACC_CUTOFF")
         mavproxy.type("wp load way.txt")
         mavproxy.until(r"Got MISSION_ACK: TYPE_MISSION: ACCEPTED")
         mavproxy.until(r"wp_dist : \d+", asking="status NAV_CONTROLLER_OUTPUT")

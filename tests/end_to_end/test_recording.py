@@ -85,7 +85,7 @@ class Recording:
         self.recorder.close()
 
 
-@pytest.fixture(params=["complementary", "paper", "eskf"])
+@pytest.fixture(params=["eskf", "paper"])
 async def recorded(
     request: pytest.FixtureRequest, tmp_path: Path, clock: ManualClock
 ) -> tuple[Path, list[bytes], list[NavState], Flight]:

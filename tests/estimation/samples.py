@@ -31,8 +31,6 @@ def imu(
         time_us=time_us,
         accel_b_mps2=accel,
         gyro_b_radps=gyro,
-        accel_lowpass_b_mps2=accel,
-        gyro_highpass_b_radps=gyro,
         mag_b_ut=mag,
         temperature_degc=25.0,
         flags=ImuFlags(0),

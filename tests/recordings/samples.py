@@ -80,7 +80,7 @@ def make_fused(rng: np.random.Generator, time_us: int) -> FusedSample:
     )
     accel, gyro = vector(rng), vector(rng)
     mag = vector(rng) if rng.integers(2) else None
-    sample = ImuSample(time_us, accel, gyro, accel, gyro, mag, number(rng), flags)
+    sample = ImuSample(time_us, accel, gyro, mag, number(rng), flags)
     state = NavState(
         time_us=time_us - 1,
         q_nb=(*vector(rng), number(rng)),

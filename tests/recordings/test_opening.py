@@ -85,8 +85,9 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     then = GatewaySettings().default_aircraft
-    sensing = msgspec.structs.replace(then.sensing, accel_cutoff_hz=3.5)
-    changed = header_for(msgspec.structs.replace(then, sensing=sensing), 1)
+    paper = msgspec.structs.replace(then.estimation.paper, accel_cutoff_hz=3.5)
+    estimation = msgspec.structs.replace(then.estimation, paper=paper)
+    changed = header_for(msgspec.structs.replace(then, estimation=estimation), 1)
     header, rows = read(fly(then, make_flight(rng, 6))[0])
     half = len(rows) // 2
     path = tmp_path / "a_01_v1.csv"
@@ -102,7 +103,7 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
         answers = VehicleAnswers(flight.answers, 1, 1, lambda at_us=at_us: at_us).parameters()
         (cutoff,) = (frame for name, frame in answers.items() if "ACC_CUTOFF" in name)
         answered[at_us] = mavlink.MAVLink(None).decode(bytearray(cutoff)).param_value
-    assert list(answered.values()) == [then.sensing.accel_cutoff_hz, 3.5]
+    assert list(answered.values()) == [then.estimation.paper.accel_cutoff_hz, 3.5]
 
 
 def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:

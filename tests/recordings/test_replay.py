@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gateway.aircraft import AircraftSettings, SettingsChanged
+from gateway.estimation.paper.paper import PaperSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
@@ -35,7 +36,6 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensingSettings
 from gateway.vehicle.actions import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -47,8 +47,9 @@ CALIBRATION = NodeCalibration(
 
 def make_settings(estimator: str) -> AircraftSettings:
     return AircraftSettings(
-        sensing=SensingSettings(accel_cutoff_hz=7.3),
-        estimation=msgspec.convert({"estimator": estimator}, EstimationSettings),
+        estimation=msgspec.convert(
+            {"estimator": estimator, "paper": {"accel_cutoff_hz": 7.3}}, EstimationSettings
+        ),
         vehicle=VehicleSettings(signing_passphrase="secret"),
         calibration=CALIBRATION,
     )
@@ -128,7 +129,7 @@ def fuse_again(settings: AircraftSettings, rows: list[TableRow]) -> list[NavStat
     ]
 
 
-@pytest.mark.parametrize("estimator", ["paper", "complementary"])
+@pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_a_table_fused_again_gives_the_recorded_states_to_the_last_bit(
     rng: np.random.Generator, estimator: str
 ) -> None:
@@ -145,7 +146,7 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
     pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
     text, states = encode_head(header_for(settings, 1)), []
     changes = {
-        400: SettingsChange(1, "estimation", make_settings("complementary").estimation, ""),
+        400: SettingsChange(1, "estimation", make_settings("eskf").estimation, ""),
         800: SettingsChange(1, "calibration", NodeCalibration(), ""),
         1200: SettingsChange(1, "vehicle", VehicleSettings(), ""),
     }
@@ -203,7 +204,7 @@ def fly_from_the_middle(
     return settings, found, rows
 
 
-@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+@pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
     rng: np.random.Generator, estimator: str
 ) -> None:
@@ -228,12 +229,13 @@ def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
     assert pipeline.aircraft[1].fusion_state.home == state.home
 
 
-@pytest.mark.parametrize("estimator", ["paper", "complementary"])
+@pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_a_state_that_does_not_fit_is_reported_and_left_alone(
     rng: np.random.Generator, estimator: str
 ) -> None:
     settings, state, rows = fly_from_the_middle(estimator, rng)
-    other = msgspec.structs.replace(settings, sensing=SensingSettings(accel_cutoff_hz=7.4))
+    estimation = msgspec.structs.replace(settings.estimation, paper=PaperSettings())
+    other = msgspec.structs.replace(settings, estimation=estimation)
     for settings_now, found, reason in (
         (other, state, "other settings"),
         (
@@ -241,7 +243,6 @@ def test_a_state_that_does_not_fit_is_reported_and_left_alone(
             msgspec.structs.replace(state, fits="0.0.1 0"),
             "another version",
         ),
-        (settings, msgspec.structs.replace(state, sensing=b"\x01"), "Expected"),
         (settings, msgspec.structs.replace(state, estimation=state.estimation[:-40]), "truncated"),
     ):
         replay = Replay(Pipeline(PipelineSettings(settings_now)))
@@ -259,7 +260,7 @@ def test_a_state_that_does_not_fit_is_reported_and_left_alone(
 
 def test_other_settings_give_another_flight(rng: np.random.Generator) -> None:
     table, states = fly(make_settings("paper"), make_flight(rng, 10))
-    again = fuse_again(make_settings("complementary"), read(table)[1])
+    again = fuse_again(make_settings("eskf"), read(table)[1])
     assert len(again) == len(states)
     assert again != states
 
@@ -274,7 +275,7 @@ def test_rows_without_counts_are_fused_too(rng: np.random.Generator) -> None:
 
 
 def test_replay_tells_the_vehicle_at_its_rates(rng: np.random.Generator) -> None:
-    settings = make_settings("complementary")
+    settings = make_settings("eskf")
     table, _ = fly(settings, make_flight(rng, 10))
     replay = Replay(Pipeline(PipelineSettings(settings)))
     told = [
@@ -289,7 +290,7 @@ def test_replay_tells_the_vehicle_at_its_rates(rng: np.random.Generator) -> None
 
 
 def test_what_was_noted_in_flight_happens_again_at_its_time(rng: np.random.Generator) -> None:
-    settings = make_settings("complementary")
+    settings = make_settings("eskf")
     _, rows = read(fly(settings, make_flight(rng, 3))[0])
     for follow in (True, False):
         pipeline = Pipeline(PipelineSettings(settings))
@@ -305,7 +306,7 @@ def test_what_was_noted_in_flight_happens_again_at_its_time(rng: np.random.Gener
         changed = list(playing.take(header_for(make_settings("paper"), 1)))
         assert {now_us for now_us, _ in changed} == ({last_us + 40_000} if follow else set())
         estimator = pipeline.aircraft[1].settings.estimation.estimator
-        assert estimator == ("paper" if follow else "complementary")
+        assert estimator == ("paper" if follow else "eskf")
 
 
 def test_settings_come_back_from_the_head() -> None:
@@ -318,7 +319,22 @@ def test_settings_come_back_from_the_head() -> None:
 
 def test_settings_of_another_version_are_refused() -> None:
     with pytest.raises(msgspec.ValidationError, match="wings"):
-        settings_of(TableHeader(settings={"sensing": {"wings": 2}}))
+        settings_of(TableHeader(settings={"estimation": {"wings": 2}}))
+
+
+def test_settings_of_earlier_versions_become_present_ones() -> None:
+    old = {
+        "sensing": {"accel_cutoff_hz": 5.0, "nominal_rate_hz": 50.0},
+        "estimation": {
+            "estimator": "complementary",
+            "complementary": {"tau_s": 3.0},
+            "eskf": {"mag_bias_ut": 2.0, "gps_position_m": 3.0},
+        },
+    }
+    estimation = settings_of(TableHeader(settings=old)).estimation
+    assert estimation.estimator == "eskf"
+    assert estimation.paper.accel_cutoff_hz == 5.0
+    assert estimation.eskf.gps_position_m == 3.0
 
 
 def test_interpolated_positions_lie_on_the_line_between_the_fixes(

@@ -14,7 +14,6 @@ from gateway.recordings.fuse import Replay, RowFusion
 from gateway.recordings.reading import Line, header_for
 from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
-from gateway.sensing.chain import SensingSettings
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 
@@ -62,7 +61,7 @@ def at_once(lines: list[Line], settings: AircraftSettings) -> list[TableEvent]:
     return [event for block in fusion.blocks(blocks) for event in block.events(1)]
 
 
-@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+@pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_the_same_bits(estimator: str) -> None:
     lines, settings = flown(), settings_for(estimator)
     assert any(row.raw is None for row in lines if isinstance(row, TableRow))
@@ -72,7 +71,7 @@ def test_the_same_bits(estimator: str) -> None:
     assert [row_to_line(row) for row in found if isinstance(row, TableRow)] == expected
 
 
-@pytest.mark.parametrize("estimator", ["complementary", "eskf"])
+@pytest.mark.parametrize("estimator", ["eskf"])
 def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -> None:
     lines, settings = flown()[:900], settings_for(estimator)
     rows = [row for row in lines if isinstance(row, TableRow)]
@@ -94,10 +93,8 @@ def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -
 
 
 def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None:
-    lines, settings = flown(), settings_for("complementary")
-    other = msgspec.structs.replace(
-        settings, sensing=SensingSettings(accel_cutoff_hz=3.0), estimation=EstimationSettings()
-    )
+    lines, settings = flown(), settings_for("eskf")
+    other = msgspec.structs.replace(settings, estimation=EstimationSettings())
     mark, header = TableMark(1, "here"), header_for(other, 1)
     begun = Aircraft(1, settings).fusion_state
     lines = [begun, *lines[:500], mark, header, *lines[500:900]]

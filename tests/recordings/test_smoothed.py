@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.app import app
-from gateway.estimation.kernel_record import FloatArray, IntArray
+from gateway.estimation.record import FloatArray, IntArray
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import RecordedFusion, smooth_blocks

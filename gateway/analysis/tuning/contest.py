@@ -15,7 +15,7 @@ from scipy.optimize import OptimizeResult, differential_evolution
 
 from gateway.analysis.blending import Judge, judge_of, make_judge, score
 from gateway.analysis.flight_arrays import Flight, FlightTrack, FusionSettings
-from gateway.analysis.fusion import Sensed, fuse, sense
+from gateway.analysis.fusion import fuse
 from gateway.analysis.interpolation import thin, withhold
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
 from gateway.analysis.tuning.axis import (
@@ -27,7 +27,6 @@ from gateway.analysis.tuning.axis import (
     with_estimator_of,
     with_values,
 )
-from gateway.sensing.chain import SensingSettings
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 COLUMN_OF: Final[dict[Metric, str]] = {
@@ -89,21 +88,17 @@ class Trials:
 
     def __init__(self, contest: Contest) -> None:
         self._contest = contest
-        self._sensed: tuple[SensingSettings, Sensed] | None = None
 
     def prepare(self) -> None:
         """Filter and fuse the samples in advance, once for all processes."""
         fusion, flight = self._contest.fusion, self._contest.judge.fused
-        self._sensed = (fusion.sensing, sense(flight, fusion.sensing))
-        fuse(flight, fusion, self._sensed[1])
+        fuse(flight, fusion)
 
     def run(self, values: Sequence[Value]) -> dict[str, float]:
         """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
         settings = settings_at(self._contest, values)
         judge = rejudged(self._contest.judge, settings)
-        if self._sensed is None or self._sensed[0] != settings.sensing:
-            self._sensed = (settings.sensing, sense(judge.fused, settings.sensing))
-        return _scores(fuse(judge.fused, settings, self._sensed[1]), judge)
+        return _scores(fuse(judge.fused, settings), judge)
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:

@@ -207,7 +207,7 @@ def run_season_sweep(
                 check_output(out, overwrite=options.overwrite)
     if options.generations:
         refuse("--optimise searches on one flight; give a grid for many")
-    fusion = FusionSettings(sensing=settings.sensing, estimation=settings.estimation)
+    fusion = FusionSettings(estimation=settings.estimation)
     try:
         axes = tuple(parse_axes(options))
         points, keys = grid(axes), [axis.key for axis in axes]
@@ -223,7 +223,7 @@ def run_season_sweep(
     base, choice = _chosen(swept)
     _show(axes, points, choice, column, len(swept))
     best = with_values(fusion, keys, points[choice.winner])
-    merged = msgspec.structs.replace(settings, sensing=best.sensing, estimation=best.estimation)
+    merged = msgspec.structs.replace(settings, estimation=best.estimation)
     with refusing():
         write_new(options.output, [render(merged).encode()], overwrite=options.overwrite)
         print(options.output)

@@ -29,8 +29,8 @@ from gateway.cli.support.settings_options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.estimation.kernel_record import FloatArray, IntArray
-from gateway.estimation.select import ESTIMATORS
+from gateway.estimation.record import FloatArray, IntArray
+from gateway.estimation.select import DEPRECATED, ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.columns import NAV, has_group
 from gateway.recordings.files import FlightError, SettingsChoice
@@ -59,6 +59,9 @@ def register(app: typer.Typer) -> None:
 
 
 def _known_estimator(name: str | None) -> str | None:
+    if name in DEPRECATED:
+        name, former = DEPRECATED[name], name
+        typer.echo(f"--estimator {former} is deprecated; using {name}", err=True)
     if name is not None and name not in ESTIMATORS:
         raise typer.BadParameter(f"{name!r} is none of {', '.join(ESTIMATORS)}")
     return name

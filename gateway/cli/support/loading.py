@@ -64,7 +64,7 @@ class Loading:
 
 def fusion_of(settings: GatewaySettings) -> FusionSettings:
     """Return the part of the settings that fuses a flight."""
-    return FusionSettings(sensing=settings.sensing, estimation=settings.estimation)
+    return FusionSettings(estimation=settings.estimation)
 
 
 def load_flight(path: Path | None, loading: Loading) -> Flight:
@@ -81,7 +81,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         aircraft = aircraft_for(parts, table, options)
         if is_table(parts[0]):
             check_latency(parts[0], table, aircraft)
-        fusion = FusionSettings(sensing=aircraft.sensing, estimation=aircraft.estimation)
+        fusion = FusionSettings(estimation=aircraft.estimation)
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:
             flight = flight_of_blocks(

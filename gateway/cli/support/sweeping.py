@@ -176,4 +176,4 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
 def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:
     """Put the best values into the whole settings."""
     fusion: FusionSettings = sweeping.settings_at(contest, best)
-    return msgspec.structs.replace(settings, sensing=fusion.sensing, estimation=fusion.estimation)
+    return msgspec.structs.replace(settings, estimation=fusion.estimation)

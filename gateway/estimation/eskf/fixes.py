@@ -1,164 +1,321 @@
-"""GPS fixes: the first heading, starts and restarts, and the update by a late fix."""
+"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update."""
 
 import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.alignment.gps_velocity import (
-    FASTEST_MPS,
-    velocity_noise,
-    velocity_of_fix,
+from gateway.estimation.columns import (
+    GPS_ALT,
+    GPS_DECLINATION,
+    GPS_DIP,
+    GPS_LAT,
+    GPS_LON,
+    GPS_USABLE,
+    GPS_VEL,
 )
-from gateway.estimation.eskf.covariance import propagate
-from gateway.estimation.eskf.eskf_settings import EskfGains
-from gateway.estimation.eskf.eskf_state import POS, EskfState
-from gateway.estimation.eskf.late_fix import (
-    lag_integrals,
-    place_distance_sq,
-    place_variance,
-    set_wander_variance,
-    update_by_fix,
+from gateway.estimation.eskf.alignment import (
+    MEMORY_S,
+    NOISE_MPS,
+    TRACK_NOISE_MPS,
+    add_velocity,
 )
-from gateway.estimation.eskf.recovery import lose_attitude, review_attitude, turn_heading
-from gateway.estimation.eskf.start import (
-    bridge_gap,
-    restart_at,
-    start_height,
-)
-from gateway.estimation.filtering.fix_intake import (
-    accept_fix,
-    is_fix_told,
-    is_flown_unaided,
-    learn_earth_field,
+from gateway.estimation.eskf.delayed import (
+    is_unlikely,
     look_back,
-    pair_with,
-    place_fix,
-    wanted_time_s,
+    past_state,
+    set_error_variances,
+    update_fix,
 )
-from gateway.estimation.filtering.sample_clock import silence_before
-from gateway.estimation.kernel_record import FloatArray, as_vec, write_vec
-from gateway.estimation.local_position import BARO_STALE_S, is_relocked, past_state
-from gateway.estimation.sensor_faults import is_sound
-from gateway.records import Vec3
+from gateway.estimation.eskf.faults import gap_limit_s, is_sound
+from gateway.estimation.eskf.integrity import lose_attitude, review_attitude
+from gateway.estimation.eskf.latency import watch_latency
+from gateway.estimation.eskf.magnetometer import raise_iron_by_dip, turn_heading
+from gateway.estimation.eskf.measurements import restart_baro
+from gateway.estimation.eskf.predict import propagate
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import GPS_ERROR, GYRO_SCALE, NEVER_S, POS, VEL, State
+from gateway.estimation.eskf.update import reset_state
+from gateway.estimation.record import FloatArray, as_vec, write_vec
+from gateway.geometry.geodesy import displacement_m, offset_deg
+from gateway.records import NAN, Vec3
 
-HELD_S: Final = 60.0
-"""A height that barometer and fixes have agreed on is held against fixes for so long at most."""
-LONGEST_S: Final = 1.0
-"""A fix speaks for no longer than this."""
+FASTEST_MPS: Final = 1000.0
+"""A larger velocity is an error."""
+BASELINE_S: Final = 0.9
+"""Positions closer together differ mostly by their noise."""
+MAX_BASELINE_S: Final = 2.5
+ZERO_S: Final = 3.0
+ZERO_MPS: Final = 2.0
+"""Fixes that move so fast for this time contradict a velocity of exactly zero."""
+STATIONARY_MPS: Final = 0.1
+"""A receiver at rest reports up to this speed, and may repeat itself."""
+SLOWEST_FIXES_S: Final = 1.1
+"""Longest usual interval of fixes; a fix without velocity may repeat after that."""
+MOVING_MPS: Final = 3.0
+"""A level that was found by gravity is discarded at this speed."""
+ORIGIN_RENEWAL_M: Final = 5_000.0
+"""The origin follows the aircraft, because metres are taken at the radii of the origin."""
+AGREE_M: Final = 10.0
+"""Rejected fixes within this distance of their own dead reckoning agree."""
+AGREE_S: Final = 5.0
+"""Rejected fixes further apart in time do not."""
+FIRST_VELOCITY_VAR: Final = 0.5**2
+NO_VELOCITY_VAR: Final = 5.0**2
+"""Of the first velocity with and without one in the fix, m2/s2."""
 
 
 @compiled
-def take_gps(s: EskfState, p: EskfGains, time_us: int, row: FloatArray) -> None:
-    """Take in one fix at its arrival.
-
-    Parameters
-    ----------
-    s : EskfState
-        Changed in place.
-    p : EskfGains
-        Constants.
-    time_us : int
-        Arrival on the gateway clock.
-    row : ndarray, shape (GPS_COLUMNS,)
-        See `columns`.
-    """
-    if not is_fix_told(s, row):
+def take_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
+    """Use one fix at its arrival; see `columns` for its row."""
+    if s.started == 0 or not is_new_fix(s, row):
         return
-    turn_rad = learn_earth_field(s, row)
-    if turn_rad != 0.0:
-        turn_heading(s, turn_rad)
-    set_wander_variance(s, p, row)
-    wanted_s = wanted_time_s(s, p, time_us, row)
-    silent_s = silence_before(s, wanted_s)
-    if silent_s > 0.0:
-        bridge_gap(s, p, silent_s)
+    learn_declination(s, row)
+    set_error_variances(s, p, row)
+    arrival_s = (arrival_us - s.base_us) * 1e-6
+    reported = as_vec(row[GPS_VEL : GPS_VEL + 3])
+    if is_sound(reported, FASTEST_MPS):
+        watch_latency(s, p.gps_latency_s, arrival_s, reported)
+    wanted_s = arrival_s - s.gps_latency_s
+    pos = position_of(s, row)
+    if is_zero_false(s, pos, reported):
+        reported = (NAN, NAN, NAN)
+    vel, vel_s = complete_velocity(s, wanted_s, pos, reported)
+    sound = is_sound(vel, FASTEST_MPS)
+    if sound:
+        write_vec(s.fix_vel, vel)
+    if arrival_s - s.imu_s > gap_limit_s(s):
+        # Without an IMU the state is that of the fix.
+        if s.aided == 1:
+            restart_at(s, p, pos, vel, arrival_s - wanted_s)
+            s.fix_s = arrival_s
+        return
+    if sound:
+        noise_mps = NOISE_MPS if is_level_sound(reported) else TRACK_NOISE_MPS
+        pair_velocity(s, p, vel_s, vel, noise_mps)
     valid_s = look_back(s, wanted_s)
-    lag = s.time_s - valid_s
-    pos, vel = place_fix(s, row)
-    align(s, p, valid_s, pos, vel)
-    look_back(s, wanted_s)
+    if sound:
+        # Integrals that do not reach back: the fix moves on by its own velocity.
+        since_s = valid_s - wanted_s
+        pos = (pos[0] + vel[0] * since_s, pos[1] + vel[1] * since_s, pos[2] + vel[2] * since_s)
+    use_fix(s, p, row, pos, vel, reported, s.time_s - valid_s)
+
+
+@compiled
+def use_fix(
+    s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, reported: Vec3, lag: float
+) -> None:
+    """Follow, restart at or fuse a fix that is `lag` seconds old."""
     if s.heading_known == 0:
         follow_fix(s, pos, lag)
     elif s.aided == 0:
-        restart_at(s, p, pos, as_vec(s.fix_vel), lag)
+        restart_at(s, p, pos, vel, lag)
         accept_fix(s)
     else:
-        fuse_fix(s, p, row, pos, vel, lag)
+        fuse_fix(s, p, row, pos, reported, lag)
 
 
 @compiled
-def align(s: EskfState, p: EskfGains, valid_s: float, pos: Vec3, told: Vec3) -> None:
-    """Give the velocity of a fix to the alignment, and heed what that says."""
-    vel, at_s = velocity_of_fix(s, valid_s, pos, told)
-    if not is_sound(vel, FASTEST_MPS):
+def is_new_fix(s: State, row: FloatArray) -> bool:
+    """Return whether a row is a usable fix that does not repeat the last one.
+
+    A log may hold a fix until the next one, and a receiver may be stuck. What moves is nowhere
+    twice; at rest a repetition may be real.
+    """
+    lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
+    if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
+        return False
+    last, has_velocity = s.fix_last, is_sound(vel, FASTEST_MPS)
+    repeated = lat == last[0] and lon == last[1]
+    for k in range(3):
+        repeated = repeated and (vel[k] == last[2 + k] or not has_velocity)
+    if not repeated:
+        last[0], last[1], s.fix_last_s = lat, lon, s.time_s
+        for k in range(3):
+            last[2 + k] = vel[k]
+        return True
+    if has_velocity:
+        return math.sqrt(vel[0] ** 2 + vel[1] ** 2 + vel[2] ** 2) <= STATIONARY_MPS
+    return bool(s.time_s - s.fix_last_s >= SLOWEST_FIXES_S)
+
+
+@compiled
+def learn_declination(s: State, row: FloatArray) -> None:
+    """Take the Earth's field at a fix; a magnetic heading becomes a true one."""
+    s.earth_field[1] = row[GPS_DIP]
+    if not math.isfinite(row[GPS_DECLINATION]):
         return
-    write_vec(s.fix_vel, vel)
-    if s.aided == 0 and is_flown_unaided(s, vel):
-        lose_attitude(s, p)
-    dt = pair_with(s, at_s, vel, velocity_noise(told))
-    if dt > 0.0:
-        review_attitude(s, p, dt)
+    s.earth_field[0] = row[GPS_DECLINATION]
+    if s.heading_known == 1 and s.heading_true == 0:
+        s.heading_true = 1
+        turn_heading(s, s.earth_field[0])
 
 
 @compiled
-def fuse_fix(s: EskfState, p: EskfGains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
-    """Update by a fix, hardly by one that does not lie near; relock on those that insist."""
+def position_of(s: State, row: FloatArray) -> Vec3:
+    """Return a fix in metres from the origin, which the first one sets, down positive."""
+    if s.has_origin == 0:
+        s.origin[0], s.origin[1], s.has_origin = row[GPS_LAT], row[GPS_LON], 1
+    elif math.hypot(s.pos_n[0], s.pos_n[1]) > ORIGIN_RENEWAL_M:
+        lat, lon = offset_deg(s.origin[0], s.origin[1], 0.0, s.pos_n[0], s.pos_n[1])
+        north, east = displacement_m(s.origin[0], s.origin[1], lat, lon, 0.0)
+        for from_pos in (s.track_from, s.zero_from):
+            from_pos[1] -= north
+            from_pos[2] -= east
+        s.pos_n[0] -= north
+        s.pos_n[1] -= east
+        s.origin[0], s.origin[1] = lat, lon
+    north, east = displacement_m(s.origin[0], s.origin[1], row[GPS_LAT], row[GPS_LON], 0.0)
+    return (north, east, -row[GPS_ALT])
+
+
+@compiled
+def is_level_sound(vel: Vec3) -> bool:
+    """Return whether a velocity has sound horizontal components."""
+    return is_sound((vel[0], vel[1], 0.0), FASTEST_MPS)
+
+
+@compiled
+def is_zero_false(s: State, pos: Vec3, vel: Vec3) -> bool:
+    """Return whether the positions contradict a velocity of exactly zero."""
+    if vel[0] != 0.0 or vel[1] != 0.0 or vel[2] != 0.0:
+        s.zero_from[0], s.zero_false = NEVER_S, 0
+        return False
+    dt = s.time_s - s.zero_from[0]
+    if not 0.0 <= dt < ZERO_S:
+        if s.zero_from[0] != NEVER_S:
+            way_m = math.hypot(pos[0] - s.zero_from[1], pos[1] - s.zero_from[2])
+            s.zero_false = 1 if way_m > ZERO_MPS * dt else 0
+        s.zero_from[0] = s.time_s
+        for k in range(3):
+            s.zero_from[1 + k] = pos[k]
+    return s.zero_false == 1
+
+
+@compiled
+def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[Vec3, float]:
+    """Return the velocity of a fix, from two positions where it has none, and its time.
+
+    Without heights it does not climb; what is unknown is NaN.
+    """
+    f = s.track_from
+    dt = valid_s - f[0]
+    if is_sound(vel, FASTEST_MPS) or not 0.0 <= dt < BASELINE_S:
+        f[0] = valid_s
+        track = ((pos[0] - f[1]) / dt, (pos[1] - f[2]) / dt, (pos[2] - f[3]) / dt)
+        for k in range(3):
+            f[1 + k] = pos[k]
+        if is_sound(vel, FASTEST_MPS):
+            return vel, valid_s
+        known = 0.0 <= dt <= MAX_BASELINE_S
+        climb = track[2] if known and math.isfinite(track[2]) else 0.0
+        if is_level_sound(vel):
+            return (vel[0], vel[1], climb), valid_s
+        if known and is_level_sound(track):
+            return (track[0], track[1], climb), valid_s - 0.5 * dt
+    elif is_level_sound(vel):
+        return (vel[0], vel[1], 0.0), valid_s
+    return (NAN, NAN, NAN), valid_s
+
+
+@compiled
+def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float) -> None:
+    """Give the velocity of a fix to the alignment, and review the attitude."""
+    unaided = s.aided == 0 and s.pairs == 0.0
+    if unaided and s.lost == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS:
+        # The level was found by gravity alone while turns and accelerations imitated it.
+        lose_attitude(s, p)
+    at_s = look_back(s, vel_s)
+    dt = add_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
+    if dt > 0.0:
+        review_attitude(s, p, dt, s.sound_s >= MEMORY_S)
+
+
+@compiled
+def accept_fix(s: State) -> None:
+    """Note that a fix was used."""
+    s.fix_s = s.time_s
+    s.reject_s, s.reject_last[0] = 0.0, NEVER_S
+
+
+@compiled
+def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: float) -> None:
+    """Update by a fix; one that is far off is rejected, unless such fixes have long agreed."""
     propagate(s, p)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
-    past_pos, past_vel = past_state(s, s.then, lag)
-    once, twice = lag_integrals(s, s.then, lag)
-    w = s.wander_n
+    past_pos, past_vel = past_state(s, lag)
+    e = s.gps_error_n
     off_pos = (
-        pos[0] - past_pos[0] - w[0],
-        pos[1] - past_pos[1] - w[1],
-        pos[2] - past_pos[2] - w[2],
+        pos[0] - past_pos[0] - e[0],
+        pos[1] - past_pos[1] - e[1],
+        pos[2] - past_pos[2] - e[2],
     )
     off_vel = (vel[0] - past_vel[0], vel[1] - past_vel[1], vel[2] - past_vel[2])
-    watch_height(s, p, row, off_pos[2])
-    unlikely = place_distance_sq(s, p, row, off_pos, once, twice, lag) > p.gate_sq
-    off_m = math.hypot(off_pos[0], off_pos[1])
-    note_contradiction(s, off_m if unlikely else 0.0)
-    far = unlikely and off_m >= p.gate_m
-    if far and is_relocked(s, p.gps_relock_s, pos, vel):
+    far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and is_unlikely(s, p, row, off_pos, lag)
+    if far and have_agreed(s, p, pos, vel):
         restart_at(s, p, pos, as_vec(s.fix_vel), lag)
         accept_fix(s)
         return
-    update_by_fix(s, p, row, off_pos, off_vel, once, twice, lag)
+    update_fix(s, p, row, off_pos, off_vel, lag)
     if not far:
         accept_fix(s)
 
 
 @compiled
-def watch_height(s: EskfState, p: EskfGains, row: FloatArray, off_m: float) -> None:
-    """Give a height up that the fixes contradict for long: the next one tells it anew.
-
-    The first heights of a receiver may be hundreds of metres off, and agree with one another. Those
-    that leave what barometer and fixes have told together are doubted for as long as they have.
-    """
-    if not math.isfinite(off_m):
-        return
-    known = s.P[POS + 2, POS + 2] + s.wander_var[2] + place_variance(p, row, 2)
-    near = abs(off_m) < p.gate_m or off_m * off_m < p.gate_sq * known
-    dt = min(s.time_s - s.weighed_s, LONGEST_S)
-    s.height_off_s = 0.0 if near else s.height_off_s + dt
-    if near and s.time_s - s.baro_s < BARO_STALE_S:
-        s.height_held_s = min(s.height_held_s + dt, HELD_S)
-    if s.height_off_s > max(p.gps_relock_s, s.height_held_s):
-        s.has_height, s.doubt_pos_sq, s.height_held_s = 0, 0.0, 0.0
+def have_agreed(s: State, p: Gains, pos: Vec3, vel: Vec3) -> bool:
+    """Return whether rejected fixes have agreed with one another for the relocking time."""
+    last = s.reject_last
+    dt = s.time_s - last[0]
+    off_m = math.hypot(pos[0] - last[1] - vel[0] * dt, pos[1] - last[2] - vel[1] * dt)
+    s.reject_s = s.reject_s + dt if dt < AGREE_S and off_m < AGREE_M else 0.0
+    last[0], last[1], last[2] = s.time_s, pos[0], pos[1]
+    return bool(s.reject_s > p.gps_relock_s)
 
 
 @compiled
-def note_contradiction(s: EskfState, off_m: float) -> None:
-    """Note how far off the fixes are: two in a row, for one alone may be nonsense."""
-    s.contradiction_m = min(off_m, s.off_last_m)
-    s.off_last_m = off_m
-
-
-@compiled
-def follow_fix(s: EskfState, pos: Vec3, lag: float) -> None:
+def follow_fix(s: State, pos: Vec3, lag: float) -> None:
     """Show a fix while it cannot be fused, without a heading; its velocity moves it on."""
     s.fix_s = s.time_s
     for k in range(3):
         moved = s.fix_vel[k] * lag
-        if k < 2 or (s.baro_known == 0 and math.isfinite(pos[2])):
+        if k < 2 or (s.baro_s == NEVER_S and math.isfinite(pos[2])):
             s.pos_n[k] = pos[k] + (moved if math.isfinite(moved) else 0.0)
+
+
+@compiled
+def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
+    """Take position and velocity from one fix, `lag` seconds old; NaN where it has none."""
+    propagate(s, p)
+    sound = is_sound(vel, FASTEST_MPS)
+    for k in range(3):
+        reset_state(s, VEL + k, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
+        s.vel_n[k] = vel[k] if sound else 0.0
+    for k in range(2):
+        start_position(s, k, pos[k] + s.vel_n[k] * lag, p.gps_position_var)
+    start_height(s, p, pos[2] + s.vel_n[2] * lag)
+    s.aided = 1
+    if s.was_aided == 0:
+        s.was_aided = 1
+        for k in range(3):
+            reset_state(s, GYRO_SCALE + k, p.gyro_scale_var)
+        raise_iron_by_dip(s, s.earth_field[1])
+
+
+@compiled
+def start_height(s: State, p: Gains, down_m: float) -> None:
+    """Take the height from the first fix that has one."""
+    if s.has_height == 1 or not math.isfinite(down_m):
+        return
+    start_position(s, 2, down_m, p.gps_height_var)
+    s.has_height = 1
+    if s.baro_s != NEVER_S:
+        restart_baro(s, p)
+
+
+@compiled
+def start_position(s: State, k: int, value: float, noise_var: float) -> None:
+    """Start one coordinate at a fix, whose slow error it then has, with the opposite sign."""
+    error_var = s.gps_error_var[k]
+    s.pos_n[k], s.gps_error_n[k] = value, 0.0
+    reset_state(s, POS + k, error_var + noise_var)
+    reset_state(s, GPS_ERROR + k, error_var)
+    s.P[POS + k, GPS_ERROR + k] = s.P[GPS_ERROR + k, POS + k] = -error_var

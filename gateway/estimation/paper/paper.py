@@ -1,29 +1,19 @@
-"""The paper's estimator: three complementary filters, its equations corrected.
+"""The paper's estimator: filters, then three complementary filters, its equations corrected.
 
-Accelerometer and gyroscope give roll and pitch, the magnetometer corrects yaw, and the
-acceleration is integrated twice and blended with GPS [1]_. Deviations from the print:
+Accelerometer and gyroscope give roll and pitch, the magnetometer corrects yaw, and the acceleration
+is integrated twice and blended with GPS [1]_. Deviations from the print:
 
 - Eq. 1, 2, 7, 8: the course is counted from north, so its cosine is the north velocity and north
-  velocity drives latitude; a metre east is `180 / (pi r_e cos(lat))` degrees.
-- Eq. 1, 2, 7, 8 are read as recursions: `V = alpha (V + a dt) + (1 - alpha) V_gps`. By default they
-  blend once at each fix and run on inertial data between fixes; blending at every sample against
-  the held fix, as printed, drags the track back to the last fix.
-- Eq. 1, 2: the acceleration is the specific force turned into NED, gravity added; body axes cannot
-  be integrated.
-- Eq. 1, 2, 7, 8: a fix is old when it arrives. What the inertial sensors saw since it was valid is
-  added to its velocity, and its place moves on by both.
-- Eq. 3 to 6: the receiver's own course over ground takes the place of the bearing between two
-  fixes, which is used where a receiver tells no velocity.
-- The vertical axis, which the paper leaves out, is blended by the same equations.
-- The gyroscope is integrated as a quaternion, so that the angles are only blended, not integrated:
-  Euler rates are singular at +-90 deg of pitch.
-- The gyroscope's high-pass acts at rest only: what the gyroscope shows there is its bias. One that
-  acts always takes the steady rate of a long turn for bias too, and the attitude with it; so that
-  of the filter chain is off unless it is asked for.
-- The gyroscope's weights, of which the paper tells nothing, give 33 s in tilt and 10 s in yaw. In a
-  turn of rate w at bank b the accelerometer says level, and pulls the tilt off by b / (w T): 3 deg
-  at a bank of 30 deg and 20 m/s. A gyroscope that is 0.1 deg/s off makes as much. The compass errs
-  by the tilt that levels it times the tangent of the dip, so yaw has to be slow as well.
+  velocity drives latitude; a metre east is `180 / (pi r_e cos(lat))` degrees. They are recursions:
+  `V = alpha (V + a dt) + (1 - alpha) V_gps`. By default they blend once at each fix; blending at
+  every sample against the held fix, as printed, drags the track back to the last fix.
+- Eq. 1, 2: the acceleration is the specific force rotated to NED, gravity added.
+- Eq. 3 to 6: the receiver's velocity replaces the bearing between two fixes, which is used where
+  there is none. A fix is moved on over its latency by its velocity and by the acceleration since.
+  The vertical axis, which the paper leaves out, is blended by the same equations.
+- The gyroscope is integrated as a quaternion; Euler angles are only blended.
+- A rate that is constant at rest is subtracted as bias. The high-pass of the rate would also remove
+  the steady rate of a turn, so it is off unless it is set.
 
 References
 ----------
@@ -32,35 +22,29 @@ References
 """
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
-import numpy as np
 
-from gateway.compiled import address_of
-from gateway.estimation.kernel_record import (
-    FloatArray,
-    IntArray,
-    Packed,
-    copy_record,
-    filled_record,
-    new_record,
-    pack_record,
-    unpack_record,
-)
-from gateway.estimation.paper import paper_kernels as kernels
-from gateway.estimation.paper.paper_entry import MOTION_COLUMNS, step_live
-from gateway.estimation.paper.paper_kernels import is_finite
+from gateway.estimation.columns import FRESH_GPS_S
+from gateway.estimation.paper.filters import Kind, VectorFilter, design_highpass, design_lowpass
 from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
-from gateway.estimation.rest import RestGains, RestSettings, rest_gains
-from gateway.geometry.geodesy import displacement_m
-from gateway.geometry.quaternion import IDENTITY
+from gateway.geometry.angle import wrap_180, wrap_pi
+from gateway.geometry.geodesy import displacement_m, offset_deg
+from gateway.geometry.quaternion import (
+    IDENTITY,
+    from_euler,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    to_euler,
+)
 from gateway.records import (
     UNKNOWN_VEC3,
     BaroSample,
     GpsFix,
+    ImuFlags,
     ImuSample,
     NavFlags,
     NavState,
@@ -68,12 +52,51 @@ from gateway.records import (
     Vec3,
 )
 from gateway.settings import Settings, setting
-from gateway.units import DEG_PER_DEGE7, US_PER_S
+from gateway.units import DEG_PER_DEGE7, STANDARD_GRAVITY_MPS2, US_PER_S
+
+GAP_S: Final = 2.5
+"""A longer interval of the IMU is not integrated."""
+GAIN_INTERVAL_S: Final = 0.01
+"""The attitude weights hold for this interval; other intervals take the matching power."""
+POSITION_HOLD_S: Final = 30.0
+"""Dead reckoning for longer is no position any more."""
+MOST_GAINS: Final = 2000
+"""Samples of the longest latency at 1000 a second."""
+STALE_MAG_S: Final = 2.0
+"""A compass without readings for longer is not in use."""
+MIN_COS_PITCH: Final = 0.05
+"""Near the vertical the accelerometer does not give the roll."""
+LIMITS: Final = (500.0, 50.0)
+"""Largest force in m/s2 and rate in rad/s that a sensor of this kind can measure."""
+REST: Final = (0.035, 0.5, 0.1, 0.7)
+"""At rest rate and force are this close to their means, rad/s and m/s2; the mean rate is no larger,
+rad/s, nor the GPS speed, m/s."""
+REST_S: Final = 1.5
+"""Rest begins after this time; the means and the bias follow with it as time constant."""
+RATE_CHANGE: Final = 0.1
+"""The filters are redesigned when the sample rate changes by this share."""
 
 
 class PaperSettings(Settings, frozen=True):
-    """Weights of the paper's three complementary filters."""
+    """Filters and weights of the paper's method."""
 
+    accel_filter: Annotated[
+        Kind, setting("Second-order low-pass of the acceleration: butterworth or chebyshev.")
+    ] = "butterworth"
+    accel_cutoff_hz: Annotated[float, setting("Its cutoff.", "Hz", ge=0.1, le=500.0)] = 10.0
+    chebyshev_ripple_db: Annotated[
+        float, setting("Ripple of the Chebyshev filter's pass band.", "dB", ge=0.01, le=6.0)
+    ] = 1.0
+    gyro_highpass_hz: Annotated[
+        float,
+        setting(
+            "Cutoff of the rate's first-order high-pass; 0 for none. It also removes the steady "
+            "rate of a long turn.",
+            "Hz",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.0
     alpha_gyro: Annotated[
         float,
         setting(
@@ -86,12 +109,7 @@ class PaperSettings(Settings, frozen=True):
     ] = 0.9997
     alpha_yaw: Annotated[
         float,
-        setting(
-            "Weight of the gyroscope in yaw over 10 ms, against the magnetometer. Small swings "
-            "with the compass in turns, large drifts; time constant as above.",
-            ge=0.0,
-            le=1.0,
-        ),
+        setting("The same in yaw, against the magnetometer.", ge=0.0, le=1.0),
     ] = 0.999
     alpha_accel: Annotated[
         float,
@@ -117,280 +135,286 @@ class PaperSettings(Settings, frozen=True):
     ] = "at_fix"
 
 
-@dataclass(slots=True)
-class PaperState:
-    """What the estimator remembers, but for `paper_kernels.Memory`."""
+class PaperState(msgspec.Struct):
+    """All that the estimator keeps; times in microseconds on the gateway clock."""
 
     time_us: int | None = None
     q_nb: Quat = IDENTITY
     rate_b_radps: Vec3 = UNKNOWN_VEC3
+    rate_hz: float = 100.0
+    mean_step_s: float = 0.0
+    filters: tuple[list[float] | None, list[float] | None] = (None, None)
+    gyro_mean: Vec3 = (0.0, 0.0, 0.0)
+    accel_mean: Vec3 = (0.0, 0.0, 0.0)
+    rest_s: float = 0.0
+    bias_b: Vec3 = (0.0, 0.0, 0.0)
     mag_time_us: int | None = None
-    place: kernels.Place = UNKNOWN_VEC3
+    location: Vec3 = UNKNOWN_VEC3
+    """Latitude and longitude in deg, height in m."""
     vel_n_mps: Vec3 = UNKNOWN_VEC3
     fix_time_us: int | None = None
-    last_fix: kernels.Place = UNKNOWN_VEC3
-    """As it came."""
-    fix_place: kernels.Place = UNKNOWN_VEC3
-    """Carried forward by its latency, as is its velocity."""
+    fix_from: Vec3 = UNKNOWN_VEC3
+    """The last fix as it came."""
+    fix_location: Vec3 = UNKNOWN_VEC3
+    """The same moved on by its latency."""
     fix_vel_n_mps: Vec3 = UNKNOWN_VEC3
+    gains: list[tuple[int, Vec3]] = []
+    """Times of recent samples, and the integral of the acceleration there, m/s."""
 
 
 class PaperEstimator:
-    """The paper's fusion behind the estimators' common interface.
+    """The paper's fusion behind the interface of all estimators.
 
     Parameters
     ----------
     settings : PaperSettings
-        Weights.
+        Filters and weights.
     reference : ReferenceSettings
         GPS latency and declination.
-    rest : RestSettings
-        What is taken for rest.
     """
 
-    def __init__(
-        self,
-        settings: PaperSettings,
-        reference: ReferenceSettings,
-        rest: RestSettings,
-    ) -> None:
-        # Before a sample waits for it.
-        step_live.load()
-        self._settings = settings
-        self._reference = reference
-        self._rest = filled_record(RestGains, rest_gains(rest))
+    def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
+        self._settings, self._reference = settings, reference
         self._earth = EarthField(reference)
-        self._s = PaperState()
-        self._memory = new_record(kernels.Memory)
-        self._motion = np.zeros(MOTION_COLUMNS)
+        s = settings
+        self._lowpass = VectorFilter(
+            lambda hz: design_lowpass(s.accel_filter, s.accel_cutoff_hz, hz, s.chebyshev_ripple_db),
+            PaperState().rate_hz,
+        )
+        self._highpass = VectorFilter(
+            lambda hz: design_highpass(s.gyro_highpass_hz, hz), PaperState().rate_hz
+        )
+        self.reset()
 
     def reset(self) -> None:
-        """Forget everything but the settings."""
+        """Discard everything except the settings."""
         self._earth.reset()
-        self._s = PaperState()
-        self._memory = new_record(kernels.Memory)
+        self._use(PaperState())
 
-    @property
-    def state(self) -> tuple[PaperState, kernels.Memory]:
-        """A copy of all that is remembered but the declination; may be set back."""
-        return replace(self._s), copy_record(self._memory)
-
-    @state.setter
-    def state(self, state: tuple[PaperState, kernels.Memory]) -> None:
-        self._s, self._memory = replace(state[0]), copy_record(state[1])
+    def _use(self, state: PaperState) -> None:
+        self._s = state
+        self._lowpass.retune(state.rate_hz)
+        self._highpass.retune(state.rate_hz)
+        self._lowpass.state, self._highpass.state = state.filters
 
     def snapshot(self) -> bytes:
-        """Write down all that is remembered, the declination included."""
-        return msgspec.msgpack.encode((self._s, pack_record(self._memory), self._earth.state))
+        """Return the whole state."""
+        self._s.filters = (self._lowpass.state, self._highpass.state)
+        return msgspec.msgpack.encode((self._s, self._earth.state))
 
     def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot; raises ValueError if it is none of this estimator."""
-        kind = tuple[PaperState, Packed, EarthPlace | None]
-        self._s, packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._memory = unpack_record(kernels.Memory, packed)
+        """Continue from a snapshot; raises ValueError for another estimator's."""
+        kind = tuple[PaperState, EarthPlace | None]
+        state, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
+        self._use(state)
 
     def update_baro(self, sample: BaroSample) -> None:
         """Ignore the barometer: the paper does not use it."""
 
     def update_imu(self, sample: ImuSample) -> NavState:
-        """Advance by one IMU sample.
-
-        Parameters
-        ----------
-        sample : ImuSample
-            Its filtered values are used: the paper filters before it fuses.
-
-        Returns
-        -------
-        NavState
-            State at the newest time seen; standard deviations are NaN.
-        """
-        s = self._s
-        accel, gyro = sample.accel_lowpass_b_mps2, sample.gyro_highpass_b_radps
-        sound = is_finite(sample.accel_b_mps2) and is_finite(sample.gyro_b_radps)
-        sound = sound and kernels.is_sound(accel, gyro)
+        """Advance by one IMU sample; the standard deviations of the state are NaN."""
+        s, accel, gyro = self._s, sample.accel_b_mps2, sample.gyro_b_radps
+        sound = _is_below(accel, LIMITS[0]) and _is_below(gyro, LIMITS[1])
         if s.time_us is None:
             if not sound:
                 return self._nav(sample.time_us, sound)
-            s.time_us = sample.time_us
-            s.rate_b_radps, s.q_nb = gyro, kernels.level_start(self._memory, accel, gyro)
-        dt_us = sample.time_us - s.time_us
-        if abs(dt_us) > kernels.GAP_US:
-            if dt_us < 0:
-                # The clock began anew: the ages of fix and compass mean nothing any more.
+            s.time_us, s.gyro_mean, s.accel_mean = sample.time_us, gyro, accel
+            s.q_nb = from_euler(*_tilt(accel), 0.0)
+            s.rate_b_radps = gyro
+        dt_s = (sample.time_us - s.time_us) / US_PER_S
+        if abs(dt_s) > GAP_S:
+            if dt_s < 0.0:
                 s.fix_time_us = s.mag_time_us = None
-                self._memory.ring_count = 0
-            s.time_us, dt_us = sample.time_us, 0
-        if dt_us > 0:
+            self._lowpass.retune(s.rate_hz)
+            self._highpass.retune(s.rate_hz)
+            s.time_us, dt_s = sample.time_us, 0.0
+        if dt_s > 0.0:
             s.time_us = sample.time_us
             if sound:
-                self._advance(accel, gyro, dt_us / US_PER_S)
-        if sample.mag_b_ut is not None and dt_us >= 0 and kernels.is_field(sample.mag_b_ut):
-            self._update_yaw(sample.mag_b_ut)
+                self._advance(accel, gyro, sample.flags, dt_s)
+        mag = sample.mag_b_ut
+        if mag is not None and dt_s >= 0.0 and any(mag) and _is_below(mag, math.inf):
+            self._correct_yaw(mag)
         return self._nav(s.time_us, sound)
 
     def update_gps(self, fix: GpsFix) -> None:
-        """Take in one fix: eq. 1 to 8 at the fix.
-
-        Parameters
-        ----------
-        fix : GpsFix
-            Moved forward by its latency before it is blended.
-        """
+        """Blend one fix: eq. 1 to 8, moved on by its latency."""
         if not is_usable(fix, self._reference):
             return
         s = self._s
-        place, vel = self._read(fix)
-        place, vel = kernels.carry_forward(
-            self._memory,
-            place,
-            vel,
-            fix.time_us,
-            _known(s.time_us),
-            self._reference.gps_latency_s,
-        )
-        # They come from numpy's numbers, which a snapshot does not take.
-        s.fix_place = (float(place[0]), float(place[1]), float(place[2]))
-        s.fix_vel_n_mps = (float(vel[0]), float(vel[1]), float(vel[2]))
-        if not math.isfinite(s.place[0]):
-            s.place, s.vel_n_mps = s.fix_place, s.fix_vel_n_mps
+        alt_m = fix.alt_amsl_m if math.isfinite(fix.alt_amsl_m) else s.fix_from[2]
+        if not math.isfinite(alt_m):
+            alt_m = 0.0
+        location = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, alt_m)
+        self._earth.update(*location, fix.utc_us)
+        vel = fix.vel_n_mps
+        if not all(map(math.isfinite, vel)):
+            vel = self._bearing_velocity(location, fix.time_us)
+        s.fix_from, s.fix_time_us = location, fix.time_us
+        latency_s = self._reference.gps_latency_s
+        gained = self._gained_since(fix.time_us - round(latency_s * US_PER_S))
+        mean = (vel[0] + 0.5 * gained[0], vel[1] + 0.5 * gained[1], vel[2] + 0.5 * gained[2])
+        s.fix_location = _moved(location, mean, latency_s)
+        s.fix_vel_n_mps = (vel[0] + gained[0], vel[1] + gained[1], vel[2] + gained[2])
+        if not math.isfinite(s.location[0]):
+            s.location, s.vel_n_mps = s.fix_location, s.fix_vel_n_mps
         self._blend_fix()
 
-    def run(self, time_us: IntArray, samples: FloatArray, fixes: Iterable[GpsFix]) -> FloatArray:
-        """Fuse a whole log from the start; bit for bit what its samples give one at a time.
+    def _gained_since(self, time_us: int) -> Vec3:
+        """Return the change of velocity since a time, and discard what is older."""
+        gains = self._s.gains
+        while len(gains) > 1 and gains[1][0] <= time_us:
+            del gains[0]
+        return _difference(gains[-1][1], gains[0][1]) if gains else (0.0, 0.0, 0.0)
 
-        Parameters
-        ----------
-        time_us : ndarray of int, shape (n,)
-            Times of the IMU samples.
-        samples : ndarray, shape (n, paper_kernels.SAMPLE_COLUMNS)
-            See there.
-        fixes : iterable of GpsFix
-            In the order of their arrival.
-
-        Returns
-        -------
-        ndarray, shape (n, paper_kernels.OUT_COLUMNS)
-            One row an IMU sample. The estimator itself is reset.
-
-        Raises
-        ------
-        ValueError
-            If a time goes back: only a live clock begins anew.
-        """
-        self.reset()
-        declination_rad = self._earth.declination_rad
-        rows = []
-        for fix in fixes:
-            if is_usable(fix, self._reference):
-                place, vel = self._read(fix)
-                rows.append((fix.time_us, *place, *vel, self._earth.declination_rad))
-        self.reset()
-        table = np.array(rows, np.float64).reshape(-1, 1 + kernels.FIX_COLUMNS)
-        fix_time_us = np.array([row[0] for row in rows], np.int64)
-        if np.any(np.diff(time_us) < 0) or np.any(np.diff(fix_time_us) < 0):
-            raise ValueError("the times of a log must not go back")
-        gains, latency_s = self._settings, self._reference.gps_latency_s
-        return kernels.run(
-            (gains.alpha_gyro, gains.alpha_yaw, gains.alpha_accel, gains.beta_velocity, latency_s),
-            self._rest,
-            new_record(kernels.Memory),
-            gains.blend == "at_fix",
-            declination_rad,
-            time_us,
-            samples,
-            fix_time_us,
-            np.ascontiguousarray(table[:, 1:]),
-        )
-
-    def _read(self, fix: GpsFix) -> tuple[kernels.Place, Vec3]:
-        """Return the place and velocity of a fix, and keep it for the next one's bearing."""
+    def _bearing_velocity(self, location: Vec3, time_us: int) -> Vec3:
+        """Return speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
         s = self._s
-        # Without a height of its own a fix lies as high as the one before.
-        last_m = s.last_fix[2] if math.isfinite(s.last_fix[2]) else 0.0
-        alt_m = fix.alt_amsl_m if math.isfinite(fix.alt_amsl_m) else last_m
-        place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, alt_m)
-        self._earth.update(*place, fix.utc_us)
-        vel = fix.vel_n_mps
-        if not is_finite(vel):
-            dt_s = 0.0 if s.fix_time_us is None else (fix.time_us - s.fix_time_us) / US_PER_S
-            vel = _bearing_velocity(s.last_fix, place, dt_s)
-        s.last_fix, s.fix_time_us = place, fix.time_us
-        return place, vel
+        dt_s = 0.0 if s.fix_time_us is None else (time_us - s.fix_time_us) / US_PER_S
+        if not 0.0 < dt_s < POSITION_HOLD_S:
+            return (0.0, 0.0, 0.0)
+        north, east = displacement_m(*s.fix_from[:2], *location[:2], location[2])
+        return (north / dt_s, east / dt_s, (s.fix_from[2] - location[2]) / dt_s)
 
-    def _advance(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
-        s, now_us, motion = self._s, _known(self._s.time_us), self._motion
-        motion[:] = (*s.q_nb, *gyro, *s.place, *s.vel_n_mps, *accel, *s.fix_vel_n_mps)
-        step_live(
-            address_of(self._memory),
-            address_of(self._rest),
-            self._settings.alpha_gyro,
-            address_of(motion),
-            now_us - _known(s.fix_time_us),
-            now_us,
-            dt_s,
-        )
-        m = motion.tolist()
-        s.q_nb, s.rate_b_radps = (m[0], m[1], m[2], m[3]), (m[4], m[5], m[6])
-        s.place, s.vel_n_mps = (m[7], m[8], m[9]), (m[10], m[11], m[12])
+    def _advance(self, accel: Vec3, gyro: Vec3, flags: ImuFlags, dt_s: float) -> None:
+        """Filter a sample, then advance attitude, velocity and position."""
+        s = self._s
+        self._follow_rate(dt_s)
+        accel_lowpass = accel if flags & ImuFlags.ACCEL_FILTERED else self._lowpass.step(accel)
+        gyro_highpass = gyro if flags & ImuFlags.GYRO_FILTERED else self._highpass.step(gyro)
+        self._follow_rest(accel, gyro, dt_s)
+        rate = _difference(gyro_highpass, s.bias_b)
+        step = from_rotation_vector((rate[0] * dt_s, rate[1] * dt_s, rate[2] * dt_s))
+        s.q_nb, s.rate_b_radps = normalise(multiply(s.q_nb, step)), rate
+        roll, pitch = _tilt(accel_lowpass)
+        if math.cos(pitch) >= MIN_COS_PITCH:
+            weight = self._settings.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
+            own = to_euler(s.q_nb)
+            s.q_nb = from_euler(
+                _blend_angle(weight, own[0], roll), _blend_angle(weight, own[1], pitch), own[2]
+            )
+        a, v = rotate(s.q_nb, accel_lowpass), s.vel_n_mps
+        gain = (a[0] * dt_s, a[1] * dt_s, (a[2] + STANDARD_GRAVITY_MPS2) * dt_s)
+        s.vel_n_mps = (v[0] + gain[0], v[1] + gain[1], v[2] + gain[2])
+        last = s.gains[-1][1] if s.gains else (0.0, 0.0, 0.0)
+        total = (last[0] + gain[0], last[1] + gain[1], last[2] + gain[2])
+        s.gains.append((s.time_us or 0, total))
+        del s.gains[:-MOST_GAINS]
+        s.location = _moved(s.location, s.vel_n_mps, dt_s)
         if self._settings.blend == "every_sample":
             self._blend_fix()
 
-    def _update_yaw(self, mag_b_ut: Vec3) -> None:
+    def _follow_rate(self, dt_s: float) -> None:
+        """Measure the sample rate, and redesign the filters when it has changed."""
         s = self._s
-        s.q_nb = kernels.turn_to_compass(
-            s.q_nb,
-            mag_b_ut,
-            self._earth.declination_rad,
-            _known(s.time_us),
-            _known(s.mag_time_us),
-            self._settings.alpha_yaw,
+        s.mean_step_s += min(1.0, dt_s / REST_S) * (dt_s - s.mean_step_s)
+        rate_hz = 1.0 / s.mean_step_s if s.mean_step_s > 0.0 else s.rate_hz
+        if abs(rate_hz / s.rate_hz - 1.0) > RATE_CHANGE:
+            s.rate_hz = rate_hz
+            self._lowpass.retune(rate_hz)
+            self._highpass.retune(rate_hz)
+
+    def _follow_rest(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
+        """Measure the gyroscope bias at rest."""
+        s, share = self._s, min(1.0, dt_s / REST_S)
+        s.gyro_mean, s.accel_mean = _mix(share, s.gyro_mean, gyro), _mix(share, s.accel_mean, accel)
+        age_s = math.inf
+        if s.time_us is not None and s.fix_time_us is not None:
+            age_s = (s.time_us - s.fix_time_us) / US_PER_S
+        quiet = (
+            math.dist(gyro, s.gyro_mean) < REST[0]
+            and math.dist(accel, s.accel_mean) < REST[1]
+            and math.hypot(*s.gyro_mean) < REST[2]
+            and not (age_s < FRESH_GPS_S and math.hypot(*s.fix_vel_n_mps) > REST[3])
         )
+        s.rest_s = s.rest_s + dt_s if quiet else 0.0
+        if s.rest_s >= REST_S:
+            s.bias_b = _mix(share, s.bias_b, s.gyro_mean)
+
+    def _correct_yaw(self, mag_b_ut: Vec3) -> None:
+        """Blend yaw with the tilt-compensated compass: the second complementary filter."""
+        s = self._s
+        roll, pitch, yaw = to_euler(s.q_nb)
+        level = rotate(from_euler(roll, pitch, 0.0), mag_b_ut)
+        compass = math.atan2(-level[1], level[0])
+        if math.isfinite(self._earth.declination_rad):
+            compass += self._earth.declination_rad
+        weight = 0.0
+        if s.mag_time_us is not None and s.time_us is not None:
+            dt_s = max(s.time_us - s.mag_time_us, 0) / US_PER_S
+            weight = self._settings.alpha_yaw ** (dt_s / GAIN_INTERVAL_S)
+        s.q_nb = from_euler(roll, pitch, _blend_angle(weight, yaw, compass))
         s.mag_time_us = s.time_us
 
     def _blend_fix(self) -> None:
-        s = self._s
-        s.place, s.vel_n_mps = kernels.blend_fix(
-            self._settings.alpha_accel,
-            self._settings.beta_velocity,
-            s.place,
-            s.vel_n_mps,
-            s.fix_place,
-            s.fix_vel_n_mps,
+        """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
+        s, settings = self._s, self._settings
+        s.vel_n_mps = _mix(1.0 - settings.alpha_accel, s.vel_n_mps, s.fix_vel_n_mps)
+        # The longitude may wrap between the two.
+        fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
+        lat, lon, alt = _mix(
+            1.0 - settings.beta_velocity,
+            s.location,
+            (s.fix_location[0], fix_lon, s.fix_location[2]),
         )
+        s.location = (lat, wrap_180(lon), alt)
 
     def _nav(self, time_us: int, sound: bool) -> NavState:
         s = self._s
-        flags = kernels.flags_of(
-            time_us,
-            s.time_us is not None,
-            _known(s.mag_time_us),
-            self._earth.declination_rad,
-            _known(s.fix_time_us),
-            sound,
-        )
         return NavState(
             time_us=time_us,
             q_nb=s.q_nb,
             rate_b_radps=s.rate_b_radps,
-            lat_deg=s.place[0],
-            lon_deg=s.place[1],
-            alt_amsl_m=s.place[2],
+            lat_deg=s.location[0],
+            lon_deg=s.location[1],
+            alt_amsl_m=s.location[2],
             vel_n_mps=s.vel_n_mps,
             attitude_std_rad=UNKNOWN_VEC3,
             vel_std_mps=UNKNOWN_VEC3,
             pos_std_m=UNKNOWN_VEC3,
-            flags=NavFlags(flags),
+            flags=self._flags(time_us, sound),
         )
 
+    def _flags(self, time_us: int, sound: bool) -> NavFlags:
+        s = self._s
+        flags = NavFlags(0) if s.time_us is None else NavFlags.ATTITUDE_VALID
+        if s.mag_time_us is not None and time_us - s.mag_time_us < STALE_MAG_S * US_PER_S:
+            flags |= NavFlags.USING_MAG
+            if math.isfinite(self._earth.declination_rad):
+                flags |= NavFlags.HEADING_VALID
+        if s.fix_time_us is not None:
+            age_s = (time_us - s.fix_time_us) / US_PER_S
+            if age_s < POSITION_HOLD_S:
+                flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
+            fresh = age_s < FRESH_GPS_S
+            flags |= NavFlags.USING_GPS if fresh else NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
+        return flags if sound else flags | NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 
-def _known(time_us: int | None) -> int:
-    return kernels.NEVER if time_us is None else time_us
+
+def _is_below(v: Vec3, limit: float) -> bool:
+    return all(abs(x) < limit for x in v)
 
 
-def _bearing_velocity(old: kernels.Place, new: kernels.Place, dt_s: float) -> Vec3:
-    """Speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
-    if not 0.0 < dt_s < kernels.POSITION_HOLD_US / US_PER_S:
-        return (0.0, 0.0, 0.0)
-    north_m, east_m = displacement_m(*old[:2], *new)
-    return (north_m / dt_s, east_m / dt_s, (old[2] - new[2]) / dt_s)
+def _difference(a: Vec3, b: Vec3) -> Vec3:
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+def _mix(share: float, a: Vec3, b: Vec3) -> Vec3:
+    """Return a vector a share of the way from one to another; exact at 0 and 1."""
+    kept = 1.0 - share
+    return (kept * a[0] + share * b[0], kept * a[1] + share * b[1], kept * a[2] + share * b[2])
+
+
+def _blend_angle(weight: float, own: float, measured: float) -> float:
+    return measured + weight * wrap_pi(own - measured)
+
+
+def _tilt(accel: Vec3) -> tuple[float, float]:
+    """Return roll and pitch of a specific force that is gravity alone."""
+    return (math.atan2(-accel[1], -accel[2]), math.atan2(accel[0], math.hypot(*accel[1:])))
+
+
+def _moved(location: Vec3, vel: Vec3, dt_s: float) -> Vec3:
+    """Move latitude, longitude and height by a velocity."""
+    lat, lon = offset_deg(*location, vel[0] * dt_s, vel[1] * dt_s)
+    return (lat, lon, location[2] - vel[2] * dt_s)

@@ -20,7 +20,7 @@ LATENCY = "estimation.reference.gps_latency_s"
         ("alpha", ALPHA),
         ("beta", BETA),
         ("gps_latency_s", LATENCY),
-        ("sensing.accel_cutoff_hz", "sensing.accel_cutoff_hz"),
+        ("accel_cutoff_hz", "estimation.paper.accel_cutoff_hz"),
         ("reference.declination_deg", "estimation.reference.declination_deg"),
     ],
 )
@@ -48,7 +48,7 @@ def test_values_are_read(text: str, values: tuple[float, ...]) -> None:
 
 def test_names_are_values_too() -> None:
     axis = parse_axis("accel_filter", "butterworth, chebyshev")
-    assert axis == Axis("sensing.accel_filter", ("butterworth", "chebyshev"))
+    assert axis == Axis("estimation.paper.accel_filter", ("butterworth", "chebyshev"))
 
 
 @pytest.mark.parametrize("text", ["0:2:3", "a:b:c", "-0.1", "chebyshev"])
@@ -61,7 +61,7 @@ def test_a_value_lands_where_it_belongs() -> None:
     changed = with_value(FusionSettings(), ALPHA, 0.7)
     assert changed.estimation.paper.alpha_accel == 0.7
     assert changed.estimation.paper.beta_velocity == 0.1
-    assert changed.sensing == FusionSettings().sensing
+    assert changed.estimation.eskf == FusionSettings().estimation.eskf
 
 
 def test_a_grid_is_every_point() -> None:

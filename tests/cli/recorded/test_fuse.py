@@ -43,7 +43,7 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
 
 
 @pytest.mark.io
-@pytest.mark.parametrize("estimator", ["paper", "complementary", "eskf"])
+@pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: str) -> None:
     rows = run(log, "--estimator", estimator)
     assert len(rows) == 500
@@ -61,7 +61,7 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
 def test_a_recording_gives_its_own_states_also_from_its_middle(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    settings, state, rows = fly_from_the_middle("complementary", rng)
+    settings, state, rows = fly_from_the_middle("eskf", rng)
     path = tmp_path / "flight.csv"
     head = encode_head(header_for(settings, 1)) + encode_state(state)
     path.write_text(head + "".join(map(row_to_line, rows)))
@@ -83,7 +83,7 @@ def test_what_it_writes_is_a_table(log: Path) -> None:
 
 @pytest.mark.io
 def test_blank_before_anything_is_known(log: Path) -> None:
-    first = run(log, "--estimator", "complementary")[0]
+    first = run(log, "--estimator", "eskf")[0]
     assert first["nav_lat_deg"] == ""
     assert first["nav_q_w"] != ""
 
@@ -92,7 +92,7 @@ def test_blank_before_anything_is_known(log: Path) -> None:
 def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
-    last = run(log, "--estimator", "complementary", "--config", str(config))[-1]
+    last = run(log, "--estimator", "eskf", "--config", str(config))[-1]
     yaw = 2.0 * math.atan2(float(last["nav_q_z"]), float(last["nav_q_w"]))
     assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
 

@@ -9,7 +9,7 @@ import typer
 from gateway.aircraft import AircraftSettings
 from gateway.cli.support.loading import STORIES, Loading, load_flight
 from gateway.config import GatewaySettings
-from gateway.estimation.alignment.latency_of_log import GpsLatency
+from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
 from gateway.recordings import fuse as log_facts
 from gateway.recordings.columns import TableRow, row_to_line
@@ -46,7 +46,7 @@ def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
 def test_a_doubtful_latency_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(log_facts, "estimate_latency", lambda log: GpsLatency(0.9, 0.01))
+    monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01, 0.9))
     load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
     assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
 

@@ -57,7 +57,7 @@ def test_a_search_writes_its_best_too(recording: Path, tmp_path: Path) -> None:
 
 def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) -> None:
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
-    arguments = ["--vary", "estimator=paper,complementary", "--vary", "gps_latency_s=0.0,0.2"]
+    arguments = ["--vary", "estimator=paper,eskf", "--vary", "gps_latency_s=0.0,0.2"]
     arguments += ["-o", str(best), "--table", str(table), "--jobs", "1"]
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 0, result.output
@@ -78,7 +78,7 @@ def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: P
     result = CliRunner().invoke(app, [*base, *idle])
     assert result.exit_code == 2
     assert "vary another setting" in result.output
-    both = ["--vary", "estimator=paper,complementary"]
+    both = ["--vary", "estimator=paper,eskf"]
     assert "changes nothing" not in CliRunner().invoke(app, [*base, *both]).output
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from gateway.analysis.sources import ideal_calibration
 from gateway.geometry.quaternion import to_euler
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
-from gateway.sensing.chain import SensingSettings, SensorChain
+from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 
@@ -34,7 +34,7 @@ def simulated() -> SimulatedFlight:
 def records() -> tuple[Record, ...]:
     """Calibrate the samples as the sensors' drivers of an autopilot do."""
     flight = simulated()
-    chain = SensorChain(SensingSettings(), ideal_calibration(flight.errors))
+    chain = SensorChain(ideal_calibration(flight.errors))
     found: list[Record] = []
     for record in flight.records():
         if isinstance(record, BaroRaw | GpsFix):

@@ -273,12 +273,11 @@ def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
     settings = GatewaySettings()
     sections = {
         "vehicle": settings.vehicle,
-        "sensing": settings.sensing,
         "estimation": settings.estimation,
         "calibration": NodeCalibration(),
     }
     table = ParameterTable(sections)
-    assert {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "SENS_ACC_CUTOFF", "REF_GPS_LATENCY"} <= set(
+    assert {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "PAPER_ACC_CUTOFF", "REF_GPS_LATENCY"} <= set(
         table.index
     )
     for parameter in table.parameters:

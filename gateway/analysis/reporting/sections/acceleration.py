@@ -18,7 +18,7 @@ AXIS_NAMES: Final = "xyz"
 
 def acceleration(case: Case) -> Section:
     """Build the section; if the flight's rate is too low for the filters, only their design."""
-    sensing, rate_hz = case.fusion.sensing, case.flight.rate_hz
+    sensing, rate_hz = case.fusion.estimation.paper, case.flight.rate_hz
     cutoff = sensing.accel_cutoff_hz
     if cutoff >= 0.5 * rate_hz:
         return Section(
@@ -62,7 +62,7 @@ def acceleration(case: Case) -> Section:
 def _paper_table(case: Case) -> ReportTable:
     return ReportTable(
         "filters_paper",
-        compare(case.fusion.sensing, PAPER_RATE_HZ),
+        compare(case.fusion.estimation.paper, PAPER_RATE_HZ),
         f"At the paper's {PAPER_RATE_HZ:.0f} samples/s.",
     )
 
@@ -97,7 +97,9 @@ def _draw_excerpt(case: Case, axis: int, width_in: float) -> Figure:
     raw = flight.accel_b_mps2[part, axis]
     axes[0].plot(time, raw, color=style.MUTED, lw=0.7, alpha=0.6, label="raw")
     filtered = {
-        kind: apply(kind, case.fusion.sensing, flight.rate_hz, flight.accel_b_mps2)[part, axis]
+        kind: apply(kind, case.fusion.estimation.paper, flight.rate_hz, flight.accel_b_mps2)[
+            part, axis
+        ]
         for kind in KINDS
     }
     for kind, line in filtered.items():
@@ -116,12 +118,14 @@ def _draw_response(case: Case, width_in: float) -> Figure:
     rate_hz = case.flight.rate_hz
     figure, axes = style.panels(width_in, 1, 2.6, columns=3, share_x=True)
     for kind in KINDS:
-        found = response(kind, case.fusion.sensing, rate_hz)
+        found = response(kind, case.fusion.estimation.paper, rate_hz)
         lines = (found.gain_db, found.phase_deg, found.delay_ms)
         for panel, line in zip(axes, lines, strict=True):
             panel.semilogx(found.frequency_hz, line, color=COLOURS[kind], label=kind.capitalize())
     for panel, label in zip(axes, ("gain (dB)", "phase (deg)", "group delay (ms)"), strict=True):
-        panel.axvline(case.fusion.sensing.accel_cutoff_hz, color=style.MUTED, lw=0.8, ls=":")
+        panel.axvline(
+            case.fusion.estimation.paper.accel_cutoff_hz, color=style.MUTED, lw=0.8, ls=":"
+        )
         panel.set(xlabel="frequency (Hz)", ylabel=label)
     axes[0].set_ylim(bottom=-60.0)
     style.legend_above(axes[0], 2)

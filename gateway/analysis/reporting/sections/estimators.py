@@ -14,12 +14,12 @@ from gateway.analysis.metrics import errors_over_time, rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
 
-COLOURS: Final = {"paper": style.ORANGE, "complementary": style.BLUE, "eskf": style.PINK}
+COLOURS: Final = {"paper": style.ORANGE, "eskf": style.PINK}
 STORY: Final = (
     "Every estimator fused the same samples, and is compared with {}. `paper` is the paper's "
     "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
-    "flight and slowly pulls the horizon over. `complementary` and `eskf` let the GPS velocity "
-    "distinguish the manoeuvre from gravity."
+    "flight and slowly tilts the horizon. `eskf` uses the GPS velocity to distinguish the "
+    "manoeuvre from gravity."
 )
 SMOOTHED_STORY: Final = (
     " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "

@@ -21,8 +21,8 @@ def weights(case: Case) -> Section | None:
     """Build the section; None without GPS."""
     if case.frame is None:
         return None
-    thinned = blend_table(case.flight, case.fusion, case.sensed, INTERVAL_S)
-    full = blend_table(case.flight, case.fusion, case.sensed, 0.0)
+    thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
+    full = blend_table(case.flight, case.fusion, 0.0)
     if not (_is_judged(thinned) and _is_judged(full)):
         return None
     return Section(

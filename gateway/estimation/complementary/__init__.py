@@ -1,1 +1,0 @@
-"""The default estimator: a quaternion complementary filter with GPS and compass references."""

@@ -1,1 +1,0 @@
-"""Errors of attitude and sensors: a Kalman filter, and what tells it of them."""

@@ -1,0 +1,299 @@
+"""Late fixes: the integrals of the recent past, and measurements as of the time of validity.
+
+A fix is compared with the state at the time it was valid, `L` seconds ago, and its row carries that
+state's error to the present one:
+
+    vel_then = vel - att x S + R L accel_bias
+    pos_then = pos - L vel + att x (L S - D) - R L^2 / 2 accel_bias
+
+with `S` and `D` the first and second integral of the specific force over the lag. This equals
+fusing the fix in time, but for the process noise of the few tenths of a second between.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import GPS_H_ACC, GPS_SPEED_ACC, GPS_V_ACC
+from gateway.estimation.eskf.alignment import NOISE_MPS
+from gateway.estimation.eskf.magnetometer import STALE_MAG_S
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
+    GPS_ERROR,
+    INTEGRALS,
+    POS,
+    SLOTS,
+    VEL,
+    State,
+)
+from gateway.estimation.eskf.update import (
+    begin_row,
+    inject,
+    innovation_variance,
+    update_scalar,
+)
+from gateway.estimation.record import FloatArray, as_quat
+from gateway.geometry.quaternion import body_axes
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+SPACING_S: Final = 0.005
+"""Samples that come faster share a slot; between slots the integrals are interpolated."""
+NOISE_SHARE: Final = 0.2
+"""Share of a receiver's accuracy that is noise from fix to fix."""
+ERROR_SHARES: Final = (0.7, 0.7, 0.9)
+"""Share of it that is slow error, north, east (of a radial accuracy) and down."""
+SPEED_SHARES: Final = (0.4, 0.4, 0.8)
+"""Share of its speed accuracy that is noise of one axis."""
+SLOW_MPS: Final = 0.05
+SLOW_S: Final = 4.0
+"""Slow error of GPS velocities where the receiver reports none, and its correlation time."""
+POOR_MPS: Final = 0.5
+"""A reported accuracy beyond this is due to reflections, which affect all fixes of some seconds."""
+REFLECTION_S: Final = 10.0
+LEAST_S: Final = 0.05
+"""Fixes closer together count as that far apart."""
+LEAST_LAG_S: Final = 0.1
+"""Over less, a mean acceleration is mostly vibration."""
+VELOCITY_GATE_SQ: Final = 9.0
+GLITCH_GATE_SQ: Final = (9.0, 16.0)
+MOST_GLITCH: Final = (5.0, 30.0)
+GLITCH_S: Final = 10.0
+GLITCH_FADE_S: Final = 1.0
+LAG_S: Final = 0.2
+EXCESS_S: Final = 1.0
+"""Velocity noise beyond the assumed one lasts for this time: the receiver's own filter."""
+
+
+@compiled
+def remember(s: State) -> None:
+    """Store the present integrals."""
+    newest = (s.ring_count - 1) % SLOTS
+    if s.ring_count > 0 and s.time_s - s.ring[newest, 0] < SPACING_S:
+        return
+    slot = s.ring_count % SLOTS
+    s.ring[slot, 0] = s.time_s
+    for k in range(INTEGRALS):
+        s.ring[slot, 1 + k] = s.integrals[k]
+    s.ring_count += 1
+
+
+@compiled
+def look_back(s: State, time_s: float) -> float:
+    """Interpolate the integrals of a past time into `then`; return the time they hold for."""
+    count = s.ring_count
+    if time_s >= s.time_s or count == 0:
+        for k in range(INTEGRALS):
+            s.then[k] = s.integrals[k]
+        return float(s.time_s)
+    oldest = max(0, count - SLOTS)
+    low, high = oldest, count
+    while low < high:
+        middle = (low + high) // 2
+        if s.ring[middle % SLOTS, 0] <= time_s:
+            low = middle + 1
+        else:
+            high = middle
+    if low == oldest:
+        for k in range(INTEGRALS):
+            s.then[k] = s.ring[oldest % SLOTS, 1 + k]
+        return float(s.ring[oldest % SLOTS, 0])
+    before, after = (low - 1) % SLOTS, low % SLOTS
+    t0 = s.ring[before, 0]
+    t1 = s.time_s if low == count else s.ring[after, 0]
+    share = (time_s - t0) / (t1 - t0) if t1 > t0 else 0.0
+    for k in range(INTEGRALS):
+        end = s.integrals[k] if low == count else s.ring[after, 1 + k]
+        s.then[k] = s.ring[before, 1 + k] + share * (end - s.ring[before, 1 + k])
+    return time_s
+
+
+@compiled
+def past_state(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return position and velocity `lag` seconds ago, from the present ones and `then`."""
+    now, then = s.integrals, s.then
+    vel = (
+        s.vel_n[0] - (now[3] - then[3]),
+        s.vel_n[1] - (now[4] - then[4]),
+        s.vel_n[2] - (now[5] - then[5]),
+    )
+    pos = (
+        s.pos_n[0] - vel[0] * lag - (now[6] - then[6] - then[3] * lag),
+        s.pos_n[1] - vel[1] * lag - (now[7] - then[7] - then[4] * lag),
+        s.pos_n[2] - vel[2] * lag - (now[8] - then[8] - then[5] * lag),
+    )
+    return pos, vel
+
+
+@compiled
+def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return `S` and `D`: the specific force in NED integrated once and twice over the lag."""
+    now, then, g = s.integrals, s.then, STANDARD_GRAVITY_MPS2
+    once = (now[3] - then[3], now[4] - then[4], now[5] - then[5] - g * lag)
+    twice = (
+        now[6] - then[6] - then[3] * lag,
+        now[7] - then[7] - then[4] * lag,
+        now[8] - then[8] - then[5] * lag - 0.5 * g * lag * lag,
+    )
+    return once, twice
+
+
+@compiled
+def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
+    """Take the slow errors of a fix from the accuracies that the receiver reports."""
+    for k in range(3):
+        usual = p.gps_error_var if k < 2 else p.gps_height_error_var
+        accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+        s.gps_error_var[k] = reported_variance(usual, accuracy, ERROR_SHARES[k])
+        slow = reported_variance(SLOW_MPS * SLOW_MPS, row[GPS_SPEED_ACC], SPEED_SHARES[k])
+        s.pos_density[k] = 2.0 * SLOW_S * slow
+
+
+@compiled
+def reported_variance(variance: float, accuracy: float, share: float) -> float:
+    """Return the variance by a reported accuracy, or the usual one where there is none."""
+    return (share * accuracy) ** 2 if accuracy > 0.0 else variance
+
+
+@compiled
+def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: float) -> float:
+    """Return the noise of one coordinate of a fix, m2; its latency varies."""
+    usual = p.gps_position_var if k < 2 else p.gps_height_var
+    accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+    white = reported_variance(usual, accuracy, NOISE_SHARE)
+    late = p.gps_jitter_sq * s.vel_n[k] * s.vel_n[k]
+    return float((white + late) * max(1.0, p.gps_correlation_s / since_s))
+
+
+@compiled
+def velocity_variance(
+    s: State, p: Gains, row: FloatArray, accel_n: Vec3, k: int, since_s: float
+) -> float:
+    """Return the white noise with the long-term effect of one velocity's errors, m2/s2."""
+    accuracy = row[GPS_SPEED_ACC]
+    usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
+    white = reported_variance(usual, accuracy, SPEED_SHARES[k])
+    assumed = NOISE_MPS * NOISE_MPS
+    if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
+        # Without a compass the heading depends on these velocities alone.
+        white = max(white, assumed * s.fix_excess)
+    white *= max(1.0, p.gps_correlation_s / since_s)
+    if accuracy > POOR_MPS:
+        reflected = SPEED_SHARES[k] ** 2 * (accuracy * accuracy - POOR_MPS * POOR_MPS)
+        white += max(1.0, REFLECTION_S / since_s) * reflected
+    late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
+    level_sq = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
+    excess = (s.fix_excess - 1.0) * (assumed + p.gps_jitter_sq * level_sq)
+    return max(white + late, excess * max(1.0, EXCESS_S / since_s))
+
+
+@compiled
+def mean_acceleration(s: State, lag: float) -> Vec3:
+    """Return the mean acceleration over the lag, m/s2; `then` is overwritten."""
+    span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
+    if span <= 0.0:
+        return (0.0, 0.0, 0.0)
+    now, then = s.integrals, s.then
+    return ((now[3] - then[3]) / span, (now[4] - then[4]) / span, (now[5] - then[5]) / span)
+
+
+@compiled
+def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
+    """Write the row of one component of a late velocity."""
+    begin_row(s)
+    set_turned(s, k, (-once[0], -once[1], -once[2]))
+    s.h[VEL + k] = 1.0
+    set_accel_bias(s, k, lag)
+
+
+@compiled
+def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
+    """Write the row of one component of a late position, which has the slow GPS error."""
+    begin_row(s)
+    w = (lag * once[0] - twice[0], lag * once[1] - twice[1], lag * once[2] - twice[2])
+    set_turned(s, k, w)
+    s.h[VEL + k] = -lag
+    s.h[POS + k] = 1.0
+    s.h[GPS_ERROR + k] = 1.0
+    set_accel_bias(s, k, -0.5 * lag * lag)
+
+
+@compiled
+def set_turned(s: State, k: int, w: Vec3) -> None:
+    """Write how `(att x w)[k]` depends on the attitude error."""
+    a, b = (k + 1) % 3, (k + 2) % 3
+    s.h[ATT + a] = w[b]
+    s.h[ATT + b] = -w[a]
+
+
+@compiled
+def set_accel_bias(s: State, k: int, share: float) -> None:
+    """Write `share` times row `k` of `R_nb` for the accelerometer bias."""
+    x, y, z = body_axes(as_quat(s.q_nb))
+    s.h[ACCEL_BIAS] = share * x[k]
+    s.h[ACCEL_BIAS + 1] = share * y[k]
+    s.h[ACCEL_BIAS + 2] = share * z[k]
+
+
+@compiled
+def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> bool:
+    """Return whether a position is outside the gate, north or east."""
+    once, twice = lag_integrals(s, lag)
+    worst = 0.0
+    for k in range(2):
+        position_row(s, k, once, twice, lag)
+        total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
+        worst = max(worst, off[k] * off[k] / total)
+    return worst > p.gate_sq
+
+
+@compiled
+def note_glitch(s: State, k: int, off: float, variance: float, since_s: float) -> None:
+    """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
+
+    `k` is 0 for velocities and 1 for positions. Taken for errors that are new in each fix, a glitch
+    would win over sound inertial sensors. The variance that errs as much in the long run is that of
+    one error times the number of fixes that share it.
+    """
+    off = min(abs(off), MOST_GLITCH[k])
+    excess = off * off / GLITCH_GATE_SQ[k] - innovation_variance(s, variance)
+    s.glitch[k] = max(s.glitch[k], excess * max(1.0, GLITCH_S / since_s))
+
+
+@compiled
+def update_fix(
+    s: State, p: Gains, row: FloatArray, off_pos: Vec3, off_vel: Vec3, lag: float
+) -> None:
+    """Update by velocity and position of a fix; components that are not finite are left out."""
+    once, twice = lag_integrals(s, lag)
+    since_s = max(s.time_s - s.update_s, LEAST_S)
+    s.update_s = s.time_s
+    accel_n = mean_acceleration(s, lag)
+    faded = math.exp(-since_s / GLITCH_FADE_S)
+    s.glitch[0] *= faded
+    s.glitch[1] *= faded
+    accel_sq = accel_n[0] ** 2 + accel_n[1] ** 2 + accel_n[2] ** 2
+    s.glitch[2] = max(accel_sq, s.glitch[2] * math.exp(-since_s))
+    late_var = LAG_S * LAG_S * s.glitch[2]
+    # The whole fix is checked before any of it is used: a glitch affects all components.
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            note_glitch(s, 0, off_vel[k], variance + late_var, since_s)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s)
+            note_glitch(s, 1, off_pos[k], variance, since_s)
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            update_scalar(s, off_vel[k], variance + s.glitch[0], VELOCITY_GATE_SQ)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s) + s.glitch[1]
+            update_scalar(s, off_pos[k], variance, p.gate_sq)
+    inject(s)

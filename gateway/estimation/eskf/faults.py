@@ -1,0 +1,357 @@
+"""Faults of the inertial sensors, and gaps between their samples.
+
+| fault | detected by | remedy |
+| --- | --- | --- |
+| not finite, out of range, all zero | the value | replaced |
+| one sensor repeats its values while the other changes | `STUCK_S` | replaced |
+| a single sample far from those around it | six times the usual change | replaced |
+| both sensors repeat their values | five times the usual time | no sample: a gap |
+| a gap | time stamps | bridged from both of its ends, or the attitude is lost |
+
+A missing rate or force is the last sound one for `HOLD_S`, then no turn, and gravity alone.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.integrity import LOST_LEVEL_RAD, lose_attitude
+from gateway.estimation.eskf.magnetometer import begin_turn
+from gateway.estimation.eskf.predict import propagate, rate_of
+from gateway.estimation.eskf.rest import is_usual_bias
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import ATT, NEVER_S, POS, VEL, State
+from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
+from gateway.geometry.quaternion import (
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    rotate_inverse,
+)
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+GYRO_LIMIT_RADPS: Final = 40.0
+ACCEL_LIMIT_MPS2: Final = 400.0
+"""Beyond the largest ranges of such sensors: 2000 deg/s and 32 g."""
+START_SHARES: Final = (0.5, 2.0)
+"""The first force must be within these multiples of gravity to give a level."""
+STUCK_S: Final = 1.0
+HOLD_S: Final = 0.2
+USUAL_S: Final = 0.5
+"""Time constant of the usual change from sample to sample."""
+TIMES_USUAL: Final = 6.0
+FASTEST: Final = ((2.0, 200.0), (10.0, 1000.0))
+"""Step and slope of an agile multirotor or a blow: rad/s and rad/s2, m/s2 and m/s3."""
+TIMES_USUAL_HOLD: Final = 5.0
+USUAL_HOLD_S: Final = 5.0
+"""Time constant of the usual time that both sensors repeat a sample."""
+UNKNOWN_HOLD_S: Final = 60.0
+"""Its initial value: a log may hold each sample until the next."""
+
+GAP_S: Final = 0.5
+GAP_STEPS: Final = 2.5
+"""A longer interval, also in usual intervals, is a gap; below that samples are interpolated."""
+LOST_STEPS: Final = 1.5
+"""Samples further apart than this multiple of the usual interval had others in between."""
+SLOWEST_STEP_S: Final = 2.0
+"""Longest interval that a first sample may show to be usual: half that of the slowest logs."""
+STEP_SHARE: Final = 0.01
+"""Share of the newest interval in the usual one: an average over a hundred samples."""
+LONGEST_GAP_S: Final = 60.0
+"""Capped: a longer gap adds no information and would destabilise the covariance."""
+STEADY_S: Final = 1.0
+"""Motion that began and ended in a longer gap is not visible at its ends."""
+RATE_TAU_S: Final = 0.3
+"""Correlation time of the angular rate, between a hand's and that of a fixed wing."""
+TURNING_S: Final = 5.0
+"""Time constant of the mean square of the rate."""
+UNSEEN_MPS2: Final = 3.0
+"""Standard deviation of the acceleration in a gap."""
+WANDER_RADPS: Final = 0.05
+HAND_WANDER_RADPS: Final = 0.3
+"""Change of the rate in a long gap, with GPS, and without: a hand moves more than an aircraft."""
+REST_WANDER_RADPS: Final = 0.02
+"""The same of a rest that may have been disturbed."""
+AIDED_LOST_RAD: Final = 0.75
+"""With GPS velocities an attitude with a larger standard deviation is lost in a gap."""
+
+
+@compiled
+def is_sound(v: Vec3, limit: float) -> bool:
+    """Return whether a vector is finite and within a limit."""
+    return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
+
+
+@compiled
+def is_zero_sample(gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether a sample is all zeros, as of a sensor that has just been reset."""
+    return not (gyro[0] or gyro[1] or gyro[2] or accel[0] or accel[1] or accel[2])
+
+
+@compiled
+def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether the filter may start with a sample, and set the fault if not."""
+    force = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2) / STANDARD_GRAVITY_MPS2
+    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
+    return s.fault == 0
+
+
+@compiled
+def change_of(v: Vec3, values: FloatArray, first: int) -> float:
+    """Return the length of a vector minus three numbers of an array."""
+    x, y, z = v[0] - values[first], v[1] - values[first + 1], v[2] - values[first + 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def is_repeated(s: State, gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether both sensors repeat the last sample."""
+    return change_of(gyro, s.imu_last, 0) == 0.0 and change_of(accel, s.imu_last, 3) == 0.0
+
+
+@compiled
+def is_hanging(s: State, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bool:
+    """Return whether both sensors have repeated a sample for too long.
+
+    A live sensor does not repeat six numbers, but a log may hold samples, and an input without
+    noise is constant at rest.
+    """
+    if is_repeated(s, gyro, accel):
+        s.hold_s[0] += dt
+        at_rest = is_usual_bias(s, gyro) and not moving
+        most_s = max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1])
+        return bool(s.hold_s[0] > most_s and not at_rest)
+    held_s = s.hold_s[0] + dt
+    if s.hold_s[0] <= max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1]):
+        s.hold_s[1] += held_s / (USUAL_HOLD_S + held_s) * (held_s - s.hold_s[1])
+    s.hold_s[0] = 0.0
+    return False
+
+
+@compiled
+def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: float) -> int:
+    """Check the gyroscope (`k` = 0) or the accelerometer (1).
+
+    Returns 0 for a sound value, 1 for a single odd one, and 2 for a fault.
+    """
+    first = 3 * k
+    from_last, from_held = change_of(v, s.imu_last, first), change_of(v, s.imu_held, first)
+    same = from_last == 0.0
+    s.stuck_s[k] = s.stuck_s[k] + dt if same and not other_same else 0.0
+    # A change that is real is there in the next sample too.
+    change = min(from_last, from_held)
+    most = FASTEST[k][0] + FASTEST[k][1] * dt + TIMES_USUAL * s.imu_usual[k]
+    if math.isfinite(change):
+        s.imu_usual[k] += dt / (USUAL_S + dt) * (min(change, most) - s.imu_usual[k])
+    if not is_sound(v, limit) or s.stuck_s[k] >= STUCK_S:
+        return 2
+    return 1 if change > most else 0
+
+
+@compiled
+def check_sensors(
+    s: State, gyro: Vec3, accel: Vec3, clipped: float, dt: float
+) -> tuple[bool, bool]:
+    """Return whether gyroscope and accelerometer can be used, and set the fault."""
+    same_gyro = change_of(gyro, s.imu_last, 0) == 0.0
+    same_accel = change_of(accel, s.imu_last, 3) == 0.0
+    turned = check_sensor(s, 0, gyro, GYRO_LIMIT_RADPS, same_accel, dt)
+    pulled = check_sensor(s, 1, accel, ACCEL_LIMIT_MPS2, same_gyro, dt)
+    s.fault = 1 if turned == 2 or pulled == 2 or clipped != 0.0 else 0
+    s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
+    # A bus error changes both sensors; a blow changes the force alone.
+    odd = turned == 1 or is_zero_sample(gyro, accel)
+    good_gyro, good_accel = turned == 0 and not odd, pulled == 0 and not odd
+    for k in range(3):
+        s.imu_last[k], s.imu_last[3 + k] = gyro[k], accel[k]
+        if good_gyro:
+            s.imu_held[k] = gyro[k]
+        if good_accel:
+            s.imu_held[3 + k] = accel[k]
+    s.missing_s[0] = 0.0 if good_gyro else s.missing_s[0] + dt
+    s.missing_s[1] = 0.0 if good_accel else s.missing_s[1] + dt
+    return good_gyro, good_accel
+
+
+@compiled
+def held_gyro(s: State) -> Vec3:
+    """Return the last sound rate, rad/s."""
+    return (s.imu_held[0], s.imu_held[1], s.imu_held[2])
+
+
+@compiled
+def held_accel(s: State) -> Vec3:
+    """Return the last sound force, m/s2."""
+    return (s.imu_held[3], s.imu_held[4], s.imu_held[5])
+
+
+@compiled
+def substitute_gyro(s: State) -> Vec3:
+    """Return the rate for a sample without a sound one."""
+    return held_gyro(s) if s.missing_s[0] < HOLD_S else as_vec(s.gyro_bias_b)
+
+
+@compiled
+def substitute_accel(s: State) -> Vec3:
+    """Return the force for a sample without a sound one."""
+    if s.missing_s[1] < HOLD_S:
+        return held_accel(s)
+    f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
+    b = s.accel_bias_b
+    return (f[0] + b[0], f[1] + b[1], f[2] + b[2])
+
+
+@compiled
+def add_clipping_noise(s: State, dt: float) -> None:
+    """Add noise for a sensor at the end of its range: as much as it reads may be cut off."""
+    gyro, accel = held_gyro(s), held_accel(s)
+    for k in range(3):
+        s.pending_noise[0] += (dt * gyro[k]) ** 2
+        s.pending_noise[1] += (dt * accel[k]) ** 2
+
+
+@compiled
+def gap_limit_s(s: State) -> float:
+    """Return the longest interval that is no gap."""
+    return max(GAP_S, GAP_STEPS * s.usual_step_s)
+
+
+@compiled
+def end_share_s(unseen_s: float) -> float:
+    """Return the time for which either end of a gap counts: `tau tanh(T / 2 tau)`."""
+    return RATE_TAU_S * math.tanh(0.5 * unseen_s / RATE_TAU_S)
+
+
+@compiled
+def unseen_turn_var(s: State, before: Vec3, after: Vec3, steady: Vec3, unseen_s: float) -> float:
+    """Return the variance of an angle that was not measured between two samples, rad2.
+
+    The rate is an Ornstein-Uhlenbeck process about a steady turn, with the variance of the recent
+    motion: its integral given both ends has the variance `2 tau (T - 2 tau tanh(T / 2 tau))` times
+    that.
+    """
+    ends_sq = 0.0
+    for k in range(3):
+        ends_sq += 0.5 * ((before[k] - steady[k]) ** 2 + (after[k] - steady[k]) ** 2)
+    spread = 2.0 * RATE_TAU_S * (unseen_s - 2.0 * end_share_s(unseen_s))
+    return float(max(s.imu_usual[2], ends_sq) * spread)
+
+
+@compiled
+def follow_step(s: State, gyro: Vec3, dt: float) -> None:
+    """Follow the usual interval, and the mean square of the rate."""
+    if s.usual_step_s == 0.0:
+        s.usual_step_s = min(dt, SLOWEST_STEP_S)
+    s.usual_step_s += STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
+    mean_sq = (gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2) / 3.0
+    s.imu_usual[2] += min(dt / TURNING_S, 1.0) * (mean_sq - s.imu_usual[2])
+
+
+@compiled
+def interpolate(
+    s: State, before: FloatArray, gyro: Vec3, accel: Vec3, dt: float
+) -> tuple[Vec3, Vec3]:
+    """Return the mean rate and force of an interval, and add noise where samples were lost.
+
+    A sample contains the usual interval before it; both change evenly over what is missing.
+    """
+    unseen_s = dt - s.usual_step_s
+    if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
+        return gyro, accel
+    gyro_before, accel_before = as_vec(before[0:3]), as_vec(before[3:6])
+    turned = unseen_turn_var(s, gyro_before, gyro, as_vec(s.gyro_bias_b), unseen_s)
+    s.pending_noise[0] += turned
+    moved = UNSEEN_MPS2**2 * unseen_s * min(unseen_s, RATE_TAU_S)
+    force_sq = accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2
+    s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * force_sq
+    share = 0.5 * unseen_s / dt
+    return part_way(gyro, gyro_before, share), part_way(accel, accel_before, share)
+
+
+@compiled
+def part_way(a: Vec3, b: Vec3, share: float) -> Vec3:
+    """Return the vector a share of the way from one to another."""
+    return (
+        a[0] + share * (b[0] - a[0]),
+        a[1] + share * (b[1] - a[1]),
+        a[2] + share * (b[2] - a[2]),
+    )
+
+
+@compiled
+def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Continue after a gap of `dt`: with the steady turn before it and the rates at both ends."""
+    propagate(s, p)
+    dt = min(dt, LONGEST_GAP_S)
+    rested = s.at_rest == 1
+    close_gap(s)
+    if rested and is_still(s, p, gyro, accel):
+        add_gap_variance(s, (REST_WANDER_RADPS * dt) ** 2, 0.0)
+        return
+    if rested and dt > STEADY_S:
+        lose_attitude(s, p)
+        return
+    before, bias = held_gyro(s), as_vec(s.gyro_bias_b)
+    mean = (s.imu_mean[0] - bias[0], s.imu_mean[1] - bias[1], s.imu_mean[2] - bias[2])
+    down_b = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
+    about = down_b[0] * mean[0] + down_b[1] * mean[1] + down_b[2] * mean[2]
+    steady = (
+        bias[0] + about * down_b[0],
+        bias[1] + about * down_b[1],
+        bias[2] + about * down_b[2],
+    )
+    share = 2.0 * end_share_s(dt) / dt
+    rate = rate_of(s, part_way(steady, part_way(before, gyro, 0.5), share))
+    turning = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+    wander = (WANDER_RADPS if s.aided == 1 else HAND_WANDER_RADPS) + turning
+    turned_var = unseen_turn_var(s, before, gyro, steady, dt)
+    turned_var += (wander * max(dt - STEADY_S, 0.0)) ** 2
+    turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
+    write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
+    write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
+    if s.aided == 1:
+        # Fixes in the gap have moved position and velocity already.
+        flown_s = min(s.time_s - s.fix_s, dt)
+        half = 0.5 * about * flown_s
+        write_vec(s.vel_n, rotate((math.cos(half), 0.0, 0.0, math.sin(half)), as_vec(s.vel_n)))
+        for k in range(3):
+            s.pos_n[k] += s.vel_n[k] * flown_s
+        add_gap_variance(s, turned_var, flown_s)
+    else:
+        add_gap_variance(s, turned_var, 0.0)
+    most = AIDED_LOST_RAD if s.aided == 1 else LOST_LEVEL_RAD
+    if s.lost == 0 and turned_var > most * most:
+        lose_attitude(s, p)
+
+
+@compiled
+def is_still(s: State, p: Gains, gyro: Vec3, accel: Vec3) -> bool:
+    """Return whether a sample is close to the means of a rest."""
+    return bool(
+        change_of(gyro, s.imu_mean, 0) < 2.0 * p.rest_gyro_radps
+        and change_of(accel, s.imu_mean, 3) < p.rest_accel_mps2
+    )
+
+
+@compiled
+def add_gap_variance(s: State, turned_var: float, flown_s: float) -> None:
+    """Inflate the variances of attitude, velocity and position after a gap."""
+    for k in range(3):
+        s.P[ATT + k, ATT + k] += turned_var
+        s.P[VEL + k, VEL + k] += (UNSEEN_MPS2 * flown_s) ** 2
+        s.P[POS + k, POS + k] += (0.5 * UNSEEN_MPS2 * flown_s * flown_s) ** 2
+        for first in (ATT, VEL, POS):
+            s.resets[first + k] += 1.0
+
+
+@compiled
+def close_gap(s: State) -> None:
+    """Discard everything that needs an unbroken IMU."""
+    s.ring_count = 0
+    s.pair_s = NEVER_S
+    s.sound_s = s.rest_s = 0.0
+    s.at_rest = 0
+    begin_turn(s, (0.0, 0.0, 0.0))

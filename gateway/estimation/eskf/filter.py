@@ -1,0 +1,368 @@
+"""The filter sample by sample, and its entry points for compiled code.
+
+One IMU sample passes: clock, gap and fault checks, prediction, rest, the measurements that stand in
+for GPS, and the compass. Barometer samples and fixes arrive between IMU samples.
+"""
+
+from typing import Final
+
+import numpy as np
+
+from gateway.compiled import array_at, compiled, record_at
+from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.columns import (
+    ACCEL_UNCALIBRATED,
+    BARO_STALE_S,
+    CLIPPED,
+    GPS_COLUMNS,
+    GYRO_UNCALIBRATED,
+    IMU_COLUMNS,
+    MAG_UNCALIBRATED,
+    NAV_COLUMNS,
+    imu_vectors,
+)
+from gateway.estimation.eskf.delayed import remember
+from gateway.estimation.eskf.faults import (
+    ACCEL_LIMIT_MPS2,
+    GAP_S,
+    GYRO_LIMIT_RADPS,
+    UNKNOWN_HOLD_S,
+    add_clipping_noise,
+    bridge_gap,
+    check_sensors,
+    close_gap,
+    follow_step,
+    gap_limit_s,
+    interpolate,
+    is_hanging,
+    is_sound,
+    is_start,
+    is_zero_sample,
+    substitute_accel,
+    substitute_gyro,
+)
+from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.integrity import (
+    accel_bias_var,
+    discard_calibration,
+    gyro_bias_var,
+    lose_attitude,
+    reset_accel_bias,
+    reset_gyro_bias,
+    watch_gravity,
+)
+from gateway.estimation.eskf.latency import begin_latency, clear_velocities
+from gateway.estimation.eskf.magnetometer import (
+    hard_iron_var,
+    is_sound_field,
+    reset_hard_iron,
+    take_mag,
+)
+from gateway.estimation.eskf.measurements import (
+    LEVEL_INTERVAL_S,
+    restart_baro,
+    update_height,
+    update_rest,
+)
+from gateway.estimation.eskf.output import write_output
+from gateway.estimation.eskf.predict import COVARIANCE_S, integrate, propagate
+from gateway.estimation.eskf.rest import begin_means, detect_rest, is_moving
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    GPS_ERROR,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    HARD_IRON,
+    MAG_LATENCY,
+    NEVER_S,
+    VEL,
+    State,
+)
+from gateway.estimation.eskf.update import reset_state
+from gateway.estimation.eskf.vibration import add_vibration
+from gateway.estimation.record import FloatArray, layout, write_quat, write_vec
+from gateway.records import NAN, Vec3
+
+UNAIDED_SCALE: Final = 0.01
+"""Gyroscope scale error before the first fix, a third of an MPU6050's tolerance."""
+
+STATE_LAYOUT: Final = layout(State)
+GAINS_LAYOUT: Final = layout(Gains)
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
+FLOAT_SIZE: Final = FLOAT.itemsize
+
+
+@compiled
+def start(s: State, p: Gains) -> None:
+    """Initialise a state of zeros."""
+    write_quat(s.q_nb, (1.0, 0.0, 0.0, 0.0))
+    write_quat(s.q_ib, (1.0, 0.0, 0.0, 0.0))
+    for k in range(3):
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] = gyro_bias_var(s, p)
+        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] = accel_bias_var(s, p)
+        s.P[HARD_IRON + k, HARD_IRON + k] = hard_iron_var(s, p)
+        s.P[GYRO_SCALE + k, GYRO_SCALE + k] = UNAIDED_SCALE * UNAIDED_SCALE
+        s.gps_error_var[k] = p.gps_error_var if k < 2 else p.gps_height_error_var
+        s.P[GPS_ERROR + k, GPS_ERROR + k] = s.gps_error_var[k]
+        s.rate_b[k] = NAN
+    s.mag_latency_s = p.mag_latency_s
+    s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_late_sq
+    s.earth_field[0] = p.declination_rad
+    s.earth_field[1] = NAN
+    s.fix_excess = 1.0
+    begin_latency(s, p.gps_latency_s)
+    clear_times(s)
+
+
+@compiled
+def clear_times(s: State) -> None:
+    """Discard everything that depends on the clock."""
+    s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
+    s.baro_s = s.reject_last[0] = s.track_from[0] = s.zero_from[0] = NEVER_S
+    s.reject_s, s.zero_false = 0.0, 0
+    clear_velocities(s)
+    close_gap(s)
+
+
+@compiled
+def take_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
+    """Advance by one IMU sample; see `columns` for its row.
+
+    A late sample is left out; a clock that went far back is a new clock.
+    """
+    gyro, accel, mag = imu_vectors(row)
+    note_calibration(s, p, row)
+    if s.started == 0:
+        begin(s, p, time_us, gyro, accel)
+        return
+    dt = (time_us - s.time_us) * 1e-6
+    if dt <= 0.0:
+        s.fault = 1
+        if dt < -GAP_S:
+            restart_clock(s, time_us)
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    since_s = s.time_s - s.imu_s
+    if is_hanging(s, gyro, accel, is_moving(s, p), dt):
+        s.fault = 1
+    elif since_s > gap_limit_s(s):
+        end_gap(s, p, gyro, accel, row[CLIPPED], since_s)
+    else:
+        s.imu_s = s.time_s
+        advance(s, p, gyro, accel, mag, row[CLIPPED], since_s)
+
+
+@compiled
+def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
+    """Bridge a gap at the first sound sample after it."""
+    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    if not sound or is_zero_sample(gyro, accel):
+        s.fault = 1
+        return
+    bridge_gap(s, p, gyro, accel, since_s)
+    follow_step(s, gyro, since_s)
+    check_sensors(s, gyro, accel, clipped, since_s)
+    s.imu_s = s.time_s
+
+
+@compiled
+def advance(
+    s: State, p: Gains, gyro: Vec3, accel: Vec3, mag: Vec3, clipped: float, dt: float
+) -> None:
+    """Advance by one sample without a gap before it."""
+    if move(s, p, gyro, accel, clipped, dt):
+        detect_rest(s, p, gyro, accel, dt)
+    if s.pending_s >= COVARIANCE_S:
+        propagate(s, p)
+    level(s, p)
+    misplaced = s.mag_misplaced
+    if is_sound_field(s, mag, dt):
+        take_mag(s, p, mag)
+    elif s.mag_misplaced > misplaced:
+        # The heading so far, and what it has shown of the sensors, came from wrong axes.
+        discard_calibration(s, p)
+        lose_attitude(s, p)
+
+
+@compiled
+def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
+    """Start at the first sound sample; gravity gives the level within the first second."""
+    if not is_start(s, gyro, accel):
+        return
+    s.started, s.base_us, s.time_us, s.time_s, s.imu_s = 1, time_us, time_us, 0.0, 0.0
+    begin_means(s, gyro, accel)
+    for k in range(3):
+        s.imu_held[k], s.imu_held[3 + k] = gyro[k], accel[k]
+        s.force_lp_i[0, k] = s.force_lp_i[1, k] = accel[k]
+    write_vec(s.rate_b, gyro)
+    s.hold_s[1] = UNKNOWN_HOLD_S
+    lose_attitude(s, p)
+
+
+@compiled
+def restart_clock(s: State, time_us: int) -> None:
+    """Continue on a new clock after a gap of unknown length."""
+    s.base_us, s.time_us, s.time_s, s.imu_s = time_us, time_us, 0.0, 0.0
+    clear_times(s)
+    if s.aided == 1:
+        for k in range(3):
+            reset_state(s, VEL + k, 0.0)
+        s.aided = 0
+
+
+@compiled
+def note_calibration(s: State, p: Gains, row: FloatArray) -> None:
+    """Discard what was estimated of a sensor whose calibration has changed."""
+    bits = 1 if row[GYRO_UNCALIBRATED] != 0.0 else 0
+    bits |= 2 if row[ACCEL_UNCALIBRATED] != 0.0 else 0
+    bits |= 4 if row[MAG_UNCALIBRATED] != 0.0 else 0
+    changed = bits ^ s.uncalibrated
+    s.uncalibrated = bits
+    if changed & 1:
+        reset_gyro_bias(s, p)
+    if changed & 2:
+        reset_accel_bias(s, p)
+    if changed & 4:
+        reset_hard_iron(s, p)
+
+
+@compiled
+def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float) -> bool:
+    """Integrate one sample or its substitute; return whether both sensors were sound."""
+    sound_gyro, sound_accel = check_sensors(s, gyro, accel, clipped, dt)
+    sound = sound_gyro and sound_accel
+    if sound:
+        follow_step(s, gyro, dt)
+        mean_gyro, mean_accel = interpolate(s, s.imu_before, gyro, accel, dt)
+        add_vibration(s, p, gyro, accel, dt)
+        gyro, accel = mean_gyro, mean_accel
+    if not sound_gyro:
+        gyro = substitute_gyro(s)
+    if not sound_accel:
+        accel = substitute_accel(s)
+    integrate(s, p, gyro, accel, dt)
+    if clipped != 0.0:
+        add_clipping_noise(s, dt)
+    remember(s)
+    return sound
+
+
+@compiled
+def level(s: State, p: Gains) -> None:
+    """Use rest, and gravity where GPS does not give the velocity."""
+    since_s = s.time_s - s.level_s
+    if since_s < LEVEL_INTERVAL_S:
+        return
+    s.level_s = s.time_s
+    if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
+        end_dead_reckoning(s, p)
+    if s.aided == 0:
+        watch_gravity(s, p, min(since_s, 1.0))
+    if s.at_rest == 1:
+        update_rest(s, p)
+
+
+@compiled
+def end_dead_reckoning(s: State, p: Gains) -> None:
+    """Stop estimating position and velocity."""
+    propagate(s, p)
+    s.aided = 0
+    for k in range(3):
+        reset_state(s, VEL + k, 0.0)
+        s.vel_n[k] = 0.0
+
+
+@compiled
+def take_baro(s: State, p: Gains, alt_m: float) -> None:
+    """Use one pressure altitude, m, positive up."""
+    if s.started == 0 or not abs(alt_m) < HIGHEST_M:
+        return
+    s.baro_down_m = -alt_m
+    if s.has_height == 0:
+        s.pos_n[2] = -alt_m
+    elif s.time_s - s.baro_s > BARO_STALE_S:
+        restart_baro(s, p)
+    else:
+        update_height(s, p)
+    s.baro_s = s.time_s
+
+
+HIGHEST_M: Final = 30_000.0
+"""Largest pressure altitude of a sound barometer."""
+
+
+@compiled
+def row_at(matrix: int, row: int, columns: int) -> FloatArray:
+    """View a row of a matrix at an address."""
+    return array_at(matrix + row * columns * FLOAT_SIZE, (columns,), FLOAT)  # type: ignore[no-any-return]
+
+
+@EntryPoint
+def begin_state(state: int, gains: int) -> None:
+    """Initialise a state of zeros."""
+    start(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT))
+
+
+@EntryPoint
+def imu_steps(
+    state: int, gains: int, count: int, times_us: int, samples: int, outputs: int
+) -> None:
+    """Advance by IMU samples, and write a row after each."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    time_us = array_at(times_us, (count,), INT)
+    for i in range(count):
+        take_imu(s, p, time_us[i], row_at(samples, i, IMU_COLUMNS))
+        write_output(s, p, row_at(outputs, i, NAV_COLUMNS))
+
+
+@EntryPoint
+def baro_step(state: int, gains: int, alt_m: float) -> None:
+    """Use one barometer sample."""
+    take_baro(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT), alt_m)
+
+
+@EntryPoint
+def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
+    """Use one fix."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    take_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
+
+
+@EntryPoint
+def run(
+    state: int,
+    gains: int,
+    imu_count: int,
+    imu_times_us: int,
+    imu_rows: int,
+    baro_count: int,
+    baro_places: int,
+    baro_alts_m: int,
+    gps_count: int,
+    gps_places: int,
+    gps_times_us: int,
+    gps_rows: int,
+    outputs: int,
+) -> None:
+    """Advance over a log: at each IMU sample first the heights, then the fixes before it.
+
+    The places are the numbers of the IMU samples before which each height and fix arrived.
+    """
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
+    baro_before = array_at(baro_places, (baro_count,), INT)
+    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
+    gps_before = array_at(gps_places, (gps_count,), INT)
+    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    baros = fixes = 0
+    for i in range(imu_count):
+        while baros < baro_count and baro_before[baros] <= i:
+            take_baro(s, p, baro_alt_m[baros])
+            baros += 1
+        while fixes < gps_count and gps_before[fixes] <= i:
+            take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
+            fixes += 1
+        take_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))
+        write_output(s, p, row_at(outputs, i, NAV_COLUMNS))

@@ -1,0 +1,236 @@
+"""Integrity of the attitude: levelled by gravity, found from motion, and checked by it.
+
+| state | condition | next |
+| --- | --- | --- |
+| lost | without GPS: gravity gives the level | levelled |
+| lost | the pairs of GPS velocities give the level | levelled, or heading too |
+| levelled | a compass or the pairs give the heading | heading known |
+| any | the pairs, or gravity, contradict the attitude for some time | lost |
+| any | a gap or a bias step leaves the attitude unknown | lost |
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.alignment import (
+    MAX_PAIR_S,
+    MEMORY_S,
+    PAIR_S,
+    align,
+    clear_pairs,
+    heading_difference,
+    level_difference,
+)
+from gateway.estimation.eskf.magnetometer import reset_hard_iron, turn_heading
+from gateway.estimation.eskf.measurements import (
+    gravity_force_n,
+    gravity_variance,
+    sustained_sq,
+    update_gravity,
+)
+from gateway.estimation.eskf.predict import NO_HEADING_VAR, propagate
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    VEL,
+    State,
+)
+from gateway.estimation.eskf.update import level_variance, raise_variance, reset_state
+from gateway.estimation.record import as_quat, fill, write_quat
+from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+LOST_LEVEL_VAR: Final = 0.5**2
+"""Of an unknown level, rad2: about what a linear filter can still correct."""
+LOST_LEVEL_RAD: Final = 0.35
+"""An attitude with a larger standard deviation is lost."""
+FOUND_LEVEL_RAD: Final = 0.08
+FOUND_HEADING_RAD: Final = 0.3
+"""Alignments with smaller standard deviations are accepted: the filter is linear within them."""
+PATIENCE_S: Final = 8.0
+"""For each of these times that the attitude has been lost, a worse level is accepted."""
+ENOUGH_PAIRS: Final = MEMORY_S / PAIR_S
+"""The noise of GPS velocities follows the pairs of the whole alignment memory."""
+MISMATCH_SIGMA: Final = 4.0
+MISMATCH_LEVEL_RAD: Final = 0.14
+MISMATCH_HEADING_RAD: Final = 0.3
+MISMATCH_S: Final = 2.0
+"""The attitude is replaced when the alignment differs by both limits for this time."""
+GRAVITY_MISMATCH_RAD: Final = 0.6
+GRAVITY_MISMATCH_S: Final = 5.0
+"""The same without GPS, where manoeuvres imitate a tilt."""
+
+
+@compiled
+def lose_attitude(s: State, p: Gains) -> None:
+    """Discard the attitude; the position follows the fixes until another one is found."""
+    s.lost, s.lost_s, s.mismatch_s = 1, 0.0, 0.0
+    s.heading_known = 0
+    clear_pairs(s)
+    begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
+    # What the low-pass contains was rotated by an attitude that is discarded, or by none.
+    s.force_lp_s = 0.0
+
+
+@compiled
+def begin_attitude(s: State, p: Gains, level_var: float, heading_var: float) -> None:
+    """Reset the covariance of the attitude; position and velocity restart at the next fix."""
+    propagate(s, p)
+    reset_state(s, ATT, level_var)
+    reset_state(s, ATT + 1, level_var)
+    # While no heading is known, it is counted from where the filter began, which is certain.
+    reset_state(s, ATT + 2, heading_var if s.heading_known == 1 or s.lost == 1 else 0.0)
+    for k in range(3):
+        reset_state(s, VEL + k, 0.0)
+        s.vel_n[k] = 0.0
+    s.aided = 0
+    # The integrals in NED contain the old attitude.
+    s.ring_count = 0
+
+
+@compiled
+def watch_gravity(s: State, p: Gains, dt: float) -> None:
+    """Level by gravity while GPS velocities do not; `dt` is the time since the last call."""
+    if s.lost == 1:
+        if s.time_s - s.pair_s > MAX_PAIR_S and s.force_lp_s > dt:
+            find_level(s, p, dt)
+        return
+    north, east, down = gravity_force_n(s)
+    off = math.atan2(math.hypot(north, east), -down)
+    std = math.sqrt(level_variance(s) + gravity_variance(s, p) / STANDARD_GRAVITY_MPS2**2)
+    wrong = off > max(GRAVITY_MISMATCH_RAD, MISMATCH_SIGMA * std) and sustained_sq(s) == 0.0
+    s.mismatch_s = s.mismatch_s + dt if wrong else 0.0
+    if s.mismatch_s > GRAVITY_MISMATCH_S or level_variance(s) > LOST_LEVEL_RAD**2:
+        lose_attitude(s, p)
+        return
+    update_gravity(s, p, dt)
+
+
+@compiled
+def find_level(s: State, p: Gains, dt: float) -> None:
+    """Rotate the attitude until the filtered force is vertical, and accept it if certain."""
+    s.lost_s += dt
+    north, east, down = gravity_force_n(s)
+    level = math.hypot(north, east)
+    if level > 0.0:
+        angle = math.atan2(level, -down)
+        turn = from_rotation_vector((-angle * east / level, angle * north / level, 0.0))
+        write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
+    update_gravity(s, p, 2.0 * p.gravity_tau_s)
+    if level_variance(s) < 2.0 * (FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S)) ** 2:
+        s.lost = 0
+        reset_state(s, ATT + 2, 0.0)
+
+
+@compiled
+def review_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
+    """Compare the attitude with the alignment after a new pair of `dt` seconds."""
+    bias_var = 0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1])
+    noise = align(s, math.sqrt(bias_var))
+    if sound and noise > 0.0:
+        s.fix_excess += s.pairs / (s.pairs + ENOUGH_PAIRS) * (noise - s.fix_excess)
+    level, heading = s.aligned_std[0], s.aligned_std[1]
+    if s.lost == 1:
+        s.lost_s += dt
+        if level < FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S):
+            take_alignment(s, p)
+        return
+    s.mismatch_s = s.mismatch_s + dt if is_contradicted(s) else 0.0
+    if s.mismatch_s > MISMATCH_S:
+        if s.was_aided == 1:
+            discard_calibration(s, p)
+        take_alignment(s, p)
+    elif s.heading_known == 0 and level < FOUND_LEVEL_RAD and heading < FOUND_HEADING_RAD:
+        turn_heading(s, heading_difference(as_quat(s.aligned_q_nb), as_quat(s.q_nb)))
+        reset_state(s, ATT + 2, heading * heading)
+        s.heading_known = s.heading_true = 1
+
+
+@compiled
+def is_contradicted(s: State) -> bool:
+    """Return whether the alignment and the attitude cannot both be right."""
+    found, q_nb = as_quat(s.aligned_q_nb), as_quat(s.q_nb)
+    allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[0] ** 2 + level_variance(s))
+    if level_difference(found, q_nb) > max(MISMATCH_LEVEL_RAD, allowed):
+        return True
+    if s.heading_known == 0 or s.aligned_std[1] > FOUND_HEADING_RAD:
+        return False
+    allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[1] ** 2 + s.P[ATT + 2, ATT + 2])
+    return abs(heading_difference(found, q_nb)) > max(MISMATCH_HEADING_RAD, allowed)
+
+
+@compiled
+def take_alignment(s: State, p: Gains) -> None:
+    """Replace the attitude by the alignment's, the heading too where that is known."""
+    found = as_quat(s.aligned_q_nb)
+    heading_std = s.aligned_std[1]
+    s.lost, s.mismatch_s = 0, 0.0
+    s.heading_known = 1 if heading_std < FOUND_HEADING_RAD else 0
+    if s.heading_known == 1:
+        s.heading_true = 1
+    else:
+        half = 0.5 * heading_difference(as_quat(s.q_nb), found)
+        found = normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found))
+    write_quat(s.q_nb, found)
+    require_bias_variance(s, p.gyro_bias_change_radps)
+    begin_attitude(s, p, s.aligned_std[0] ** 2, heading_std * heading_std)
+
+
+@compiled
+def require_bias_variance(s: State, std: float) -> None:
+    """Raise the variance of the gyroscope bias to that of a standard deviation, rad/s."""
+    for k in range(3):
+        more = std * std - s.P[GYRO_BIAS + k, GYRO_BIAS + k]
+        raise_variance(s, GYRO_BIAS + k, max(more, 0.0))
+
+
+@compiled
+def discard_calibration(s: State, p: Gains) -> None:
+    """Discard the sensor errors that were estimated with a wrong attitude."""
+    reset_accel_bias(s, p)
+    reset_hard_iron(s, p)
+    fill(s.gyro_scale_b, 0.0)
+    for k in range(3):
+        if s.rest_seen > 0:
+            s.gyro_bias_b[k] = s.rest_bias_b[k]
+        reset_state(s, GYRO_BIAS + k, gyro_bias_var(s, p))
+        reset_state(s, GYRO_SCALE + k, p.gyro_scale_var)
+
+
+@compiled
+def reset_accel_bias(s: State, p: Gains) -> None:
+    """Discard the accelerometer bias."""
+    propagate(s, p)
+    fill(s.accel_bias_b, 0.0)
+    for k in range(ACCEL_BIAS, ACCEL_BIAS + 3):
+        reset_state(s, k, accel_bias_var(s, p))
+
+
+@compiled
+def reset_gyro_bias(s: State, p: Gains) -> None:
+    """Discard the gyroscope bias, and that of the last rest."""
+    propagate(s, p)
+    fill(s.gyro_bias_b, 0.0)
+    fill(s.rest_bias_b, 0.0)
+    s.rest_seen = 0
+    for k in range(GYRO_BIAS, GYRO_BIAS + 3):
+        reset_state(s, k, gyro_bias_var(s, p))
+
+
+@compiled
+def gyro_bias_var(s: State, p: Gains) -> float:
+    """Return the variance of the gyroscope bias before it is measured, rad2/s2."""
+    return (
+        p.gyro_bias_uncalibrated_var if s.uncalibrated & 1 and s.rest_seen == 0 else p.gyro_bias_var
+    )
+
+
+@compiled
+def accel_bias_var(s: State, p: Gains) -> float:
+    """Return the variance of the accelerometer bias before it is measured, m2/s4."""
+    return p.accel_bias_uncalibrated_var if s.uncalibrated & 2 else p.accel_bias_var

@@ -1,0 +1,403 @@
+"""Magnetometer: sound readings, disturbances, misplaced axes, hard iron, and the heading.
+
+Four checks need no attitude. A reading that does not change during a turn is stuck. The field must
+turn as the gyroscope does, or axes are swapped. A field that jumps in the gyroscope frame, where
+the Earth's field stands still, has a new source. And its norm and dip must be the usual ones; a new
+field that stays the same while the aircraft turns becomes the usual one [1]_. The hard iron itself
+is three states of the filter: turns separate it from the heading, since it turns with the body.
+
+References
+----------
+.. [1] D. Laidig and T. Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation
+   and magnetic disturbance rejection", Information Fusion 91, 2023, section 3.5.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.predict import NO_HEADING_VAR, propagate
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import ACCEL_BIAS, ATT, GYRO_SCALE, HARD_IRON, MAG_LATENCY, State
+from gateway.estimation.eskf.update import (
+    begin_row,
+    consider,
+    inject,
+    raise_variance,
+    reset_state,
+    update_scalar,
+)
+from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
+from gateway.geometry.angle import wrap_pi
+from gateway.geometry.quaternion import (
+    body_axes,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    rotate_inverse,
+)
+from gateway.records import Vec3
+from gateway.units import RAD_PER_DEG
+
+STALE_MAG_S: Final = 1.0
+"""A compass without readings for longer is not in use."""
+FIELD_RANGE_UT: Final = (1.0, 200.0)
+"""The Earth's field is 22 to 67 uT; outside this range it is a fault or a magnet."""
+MIN_LEVEL_SHARE: Final = 0.05
+"""A field with a smaller horizontal share gives no heading."""
+STUCK_TURN_RAD: Final = 0.05
+"""A reading that repeats exactly over such a turn is stuck."""
+
+SETTLE_S: Final = 0.5
+"""A usual field counts as undisturbed after this time, as in VQF."""
+REJECT_MAX_S: Final = 60.0
+"""After this time a disturbed field is used again, at half its weight, as in VQF."""
+FIELD_TAU_S: Final = 20.0
+"""Time constant of the usual norm and dip, as in VQF."""
+NEW_FIELD_S: Final = 20.0
+"""A candidate becomes the usual field after this time in turns, as in VQF."""
+FIRST_FIELD_S: Final = 5.0
+"""The first candidate after this time, as in VQF."""
+TURNING_RADPS: Final = 0.35
+"""Angular rate of a turn in this sense, 20 deg/s, as in VQF."""
+LIKE_NORM: Final = 0.04
+LIKE_DIP_RAD: Final = 0.035
+"""A field that differs by this in norm or dip counts half: a third of the tolerances."""
+CORRELATION_S: Final = 1.0
+"""Correlation time of compass errors: those of soft iron and currents change with the attitude."""
+UNAIDED_CORRELATION_S: Final = 2.5
+"""The same without GPS, where the level's error turns the heading through the dip."""
+STEEP_DIP_RAD: Final = 74.0 * RAD_PER_DEG
+"""Beyond this dip the horizontal field is too weak for the set noise, which then grows as 1/cos."""
+DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
+"""Error of the model's dip at a location, and of the sensor's scale, as angle."""
+
+TURN_SHARE: Final = 0.2
+"""A turn is evaluated once it has changed the field by this share of its norm."""
+TURNS_KEPT: Final = 0.99
+"""Forgetting factor from turn to turn."""
+WRONG_SHARE: Final = 0.75
+RIGHT_SHARE: Final = 0.5
+"""Unexplained share of the squared changes: swapped or reversed axes leave most of it."""
+NORM_SHARE: Final = 0.1
+"""Hard iron changes the norm by more than this share of what it leaves unexplained."""
+
+UNTURNED_RAD: Final = 4.0 * math.pi
+"""An apparent turn of two circles without a turn of anything else is a gyroscope bias."""
+
+JUMP_WINDOW_S: Final = 0.5
+JUMP_SIGMA_SQ: Final = 16.0
+"""Within this time a change beyond so many squared standard deviations is a jump."""
+JUMP_NOISE_UT: Final = 4.0
+"""Field noise until `JUMP_PRIOR_S` of readings have shown it: that of the noisiest compasses."""
+LEAST_NOISE_UT: Final = 1.5
+"""Noise of a quiet compass on a moving aircraft."""
+JUMP_PRIOR_S: Final = 2.0
+JUMP_MEMORY_S: Final = 20.0
+CARRIED_SHARE: Final = 0.7
+"""Hard iron of this share of the field turns with the aircraft and is no jump."""
+
+
+@compiled
+def is_zero(v: Vec3) -> bool:
+    """Return whether all three numbers are zero."""
+    return v[0] == 0.0 and v[1] == 0.0 and v[2] == 0.0
+
+
+@compiled
+def norm_sq(v: Vec3) -> float:
+    """Return the squared length."""
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+
+
+@compiled
+def difference(a: Vec3, b: Vec3) -> Vec3:
+    """Subtract two vectors."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@compiled
+def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
+    """Return whether a sample contains a usable new field; to be called for each sample."""
+    stuck = norm_sq(as_vec(s.mag_turned)) > STUCK_TURN_RAD * STUCK_TURN_RAD
+    if s.at_rest == 0 and not stuck:
+        for k in range(3):
+            s.mag_turned[k] += s.rate_b[k] * dt
+    strength_sq = norm_sq(mag_b)
+    if not FIELD_RANGE_UT[0] ** 2 < strength_sq < FIELD_RANGE_UT[1] ** 2:
+        return False
+    if is_zero(difference(mag_b, as_vec(s.mag_last))):
+        return bool(s.mag_misplaced == 0 and not stuck)
+    write_vec(s.mag_last, mag_b)
+    fill(s.mag_turned, 0.0)
+    check_placement(s, mag_b)
+    return bool(s.mag_misplaced == 0)
+
+
+@compiled
+def begin_turn(s: State, mag_b: Vec3) -> None:
+    """Compare the following fields with this one; zero for with none."""
+    write_vec(s.mag_from_b, mag_b)
+    write_vec(s.mag_from_i, rotate(as_quat(s.q_ib), mag_b))
+
+
+@compiled
+def check_placement(s: State, mag_b: Vec3) -> None:
+    """Compare how the field turns in the body with the gyroscope.
+
+    Swapped or reversed axes keep the norm. A strong hard iron leaves as much unexplained, but it
+    changes the norm, and is no reason to reject the compass.
+    """
+    begin = as_vec(s.mag_from_b)
+    carried = rotate_inverse(as_quat(s.q_ib), as_vec(s.mag_from_i))
+    begin_sq = norm_sq(begin)
+    expected_sq = norm_sq(difference(carried, begin))
+    if expected_sq < TURN_SHARE**2 * begin_sq:
+        return
+    begin_turn(s, mag_b)
+    if begin_sq == 0.0:
+        return
+    changed_sq = norm_sq(difference(mag_b, begin))
+    if changed_sq > NORM_SHARE * expected_sq:
+        s.spun_rad = 0.0
+    else:
+        # Only the gyroscope turns, so its bias is unknown.
+        s.rest_seen, s.spun_rad = 0, UNTURNED_RAD
+    change = math.sqrt(norm_sq(mag_b)) - math.sqrt(begin_sq)
+    q = s.mag_squares
+    # One such turn is assumed to have been explained, so that a few cannot decide.
+    q[0] = TURNS_KEPT * (q[0] if q[0] > 0.0 else begin_sq) + changed_sq
+    q[1] = TURNS_KEPT * q[1] + norm_sq(difference(mag_b, carried))
+    q[2] = TURNS_KEPT * q[2] + change * change
+    most = RIGHT_SHARE if s.mag_misplaced == 1 else WRONG_SHARE
+    s.mag_misplaced = 1 if q[1] > most * q[0] and q[2] < NORM_SHARE * q[1] else 0
+
+
+@compiled
+def has_jumped(s: State, mag_b: Vec3) -> bool:
+    """Return whether the field has a new source, and raise the variance of the hard iron if so."""
+    f = s.jump_from
+    since_s, from_i, from_b = s.time_s - f[0], (f[1], f[2], f[3]), (f[4], f[5], f[6])
+    if is_zero(from_b) or not 0.0 <= since_s <= min(3.0 * JUMP_WINDOW_S, s.sound_s):
+        jump_compare_from(s, mag_b)
+        return False
+    carried = rotate_inverse(as_quat(s.q_ib), from_i)
+    off = difference(mag_b, carried)
+    known = s.jump_noise[1] / (s.jump_noise[1] + JUMP_PRIOR_S)
+    noise_sq = JUMP_NOISE_UT**2 + known * (s.jump_noise[0] - JUMP_NOISE_UT**2)
+    noise_sq = max(noise_sq, LEAST_NOISE_UT * LEAST_NOISE_UT)
+    carried_sq = CARRIED_SHARE**2 * norm_sq(difference(carried, from_b))
+    if norm_sq(off) > JUMP_SIGMA_SQ * noise_sq + carried_sq:
+        if s.jump_seen == 0:
+            # A single odd reading is no jump.
+            s.jump_seen = 1
+            return False
+        for k in range(3):
+            raise_variance(s, HARD_IRON + k, off[k] * off[k])
+        jump_compare_from(s, mag_b)
+        return True
+    s.jump_seen = 0
+    if since_s >= JUMP_WINDOW_S:
+        s.jump_noise[1] = min(s.jump_noise[1] + since_s, JUMP_MEMORY_S)
+        s.jump_noise[0] += since_s / s.jump_noise[1] * (norm_sq(off) - s.jump_noise[0])
+        jump_compare_from(s, mag_b)
+    return False
+
+
+@compiled
+def jump_compare_from(s: State, mag_b: Vec3) -> None:
+    """Compare the following fields with this one."""
+    field_i = rotate(as_quat(s.q_ib), mag_b)
+    s.jump_seen = 0
+    s.jump_from[0] = s.time_s
+    for k in range(3):
+        s.jump_from[1 + k], s.jump_from[4 + k] = field_i[k], mag_b[k]
+
+
+@compiled
+def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> float:
+    """Compare a field with the usual one; return the weight of its heading, 0 to 1."""
+    if s.mag_ref[0] == 0.0:
+        learn_field(s, p, norm, dip, dt)
+        return 1.0
+    norm_off, dip_off = norm / s.mag_ref[0] - 1.0, dip - s.mag_ref[1]
+    usual = abs(norm_off) < p.field_norm_tolerance and abs(dip_off) < p.field_dip_tolerance_rad
+    s.mag_times[0] = s.mag_times[0] + dt if usual else 0.0
+    if not usual:
+        s.mag_disturbed = 1
+    elif s.mag_times[0] >= SETTLE_S:
+        s.mag_disturbed = 0
+        s.mag_ref[0] += dt / FIELD_TAU_S * (norm - s.mag_ref[0])
+        s.mag_ref[1] += dt / FIELD_TAU_S * (dip - s.mag_ref[1])
+    learn_field(s, p, norm, dip, dt)
+    if s.mag_disturbed == 0:
+        s.mag_times[1] = max(s.mag_times[1] - 2.0 * dt, 0.0)
+        unlike = (norm_off / LIKE_NORM) ** 2 + (dip_off / LIKE_DIP_RAD) ** 2
+        return float(1.0 / (1.0 + unlike))
+    s.mag_times[1] = min(s.mag_times[1] + dt, REJECT_MAX_S)
+    return 0.0 if s.mag_times[1] < REJECT_MAX_S else 0.5
+
+
+@compiled
+def learn_field(s: State, p: Gains, norm: float, dip: float, dt: float) -> None:
+    """Follow a candidate field, and make it the usual one when it has proved steady."""
+    new = s.mag_new
+    like = abs(norm - new[0]) < p.field_norm_tolerance * new[0]
+    if not like or abs(dip - new[1]) > p.field_dip_tolerance_rad:
+        new[0], new[1], s.mag_times[2] = norm, dip, 0.0
+        return
+    first = s.mag_ref[0] == 0.0
+    if first or norm_sq(as_vec(s.rate_b)) > TURNING_RADPS * TURNING_RADPS:
+        s.mag_times[2] += dt
+    new[0] += dt / FIELD_TAU_S * (norm - new[0])
+    new[1] += dt / FIELD_TAU_S * (dip - new[1])
+    needed_s = FIRST_FIELD_S if first else NEW_FIELD_S
+    if (first or s.mag_disturbed == 1) and s.mag_times[2] >= needed_s:
+        s.mag_ref[0], s.mag_ref[1], s.mag_disturbed = new[0], new[1], 0
+
+
+@compiled
+def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
+    """Use one sound reading of the calibrated field in body FRD, uT."""
+    if s.lost == 1:
+        return
+    if s.aided == 1 and has_jumped(s, mag_b):
+        propagate(s, p)
+    turned = (
+        s.rate_b[0] * s.mag_latency_s,
+        s.rate_b[1] * s.mag_latency_s,
+        s.rate_b[2] * s.mag_latency_s,
+    )
+    earth_b = difference(mag_b, as_vec(s.hard_iron_b))
+    present_b = rotate_inverse(from_rotation_vector(turned), earth_b)
+    field_n = rotate(as_quat(s.q_nb), present_b)
+    level = math.hypot(field_n[0], field_n[1])
+    norm = math.hypot(level, field_n[2])
+    since_s = s.time_s - s.mag_s
+    if norm < FIELD_RANGE_UT[0] or level < MIN_LEVEL_SHARE * norm or since_s <= 0.0:
+        return
+    s.mag_s = s.time_s
+    dip = math.atan2(field_n[2], level)
+    weight = field_weight(s, p, norm, dip, min(since_s, STALE_MAG_S))
+    if weight == 0.0:
+        return
+    steep = max(1.0, (math.cos(STEEP_DIP_RAD) * norm / level) ** 2)
+    variance = p.mag_var * steep / weight
+    if s.heading_known == 0:
+        start_heading(s, p, field_n, variance)
+    else:
+        update_heading(s, p, field_n, variance)
+    s.mag_used_s = s.time_s
+
+
+@compiled
+def heading_row(s: State, field_n: Vec3) -> None:
+    """Write the row of a magnetic heading.
+
+    The heading itself, the tilt through the field's dip, and hard iron across the horizontal field.
+    """
+    begin_row(s)
+    north, east, down = field_n
+    level_sq = north * north + east * east
+    s.h[ATT] = -down * north / level_sq
+    s.h[ATT + 1] = -down * east / level_sq
+    s.h[ATT + 2] = 1.0
+    axes = body_axes(as_quat(s.q_nb))
+    for k in range(3):
+        s.h[HARD_IRON + k] = (east * axes[k][0] - north * axes[k][1]) / level_sq
+    # A field that is older by dt is turned back by the angular rate times dt.
+    rate_n = rotate(as_quat(s.q_nb), as_vec(s.rate_b))
+    for k in range(3):
+        s.h[MAG_LATENCY] -= s.h[ATT + k] * rate_n[k]
+
+
+@compiled
+def declination(s: State) -> float:
+    """Return the declination, rad; 0 while unknown."""
+    return s.earth_field[0] if math.isfinite(s.earth_field[0]) else 0.0
+
+
+@compiled
+def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
+    """Take the heading from the compass."""
+    propagate(s, p)
+    turn_heading(s, declination(s) - math.atan2(field_n[1], field_n[0]))
+    reset_state(s, ATT + 2, NO_HEADING_VAR)
+    heading_row(s, field_n)
+    update_scalar(s, 0.0, variance, p.gate_sq)
+    inject(s)
+    s.heading_known = 1
+    s.heading_true = 1 if math.isfinite(s.earth_field[0]) else 0
+    write_vec(s.field_n, field_n)
+
+
+@compiled
+def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
+    """Update by the direction of the horizontal field, whose errors last for a while."""
+    propagate(s, p)
+    heading_row(s, field_n)
+    correlation_s = CORRELATION_S
+    if s.aided == 0:
+        # Without GPS the level depends on the accelerometer alone: the dip must not change it. And
+        # hard iron turns the compass in step with each turn, as a scale error would.
+        consider(s, ATT, 2)
+        consider(s, ACCEL_BIAS, 3)
+        consider(s, GYRO_SCALE, 3)
+        correlation_s = UNAIDED_CORRELATION_S
+    since_s = min(s.time_s - s.mag_used_s, STALE_MAG_S)
+    off = wrap_pi(declination(s) - math.atan2(field_n[1], field_n[0]))
+    update_scalar(s, off, variance * max(1.0, correlation_s / since_s), p.gate_sq)
+    inject(s)
+    write_vec(s.field_n, field_n)
+
+
+@compiled
+def raise_iron_by_dip(s: State, earth_dip_rad: float) -> None:
+    """Raise the variance of the hard iron by the difference of the dip from the Earth model's.
+
+    Hard iron that changes the dip changes the heading as much. A heading that follows the compass
+    gets the same error.
+    """
+    north, east, down = as_vec(s.field_n)
+    level_sq = north * north + east * east
+    if level_sq == 0.0 or not math.isfinite(earth_dip_rad):
+        return
+    share = math.sin(math.atan2(down, math.sqrt(level_sq)) - earth_dip_rad)
+    excess = (share * share - DIP_ERROR_RAD**2) * (level_sq + down * down)
+    more = excess - s.P[HARD_IRON, HARD_IRON]
+    if more <= 0.0:
+        return
+    heading_row(s, as_vec(s.field_n))
+    for k in range(HARD_IRON, HARD_IRON + 3):
+        raise_variance(s, k, more)
+        turned = s.h[k] * more
+        s.P[ATT + 2, k] -= turned
+        s.P[k, ATT + 2] -= turned
+        s.P[ATT + 2, ATT + 2] += s.h[k] * turned
+
+
+@compiled
+def reset_hard_iron(s: State, p: Gains) -> None:
+    """Discard the hard iron that was found."""
+    propagate(s, p)
+    for k in range(3):
+        s.hard_iron_b[k] = 0.0
+        reset_state(s, HARD_IRON + k, hard_iron_var(s, p))
+
+
+@compiled
+def hard_iron_var(s: State, p: Gains) -> float:
+    """Return the initial variance of the hard iron per axis, uT2."""
+    return p.hard_iron_uncalibrated_var if s.uncalibrated & 4 else p.hard_iron_var
+
+
+@compiled
+def turn_heading(s: State, turn_rad: float) -> None:
+    """Turn the whole attitude about down."""
+    half = 0.5 * turn_rad
+    turn = (math.cos(half), 0.0, 0.0, math.sin(half))
+    write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
+    s.resets[ATT + 2] += 1.0
+    # The integrals in NED contain the old heading.
+    s.ring_count = 0

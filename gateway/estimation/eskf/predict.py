@@ -1,0 +1,244 @@
+"""Prediction: the nominal state by each IMU sample, the covariance every `COVARIANCE_S`.
+
+With the attitude error in NED, `R` the integral of `R_nb`, `f` that of the specific force in NED
+and `dt` the time, the error state obeys [1]_
+
+    att' = att - R gyro_bias - R diag(gyro) gyro_scale
+    vel' = vel + att x f - R accel_bias
+    pos' = pos + vel dt
+
+Corrections of the gyroscope bias are white while the model is right. A bias that steps or drifts is
+corrected in one direction again and again: the part of the recent corrections beyond chance becomes
+process noise of the bias [2]_.
+
+References
+----------
+.. [1] J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, section 7.2.
+.. [2] R. K. Mehra, "On the identification of variances and adaptive Kalman filtering", IEEE
+   Transactions on Automatic Control 15, 1970.
+.. [3] D. Laidig and T. Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation
+   and magnetic disturbance rejection", Information Fusion 91, 2023.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
+    BARO_OFFSET,
+    GPS_ERROR,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    HARD_IRON,
+    MOVING_STATES,
+    POS,
+    STATES,
+    VEL,
+    State,
+)
+from gateway.estimation.eskf.update import limit_variance, raise_variance, scale_state
+from gateway.estimation.record import FloatArray, as_quat, fill, write_quat, write_vec
+from gateway.geometry.quaternion import (
+    body_axes,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+)
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
+
+COVARIANCE_S: Final = 0.02
+"""Interval of the covariance's propagation; measurements propagate it in between."""
+SCALE_S: Final = 1.0
+"""An acceleration keeps its body axis for about this time, and its scale error the sign."""
+NO_HEADING_VAR: Final = 3.0
+"""Variance of an unknown heading: that of a uniform angle, `pi^2 / 3`, rad2."""
+BIAS_MEMORY_S: Final = 20.0
+"""Corrections of the gyroscope bias are summed over this time."""
+BIAS_CHANCE_SQ: Final = 6.0
+"""A sum is chance up to this multiple of its variance: chi-squared of 1, 98.6 %."""
+BIAS_RAISE_S: Final = 0.3
+"""Time in which the rest is added to the variance of the bias."""
+CLIMB_DENSITY: Final = 4.0
+"""Random walk of the height without GPS, m2/s: a climb of 2 m/s that lasts for a second."""
+
+
+@compiled
+def rate_of(s: State, gyro: Vec3) -> Vec3:
+    """Return the angular rate without bias and scale error, rad/s."""
+    b, e = s.gyro_bias_b, s.gyro_scale_b
+    return (
+        gyro[0] - b[0] - e[0] * gyro[0],
+        gyro[1] - b[1] - e[1] * gyro[1],
+        gyro[2] - b[2] - e[2] * gyro[2],
+    )
+
+
+@compiled
+def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Advance the nominal state by one sample, and collect the terms of the propagation.
+
+    Midpoint rule: the force acts at the attitude half way through the interval.
+    """
+    c = s.accel_bias_b
+    rate = rate_of(s, gyro)
+    write_vec(s.rate_b, rate)
+    half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
+    q_i = multiply(as_quat(s.q_ib), half)
+    write_quat(s.q_ib, normalise(multiply(q_i, half)))
+    q = multiply(as_quat(s.q_nb), half)
+    write_quat(s.q_nb, normalise(multiply(q, half)))
+    x, y, z = body_axes(q)
+    f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
+    force_i = rotate(q_i, (f0, f1, f2))
+    accel_sq = 0.0
+    for k in range(3):
+        force = x[k] * f0 + y[k] * f1 + z[k] * f2
+        s.pending_force_n[k] += force * dt
+        s.pending_turn[k, 0] += x[k] * dt
+        s.pending_turn[k, 1] += y[k] * dt
+        s.pending_turn[k, 2] += z[k] * dt
+        s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
+        s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
+        s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
+        a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
+        accel_sq += a * a
+        s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
+        s.integrals[3 + k] += a * dt
+        s.integrals[k] += force_i[k] * dt
+        if s.aided == 1:
+            s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
+            s.vel_n[k] += a * dt
+    turn_rad = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    s.pending_noise[0] += p.gyro_turn_var * turn_rad
+    s.pending_noise[1] += p.accel_scale_sq * SCALE_S * accel_sq * dt
+    s.pending_s += dt
+    follow_gravity(s, p, force_i, dt)
+
+
+@compiled
+def follow_gravity(s: State, p: Gains, force_i: Vec3, dt: float) -> None:
+    """Low-pass the force in the gyroscope frame, where gravity stands still [3]_.
+
+    A plain mean at first, so that the first sample does not count for a whole time constant.
+    """
+    s.force_lp_s += dt
+    share = min(1.0, dt / min(p.gravity_tau_s, s.force_lp_s))
+    slow = min(1.0, dt / min(2.0 * p.gravity_tau_s, s.force_lp_s))
+    deviation_sq = 0.0
+    for k in range(3):
+        s.force_lp_i[0, k] += share * (force_i[k] - s.force_lp_i[0, k])
+        s.force_lp_i[1, k] += share * (s.force_lp_i[0, k] - s.force_lp_i[1, k])
+        deviation_sq += (s.force_lp_i[0, k] - s.force_lp_i[1, k]) ** 2
+    s.force_dev_sq += slow * (deviation_sq - s.force_dev_sq)
+
+
+@compiled
+def propagate(s: State, p: Gains) -> None:
+    """Propagate the covariance over the pending time: `F P F^T + Q`."""
+    dt = s.pending_s
+    if dt <= 0.0:
+        return
+    apply_transition(s, s.P, STATES)
+    mirror(s.P)
+    apply_transition(s, s.P, MOVING_STATES)
+    symmetrise(s.P)
+    turned, pulled = s.pending_noise[0], s.pending_noise[1]
+    kept = math.exp(-dt / p.gps_error_s)
+    for k in range(3):
+        s.P[ATT + k, ATT + k] += turned + p.gyro_density * dt
+        s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
+        raise_bias_variance(s, p, k, unexpected_bias_density(s, k) * dt)
+        s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
+        s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_density * dt
+        if s.aided == 1:
+            s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
+            s.P[POS + k, POS + k] += s.pos_density[k] * dt
+        scale_state(s.P, GPS_ERROR + k, kept)
+        s.P[GPS_ERROR + k, GPS_ERROR + k] += s.gps_error_var[k] * (1.0 - kept * kept)
+        s.gps_error_n[k] *= kept
+    if s.aided == 0:
+        s.P[POS + 2, POS + 2] += CLIMB_DENSITY * dt
+    s.P[BARO_OFFSET, BARO_OFFSET] += p.baro_density * dt
+    limit_variance(s.P, ATT + 2, NO_HEADING_VAR)
+    follow_bias_steps(s, dt)
+    s.pending_s = 0.0
+    fill(s.pending_noise, 0.0)
+    fill(s.pending_force_n, 0.0)
+    for k in range(3):
+        for j in range(3):
+            s.pending_turn[k, j] = s.pending_scaled[k, j] = 0.0
+
+
+@compiled
+def raise_bias_variance(s: State, p: Gains, k: int, more: float) -> None:
+    """Add to the variance of one axis of the gyroscope bias, up to its initial variance."""
+    limit = max(p.gyro_bias_var - s.P[GYRO_BIAS + k, GYRO_BIAS + k], 0.0)
+    raise_variance(s, GYRO_BIAS + k, min(more, limit))
+
+
+@compiled
+def apply_transition(s: State, P: FloatArray, columns: int) -> None:
+    """Multiply the first columns of `P` by the transition matrix from the left."""
+    R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
+    for j in range(columns):
+        if s.aided == 1:
+            for k in range(3):
+                P[POS + k, j] += dt * P[VEL + k, j]
+            P[VEL, j] += P[ATT + 1, j] * f[2] - P[ATT + 2, j] * f[1]
+            P[VEL + 1, j] += P[ATT + 2, j] * f[0] - P[ATT, j] * f[2]
+            P[VEL + 2, j] += P[ATT, j] * f[1] - P[ATT + 1, j] * f[0]
+            for i in range(3):
+                for k in range(3):
+                    P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
+        for i in range(3):
+            for k in range(3):
+                P[ATT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
+
+
+@compiled
+def mirror(P: FloatArray) -> None:
+    """Transpose the product from the left, for one from the right, without a copy.
+
+    The second product changes the columns of the moving states alone. Their rows keep what is
+    final: the covariances with the other states.
+    """
+    for j in range(MOVING_STATES):
+        for i in range(j + 1, STATES):
+            upper = P[j, i]
+            if i < MOVING_STATES:
+                P[j, i] = P[i, j]
+            P[i, j] = upper
+
+
+@compiled
+def symmetrise(P: FloatArray) -> None:
+    """Remove the asymmetry of rounding, which would grow without bound in long flights."""
+    for i in range(STATES):
+        for j in range(i):
+            P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
+
+
+@compiled
+def unexpected_bias_density(s: State, k: int) -> float:
+    """Return the process noise of one axis of the bias beyond the model, (rad/s)2/s."""
+    return float(max(s.bias_sum[k] ** 2 / BIAS_CHANCE_SQ - s.bias_sum_var[k], 0.0) / BIAS_RAISE_S)
+
+
+@compiled
+def follow_bias_steps(s: State, dt: float) -> None:
+    """Fade the sums; they start once GPS has corrected a sound IMU for `BIAS_MEMORY_S`."""
+    aided = s.aided == 1 and s.heading_known == 1
+    s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if aided else 0.0
+    if min(s.bias_watch_s, s.sound_s) < BIAS_MEMORY_S:
+        fill(s.bias_sum, 0.0)
+        fill(s.bias_sum_var, 0.0)
+        return
+    kept = math.exp(-dt / BIAS_MEMORY_S)
+    for k in range(3):
+        s.bias_sum[k] *= kept
+        s.bias_sum_var[k] *= kept * kept

@@ -1,0 +1,150 @@
+"""Rest: quiet sensors with a constant mean, and no speed. The mean rate is then the bias.
+
+An idling engine shakes the gyroscope, so only its mean has to be quiet. A rate beyond the usual
+bias is the bias of an uncalibrated gyroscope if it turns nothing: not the force, which is constant
+and that of gravity, and not the magnetic field; without a compass, if it has not ended after two
+full circles.
+"""
+
+import math
+from typing import Final
+
+from gateway.compiled import compiled
+from gateway.estimation.columns import FRESH_GPS_S
+from gateway.estimation.eskf.integrity import (
+    lose_attitude,
+    require_bias_variance,
+)
+from gateway.estimation.eskf.magnetometer import UNTURNED_RAD, begin_turn, reset_hard_iron
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State
+from gateway.estimation.eskf.update import reset_state
+from gateway.records import Vec3
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+
+MEAN_S: Final = 0.5
+"""Time constant of the means."""
+DRIFT_S: Final = 10.0
+"""Time constant by which the means of a rest may drift, as in a sensor that warms up."""
+SHAKEN: Final = 5.0
+"""An idling engine shakes the gyroscope by this multiple of the rest limit."""
+STEADY: Final = 0.15
+"""Its mean stays within this share of the rest limit then."""
+REST_RATE_RADPS: Final = 0.5 * RAD_PER_DEG
+REST_FORCE_MPS2: Final = 0.35
+"""Changes of the means that end a rest: 2 deg of tilt."""
+USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
+"""A larger constant rate is more often a turn than a bias."""
+STATIONARY_UNTURNED_RAD: Final = 1.0
+"""The same as `UNTURNED_RAD` while GPS shows no speed."""
+GRAVITY_SHARE: Final = 0.2
+"""Error of an uncalibrated accelerometer at rest, as a share of gravity."""
+
+
+@compiled
+def is_moving(s: State, p: Gains) -> bool:
+    """Return whether GPS, or dead reckoning with one standard deviation, shows a speed."""
+    fresh = s.time_s - s.fix_s < FRESH_GPS_S
+    if s.aided == 0:
+        return fresh and math.hypot(s.fix_vel[0], s.fix_vel[1]) > p.rest_speed_mps
+    std = 0.0 if fresh else math.sqrt(s.P[VEL, VEL] + s.P[VEL + 1, VEL + 1])
+    return math.hypot(s.vel_n[0], s.vel_n[1]) > p.rest_speed_mps + std
+
+
+@compiled
+def begin_means(s: State, gyro: Vec3, accel: Vec3) -> None:
+    """Start the means at a first sample."""
+    for k in range(3):
+        s.imu_mean[k] = s.gyro_mean[k] = gyro[k]
+        s.imu_mean[3 + k] = accel[k]
+
+
+@compiled
+def detect_rest(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Update the means, and decide whether the aircraft is at rest."""
+    share = min(1.0, dt / MEAN_S)
+    gyro_sq = accel_sq = mean_sq = largest = 0.0
+    for k in range(3):
+        s.imu_mean[k] += share * (gyro[k] - s.imu_mean[k])
+        s.gyro_mean[k] += share * (s.imu_mean[k] - s.gyro_mean[k])
+        s.imu_mean[3 + k] += share * (accel[k] - s.imu_mean[3 + k])
+        gyro_sq += (gyro[k] - s.imu_mean[k]) ** 2
+        mean_sq += (s.imu_mean[k] - s.gyro_mean[k]) ** 2
+        accel_sq += (accel[k] - s.imu_mean[3 + k]) ** 2
+        largest = max(largest, abs(s.imu_mean[k]))
+    limit_sq = p.rest_gyro_radps**2
+    shaken = gyro_sq < SHAKEN**2 * limit_sq and mean_sq < STEADY**2 * limit_sq
+    quiet = (gyro_sq < limit_sq or shaken) and accel_sq < p.rest_accel_mps2**2
+    moving = is_moving(s, p)
+    quiet = quiet and largest < p.bias_limit_radps and not moving
+    likely = is_likely_bias(s, quiet, dt)
+    s.rest_s = s.rest_s + dt if keeps_means(s, dt) and quiet and likely else 0.0
+    if s.rest_s == 0.0:
+        for k in range(6):
+            s.rest_from[k] = s.imu_mean[k]
+    s.at_rest = 1 if s.rest_s >= p.rest_time_s else 0
+    if s.at_rest == 1:
+        begin_rest(s, p)
+    elif moving and s.rest_seen == 1:
+        s.rest_seen = 2
+        require_bias_variance(s, p.gyro_bias_change_radps)
+
+
+@compiled
+def keeps_means(s: State, dt: float) -> bool:
+    """Return whether mean rate and force are those with which a rest began."""
+    rate_sq = force_sq = 0.0
+    share = min(1.0, dt / DRIFT_S)
+    for k in range(3):
+        rate_off = s.imu_mean[k] - s.rest_from[k]
+        force_off = s.imu_mean[3 + k] - s.rest_from[3 + k]
+        rate_sq += rate_off * rate_off
+        force_sq += force_off * force_off
+        s.rest_from[k] += share * rate_off
+        s.rest_from[3 + k] += share * force_off
+    return bool(rate_sq < REST_RATE_RADPS**2 and force_sq < REST_FORCE_MPS2**2)
+
+
+@compiled
+def is_usual_bias(s: State, rate: Vec3) -> bool:
+    """Return whether a rate is close to the bias of the last rest."""
+    b = s.rest_bias_b
+    off = max(abs(rate[0] - b[0]), abs(rate[1] - b[1]))
+    return bool(max(off, abs(rate[2] - b[2])) < USUAL_BIAS_RADPS)
+
+
+@compiled
+def is_likely_bias(s: State, quiet: bool, dt: float) -> bool:
+    """Return whether the mean rate can be a bias; beyond the usual one it must turn nothing."""
+    upright = norm_sq = 0.0
+    for k in range(3):
+        upright += (s.imu_mean[k] - s.rest_bias_b[k]) * s.imu_mean[3 + k]
+        norm_sq += s.imu_mean[3 + k] ** 2
+    force = math.sqrt(norm_sq)
+    upright = abs(upright) / force if force > 0.0 else 0.0
+    s.spun_rad = s.spun_rad + upright * dt if quiet else 0.0
+    if is_usual_bias(s, (s.imu_mean[0], s.imu_mean[1], s.imu_mean[2])):
+        return True
+    fresh = s.time_s - s.fix_s < FRESH_GPS_S
+    unturned = upright < USUAL_BIAS_RADPS
+    unturned = unturned or s.spun_rad > (STATIONARY_UNTURNED_RAD if fresh else UNTURNED_RAD)
+    return bool(unturned and abs(force / STANDARD_GRAVITY_MPS2 - 1.0) < GRAVITY_SHARE)
+
+
+@compiled
+def begin_rest(s: State, p: Gains) -> None:
+    """Store the bias of a rest; one that is far off has turned the attitude, which is lost then."""
+    off = 0.0
+    for k in range(3):
+        off = max(off, abs(s.gyro_mean[k] - s.gyro_bias_b[k]))
+        s.rest_bias_b[k] = s.gyro_mean[k]
+    if s.rest_seen == 2:
+        require_bias_variance(s, off)
+    s.rest_seen = 1
+    if off > USUAL_BIAS_RADPS:
+        lose_attitude(s, p)
+        for k in range(3):
+            s.gyro_bias_b[k] = s.gyro_mean[k]
+            reset_state(s, GYRO_BIAS + k, p.gyro_bias_change_radps**2)
+        begin_turn(s, (0.0, 0.0, 0.0))
+        reset_hard_iron(s, p)

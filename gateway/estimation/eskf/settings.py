@@ -1,0 +1,330 @@
+"""Settings of the filter, and the same as variances and densities in SI units."""
+
+import math
+from typing import Annotated
+
+from gateway.estimation.record import filled_record
+from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.settings import Settings, setting
+from gateway.units import RAD_PER_DEG
+
+
+class EskfSettings(Settings, frozen=True):
+    """Noise of the sensors and limits of the filter; standard deviations unless stated otherwise.
+
+    A larger noise makes the filter follow the other sensors; a smaller one makes it follow this
+    sensor and reject more of the others.
+    """
+
+    gyro_noise_degprs: Annotated[
+        float,
+        setting("Gyroscope noise, without vibration.", "deg/sqrt(s)", ge=1e-4, le=10.0),
+    ] = 0.066
+    gyro_vibration: Annotated[
+        float,
+        setting(
+            "Share of the measured sample-to-sample noise of the angular rate that counts as white "
+            "noise.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 1.4
+    gyro_scale: Annotated[
+        float, setting("Relative scale error of each gyroscope axis.", ge=0.0, le=0.1)
+    ] = 0.088
+    gyro_turn_deg: Annotated[
+        float,
+        setting(
+            "Attitude error after a turn of 1 rad, by axes that are not orthogonal.",
+            "deg",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.2
+    gyro_bias_degps: Annotated[
+        float, setting("Initial gyroscope bias.", "deg/s", ge=0.01, le=20.0)
+    ] = 0.6
+    gyro_bias_uncalibrated_degps: Annotated[
+        float,
+        setting("Initial bias of a gyroscope without calibration.", "deg/s", ge=0.01, le=20.0),
+    ] = 3.0
+    gyro_bias_walk_degpsprs: Annotated[
+        float, setting("Random walk of the gyroscope bias.", "deg/s/sqrt(s)", ge=0.0, le=1.0)
+    ] = 0.0055
+    gyro_bias_change_degps: Annotated[
+        float,
+        setting(
+            "Change of the gyroscope bias between rest and motion, by heat and vibration.",
+            "deg/s",
+            ge=0.0,
+            le=5.0,
+        ),
+    ] = 0.15
+    accel_noise_mpsprs: Annotated[
+        float, setting("Accelerometer noise, without vibration.", "m/s/sqrt(s)", ge=1e-4, le=10.0)
+    ] = 0.1
+    accel_vibration: Annotated[
+        float,
+        setting(
+            "Share of the measured sample-to-sample noise of the force that counts as white noise.",
+            ge=0.0,
+            le=10.0,
+        ),
+    ] = 0.46
+    accel_scale: Annotated[
+        float, setting("Relative error of the force beyond gravity.", ge=0.0, le=0.2)
+    ] = 0.01
+    accel_bias_mps2: Annotated[
+        float, setting("Initial accelerometer bias.", "m/s2", ge=0.001, le=2.0)
+    ] = 0.04
+    accel_bias_uncalibrated_mps2: Annotated[
+        float,
+        setting("Initial bias of an accelerometer without calibration.", "m/s2", ge=0.001, le=2.0),
+    ] = 0.3
+    accel_bias_walk_mps2prs: Annotated[
+        float, setting("Random walk of the accelerometer bias.", "m/s2/sqrt(s)", ge=0.0, le=1.0)
+    ] = 0.0018
+    gravity_tau_s: Annotated[
+        float,
+        setting(
+            "Time constant of each of two low-passes that find gravity without GPS. Small follows "
+            "accelerations, large the gyroscope's drift.",
+            "s",
+            ge=0.1,
+            le=20.0,
+        ),
+    ] = 1.0
+    gravity_noise_mps2: Annotated[
+        float,
+        setting("Acceleration that low-pass filtered gravity contains.", "m/s2", ge=0.001, le=5.0),
+    ] = 0.1
+    gravity_motion: Annotated[
+        float,
+        setting(
+            "Share of the difference between both low-passes that counts as error of gravity.",
+            ge=0.0,
+            le=2.0,
+        ),
+    ] = 0.8
+    gps_position_m: Annotated[
+        float, setting("Noise of a fix, horizontal.", "m", ge=0.01, le=50.0)
+    ] = 1.2
+    gps_height_m: Annotated[float, setting("Noise of its height.", "m", ge=0.01, le=50.0)] = 1.9
+    gps_error_m: Annotated[
+        float, setting("Slow error of the GPS position, horizontal.", "m", ge=0.01, le=50.0)
+    ] = 0.7
+    gps_height_error_m: Annotated[
+        float, setting("Slow error of the GPS height.", "m", ge=0.01, le=50.0)
+    ] = 2.5
+    gps_error_s: Annotated[
+        float, setting("Correlation time of these slow errors.", "s", ge=1.0, le=3600.0)
+    ] = 29.0
+    gps_velocity_mps: Annotated[
+        float, setting("Noise of the GPS velocity, horizontal.", "m/s", ge=0.01, le=10.0)
+    ] = 0.4
+    gps_climb_mps: Annotated[
+        float, setting("Noise of its vertical velocity.", "m/s", ge=0.01, le=10.0)
+    ] = 0.25
+    gps_correlation_s: Annotated[
+        float,
+        setting(
+            "Correlation time of this noise: faster fixes add no information.", "s", ge=0.0, le=10.0
+        ),
+    ] = 0.4
+    gps_jitter_s: Annotated[
+        float, setting("Variation of the latency from fix to fix.", "s", ge=0.0, le=0.5)
+    ] = 0.085
+    mag_noise_deg: Annotated[
+        float, setting("Compass noise, sample to sample.", "deg", ge=0.1, le=45.0)
+    ] = 5.3
+    mag_latency_s: Annotated[
+        float, setting("Age of the field in its sample.", "s", ge=0.0, le=0.2)
+    ] = 0.02
+    mag_latency_std_s: Annotated[
+        float, setting("Standard deviation of that age.", "s", ge=0.0, le=0.2)
+    ] = 0.03
+    hard_iron_ut: Annotated[
+        float, setting("Hard iron left by a calibration, per axis.", "uT", ge=0.001, le=50.0)
+    ] = 1.5
+    hard_iron_uncalibrated_ut: Annotated[
+        float, setting("Hard iron without calibration, per axis.", "uT", ge=0.001, le=100.0)
+    ] = 15.0
+    hard_iron_walk_utprs: Annotated[
+        float, setting("Random walk of the hard iron.", "uT/sqrt(s)", ge=0.0, le=10.0)
+    ] = 0.005
+    field_norm_tolerance: Annotated[
+        float,
+        setting(
+            "Relative difference from the usual field strength that is accepted.", ge=0.01, le=1.0
+        ),
+    ] = 0.1
+    field_dip_tolerance_deg: Annotated[
+        float, setting("Difference from the usual dip that is accepted.", "deg", ge=1.0, le=90.0)
+    ] = 10.0
+    baro_noise_m: Annotated[
+        float, setting("Noise of the barometer's height.", "m", ge=0.01, le=20.0)
+    ] = 0.26
+    baro_walk_mprs: Annotated[
+        float, setting("Random walk of the barometer's offset.", "m/sqrt(s)", ge=0.0, le=5.0)
+    ] = 1.2
+    dead_reckoning_s: Annotated[
+        float,
+        setting("How long position and velocity are carried without GPS.", "s", ge=1.0, le=600.0),
+    ] = 60.0
+    gate_sigma: Annotated[
+        float,
+        setting(
+            "Innovations beyond this many standard deviations are weighted down.", ge=2.0, le=20.0
+        ),
+    ] = 5.0
+    gate_m: Annotated[
+        float,
+        setting(
+            "A fix that is off by less is never rejected, only weighted down.",
+            "m",
+            ge=0.0,
+            le=100.0,
+        ),
+    ] = 10.0
+    rest_gyro_degps: Annotated[
+        float,
+        setting("At rest the rate stays this close to its mean.", "deg/s", ge=0.01, le=10.0),
+    ] = 2.0
+    rest_accel_mps2: Annotated[
+        float,
+        setting("At rest the force stays this close to its mean.", "m/s2", ge=0.01, le=5.0),
+    ] = 0.5
+    rest_time_s: Annotated[
+        float, setting("How long that must last to be called rest.", "s", ge=0.2, le=30.0)
+    ] = 1.5
+    rest_speed_mps: Annotated[
+        float, setting("GPS speed above which nothing is at rest.", "m/s", ge=0.05, le=10.0)
+    ] = 0.7
+    bias_limit_degps: Annotated[
+        float,
+        setting("Largest gyroscope bias that is possible.", "deg/s", ge=0.1, le=30.0),
+    ] = 20.0
+
+
+class Gains:
+    """The settings as variances and densities in SI units; see `EskfSettings`."""
+
+    gyro_density: float
+    """rad2/s."""
+    gyro_vibration_sq: float
+    gyro_scale_var: float
+    gyro_turn_var: float
+    """rad2 per rad."""
+    gyro_bias_var: float
+    gyro_bias_uncalibrated_var: float
+    gyro_bias_density: float
+    gyro_bias_change_radps: float
+    accel_density: float
+    """m2/s3."""
+    accel_vibration_sq: float
+    accel_scale_sq: float
+    accel_bias_var: float
+    accel_bias_uncalibrated_var: float
+    accel_bias_density: float
+    gravity_tau_s: float
+    gravity_var: float
+    gravity_motion_sq: float
+    gps_position_var: float
+    gps_height_var: float
+    gps_error_var: float
+    gps_height_error_var: float
+    gps_error_s: float
+    gps_velocity_var: float
+    gps_climb_var: float
+    gps_jitter_sq: float
+    gps_correlation_s: float
+    gps_latency_s: float
+    gps_relock_s: float
+    mag_var: float
+    mag_latency_s: float
+    mag_late_sq: float
+    hard_iron_var: float
+    hard_iron_uncalibrated_var: float
+    hard_iron_density: float
+    field_norm_tolerance: float
+    field_dip_tolerance_rad: float
+    declination_rad: float
+    """NaN where it is looked up at the position of a fix."""
+    baro_var: float
+    baro_density: float
+    dead_reckoning_s: float
+    gate_sq: float
+    gate_m: float
+    rest_gyro_radps: float
+    rest_accel_mps2: float
+    rest_time_s: float
+    rest_speed_mps: float
+    bias_limit_radps: float
+
+
+def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
+    """Convert the settings to SI units.
+
+    Parameters
+    ----------
+    settings : EskfSettings
+        Of this filter.
+    reference : ReferenceSettings
+        GPS latency, relocking and declination.
+
+    Returns
+    -------
+    Gains
+        A flat record for the compiled code.
+    """
+    s = settings
+    values = {
+        "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
+        "gyro_vibration_sq": s.gyro_vibration**2,
+        "gyro_scale_var": s.gyro_scale**2,
+        "gyro_turn_var": (s.gyro_turn_deg * RAD_PER_DEG) ** 2,
+        "gyro_bias_var": (s.gyro_bias_degps * RAD_PER_DEG) ** 2,
+        "gyro_bias_uncalibrated_var": (s.gyro_bias_uncalibrated_degps * RAD_PER_DEG) ** 2,
+        "gyro_bias_density": (s.gyro_bias_walk_degpsprs * RAD_PER_DEG) ** 2,
+        "gyro_bias_change_radps": s.gyro_bias_change_degps * RAD_PER_DEG,
+        "accel_density": s.accel_noise_mpsprs**2,
+        "accel_vibration_sq": s.accel_vibration**2,
+        "accel_scale_sq": s.accel_scale**2,
+        "accel_bias_var": s.accel_bias_mps2**2,
+        "accel_bias_uncalibrated_var": s.accel_bias_uncalibrated_mps2**2,
+        "accel_bias_density": s.accel_bias_walk_mps2prs**2,
+        "gravity_tau_s": s.gravity_tau_s,
+        "gravity_var": s.gravity_noise_mps2**2,
+        "gravity_motion_sq": s.gravity_motion**2,
+        "gps_position_var": s.gps_position_m**2,
+        "gps_height_var": s.gps_height_m**2,
+        "gps_error_var": s.gps_error_m**2,
+        "gps_height_error_var": s.gps_height_error_m**2,
+        "gps_error_s": s.gps_error_s,
+        "gps_velocity_var": s.gps_velocity_mps**2,
+        "gps_climb_var": s.gps_climb_mps**2,
+        "gps_jitter_sq": s.gps_jitter_s**2,
+        "gps_correlation_s": s.gps_correlation_s,
+        "gps_latency_s": reference.gps_latency_s,
+        "gps_relock_s": reference.gps_relock_s,
+        "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
+        "mag_latency_s": s.mag_latency_s,
+        "mag_late_sq": s.mag_latency_std_s**2,
+        "hard_iron_var": s.hard_iron_ut**2,
+        "hard_iron_uncalibrated_var": s.hard_iron_uncalibrated_ut**2,
+        "hard_iron_density": s.hard_iron_walk_utprs**2,
+        "field_norm_tolerance": s.field_norm_tolerance,
+        "field_dip_tolerance_rad": math.radians(s.field_dip_tolerance_deg),
+        "declination_rad": EarthField(reference).declination_rad,
+        "baro_var": s.baro_noise_m**2,
+        "baro_density": s.baro_walk_mprs**2,
+        "dead_reckoning_s": s.dead_reckoning_s,
+        "gate_sq": s.gate_sigma**2,
+        "gate_m": s.gate_m,
+        "rest_gyro_radps": math.radians(s.rest_gyro_degps),
+        "rest_accel_mps2": s.rest_accel_mps2,
+        "rest_time_s": s.rest_time_s,
+        "rest_speed_mps": s.rest_speed_mps,
+        "bias_limit_radps": math.radians(s.bias_limit_degps),
+    }
+    return filled_record(Gains, values)

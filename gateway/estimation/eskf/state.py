@@ -1,0 +1,284 @@
+"""State of the filter: the nominal state, the covariance of its errors, and what each part keeps.
+
+The error state, in the order of the covariance's rows:
+
+| rows | error | frame, unit |
+| --- | --- | --- |
+| ATT | rotation that takes the estimated attitude to the true one | NED, rad |
+| VEL | velocity | NED, m/s |
+| POS | position | NED, m |
+| GYRO_BIAS | gyroscope bias | body, rad/s |
+| ACCEL_BIAS | accelerometer bias | body, m/s2 |
+| GPS_ERROR | slow (Gauss-Markov) error of the GPS position | NED, m |
+| HARD_IRON | hard iron left by the calibration | body, uT |
+| GYRO_SCALE | relative scale error of each gyroscope axis | body |
+| BARO_OFFSET | offset added to the barometer's depth | m |
+| MAG_LATENCY | age of the field in a magnetometer sample | s |
+"""
+
+from typing import Annotated, Final
+
+from gateway.estimation.record import FloatArray
+
+ATT: Final = 0
+VEL: Final = 3
+POS: Final = 6
+GYRO_BIAS: Final = 9
+ACCEL_BIAS: Final = 12
+GPS_ERROR: Final = 15
+HARD_IRON: Final = 18
+GYRO_SCALE: Final = 21
+BARO_OFFSET: Final = 24
+MAG_LATENCY: Final = 25
+STATES: Final = 26
+MOVING_STATES: Final = 9
+"""Attitude, velocity and position: the states that the transition changes."""
+
+INTEGRALS: Final = 9
+"""Force in the gyroscope frame, acceleration in NED, and the integral of that: three numbers each,
+each integrated once more over time."""
+SLOTS: Final = 512
+"""Past integrals that are kept: 2.5 s at `delayed.SPACING_S`, more than the longest latency."""
+LATENCIES: Final = 13
+"""Latencies that are compared at once, see `latency`."""
+MOMENTS: Final = 8
+"""Reference acceleration, measured force (three each), 1 and time: see `alignment`."""
+
+NEVER_S: Final = -1e9
+"""A time before everything."""
+
+
+class State:
+    """All that the filter keeps from sample to sample."""
+
+    # Nominal state.
+    q_nb: Annotated[FloatArray, (4,)]
+    vel_n: Annotated[FloatArray, (3,)]
+    pos_n: Annotated[FloatArray, (3,)]
+    """Metres from the origin; the third is minus the height above mean sea level."""
+    gyro_bias_b: Annotated[FloatArray, (3,)]
+    accel_bias_b: Annotated[FloatArray, (3,)]
+    gps_error_n: Annotated[FloatArray, (3,)]
+    hard_iron_b: Annotated[FloatArray, (3,)]
+    gyro_scale_b: Annotated[FloatArray, (3,)]
+    baro_offset_m: float
+    mag_latency_s: float
+    P: Annotated[FloatArray, (STATES, STATES)]
+
+    # Work space of a measurement update.
+    h: Annotated[FloatArray, (STATES,)]
+    """Row of the measurement matrix."""
+    Ph: Annotated[FloatArray, (STATES,)]
+    considered: Annotated[FloatArray, (STATES,)]
+    """1 for states that the measurement must not change."""
+    dx: Annotated[FloatArray, (STATES,)]
+    """Error found so far by one group of scalar updates."""
+
+    # Time, on the gateway clock, s since `base_us` unless another unit is named.
+    started: int
+    base_us: int
+    time_us: int
+    time_s: float
+    imu_s: float
+    """Newest IMU sample that was used."""
+    usual_step_s: float
+    """Average interval of IMU samples; 0 before the second."""
+    sound_s: float
+    """Time since the last IMU fault or gap."""
+
+    # Integrated since the covariance was last propagated.
+    pending_s: float
+    pending_force_n: Annotated[FloatArray, (3,)]
+    """Specific force."""
+    pending_turn: Annotated[FloatArray, (3, 3)]
+    """`R_nb`."""
+    pending_scaled: Annotated[FloatArray, (3, 3)]
+    """`R_nb diag(gyro)`."""
+    pending_noise: Annotated[FloatArray, (2,)]
+    """Variances of angle and velocity beyond the sensors' noise densities."""
+
+    # Angular rate and the frame of the gyroscope alone.
+    rate_b: Annotated[FloatArray, (3,)]
+    """Without bias and scale error, rad/s."""
+    q_ib: Annotated[FloatArray, (4,)]
+    """Body to the frame that the integrated angular rate keeps."""
+    imu_before: Annotated[FloatArray, (6,)]
+    """Rate and force of the sample before."""
+    imu_change: Annotated[FloatArray, (6,)]
+    """Their change up to it, for the vibration noise."""
+
+    # Gravity: specific force in the gyroscope frame.
+    force_lp_i: Annotated[FloatArray, (2, 3)]
+    """First and second low-pass, m/s2."""
+    force_dev_sq: float
+    """Mean square of the force about the second one, m2/s4."""
+    force_lp_s: float
+    """Time that the low-pass has run since it was reset."""
+    level_s: float
+    """Last measurement of gravity or rest."""
+
+    # Past integrals for late fixes, see `delayed`.
+    integrals: Annotated[FloatArray, (INTEGRALS,)]
+    then: Annotated[FloatArray, (INTEGRALS,)]
+    """Work space: the integrals at the time of a fix."""
+    ring: Annotated[FloatArray, (SLOTS, 1 + INTEGRALS)]
+    ring_count: int
+
+    # GPS.
+    origin: Annotated[FloatArray, (2,)]
+    """Latitude and longitude of the zero of `pos_n`, deg."""
+    has_origin: int
+    aided: int
+    """1 while velocity and position are estimated, from a fix on until dead reckoning ends."""
+    was_aided: int
+    """1 once `aided` has been 1."""
+    has_height: int
+    """1 once a fix has given the height above sea level."""
+    fix_s: float
+    """Arrival of the last accepted fix."""
+    update_s: float
+    """Arrival of the last fix that was fused or rejected."""
+    fix_vel: Annotated[FloatArray, (3,)]
+    fix_last: Annotated[FloatArray, (5,)]
+    """Latitude, longitude and velocity of the newest fix, to recognise repetitions."""
+    fix_last_s: float
+    """Arrival of the first fix with these values."""
+    track_from: Annotated[FloatArray, (4,)]
+    """Time and position from which a velocity is derived where fixes have none."""
+    zero_from: Annotated[FloatArray, (4,)]
+    """The same for velocities of exactly zero."""
+    zero_false: int
+    """1 while positions contradict a velocity of exactly zero."""
+    gps_error_var: Annotated[FloatArray, (3,)]
+    pos_density: Annotated[FloatArray, (3,)]
+    """Position noise for slow errors of GPS velocities, m2/s."""
+    reject_s: float
+    """How long fixes have been rejected and agreed with one another."""
+    reject_last: Annotated[FloatArray, (3,)]
+    """Time, north and east of the last rejected fix."""
+    glitch: Annotated[FloatArray, (3,)]
+    """Variance of velocity and position by a present glitch, m2/s2 and m2; and the square of the
+    hardest recent acceleration, m2/s4."""
+    fix_excess: float
+    """Noise of GPS velocities in units of the assumed variance, see `alignment`."""
+
+    # Barometer.
+    baro_s: float
+    baro_down_m: float
+
+    # Alignment by GPS velocities, see `alignment`.
+    moments: Annotated[FloatArray, (MOMENTS, MOMENTS)]
+    pairs: float
+    pairs_s: float
+    """Time spanned by the pairs, faded like them."""
+    pair_s: float
+    pair_vel: Annotated[FloatArray, (3,)]
+    pair_force: Annotated[FloatArray, (3,)]
+    work: Annotated[FloatArray, (2, 4, 4)]
+    """Work space of the eigenvector."""
+    aligned_q_nb: Annotated[FloatArray, (4,)]
+    aligned_std: Annotated[FloatArray, (2,)]
+    """Standard deviations of its level and heading, rad."""
+
+    # Integrity of the attitude.
+    lost: int
+    """1 while the attitude is unknown."""
+    lost_s: float
+    mismatch_s: float
+    """For how long the alignment has contradicted the attitude."""
+    heading_known: int
+    heading_true: int
+    """1 where the heading refers to true north, 0 to magnetic north."""
+
+    # Rest.
+    imu_mean: Annotated[FloatArray, (6,)]
+    """Low-pass of rate and force."""
+    gyro_mean: Annotated[FloatArray, (3,)]
+    """Low-pass of that rate."""
+    rest_from: Annotated[FloatArray, (6,)]
+    """Mean rate and force with which a rest began."""
+    rest_s: float
+    at_rest: int
+    rest_bias_b: Annotated[FloatArray, (3,)]
+    """Bias measured at the last rest, rad/s; zero before."""
+    rest_seen: int
+    """1 once a rest has measured the bias, 2 once the aircraft has moved since."""
+    spun_rad: float
+    """Angle of an apparent turn about the vertical at rest, since the compass last turned too."""
+
+    # Magnetometer.
+    earth_field: Annotated[FloatArray, (2,)]
+    """Declination and dip of the Earth's field at the last fix, rad; NaN before."""
+    mag_s: float
+    """Newest field that was compared with the usual one."""
+    mag_used_s: float
+    mag_ref: Annotated[FloatArray, (2,)]
+    """Norm in uT and dip in rad of the usual field; zero before one is known."""
+    mag_new: Annotated[FloatArray, (2,)]
+    """The same of a candidate for it."""
+    mag_times: Annotated[FloatArray, (3,)]
+    """For how long the field has been usual, been rejected, and agreed with the candidate, s."""
+    mag_disturbed: int
+    mag_last: Annotated[FloatArray, (3,)]
+    mag_turned: Annotated[FloatArray, (3,)]
+    """Turn since the readings last changed, rad."""
+    mag_from_b: Annotated[FloatArray, (3,)]
+    mag_from_i: Annotated[FloatArray, (3,)]
+    """Field with which a turn began, in the body and in the gyroscope frame; zero: none."""
+    mag_squares: Annotated[FloatArray, (3,)]
+    """Sums over turns: squared change of the field, of what the gyroscope leaves unexplained, and
+    of the change of the norm, uT2."""
+    mag_misplaced: int
+    """1 while the field turns otherwise than the aircraft."""
+    jump_from: Annotated[FloatArray, (7,)]
+    """Time, and field in the gyroscope and the body frame, that the newest one is compared with."""
+    jump_noise: Annotated[FloatArray, (2,)]
+    """Mean square of field noise in uT2, and the time it was averaged over in s."""
+    jump_seen: int
+    """1 where the last field differed by a jump."""
+    field_n: Annotated[FloatArray, (3,)]
+    """Field of the last heading update, uT."""
+
+    # GPS latency, see `latency`.
+    gps_latency_s: float
+    """The latency in use."""
+    window_from: Annotated[FloatArray, (5,)]
+    """Arrival and velocity at which the next pair begins, and the begin of the window."""
+    window_misfit: Annotated[FloatArray, (LATENCIES,)]
+    """Work space: the misfits of one window."""
+    window_force: Annotated[FloatArray, (LATENCIES, 3)]
+    """Integrated force there, for every latency."""
+    window_sums: Annotated[FloatArray, (5,)]
+    """Pairs; their acceleration (three sums) and its square."""
+    window_products: Annotated[FloatArray, (LATENCIES, 10)]
+    """Products of both changes of velocity, and their squares."""
+    latency_misfit: Annotated[FloatArray, (LATENCIES,)]
+    """Twice the negative log-likelihood of each latency over all windows."""
+    latency_found: Annotated[FloatArray, (2,)]
+    """The best latency in s and its inverse variance in 1/s2."""
+
+    # Sensor faults.
+    fault: int
+    imu_last: Annotated[FloatArray, (6,)]
+    imu_held: Annotated[FloatArray, (6,)]
+    """Newest sound values of rate and force."""
+    imu_usual: Annotated[FloatArray, (3,)]
+    """Average change of rate and force from sample to sample, and mean square of the rate."""
+    stuck_s: Annotated[FloatArray, (2,)]
+    missing_s: Annotated[FloatArray, (2,)]
+    hold_s: Annotated[FloatArray, (2,)]
+    """For how long both sensors have repeated a sample, and for how long they usually do."""
+    uncalibrated: int
+    """Bits: 1 gyroscope, 2 accelerometer, 4 magnetometer."""
+
+    # Bias steps, see `integrity`.
+    bias_sum: Annotated[FloatArray, (3,)]
+    bias_sum_var: Annotated[FloatArray, (3,)]
+    """Recent corrections of the gyroscope bias, and the variance expected of them."""
+    bias_watch_s: float
+
+    # For the smoother: discontinuities of the covariance since the start.
+    resets: Annotated[FloatArray, (STATES,)]
+    """How often each state was reset."""
+    raised: Annotated[FloatArray, (STATES,)]
+    """Variance added to each state outside the process model."""

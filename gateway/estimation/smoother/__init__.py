@@ -1,0 +1,1 @@
+"""A recorded flight smoothed from both ends."""

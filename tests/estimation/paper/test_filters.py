@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+from scipy import signal
+
+from gateway.estimation.paper.filters import (
+    PASS_THROUGH,
+    Coefficients,
+    VectorFilter,
+    design_highpass,
+    design_lowpass,
+)
+
+
+def gain(c: Coefficients, frequency_hz: float, rate_hz: float) -> float:
+    _, h = signal.freqz(c[:3], (1.0, *c[3:]), worN=[frequency_hz], fs=rate_hz)
+    return float(abs(h[0]))
+
+
+@pytest.mark.parametrize("rate_hz", [60.0, 200.0, 1000.0])
+class TestGain:
+    def test_butterworth(self, rate_hz: float) -> None:
+        c = design_lowpass("butterworth", 10.0, rate_hz)
+        assert gain(c, 0.0, rate_hz) == pytest.approx(1.0)
+        assert gain(c, 10.0, rate_hz) == pytest.approx(0.5**0.5)
+
+    def test_chebyshev(self, rate_hz: float) -> None:
+        c = design_lowpass("chebyshev", 10.0, rate_hz, 1.0)
+        assert gain(c, 0.0, rate_hz) == pytest.approx(1.0)
+        # The ripple's end lies where the design began before its scaling: at the gain of 0 Hz.
+        assert gain(c, 10.0, rate_hz) == pytest.approx(1.0)
+        assert gain(c, 7.0, rate_hz) > 1.05
+
+    def test_highpass(self, rate_hz: float) -> None:
+        c = design_highpass(0.5, rate_hz)
+        assert gain(c, 0.0, rate_hz) == pytest.approx(0.0, abs=1e-12)
+        assert gain(c, 0.5, rate_hz) == pytest.approx(0.5**0.5)
+
+
+def test_cutoff_beyond_half_the_rate_is_a_wire() -> None:
+    assert design_lowpass("butterworth", 10.0, 20.0) == PASS_THROUGH
+    assert design_highpass(0.0, 20.0) == PASS_THROUGH
+
+
+@pytest.mark.parametrize("kind", ["butterworth", "chebyshev"])
+def test_array_and_samples_and_pieces_give_the_same_bits(kind: str) -> None:
+    x = np.random.default_rng(3).normal(size=(500, 3))
+
+    def make() -> VectorFilter:
+        return VectorFilter(lambda rate: design_lowpass(kind, 10.0, rate), 200.0)
+
+    whole = make().run(x)
+    one = make()
+    by_sample = np.array([one.step(tuple(row)) for row in x.tolist()])
+    pieces = make()
+    first = pieces.run(x[:123])
+    other = make()
+    other.state = pieces.state
+    np.testing.assert_array_equal(by_sample, whole)
+    np.testing.assert_array_equal(np.vstack([first, other.run(x[123:])]), whole)
+
+
+def test_agrees_with_scipy() -> None:
+    x = np.random.default_rng(4).normal(size=(300, 3)) + 5.0
+    b, a = signal.butter(2, 10.0, fs=100.0)
+    zi = signal.lfilter_zi(b, a)[:, None] * x[0]
+    expected, _ = signal.lfilter(b, a, x, axis=0, zi=zi)
+    got = VectorFilter(lambda rate: design_lowpass("butterworth", 10.0, rate), 100.0).run(x)
+    np.testing.assert_allclose(got, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["butterworth", "chebyshev"])
+def test_no_transient_at_start_or_retune(kind: str) -> None:
+    f = VectorFilter(lambda rate: design_lowpass(kind, 10.0, rate), 200.0)
+    for rate_hz in (200.0, 60.0, 1000.0):
+        f.retune(rate_hz)
+        for _ in range(50):
+            assert f.step((0.3, -0.2, -9.81)) == pytest.approx((0.3, -0.2, -9.81), abs=1e-9)
+
+
+def test_highpass_forgets_a_constant_at_once() -> None:
+    f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
+    assert f.step((0.5, 0.5, 0.5)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    assert f.step((1.5, 0.5, 0.5))[0] == pytest.approx(1.0, abs=0.01)
+
+
+def test_empty_array() -> None:
+    f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
+    assert f.run(np.empty((0, 3))).shape == (0, 3)
+    assert f.state is None
+
+
+@pytest.mark.parametrize("kind", ["butterworth", "chebyshev"])
+@pytest.mark.parametrize("rate_hz", [50.0, 100.0, 1000.0])
+@pytest.mark.parametrize("share", [1e-4, 0.01, 0.1, 0.3, 0.49])
+def test_designs_are_those_of_scipy(kind: str, rate_hz: float, share: float) -> None:
+    cutoff_hz = share * rate_hz
+    if kind == "butterworth":
+        b, a = signal.butter(2, cutoff_hz, fs=rate_hz)
+    else:
+        b, a = signal.cheby1(2, 0.7, cutoff_hz, fs=rate_hz)
+        b = b * (a.sum() / b.sum())
+    found = design_lowpass(kind, cutoff_hz, rate_hz, 0.7)
+    np.testing.assert_allclose(found, (*b, *a[1:]), rtol=1e-7)
+    b, a = signal.butter(1, cutoff_hz, "highpass", fs=rate_hz)
+    np.testing.assert_allclose(design_highpass(cutoff_hz, rate_hz), (*b, 0.0, a[1], 0.0), rtol=1e-9)

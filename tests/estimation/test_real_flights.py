@@ -1,0 +1,58 @@
+"""Accuracy on recorded flights with a reference: limits for attitude, position and outages."""
+
+from pathlib import Path
+
+import pytest
+
+from tools.flights import read_flight
+from tools.peers import run_vqf
+from tools.score_estimators import (
+    attitude_scores,
+    outage_score,
+    position_errors_m,
+    rms,
+    run_eskf,
+    share_scores,
+)
+
+LIMITS: dict[str, dict[str, float]] = {
+    "arduplane_testlog2": {
+        "roll": 0.85, "pitch": 0.72, "yaw": 1.4, "pos": 1.0, "out10": 4.5, "out30": 31.0,
+    },
+    "arducopter_quad106": {"total": 2.3, "pos": 0.75, "out10": 4.8},
+    "car_rtk_drive0708_first_half": {"out10": 1.9, "out30": 8.5},
+    "walk_rtk_0827": {"out10": 1.5},
+    "px4_mocap_log008": {"total": 0.3},
+    "phantom_rtk_dot2": {"inclination": 1.3, "pos": 0.2},
+}  # fmt: skip
+SHARE = 0.9
+"""Least share of the time within two standard deviations."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LIMITS)
+def test_errors_are_within_limits(data_dir: Path, name: str) -> None:
+    flight = read_flight(data_dir / f"{name}.csv.gz")
+    out = run_eskf(flight)
+    found = attitude_scores(flight, out[:, :4])
+    limits = LIMITS[name]
+    if "pos" in limits:
+        found["pos"] = rms(position_errors_m(flight, out)[flight.counts])
+    for key, length_s in (("out10", 10.0), ("out30", 30.0)):
+        if key in limits:
+            found[key] = outage_score(flight, run_eskf, length_s)
+    assert {key: found[key] for key in limits if found[key] > limits[key]} == {}
+    shares = share_scores(flight, out)
+    assert {key: share for key, share in shares.items() if share < SHARE} == {}
+
+
+@pytest.mark.slow
+def test_magnetic_disturbances_are_handled_better_than_by_vqf(data_dir: Path) -> None:
+    pytest.importorskip("vqf")
+    names = ("broad_30_disturbed_stationary_magnet_C", "broad_33_disturbed_attached_magnet_2cm")
+    for name in names:
+        flight = read_flight(data_dir / f"{name}.csv.gz")
+        own = attitude_scores(flight, run_eskf(flight)[:, :4])
+        vqf = attitude_scores(flight, run_vqf(flight))
+        assert own["total"] < 1.25 * vqf["total"]
+        assert own["inclination"] < 1.25 * vqf["inclination"]
