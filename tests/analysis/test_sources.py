@@ -58,7 +58,7 @@ def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
         name="a",
         story="",
     )
-    chain = SensorChain(flight.fusion.sensing, ideal_calibration(SIMULATED.errors))
+    chain = SensorChain(ideal_calibration(SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
     assert flight.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
     assert np.isfinite(flight.mag_b_ut[:, 0]).tolist() == [s.mag_b_ut is not None for s in samples]
