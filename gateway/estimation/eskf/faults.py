@@ -294,15 +294,8 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     if rested and dt > STEADY_S:
         lose_attitude(s, p)
         return
-    before, bias = held_gyro(s), as_vec(s.gyro_bias_b)
-    mean = (s.imu_mean[0] - bias[0], s.imu_mean[1] - bias[1], s.imu_mean[2] - bias[2])
-    down_b = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
-    about = down_b[0] * mean[0] + down_b[1] * mean[1] + down_b[2] * mean[2]
-    steady = (
-        bias[0] + about * down_b[0],
-        bias[1] + about * down_b[1],
-        bias[2] + about * down_b[2],
-    )
+    mean, about, steady = steady_turn(s)
+    before = held_gyro(s)
     share = 2.0 * end_share_s(dt) / dt
     rate = rate_of(s, part_way(steady, part_way(before, gyro, 0.5), share))
     turning = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
@@ -325,6 +318,21 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     most = AIDED_LOST_RAD if s.aided == 1 else LOST_LEVEL_RAD
     if s.lost == 0 and turned_var > most * most:
         lose_attitude(s, p)
+
+
+@compiled
+def steady_turn(s: State) -> tuple[Vec3, float, Vec3]:
+    """Return the mean rate before a gap, its part about down, and that part with the bias."""
+    bias = as_vec(s.gyro_bias_b)
+    mean = (s.imu_mean[0] - bias[0], s.imu_mean[1] - bias[1], s.imu_mean[2] - bias[2])
+    down_b = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
+    about = down_b[0] * mean[0] + down_b[1] * mean[1] + down_b[2] * mean[2]
+    steady = (
+        bias[0] + about * down_b[0],
+        bias[1] + about * down_b[1],
+        bias[2] + about * down_b[2],
+    )
+    return mean, about, steady
 
 
 @compiled

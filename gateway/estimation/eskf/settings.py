@@ -277,8 +277,12 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
     Gains
         A flat record for the compiled code.
     """
-    s = settings
-    values = {
+    return filled_record(Gains, _inertial_gains(settings) | _aiding_gains(settings, reference))
+
+
+def _inertial_gains(s: EskfSettings) -> dict[str, float]:
+    """Return the gains of the inertial sensors, of gravity and rest."""
+    return {
         "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
         "gyro_vibration_sq": s.gyro_vibration**2,
         "gyro_scale_var": s.gyro_scale**2,
@@ -296,6 +300,17 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "gravity_tau_s": s.gravity_tau_s,
         "gravity_var": s.gravity_noise_mps2**2,
         "gravity_motion_sq": s.gravity_motion**2,
+        "rest_gyro_radps": math.radians(s.rest_gyro_degps),
+        "rest_accel_mps2": s.rest_accel_mps2,
+        "rest_time_s": s.rest_time_s,
+        "rest_speed_mps": s.rest_speed_mps,
+        "bias_limit_radps": math.radians(s.bias_limit_degps),
+    }
+
+
+def _aiding_gains(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float]:
+    """Return the gains of GPS, compass and barometer."""
+    return {
         "gps_position_var": s.gps_position_m**2,
         "gps_height_var": s.gps_height_m**2,
         "gps_error_var": s.gps_error_m**2,
@@ -321,10 +336,4 @@ def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
         "dead_reckoning_s": s.dead_reckoning_s,
         "gate_sq": s.gate_sigma**2,
         "gate_m": s.gate_m,
-        "rest_gyro_radps": math.radians(s.rest_gyro_degps),
-        "rest_accel_mps2": s.rest_accel_mps2,
-        "rest_time_s": s.rest_time_s,
-        "rest_speed_mps": s.rest_speed_mps,
-        "bias_limit_radps": math.radians(s.bias_limit_degps),
     }
-    return filled_record(Gains, values)
