@@ -42,7 +42,7 @@ SYNC_TRIES: Final = 12
 SYNC_WAIT_S: Final = 0.1
 """Optiboot flashes its LED for 0.3 s before it listens, and waits 1 s for a request."""
 AVRDUDE_LIMIT_S: Final = 180.0
-AVRDUDE_TRIES: Final = 2
+AVRDUDE_TRIES: Final = 3
 """A board that restarts slowly can miss the first requests."""
 
 
