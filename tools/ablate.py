@@ -1,0 +1,150 @@
+"""Measure the contribution of each mechanism of the Kalman filter beyond the textbook equations.
+
+    python -m tools.ablate --data DIR
+
+Each mechanism is disabled in turn: one function or constant is replaced, and the kernels are
+compiled again, for some 20 s each. The errors are those of `tools.score_estimators`, on recorded
+flights and on flights with the disturbances of `tools.spoil_flight`. A ratio above 1 means larger
+errors without the mechanism, as geometric mean over the flights; a flight counts as worse or better
+if its own mean differs by more than 1 %. A score that only the full filter has counts as worse.
+"""
+
+import argparse
+import math
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Final, NamedTuple
+from unittest.mock import patch
+
+from rich.console import Console
+from rich.table import Table
+
+from gateway.compiled import compiled
+from gateway.estimation.eskf.filter import begin_state, run
+from gateway.estimation.eskf.state import INTEGRALS, State
+from tools.build_kernels import compiled_again
+from tools.flights import Flight
+from tools.score_estimators import (
+    SHARES,
+    Scores,
+    flights_to_score,
+    geometric_means,
+    run_eskf,
+    score,
+    spoilt_scores,
+)
+
+
+@compiled
+def at_present(s: State, _: float) -> float:
+    """Use a fix as if it were valid now; replaces `look_back`."""
+    for k in range(INTEGRALS):
+        s.then[k] = s.integrals[k]
+    return float(s.time_s)
+
+
+NOTHING: Final = compiled(lambda *_: None)
+FALSE: Final = compiled(lambda *_: False)
+ZERO: Final = compiled(lambda *_: 0)
+NO_NUMBER: Final = compiled(lambda *_: 0.0)
+FULL_WEIGHT: Final = compiled(lambda *_: 1.0)
+
+
+class Mechanism(NamedTuple):
+    """A mechanism, the module of the filter that uses it, and the name to replace there."""
+
+    title: str
+    module: str
+    name: str
+    replacement: object
+
+
+MECHANISMS: Final = (
+    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING),
+    Mechanism("steps of the gyroscope bias", "predict", "unexpected_bias_density", NO_NUMBER),
+    Mechanism("rest", "rest", "keeps_means", FALSE),
+    Mechanism("integrity check of the attitude", "integrity", "is_contradicted", FALSE),
+    Mechanism("heading from motion", "integrity", "FOUND_HEADING_RAD", 0.0),
+    Mechanism("norm and dip of the field", "magnetometer", "field_weight", FULL_WEIGHT),
+    Mechanism("jumps of the field", "magnetometer", "has_jumped", FALSE),
+    Mechanism("hard iron by the model's dip", "fixes", "raise_iron_by_dip", NOTHING),
+    Mechanism("time of validity of a fix", "fixes", "look_back", at_present),
+    Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING),
+    Mechanism("GPS glitches", "delayed", "note_glitch", NOTHING),
+    Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO),
+)
+FILTER: Final = "gateway.estimation.eskf"
+FULL: Final = "full filter"
+FLIGHTS: Final = (
+    *("arduplane", "quad106", "phantom", "mocap", "car_", "walk"),
+    *("broad_06", "broad_30", "broad_33"),
+)
+DISTURBED: Final = ("arduplane", "phantom", "broad_06")
+"""Words in the names of the flights that are scored as recorded, and with disturbances."""
+EQUAL: Final = 0.01
+"""A flight whose errors change by a smaller share counts as equal."""
+
+Board = dict[str, dict[str, Scores]]
+
+
+def add_scores(recorded: Board, disturbed: Board, name: str, flights: Sequence[Flight]) -> None:
+    """Score all flights with the kernels as they are now."""
+    for flight in flights:
+        recorded.setdefault(flight.name, {})[name] = score(flight, run_eskf)
+        if any(word in flight.name for word in DISTURBED):
+            for how, scores in spoilt_scores(flight, run_eskf).items():
+                disturbed.setdefault(f"{flight.name} {how}", {})[name] = scores
+
+
+def comparison(board: Board, name: str) -> tuple[str, str, str]:
+    """Return the numbers of flights that are worse and better without it, and the mean ratio."""
+    worse, better, logarithms = 0, 0, []
+    for flight, scores in board.items():
+        ratios = geometric_means({flight: scores}, FULL)
+        if len(ratios[name]) < len(ratios[FULL]):
+            worse += 1
+        elif ratios[FULL]:
+            logarithms.append(fmean(math.log(ratio) for ratio in ratios[name].values()))
+            worse += logarithms[-1] > math.log1p(EQUAL)
+            better += logarithms[-1] < -math.log1p(EQUAL)
+    return str(worse), str(better), f"{math.exp(fmean(logarithms)):.3f}"
+
+
+def share_within(board: Board, name: str) -> str:
+    """Return the mean share of the time that errors are within two standard deviations."""
+    shares = [scores[name].get(key, math.nan) for scores in board.values() for key in SHARES]
+    return f"{100 * fmean(share for share in shares if math.isfinite(share)):.1f} %"
+
+
+def main() -> None:
+    """Score the full filter, then each variant, and print the table."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True, help="folder of *.csv.gz flights")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    flights = list(flights_to_score(options.data, FLIGHTS))
+    if not flights:
+        raise SystemExit(f"{options.data} contains none of the flights {', '.join(FLIGHTS)}")
+    boards: tuple[Board, Board] = {}, {}
+    add_scores(*boards, FULL, flights)
+    table = Table("disabled mechanism", box=None, pad_edge=False)
+    for board, kind in zip(boards, ("recorded", "disturbed"), strict=True):
+        for title in (f"{len(board)} {kind}: worse", "better", "ratio", "within 2 sigma"):
+            table.add_column(title, justify="right")
+    table.add_row("none", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
+    table.add_column()
+    for number, (title, module, name, replacement) in enumerate(MECHANISMS, 1):
+        target = f"{FILTER}.{module}.{name}"
+        with patch(target, replacement), compiled_again([begin_state, run]):
+            add_scores(*boards, title, flights)
+        cells = [c for b in boards for c in (*comparison(b, title), share_within(b, title))]
+        differs = any(int(cells[k]) for k in (0, 1, 4, 5))
+        table.add_row(title, *cells, "" if differs else "no measurable difference")
+        print(f"{number} of {len(MECHANISMS)}: without {title}: {'  '.join(cells)}", flush=True)
+    Console(width=140).print(table)
+
+
+if __name__ == "__main__":
+    main()
