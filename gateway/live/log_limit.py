@@ -2,11 +2,13 @@
 
 A kind of line is the code position that writes it and, for an unexpected error, the one that
 raised it. Of each kind a few lines at once are written and then one a second; the next one written
-says how many were not.
+says how many were not. Time is monotonic: a wall clock that is set back suppresses no line.
 """
 
 import logging
+import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -29,18 +31,18 @@ class _Kind:
 class LogLimit(logging.Filter):
     """Let a bounded number of lines of each kind through a handler."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
+        self._clock = clock
         self._kinds: dict[Kind, _Kind] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether a line is written; the first after a gap says how many were not."""
         if len(self._kinds) >= MAX_KINDS:
             self._kinds.clear()
-        now_s = record.created
+        now_s = self._clock()
         kind = self._kinds.setdefault(_kind_of(record), _Kind(now_s - BURST * REFILL_S))
-        # A clock that was set back would silence a kind until it has caught up.
-        kind.since_s = min(max(kind.since_s, now_s - BURST * REFILL_S), now_s)
+        kind.since_s = max(kind.since_s, now_s - BURST * REFILL_S)
         if now_s - kind.since_s < REFILL_S:
             kind.suppressed += 1
             return False

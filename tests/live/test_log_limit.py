@@ -1,43 +1,62 @@
-"""The log is bounded whatever happens, and tells how much it left out."""
+"""The log is bounded whatever happens, and reports how many lines it left out."""
 
 import logging
+from itertools import pairwise
+
+import pytest
 
 from gateway.live.log_limit import BURST, LogLimit
+from tests.conftest import ManualClock
 
 
-def line(
-    text: str, second: float, lineno: int = 1, error: Exception | None = None
-) -> logging.LogRecord:
+@pytest.fixture
+def limit(clock: ManualClock) -> LogLimit:
+    clock.advance(1000.0)
+    return LogLimit(lambda: clock.now_us / 1e6)
+
+
+def line(text: str, lineno: int = 1, error: Exception | None = None) -> logging.LogRecord:
     info = (type(error), error, error.__traceback__) if error else None
-    record = logging.LogRecord("here", logging.INFO, "place.py", lineno, "%s", (text,), info)
-    record.created = second
-    return record
+    return logging.LogRecord("here", logging.INFO, "place.py", lineno, "%s", (text,), info)
 
 
-def test_a_kind_has_a_few_lines_at_once_and_then_one_a_second() -> None:
-    limit = LogLimit()
-    told = [limit.filter(line(f"n {n}", 1000.0 + n / 1000)) for n in range(5000)]
-    assert sum(told) == BURST + 4
-    assert all(told[:BURST])
+def test_a_burst_passes_and_then_one_line_a_second(limit: LogLimit, clock: ManualClock) -> None:
+    passed = []
+    for n in range(5000):
+        passed.append(limit.filter(line(f"n {n}")))
+        clock.advance(0.001)
+    assert sum(passed) == BURST + 4
+    assert all(passed[:BURST])
 
 
-def test_the_next_line_tells_how_many_were_left_out() -> None:
-    limit = LogLimit()
+def test_next_line_reports_how_many_were_suppressed(limit: LogLimit, clock: ManualClock) -> None:
     for n in range(BURST + 7):
-        limit.filter(line(f"n {n}", 1000.0))
-    record = line("at last", 1001.0)
+        limit.filter(line(f"n {n}"))
+    clock.advance(1.0)
+    record = line("at last")
     assert limit.filter(record)
     assert record.getMessage() == "at last (and 7 more like it, not logged)"
-    after = line("and then", 1002.0)
+    clock.advance(1.0)
+    after = line("and then")
     assert limit.filter(after)
     assert after.getMessage() == "and then"
 
 
-def test_kinds_do_not_silence_each_other() -> None:
-    limit = LogLimit()
+def test_endless_repetition_is_logged_every_second(limit: LogLimit, clock: ManualClock) -> None:
+    passed_s = []
+    for _ in range(36_000):
+        if limit.filter(line("again")):
+            passed_s.append(clock.now_us / 1e6)
+        clock.advance(0.1)
+    gaps_s = [after - before for before, after in pairwise(passed_s)]
+    assert passed_s[-1] > clock.now_us / 1e6 - 1.1
+    assert max(gaps_s) < 1.2
+
+
+def test_kinds_are_limited_separately(limit: LogLimit) -> None:
     for n in range(1000):
-        limit.filter(line(f"n {n}", 1000.0))
-    assert limit.filter(line("elsewhere", 1000.0, lineno=2))
+        limit.filter(line(f"n {n}"))
+    assert limit.filter(line("elsewhere", lineno=2))
 
 
 def fail(where: int) -> Exception:
@@ -50,19 +69,20 @@ def fail(where: int) -> Exception:
     raise AssertionError
 
 
-def test_errors_are_told_apart_by_where_they_came_from() -> None:
-    """The loop logs every error of a callback at one place of its own."""
-    limit = LogLimit()
+def test_errors_of_different_code_positions_are_limited_separately(limit: LogLimit) -> None:
+    """The loop logs every error of a callback at one code position of its own."""
     for _ in range(1000):
-        limit.filter(line("Exception in callback", 1000.0, error=fail(0)))
-    assert not limit.filter(line("Exception in callback", 1000.0, error=fail(0)))
-    assert limit.filter(line("Exception in callback", 1000.0, error=fail(1)))
+        limit.filter(line("Exception in callback", error=fail(0)))
+    assert not limit.filter(line("Exception in callback", error=fail(0)))
+    assert limit.filter(line("Exception in callback", error=fail(1)))
 
 
-def test_a_clock_that_is_set_back_silences_nothing() -> None:
-    limit = LogLimit()
-    for n in range(BURST):
-        assert limit.filter(line(f"n {n}", 1_000_000.0))
-    assert not limit.filter(line("too many", 1_000_000.0))
-    told = [limit.filter(line("back then", 1000.0 + n)) for n in range(5)]
-    assert sum(told) >= 4
+@pytest.mark.parametrize("step_s", [-7200.0, 7200.0])
+def test_step_of_the_wall_clock_suppresses_no_line(
+    limit: LogLimit, clock: ManualClock, step_s: float
+) -> None:
+    for n in range(100):
+        record = line(f"status {n}")
+        record.created = 1e9 + n * (step_s + 10.0)
+        assert limit.filter(record)
+        clock.advance(10.0)
