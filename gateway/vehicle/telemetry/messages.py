@@ -467,8 +467,9 @@ def high_latency2(
 ) -> Any:
     """Encode the state of the vehicle in 42 bytes.
 
-    A position has no "unknown" in this message: it is 0, 0 before the first fix, and the GPS
-    failure flag is set. Nothing measures wind, airspeed or throttle.
+    Latitude, longitude and altitude have no "unknown" in this message, which is the only one of
+    its link, so it is sent before the first fix too: as PX4 does, with 0, 0, errors of UINT8_MAX
+    and the GPS failure flag. Nothing measures wind, airspeed or throttle.
 
     Parameters
     ----------
@@ -490,8 +491,11 @@ def high_latency2(
     MAVLink_message
     """
     failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
+    h_acc_m, v_acc_m = NAN, NAN
     if fix is None or not is_3d(fix):
         failures |= mavlink.HL_FAILURE_FLAG_GPS
+    elif health.is_alive(GPS, now_us):
+        h_acc_m, v_acc_m = fix.h_acc_m, fix.v_acc_m
     known = state is not None and has_position(state)
     north, east, down = state.vel_n_mps if state is not None else (NAN, NAN, NAN)
     yaw_deg = math.degrees(to_euler(state.q_nb)[2]) if state is not None else NAN
@@ -504,7 +508,7 @@ def high_latency2(
         custom_mode=CUSTOM_MODES[autopilot] >> 16,
         latitude=encoding.int32(state.lat_deg * DEGE7) if state is not None and known else 0,
         longitude=encoding.int32(state.lon_deg * DEGE7) if state is not None and known else 0,
-        altitude=encoding.int16(state.alt_amsl_m) if state is not None and known else 0,
+        altitude=encoding.int16(state.alt_amsl_m) if state is not None else 0,
         target_altitude=0,
         heading=encoding.uint8(yaw_deg % 360.0 / HALF_DEGREES, unknown=0),
         target_heading=0,
@@ -515,8 +519,8 @@ def high_latency2(
         groundspeed=speed,
         windspeed=0,
         wind_heading=0,
-        eph=encoding.uint8(fix.h_acc_m * TENTHS if fix is not None else NAN),
-        epv=encoding.uint8(fix.v_acc_m * TENTHS if fix is not None else NAN),
+        eph=encoding.uint8(h_acc_m * TENTHS),
+        epv=encoding.uint8(v_acc_m * TENTHS),
         temperature_air=0,
         climb_rate=encoding.whole(-down * TENTHS, -INT8_MAX, INT8_MAX, 0),
         battery=UNKNOWN_PERCENT,
