@@ -90,7 +90,9 @@ class PlayerDaemon:
         self._now_us = GatewayClock()
         self._plan = plan
         self._player = self._make_player(flights)
-        self._hub = Hub(settings.hub, self._on_frame, self._now_us, on_gone=self._on_gone)
+        self._hub = Hub(
+            settings.hub, self._on_frame, self._now_us, on_gone=self._on_gone, keeps_order=True
+        )
         self._numbering = _Numbering()
         metadata = Aircraft(1, settings.default_aircraft).vehicle.metadata
         self._vehicles = [

@@ -218,7 +218,7 @@ def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after:
 def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
     aircraft = Aircraft(1, with_estimator(name))
     before = fly(aircraft)[-1]
-    wanted = replaced(with_estimator(name), "estimation.rest.bias_limit_degps", 3.0).estimation
+    wanted = replaced(with_estimator(name), "estimation.reference.gps_latency_s", 0.3).estimation
     aircraft.perform([SettingsChange(1, "estimation", wanted, "")], 0)
     after = fly(aircraft, 3_700_000, 2)[0]
     assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
@@ -235,7 +235,9 @@ def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
     monkeypatch.setattr("gateway.aircraft.make_estimator", fail)
     before = aircraft.settings
     with pytest.raises(ArithmeticError):
-        aircraft.change(with_estimator("eskf"), 0)
+        aircraft.perform(
+            [SettingsChange(1, "estimation", with_estimator("paper").estimation, "")], 0
+        )
     assert aircraft.settings == before
 
 

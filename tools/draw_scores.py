@@ -22,11 +22,9 @@ TARGET = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "accurac
 MARKS = {
     "smoothed": (GREEN, "o"),
     "eskf": (COLOURS["eskf"], "o"),
-    "complementary": (COLOURS["complementary"], "o"),
     "paper": (COLOURS["paper"], "s"),
     "vqf": (MUTED, "D"),
-    "imufusion": (MUTED, "^"),
-    "ahrs Madgwick": (MUTED, "x"),
+    "textbook": (MUTED, "^"),
 }
 """The colours that reports give to our own, grey for other people's."""
 PANELS = {

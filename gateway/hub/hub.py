@@ -93,6 +93,8 @@ class Hub:
         Called with each received frame and the time; True drops it.
     recordings : Path, optional
         Folder of the recordings that a fleet may fetch.
+    keeps_order : bool, optional
+        Send frames in their order, without answers first, and drop none: for a recording.
     """
 
     def __init__(
@@ -106,8 +108,10 @@ class Hub:
         signer: FrameSigner | None = None,
         rejects: Callable[[bytes, int], bool] | None = None,
         recordings: Path | None = None,
+        keeps_order: bool = False,
     ) -> None:
         self.settings = settings
+        self._keeps_order = keeps_order
         self.recordings = recordings
         self.signer = signer = signer or FrameSigner()
         self.now_us = now_us
@@ -179,7 +183,9 @@ class Hub:
         for outgoing in frames:
             queued = self._queued(outgoing)
             is_answer = (
-                outgoing.client_id is not None or queued.frame.message_id in NOT_TELEMETRY_IDS
+                self._keeps_order
+                or outgoing.client_id is not None
+                or queued.frame.message_id in NOT_TELEMETRY_IDS
             )
             (self._answers if is_answer else self._telemetry).append(queued)
         if self._burst_turn is None:

@@ -60,9 +60,9 @@ def test_one_broken_file_stops_nothing_and_is_reported(fused: tuple[Path, int, s
     assert "1 of 5 recordings failed" in text
     flights = pd.read_csv(out / "flights.csv")
     assert flights["failed"].notna().sum() == 1
-    errors = flights.dropna(subset="complementary, m")
+    errors = flights.dropna(subset="eskf, m")
     assert sorted(errors["recording"]) == sorted(FLIGHTS)
-    assert errors["complementary, m"].between(0.01, 5.0).all()
+    assert errors["eskf, m"].between(0.01, 5.0).all()
     page = (out / "index.html").read_text()
     assert "Errors by aircraft and estimator" in page
     assert "broken.csv" in page
@@ -123,7 +123,7 @@ def test_a_version_is_compared_with_another(
     assert (
         "eskf against the other results: +100.0 % error over 4 flights on 4 aircraft-days" in text
     )
-    assert "complementary against the other results: the same error on all 4 flights" in text
+    assert "paper against the other results: the same error on all 4 flights" in text
     assert text.count("worse: ") == 4
     assert "got worse" in (out / "index.html").read_text()
     missing = run("fuse", season, "-o", out, "--against", tmp_path / "nowhere")
@@ -406,7 +406,7 @@ def test_without_the_extra_it_says_how_to_add_it(
     words: tuple[str, ...], lacking: str, season: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(f"gateway.cli.recorded.batch_work.{lacking}", lambda: False)
+    monkeypatch.setattr(f"gateway.cli.support.batch_work.{lacking}", lambda: False)
     named = [word.format(season=season) for word in words]
     code, text = run("fuse", *named, "-o", tmp_path)
     assert code == 2

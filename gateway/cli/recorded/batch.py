@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from gateway.cli.recorded.batch_work import (
+from gateway.cli.support.batch_work import (
     JobsOption,
     SchedulerOption,
     SeasonFiles,
@@ -154,7 +154,7 @@ def sweep(
     force: ForceOption = False,
 ) -> None:
     """Find one set of settings for many flights; those of other days judge what was chosen."""
-    from gateway.cli.recorded.batch_work import run_season_sweep
+    from gateway.cli.support.batch_work import run_season_sweep
     from gateway.cli.support.sweeping import SweepOptions
 
     work = SeasonWork(files, config, jobs, scheduler)

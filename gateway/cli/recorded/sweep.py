@@ -86,7 +86,7 @@ def sweep(
     )
     given = flights or []
     if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
-        from gateway.cli.recorded.batch_work import SeasonWork, run_season_sweep, season_options
+        from gateway.cli.support.batch_work import SeasonWork, run_season_sweep, season_options
 
         if reference is not None or system is not None:
             refuse("--reference and --system belong to one flight")

@@ -72,7 +72,7 @@ def table(path: Path, **head: object) -> Path:
 def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
     out = tmp_path / "out.csv"
     printed = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
-    assert "samples fused" in printed
+    assert "fused by eskf" in printed
     assert "left out 10 lines that cannot be read" in printed
     assert "out.csv: 90 samples" in printed
 
@@ -82,7 +82,7 @@ def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
     tmp_path: Path, height: str
 ) -> None:
     printed = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
-    assert "100 samples fused" in printed
+    assert "100 samples at 100 Hz fused" in printed
 
 
 @pytest.mark.parametrize(
@@ -90,8 +90,8 @@ def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
     [
         (b"# gps_latency_s=1.1.1\n", "line 1: gps_latency_s=1.1.1 is no number"),
         (b"# gps_latency_s=99\n", "Expected `float` <= 2.0"),
-        (b"# \xe4\xf6\xfc gps_latency_s=0.2\n", "samples fused"),
-        (b"\xef\xbb\xbf", "samples fused"),
+        (b"# \xe4\xf6\xfc gps_latency_s=0.2\n", "fused by eskf"),
+        (b"\xef\xbb\xbf", "fused by eskf"),
     ],
 )
 def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
@@ -252,10 +252,10 @@ def test_a_mark_that_is_nowhere_does_not_clear_the_one_there_is(words: tuple[str
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ('[hub]\nendpoints = ["udp:127.0.0.1:0"]', "port 0 is nowhere"),
+        ('[hub]\nendpoints = ["udp:127.0.0.1:0"]', "port must be 1 to 65535"),
         ('[hub]\nendpoints = ["udp-listen:127.0.0.1:0"]', "takes any free port"),
         ('[hub]\nendpoints = ["serial::57600"]', "write serial:DEVICE:BAUD"),
-        ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is no multicast group"),
+        ('[hub]\nendpoints = ["udp-multicast:127.0.0.1:14550"]', "is not a multicast group"),
         ('[recording]\nfolder = "~no-such-user/x"', "no user has the home ~no-such-user"),
         ('aircraft_folder = "~no-such-user"', "write the whole path"),
         ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, always"),
