@@ -11,6 +11,7 @@ these disturbances are left out.
 
 import argparse
 import asyncio
+import contextlib
 import os
 import shutil
 import signal
@@ -54,6 +55,8 @@ endpoints = ["udp:127.0.0.1:{client}"]
 [recording]
 mode = "always"
 folder = "{recordings}"
+free_floor_mb = 0
+rotate_mb = 1
 """
 
 
@@ -198,13 +201,9 @@ class Gateway:
             self.receiver.plug()
         elif kind == "disk full":
             filler = self.disk / "filler"
-            with filler.open("wb") as file:
-                try:
-                    while True:
-                        file.write(b"\0" * 65536)
-                        file.flush()
-                except OSError:
-                    pass
+            with filler.open("wb", buffering=0) as file, contextlib.suppress(OSError):
+                while True:
+                    file.write(b"\0" * 65536)
             await asyncio.sleep(rng.uniform(1.0, 8.0))
             filler.unlink()
             for old in sorted(self.disk.rglob("*.*"))[:-4]:
@@ -260,7 +259,7 @@ async def soak(options: argparse.Namespace) -> int:
 def judge(listener: Listener, found: list[Disturbance], folder: Path) -> int:
     """Print the longest gap of every stream with its cause."""
     status = 0
-    print(f"{len(found)} disturbances; log and files in {folder}")
+    print(f"{len(found)} disturbances; files in {folder}; its log has the stepped clock")
     print(f"{'message':22} {'count':>8} {'gap s':>7} {'at s':>8} {'unexplained s':>14}  cause")
     for name in STREAMS:
         message_id = getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
