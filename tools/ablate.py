@@ -133,8 +133,8 @@ def main() -> None:
     for board, kind in zip(boards, ("recorded", "disturbed"), strict=True):
         for title in (f"{len(board)} {kind}: worse", "better", "ratio", "within 2 sigma"):
             table.add_column(title, justify="right")
-    table.add_row("none", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
     table.add_column()
+    table.add_row("none", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
     for number, (title, module, name, replacement) in enumerate(MECHANISMS, 1):
         target = f"{FILTER}.{module}.{name}"
         with patch(target, replacement), compiled_again([begin_state, run]):
@@ -143,7 +143,7 @@ def main() -> None:
         differs = any(int(cells[k]) for k in (0, 1, 4, 5))
         table.add_row(title, *cells, "" if differs else "no measurable difference")
         print(f"{number} of {len(MECHANISMS)}: without {title}: {'  '.join(cells)}", flush=True)
-    Console(width=140).print(table)
+    Console(width=170).print(table)
 
 
 if __name__ == "__main__":
