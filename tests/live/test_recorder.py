@@ -153,7 +153,7 @@ async def test_a_part_begins_with_what_the_fusion_remembers(
 ) -> None:
     bench = Bench(tmp_path, clock, rotate_min=1)
     seen = 0
-    bench.recorder._state_of = lambda vehicle_id: FusionState(vehicle_id, str(seen), b"", b"")
+    bench.recorder._state_of = lambda vehicle_id: FusionState(vehicle_id, str(seen), b"")
     await bench.turn()
     flight = [make_fused(rng, 1000), make_baro(rng, 1500), make_fused(rng, 2000)]
     for record in flight[:2]:
@@ -169,7 +169,7 @@ async def test_a_part_begins_with_what_the_fusion_remembers(
     )
     # What waited for the next sample was fused before the second part began.
     assert [type(event) for event in first] == [TableRow, TableRow]
-    assert second[0] == FusionState(3, "2", b"", b"")
+    assert second[0] == FusionState(3, "2", b"")
     assert [type(event) for event in second[1:]] == [TableHeader, TableRow]
     assert isinstance(second[2], TableRow)
     assert second[2].baro is None

@@ -62,7 +62,7 @@ def test_withheld_fixes_find_the_latency() -> None:
     table = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "held")
     assert table.iloc[0][LATENCY] == pytest.approx(0.16, abs=0.09)
     copied = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "interpolated")
-    assert copied.iloc[0][LATENCY] < table.iloc[0][LATENCY]
+    assert copied.iloc[0][LATENCY] <= table.iloc[0][LATENCY]
 
 
 def test_the_best_stands_first_and_what_is_not_known_is_left_out() -> None:

@@ -81,7 +81,7 @@ def test_it_is_where_it_was(shown: list[Message]) -> None:
         assert fix["latitude"] == pytest.approx(truth.lat_deg[k], abs=1e-4)
         assert fix["longitude"] == pytest.approx(truth.lon_deg[k], abs=1e-4)
         assert fix["altitude"] == pytest.approx(truth.alt_amsl_m[k], abs=10.0)
-        assert fix["position_covariance_type"] == 1
+        assert fix["position_covariance_type"] == 2
         east, north, up = (fix["position_covariance"][i] for i in (0, 4, 8))
         assert 0.01 < east == north < 100.0
         assert 0.01 < up < 400.0
