@@ -5,6 +5,7 @@ from typing import Final
 
 import msgspec
 
+from gateway.hub.limits import TokenBucket
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.table import (
     TableHeader,
@@ -17,7 +18,6 @@ from gateway.recordings.table import (
 )
 from gateway.recordings.tlog import Stamper, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
-from gateway.units import US_PER_S
 
 PENDING_LIMIT: Final = 16 << 20
 """Bytes that wait for a slow disk: minutes of telemetry. More is dropped."""
@@ -125,50 +125,41 @@ def table_ending(vehicle_id: int) -> str:
     return f"_v{vehicle_id}.csv"
 
 
-TRUSTED_BPS: Final = 64_000
+TRUSTED_RATE: Final = 64_000
 """Bytes a second for each client that may change things: more than any ground station sends."""
-STRANGERS_BPS: Final = 4_000
+UNTRUSTED_RATE: Final = 4_000
 """Bytes a second for all others together."""
 BURST_S: Final = 16
-"""Length of a burst: a ground station asks much when it connects, then little."""
-
-
-class _Bucket:
-    """A token bucket."""
-
-    def __init__(self, rate_bps: int, now_us: int) -> None:
-        self._rate_bps = rate_bps
-        self._bytes = float(rate_bps * BURST_S)
-        self._filled_us = now_us
-
-    def draw(self, size: int, now_us: int) -> bool:
-        added = self._rate_bps * (now_us - self._filled_us) / US_PER_S
-        self._bytes = min(self._bytes + added, self._rate_bps * BURST_S)
-        self._filled_us = now_us
-        if self._bytes < size:
-            return False
-        self._bytes -= size
-        return True
+"""Length of a burst: a ground station requests much when it connects, then little."""
 
 
 class RecordingBudget:
-    """What may still be recorded of each client; one that was never noted is untrusted."""
+    """Quotas of bytes that are recorded of each client; an unknown client is untrusted."""
 
     def __init__(self) -> None:
-        self._strangers = _Bucket(STRANGERS_BPS, 0)
-        self._trusted: dict[int, _Bucket] = {}
+        self._untrusted = _bucket(UNTRUSTED_RATE, 0)
+        self._trusted: dict[int, TokenBucket] = {}
 
     def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
         """Note whether a client may change things."""
         if not trusted:
             self._trusted.pop(client_id, None)
         elif client_id not in self._trusted:
-            self._trusted[client_id] = _Bucket(TRUSTED_BPS, now_us)
+            self._trusted[client_id] = _bucket(TRUSTED_RATE, now_us)
 
     def remove_client(self, client_id: int) -> None:
-        """Forget a client that has gone."""
+        """Discard the quota of a client that has gone."""
         self._trusted.pop(client_id, None)
 
     def takes(self, client_id: int, size: int, now_us: int) -> bool:
         """Return whether a frame from a client, or to it alone, is recorded."""
-        return self._trusted.get(client_id, self._strangers).draw(size, now_us)
+        bucket = self._trusted.get(client_id, self._untrusted)
+        bucket.refill(now_us)
+        if bucket.level < size:
+            return False
+        bucket.level -= size
+        return True
+
+
+def _bucket(rate: int, now_us: int) -> TokenBucket:
+    return TokenBucket(rate, rate * BURST_S, rate * BURST_S, now_us)

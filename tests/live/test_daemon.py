@@ -17,7 +17,7 @@ from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
-from gateway.live.part import BURST_S, STRANGERS_BPS
+from gateway.live.part import BURST_S, UNTRUSTED_RATE
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
 from gateway.vehicle.actions import Request, SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
@@ -92,13 +92,13 @@ def test_of_a_stranger_only_what_was_taken_is_recorded(
     assert recorded == [frame(HEARTBEAT)]
 
 
-def test_a_stranger_that_asks_without_end_fills_no_disk(
+def test_untrusted_client_that_floods_requests_fills_no_disk(
     daemon: Daemon, recorded: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
     for n in range(5000):
         daemon._on_frame(Incoming(5, frame(PING, n % 256), False))
-    assert sum(map(len, recorded)) <= STRANGERS_BPS * (BURST_S + 1)
+    assert sum(map(len, recorded)) <= UNTRUSTED_RATE * (BURST_S + 1)
     told = Outgoing(b"telemetry", 30, None)
     daemon._perform([told])
     assert recorded[-1] == b"telemetry", "all the same"
