@@ -10,7 +10,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 COVERED: Final = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "docs", "firmware/README.md"),
-    *("gateway/fleet", "gateway/hub", "gateway/cli", "gateway/flashing", "gateway/compiled"),
+    *("gateway/fleet", "gateway/hub", "gateway/live", "gateway/cli", "gateway/flashing"),
+    "gateway/compiled",
     *("gateway/analysis", "gateway/simulator", "gateway/geometry", "gateway/panel/api"),
     *("gateway/panel/widgets", "gateway/output.py", "gateway/settings.py", "gateway/config.py"),
     *("gateway/recordings", "gateway/vehicle", "gateway/batch", "gateway/wire"),

@@ -1,1 +1,1 @@
-"""The fleet: many sites as one picture for the ground stations here; Zenoh carries it."""
+"""The fleet: the vehicles of many sites for the ground stations here, over Zenoh."""

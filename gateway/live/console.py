@@ -1,7 +1,7 @@
 """The live view in the terminal: link, aircraft and clients at a glance.
 
 Tables that are wider than the terminal are split into several below each other, so that all is
-legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates are beside the aircraft. If
+legible at 40 columns; from `SIDE_BY_SIDE` columns on clients and rates are next to the aircraft. If
 there are too few rows, the end is cut off; so the most important comes first, and the message
 rates last.
 """
@@ -101,9 +101,9 @@ class LiveView:
         boards = {s.node: s for one in snapshot.aircraft for s in one.boards}
         if snapshot.report.nodes:
             flying.append(_nodes(snapshot.report, boards))
-        beside = {one.vehicle_id: one for one in snapshot.aircraft}
+        status = {one.vehicle_id: one for one in snapshot.aircraft}
         for vehicle_id, state in snapshot.states:
-            flying += [Text(), _aircraft(vehicle_id, state, beside.get(vehicle_id)), _flags(state)]
+            flying += [Text(), _aircraft(vehicle_id, state, status.get(vehicle_id)), _flags(state)]
         if not snapshot.states:
             flying.append(Text("No aircraft heard yet.", style="dim"))
         others: list[RenderableType] = [_clients(snapshot)]

@@ -321,8 +321,8 @@ class Daemon:
         actions = self._pipeline.handle(incoming, now_us)
         if (stamps := self._pipeline.stamps_to_keep()) is not None:
             self._stamps.save(stamps)
-        # A ground station's broadcast comes both to us and past us; of strangers only what had an
-        # effect is recorded.
+        # A ground station's broadcast is both handled and forwarded: it is recorded once. Frames of
+        # untrusted clients are recorded only if they had an effect.
         kept = incoming.trusted or bool(actions)
         if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
             self._record(frame)
@@ -432,8 +432,8 @@ class Daemon:
             text, stored = reason_of(error), False
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
-        told = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
-        self._perform(aircraft.perform(told, now_us))
+        actions = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
+        self._perform(aircraft.perform(actions, now_us))
 
     def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
         status = StatusText(INFO, "Mission, mark and home are kept again")

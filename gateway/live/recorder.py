@@ -307,7 +307,7 @@ class Recorder:
         return []
 
     def _check_sync(self) -> None:
-        """Forget the last sync if it has ended; raises the OSError with which it failed."""
+        """Clear the last sync if it has ended; raises the OSError with which it failed."""
         if self._syncing is not None and self._syncing.done():
             ended, self._syncing = self._syncing, None
             ended.result()

@@ -28,7 +28,7 @@ class StampFile:
         self._file = folder / NAME
         self._worker = begin_worker("stamps")
         self._waiting: Kept | None = None
-        self._is_told = False
+        self._is_reported = False
 
     def load(self) -> Kept:
         """Read the file; nothing if there is none, or it cannot be read."""
@@ -65,8 +65,8 @@ class StampFile:
             text = msgspec.json.encode({str(key): kept for key, kept in (stamps or {}).items()})
             write_new(self._file, [text], overwrite=True, rights=PRIVATE)
         except OSError as error:
-            if not self._is_told:
+            if not self._is_reported:
                 log.warning("%s cannot be written: %s", self._file, reason_of(error))
-            self._is_told = True
+            self._is_reported = True
         else:
-            self._is_told = False
+            self._is_reported = False

@@ -90,7 +90,7 @@ class DetachedStream(io.TextIOBase):
     Parameters
     ----------
     stream : file object
-        What it stands for; must have a file descriptor.
+        The stream to write to; must have a file descriptor.
     """
 
     def __init__(self, stream: TextIO) -> None:
