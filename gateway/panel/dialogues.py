@@ -129,7 +129,7 @@ class Dialogues:
         self._clock = clock
         self._task: asyncio.Task[None] | None = None
         fleet.listen(self._take)
-        fleet.on_forget(self._forget)
+        fleet.on_discard(self._discard)
 
     def start(self) -> None:
         """Start repeating requests without an answer; needs a running event loop."""
@@ -168,7 +168,7 @@ class Dialogues:
         if run is not None:
             self._send(run.cancel_message())
 
-    def _forget(self, system_id: int) -> None:
+    def _discard(self, system_id: int) -> None:
         self._all.pop(system_id, None)
 
     def _take(self, system_id: int, message: Any, now_us: int) -> None:

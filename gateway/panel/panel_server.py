@@ -165,8 +165,8 @@ def make_parts(
     history, samples = FieldHistory(), SampleMemory()
     fleet.listen(history.take)
     fleet.listen(samples.take)
-    fleet.on_forget(history.forget)
-    fleet.on_forget(samples.forget)
+    fleet.on_discard(history.discard)
+    fleet.on_discard(samples.discard)
     dialogues = Dialogues(fleet, uplink.send, clock)
     watch = GatewayWatch(control, fleet)
     return PanelParts(

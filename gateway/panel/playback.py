@@ -260,7 +260,7 @@ class Playback:
         self._child = self._folder = self._control = self._watching = self.status = None
         self.name = ""
         for system_id in self.aircraft:
-            self._fleet.forget(system_id)
+            self._fleet.discard(system_id)
         self.aircraft = {}
 
     async def order(self, verb: str, **params: Any) -> None:

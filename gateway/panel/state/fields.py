@@ -87,7 +87,7 @@ class FieldHistory:
             columns = kinds[name] = _Columns(message)
         columns.add(message, now_us)
 
-    def forget(self, system_id: int) -> None:
+    def discard(self, system_id: int) -> None:
         """Delete the data of an aircraft."""
         self._vehicles.pop(system_id, None)
 

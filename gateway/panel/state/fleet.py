@@ -42,7 +42,7 @@ class FleetState:
         self.version = 0
         """Counts the messages, so that a reader knows whether there is new data."""
         self._listeners: list[Listener] = []
-        self._on_forget: list[Callable[[int], None]] = []
+        self._on_discard: list[Callable[[int], None]] = []
 
     def visible(self, page: str) -> dict[int, VehicleState]:
         """Return the aircraft that a page shows: live ones, and those that it plays itself."""
@@ -62,16 +62,16 @@ class FleetState:
 
         return leave
 
-    def on_forget(self, callback: Callable[[int], None]) -> None:
-        """Call a function with the system id of every aircraft that is forgotten."""
-        self._on_forget.append(callback)
+    def on_discard(self, callback: Callable[[int], None]) -> None:
+        """Call a function with the system id of every aircraft that is discarded."""
+        self._on_discard.append(callback)
 
-    def forget(self, system_id: int) -> None:
-        """Forget an aircraft."""
+    def discard(self, system_id: int) -> None:
+        """Discard an aircraft and its origin."""
         self.vehicles.pop(system_id, None)
         self.origins.pop(system_id, None)
         self.version += 1
-        for callback in self._on_forget:
+        for callback in self._on_discard:
             callback(system_id)
 
     def take(self, message: Any, now_us: int) -> None:
@@ -134,7 +134,7 @@ class SampleMemory:
         while frames[0][0] < now_us - SPAN_US:
             frames.popleft()
 
-    def forget(self, system_id: int) -> None:
+    def discard(self, system_id: int) -> None:
         """Delete the frames of an aircraft."""
         self._frames.pop(system_id, None)
 

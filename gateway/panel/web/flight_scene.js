@@ -348,7 +348,7 @@ export default {
       this.pad.material.color.set(mavgate.colour("home"));
       this.pole.material.color.set(mavgate.colour("home"));
       this.beacon.material.color.set(mavgate.colour("mark"));
-      for (const id of Object.keys(this.aircraft)) this.forget(id);
+      for (const id of Object.keys(this.aircraft)) this.discard(id);
       this.take();
     },
     place(lat, lon, alt) {
@@ -366,7 +366,7 @@ export default {
         if (!state || state.lat_deg === null || state.alt_amsl_m === null) continue;
         this.set_origin(state);
         const known = this.aircraft[id];
-        if (known && known.model !== state.model) this.forget(id);
+        if (known && known.model !== state.model) this.discard(id);
         const craft = (this.aircraft[id] ??= this.make(id, state));
         const point = this.place(state.lat_deg, state.lon_deg, state.alt_amsl_m);
         if (!craft.point || craft.point.distanceToSquared(point) > 0) {
@@ -377,7 +377,7 @@ export default {
         craft.state = state;
         craft.turned_ms = now_ms;
       }
-      for (const id of Object.keys(this.aircraft)) if (!(id in mavgate.vehicles)) this.forget(id);
+      for (const id of Object.keys(this.aircraft)) if (!(id in mavgate.vehicles)) this.discard(id);
       const mark = mavgate.state?.mark;
       this.beacon.visible = Boolean(mark && this.origin);
       if (this.beacon.visible) this.beacon.position.copy(this.place(mark.lat_deg, mark.lon_deg, this.origin.alt + 30));
@@ -390,7 +390,7 @@ export default {
       if (!this.origin || (wanted.by_home && !this.origin.by_home) || (moved && wanted.by_home && this.owner === state.system_id)) {
         this.origin = wanted;
         this.owner = state.system_id;
-        for (const id of Object.keys(this.aircraft)) this.forget(id);
+        for (const id of Object.keys(this.aircraft)) this.discard(id);
       }
     },
     make(id, { model, origin }) {
@@ -402,7 +402,7 @@ export default {
       craft.pose = new THREE.Quaternion();
       return craft;
     },
-    forget(id) {
+    discard(id) {
       const craft = this.aircraft[id];
       if (!craft) return;
       this.scene.remove(craft.group, ...craft.path.parts());

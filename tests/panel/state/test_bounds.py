@@ -1,4 +1,4 @@
-"""What the panel remembers of an aircraft stops growing, however long it flies."""
+"""The stored data of an aircraft stop growing, however long it flies."""
 
 from typing import Any
 
@@ -22,8 +22,8 @@ class Memory:
         self.fleet, self.history, self.samples = FleetState(), FieldHistory(), SampleMemory()
         for listener in (self.history.take, self.samples.take):
             self.fleet.listen(listener)
-        for forget in (self.history.forget, self.samples.forget):
-            self.fleet.on_forget(forget)
+        for discard in (self.history.discard, self.samples.discard):
+            self.fleet.on_discard(discard)
 
     def fly(self, begin_s: int, end_s: int) -> None:
         imu = decoded(mavlink.MAVLink_highres_imu_message(0, *[0.0] * 13, 63))
@@ -63,7 +63,7 @@ def test_second_hour_takes_nothing_more() -> None:
 def test_aircraft_that_is_let_go_leaves_nothing() -> None:
     memory = Memory()
     memory.fly(0, 5)
-    memory.fleet.forget(1)
+    memory.fleet.discard(1)
     assert memory.fleet.vehicles == {}
     assert memory.history.fields(1) == {}
     assert memory.samples.frames(1) == []
