@@ -39,10 +39,10 @@ class ImuFlags(IntFlag):
     ACCEL_CLIPPED = 1 << 6
     GYRO_CLIPPED = 1 << 7
     MAG_UNCALIBRATED = 1 << 8
-    """The gateway's own: the compass was never calibrated, the aircraft's iron is still in it."""
+    """The gateway's own: the compass was never calibrated: hard and soft iron are not removed."""
     GYRO_UNCALIBRATED = 1 << 9
     ACCEL_UNCALIBRATED = 1 << 10
-    """The same of the inertial sensors: their biases are still in what they tell."""
+    """The same of the inertial sensors: their biases are not removed."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """Returns a plain int to test a bit: building a flag would cost six times as much."""

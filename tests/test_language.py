@@ -44,7 +44,6 @@ WORDS: Final = {
 """Words that are not used, and terms to use instead."""
 
 ALLOWED: Final = {
-    "docs/panel.md": ("fused again beside it",),
     "firmware/README.md": ("if you can tell", "on D13 beside"),
 }
 """Legitimate uses, by file."""

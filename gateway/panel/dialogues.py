@@ -144,10 +144,10 @@ class Dialogues:
         """Return the dialogue with an aircraft."""
         return self._all.setdefault(system_id, Dialogue(system_id))
 
-    def load(self, system_id: int, *, anew: bool = False) -> None:
-        """Request an aircraft's parameters, unless they are known or being requested."""
+    def load(self, system_id: int, *, reload: bool = False) -> None:
+        """Request an aircraft's parameters; known or requested ones only with `reload`."""
         dialogue = self.of(system_id)
-        if anew or dialogue.parameters.state in (ListState.UNKNOWN, ListState.FAILED):
+        if reload or dialogue.parameters.state in (ListState.UNKNOWN, ListState.FAILED):
             self._send_all(dialogue.load(self._clock()))
 
     def change(self, system_id: int, name: str, value: float) -> None:

@@ -1,4 +1,4 @@
-"""A recording played beside the live aircraft, by a separate `mavgate play`; its aircraft.
+"""Playback of a recording next to the live aircraft, by a separate `mavgate play`.
 
 The player is a process with its own control socket, sends its frames only to a loopback port of the
 panel, and its aircraft get system ids that no live one has.
@@ -103,7 +103,7 @@ def free_ids(count: int, taken: Collection[int]) -> range:
         wanted = range(first, first + count)
         if not any(system_id in wanted for system_id in taken):
             return wanted
-    raise ValueError(f"{count} more aircraft have no room beside those that are shown")
+    raise ValueError(f"{count} more aircraft do not fit next to those that are shown")
 
 
 def _of_tlogs(parts: Sequence[Path]) -> list[RecordedAircraft]:
@@ -216,7 +216,7 @@ class Playback:
         name : str
             Name of an existing one.
         fused_again : bool
-            Whether to play a copy that is fused again beside it too.
+            Whether to also play a copy that is fused again.
 
         Raises
         ------

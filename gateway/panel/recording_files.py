@@ -128,7 +128,7 @@ class _Sink:
 
 
 async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
-    """Write an upload beside the recordings, and rename it if it is a recording.
+    """Write an upload into the folder of the recordings, and rename it if it is a recording.
 
     Raises
     ------

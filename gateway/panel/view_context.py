@@ -15,7 +15,7 @@ the `Instant` of every aircraft comes up to 30 times a second, and passes it to 
     mavgate.units          "metric" | "imperial" | "aviation"
     mavgate.show(quantity, value)   -> [text, unit]   quantity: "speed", "length", "climb", …
 
-so a Vue component (a JavaScript file in `gateway/panel/web/`, a Python class beside the view with
+so a Vue component (a JavaScript file in `gateway/panel/web/`, a Python class next to the view with
 `class Horizon(Element, component=WEB / "horizon.js")`) subscribes in `mounted()`, stops in
 `unmounted()`, and draws in `requestAnimationFrame`; nothing of it passes through NiceGUI.
 

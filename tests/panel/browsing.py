@@ -94,11 +94,11 @@ class Process:
             self.process.wait(5)
 
 
-def wait_for(look: Callable[[], Found | None], tell: Callable[[], str]) -> Found:
+def wait_for(look: Callable[[], Found | None], describe: Callable[[], str]) -> Found:
     """Look again and again until there is something."""
     deadline = time.monotonic() + START_LIMIT_S
     while not (found := look()):
-        assert time.monotonic() < deadline, f"not in {START_LIMIT_S:.0f} s:\n{tell()}"
+        assert time.monotonic() < deadline, f"not in {START_LIMIT_S:.0f} s:\n{describe()}"
         time.sleep(0.05)
     return found
 

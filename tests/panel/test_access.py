@@ -36,7 +36,7 @@ from gateway.panel.panel_server import PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
 
 HERE = "http://127.0.0.1:14590"
-OPERATOR, VIEWER = hash_password("tower"), hash_password("visitor")
+OPERATOR, VIEWER = hash_password("tower"), hash_password("guest")
 
 
 async def grants_all(scope: Scope, receive: Receive, send: Send) -> None:
@@ -95,11 +95,11 @@ async def test_own_names_are_let_in(host: str) -> None:
 async def test_head_is_answered_as_get_is() -> None:
     """Its body is left out by the server in front of the guard."""
 
-    async def tells_the_method(scope: Scope, receive: Receive, send: Send) -> None:
+    async def answers_with_the_method(scope: Scope, receive: Receive, send: Send) -> None:
         await PlainTextResponse(scope["method"])(scope, receive, send)
 
     guard = guarded()
-    guard.app = tells_the_method
+    guard.app = answers_with_the_method
     async with client_of(guard) as client:
         answer = await client.head("/")
     assert answer.headers["content-length"] == str(len("GET"))
@@ -232,12 +232,12 @@ async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
             yield bytes(MAX_BODY // 10)
 
     async with client_of(guarded()) as client:
-        told = await client.post("/x", content=bytes(MAX_BODY + 1))
-        untold = await client.post("/x", content=chunks())
+        declared = await client.post("/x", content=bytes(MAX_BODY + 1))
+        undeclared = await client.post("/x", content=chunks())
         fitting = await client.post("/x", content=bytes(MAX_BODY))
         endless = await client.post("/x", headers={"content-length": "9" * 5000})
-    assert told.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
-    assert untold.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert declared.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+    assert undeclared.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
     assert endless.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
     assert fitting.text == f"operator {MAX_BODY}"
 
@@ -255,8 +255,10 @@ async def test_websocket_needs_the_password() -> None:
     assert answer == "websocket.close"
 
 
-@pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("visitor", "viewer")])
-async def test_password_tells_the_role(locked: httpx.AsyncClient, password: str, role: str) -> None:
+@pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("guest", "viewer")])
+async def test_password_decides_the_role(
+    locked: httpx.AsyncClient, password: str, role: str
+) -> None:
     answer = await locked.post("/login", data={"password": password})
     assert answer.status_code == http.HTTPStatus.SEE_OTHER
     assert "HttpOnly" in answer.headers["set-cookie"]
@@ -391,7 +393,7 @@ def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: s
 
 @pytest.mark.io
 @pytest.mark.parametrize(
-    ("certificate", "key", "told"),
+    ("certificate", "key", "message"),
     [
         ("gone.pem", "here.pem", r"^\S*gone.pem: No such file"),
         ("here.pem", "gone.pem", r"^\S*gone.pem: No such file"),
@@ -399,14 +401,14 @@ def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: s
     ],
 )
 def test_a_certificate_that_cannot_be_used_is_named(
-    tmp_path: Path, certificate: str, key: str, told: str
+    tmp_path: Path, certificate: str, key: str, message: str
 ) -> None:
     (tmp_path / "here.pem").write_text("junk")
     settings = PanelSettings(
         certificate=str(tmp_path / certificate),
         certificate_key=str(tmp_path / key) if key else "",
     )
-    with pytest.raises(PanelError, match=told):
+    with pytest.raises(PanelError, match=message):
         tls_files(settings)
 
 
@@ -430,7 +432,7 @@ def test_a_key_may_be_in_the_certificates_file_but_needs_no_password(tmp_path: P
     ("error", "is_kept"),
     [(UnicodeDecodeError("utf-8", b"\xff", 0, 1, "no text"), False), (OSError("another"), True)],
 )
-def test_what_is_no_text_is_one_line_in_the_log(error: Exception, is_kept: bool) -> None:
+def test_request_with_invalid_text_is_one_line_in_the_log(error: Exception, is_kept: bool) -> None:
     cause = (type(error), error, None)
     record = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Invalid", (), cause)
     assert without_traceback(record)

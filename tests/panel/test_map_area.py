@@ -55,7 +55,7 @@ def test_length(text: str, metres: float) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "km", "-5km", "5 parsec"])
-def test_what_is_no_length(text: str) -> None:
+def test_invalid_length_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="no length"):
         length_m(text)
 

@@ -98,9 +98,7 @@ async def test_seen_once_it_is_kept_on_disk(
     assert asked.asked == ["/3/1/2.png"]
 
 
-async def test_what_is_no_picture_is_not_kept(
-    tmp_path: Path, owner: tuple[str, type[_Owner]]
-) -> None:
+async def test_invalid_tile_is_not_cached(tmp_path: Path, owner: tuple[str, type[_Owner]]) -> None:
     url, asked = owner
     asked.answers["/0/0/0.png"] = b"<script>alert(1)</script>"
     assert await tiles_of(tmp_path, url).tile(0, 0, 0, 0) is None

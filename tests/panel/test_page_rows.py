@@ -24,8 +24,8 @@ from tests.panel.browsing import (
     show,
     wait_for,
 )
+from tests.panel.scripted_vehicle import ScriptedVehicle
 from tests.panel.test_flight_page import frames
-from tests.panel.told_vehicle import ToldVehicle
 
 pytestmark = [
     pytest.mark.io,
@@ -61,13 +61,13 @@ CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
 
 
 @pytest.fixture(scope="class")
-def told(
+def scripted(
     browser: Browser, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[tuple[ToldVehicle, Page]]:
+) -> Iterator[tuple[ScriptedVehicle, Page]]:
     """An aircraft whose figures are set by the test, and the page of a panel of its own."""
-    vehicle = ToldVehicle()
+    vehicle = ScriptedVehicle()
     vehicle.start()
-    folder = tmp_path_factory.mktemp("told")
+    folder = tmp_path_factory.mktemp("scripted")
     panel = Process(folder, "panel", "--connect", f"udp-listen:127.0.0.1:{vehicle.port}")
     page = browser.new_page(viewport={"width": 1000, "height": 700})
     page.set_default_timeout(WAIT_MS)
@@ -111,8 +111,8 @@ def colour_at(page: Page, right: float, down: float) -> str:
 class TestFlightDisplay:
     """On an aircraft whose figures are exactly known; its page is closed before others are open."""
 
-    def test_row_horizon(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_row_horizon(self, scripted: tuple[ScriptedVehicle, Page]) -> None:
+        vehicle, page = scripted
         left, right, low = (0.25, 0.5), (0.72, 0.5), (0.25, 0.62)
         for roll, pitch, expected in (
             (30, 0, ("sky", "ground", "sky")),
@@ -129,8 +129,8 @@ class TestFlightDisplay:
             )
         vehicle.roll_deg = vehicle.pitch_deg = 0.0
 
-    def test_row_compass(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_row_compass(self, scripted: tuple[ScriptedVehicle, Page]) -> None:
+        vehicle, page = scripted
         vehicle.heading_deg = 272.0
         until_drawn(page, "272°", "W", "300")
         expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"heading 272.0°"))
@@ -139,16 +139,16 @@ class TestFlightDisplay:
         until_drawn(page, "003°", "N", "030")
         assert "W" not in page.evaluate("window.seen")
 
-    def test_row_altitude(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_row_altitude(self, scripted: tuple[ScriptedVehicle, Page]) -> None:
+        vehicle, page = scripted
         vehicle.alt_home_m, vehicle.climb_mps = 123.0, -2.5
         until_drawn(page, "HOME  m", "123", "AMSL 554", "-2.5")
         expect(display_of(page)).to_have_attribute(
             "aria-label", re.compile(r"altitude 123.0 m, climb -2.5 m/s$")
         )
 
-    def test_row_speed(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_row_speed(self, scripted: tuple[ScriptedVehicle, Page]) -> None:
+        vehicle, page = scripted
         vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.3
         until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
         vehicle.airspeed_mps = 0.0
@@ -159,8 +159,8 @@ class TestFlightDisplay:
         vehicle.airspeed_mps = vehicle.groundspeed_mps
         until_drawn(page, "GS  m/s", "19.3")
 
-    def test_row_roll_pitch_and_yaw(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_row_roll_pitch_and_yaw(self, scripted: tuple[ScriptedVehicle, Page]) -> None:
+        vehicle, page = scripted
         vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = -17.5, 8.3, 123.4
         spoken = re.compile(r"^Roll -17.5°, pitch 8.3°, heading 123.4°,")
         expect(display_of(page)).to_have_attribute("aria-label", spoken)
@@ -169,8 +169,10 @@ class TestFlightDisplay:
             [-17.5, 8.3, 123.4], abs=0.01
         )
 
-    def test_model_in_3d_is_that_of_the_vehicle_type(self, told: tuple[ToldVehicle, Page]) -> None:
-        vehicle, page = told
+    def test_model_in_3d_is_that_of_the_vehicle_type(
+        self, scripted: tuple[ScriptedVehicle, Page]
+    ) -> None:
+        vehicle, page = scripted
         scene = page.locator(".scene")
         expect(scene).to_have_attribute("data-model", "plane")
         vehicle.kind = mavlink.MAV_TYPE_QUADROTOR
@@ -179,7 +181,7 @@ class TestFlightDisplay:
         expect(page.locator(".chips").get_by_text("MAVLink")).to_be_visible()
 
 
-def test_several_aircraft_are_told_apart_and_chosen(page: Page) -> None:
+def test_several_aircraft_are_distinguished_and_chosen(page: Page) -> None:
     show(page, "map")
     page.wait_for_function("Object.keys(mavgate.vehicles).length === 2")
     expect(page.locator("section[data-view='map'] .craft")).to_have_count(2)
@@ -328,7 +330,7 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
     expect(state).to_have_text("recording")
     expect(page.locator(".chips").get_by_text("REC")).to_be_visible()
     page.evaluate("window.begun_us = mavgate.state.time_us")
-    # Longer than two heartbeats, so that the recording tells what flies.
+    # Longer than two heartbeats, so that the recording contains the vehicle type.
     page.wait_for_function("mavgate.state.time_us > window.begun_us + 5e6")
     view.get_by_label("Stop recording").click()
     expect(state).to_have_text("idle")
@@ -394,7 +396,7 @@ def _move_in_time(page: Page, row: object) -> None:
     for icon in ("pause", "play_arrow"):
         page.keyboard.press("Space")
         expect(view.get_by_label("Play or pause")).to_have_text(icon)
-    view.get_by_text("fused again beside it").click()
+    view.get_by_text("fused again next to it").click()
     # The table is fused by another process.
     page.wait_for_function(
         "Object.values(mavgate.vehicles).filter((v) => v.origin === 'fused again').length === 2",

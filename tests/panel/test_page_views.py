@@ -1,4 +1,4 @@
-"""The views of a page beside a gateway that the test feeds: what each does, seen on the page."""
+"""The views of a page with a gateway that the test feeds: what each does, seen on the page."""
 
 import csv
 import re
@@ -215,8 +215,8 @@ def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
     expect(asks).to_have_count(0)
     desk.gateway.process.send_signal(signal.SIGCONT)
     # A busy machine may have taken longer to close the question than the page waits for answers.
-    told = desk.page.get_by_text(re.compile("^Home set$|does not answer$"))
-    expect(told).to_be_visible()
+    answer = desk.page.get_by_text(re.compile("^Home set$|does not answer$"))
+    expect(answer).to_be_visible()
     lat_deg, lon_deg = (float(part) for part in place.split(","))
     desk.page.wait_for_function(f"Math.abs(mavgate.state.home.lat_deg - {lat_deg}) < 1e-6")
     assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)
@@ -290,7 +290,7 @@ def test_keys_choose_a_view_wherever_the_keyboard_has_led(desk: Desk) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_of_filled_buttons_is_told_from_them(
+def test_text_of_filled_buttons_has_enough_contrast(
     desk: Desk, scheme: Literal["light", "dark"]
 ) -> None:
     desk.page.emulate_media(color_scheme=scheme)

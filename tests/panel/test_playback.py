@@ -1,4 +1,4 @@
-"""The page's player, beside processes and answers that come when the test says so."""
+"""The page's player, with processes and answers that the test controls."""
 
 import asyncio
 from pathlib import Path

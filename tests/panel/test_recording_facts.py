@@ -26,7 +26,7 @@ def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> No
     assert [facts.shows(name, "morn") for name in ("Morning", "evening")] == [True, False]
     row = facts.of("Morning")
     assert row is not None
-    # The table tells more than the tlog beside it.
+    # The table contains more facts than the tlog next to it.
     assert (row["kind"], row["duration"], row["loss"]) == ("table", 400.0, 0.1)
     facts.look(tmp_path, "duration < 300")
     assert [facts.shows(name, "duration < 300") for name in ("Morning", "evening")] == [False, True]

@@ -57,7 +57,9 @@ async def client(folder: Path) -> AsyncIterator[httpx.AsyncClient]:
         yield opened
 
 
-async def test_what_was_brought_can_be_taken_away(client: httpx.AsyncClient, folder: Path) -> None:
+async def test_uploaded_recording_can_be_downloaded(
+    client: httpx.AsyncClient, folder: Path
+) -> None:
     answer = await client.put("/recordings/day one", content=flight())
     assert answer.status_code == HTTPStatus.CREATED
     assert (folder / "day one_01.tlog").read_bytes() == flight()
@@ -83,7 +85,7 @@ async def test_no_name_leaves_the_folder(
 @pytest.mark.parametrize(
     "content", [b"", b"a text\n", b"a,b,c\n1,2,3\n", bytes(range(256)) * 40, flight()[:12]]
 )
-async def test_what_is_no_recording_leaves_nothing(
+async def test_invalid_upload_leaves_no_file(
     client: httpx.AsyncClient, folder: Path, content: bytes
 ) -> None:
     answer = await client.put("/recordings/upload", content=content)

@@ -60,7 +60,7 @@ def heard(sock: socket.socket) -> list[mavlink.MAVLink_message]:
         found.append(mavlink.MAVLink(None).decode(bytearray(data)))
 
 
-async def test_what_is_played_stays_in_the_panel(
+async def test_played_messages_stay_in_the_panel(
     tmp_path: Path, sockets: tuple[socket.socket, socket.socket]
 ) -> None:
     gateway, player = sockets

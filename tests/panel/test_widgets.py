@@ -73,7 +73,7 @@ def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answe
     assert sent == [0.8, 0.0]
 
 
-def test_what_is_typed_is_not_written_over_by_its_own_answer() -> None:
+def test_typed_value_is_not_overwritten_by_its_own_answer() -> None:
     sent: list[float] = []
     row, dialogue = row_of(sent)
     row._field.set_value(0.8)

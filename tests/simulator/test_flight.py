@@ -1,4 +1,4 @@
-"""Samples beside their truth, whole and in pieces."""
+"""Samples and their truth, whole and in pieces."""
 
 import dataclasses
 

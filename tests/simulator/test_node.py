@@ -80,7 +80,7 @@ class TestGpsNode:
             assert isinstance(fix, GpsFixPayload)
             assert quality.itow_ms == fix.itow_ms
 
-    def test_tells_when_it_has_no_fix(self, gps_sent: list[Sent]) -> None:
+    def test_lack_of_a_fix_is_reported(self, gps_sent: list[Sent]) -> None:
         fixes = of_kind(gps_sent, GpsFixPayload)
         for sent in fixes:
             found = sent.time_s > 5.15

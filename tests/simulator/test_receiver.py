@@ -204,12 +204,12 @@ class TestThroughTheWire:
 def test_a_clock_that_was_never_set_does_not_stop_the_simulator(
     start_unix_us: int, years: set[int]
 ) -> None:
-    """Its receiver tells the year 2000 then, which is not believed."""
+    """Its receiver then reports the year 2000, which is rejected."""
     line = list(simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0))
     link = Link()
     records = [record for frame in line for record in link.feed(frame.data, 0)]
-    told = [r.utc_us for r in records if isinstance(r, GpsFix) and r.utc_us is not None]
-    assert {datetime.fromtimestamp(us / 1e6, UTC).year for us in told} == years
+    reported_us = [r.utc_us for r in records if isinstance(r, GpsFix) and r.utc_us is not None]
+    assert {datetime.fromtimestamp(us / 1e6, UTC).year for us in reported_us} == years
     faults = dict(link.report(3_000_000, connected=True, port="").faults)
     assert ("gps_date" in faults) == (not years)
 

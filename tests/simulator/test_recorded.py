@@ -115,7 +115,7 @@ class TestThroughTheWire:
             # Once the clocks are learned: one and the same delay of reading, radio and line.
             assert np.ptp(late_s[recorded_s > 5.0]) < 0.0001
 
-    def test_status_tells_the_rate(self, records: list[RawRecord]) -> None:
+    def test_status_contains_the_rate(self, records: list[RawRecord]) -> None:
         status = [r for r in records if isinstance(r, NodeStatus)]
         rates = {r.node.node_id: (r.sample_rate_hz, r.sensors_present) for r in status}
         assert rates == {0: (50, 0b0111), 1: (5, 0b1000)}
@@ -146,7 +146,7 @@ class TestRanges:
 
 
 class TestGpsGaps:
-    def test_what_is_missing_is_reported_as_unknown(self) -> None:
+    def test_missing_values_are_reported_as_unknown(self) -> None:
         table = columns(gps_vn=None, gps_alt_m=None)
         fixes = [r for r in fly(RecordedFlight.from_columns(table)) if isinstance(r, GpsFix)]
         assert np.isnan(fixes[0].speed_acc_mps)

@@ -1,4 +1,4 @@
-"""Each chip errs by what its data sheet says, and the told calibration undoes it."""
+"""Each chip's error is that of its data sheet, and the reported calibration removes it."""
 
 import numpy as np
 import pytest

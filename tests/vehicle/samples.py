@@ -58,7 +58,7 @@ NOTHING = replace(
     pos_std_m=(math.nan,) * 3,
     flags=NavFlags(0),
 )
-"""What an estimator tells before it knows anything but an attitude."""
+"""Output of an estimator that has only an attitude so far."""
 
 SAMPLE = ImuSample(
     time_us=1_000_000,

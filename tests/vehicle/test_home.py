@@ -1,4 +1,4 @@
-"""Home as parameters: one number at a time, kept only when asked, and how it is forgotten."""
+"""Home as parameters: one number at a time, stored only on request, and cleared."""
 
 import struct
 from typing import Any

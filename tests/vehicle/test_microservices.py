@@ -76,7 +76,7 @@ TABLE: dict[str, tuple[Callable[[], Any], str, dict[str, Any]]] = {
     "request/interval-by-message": (
         command(512, 244, 30), "MESSAGE_INTERVAL", {"interval_us": 20_000},
     ),
-    "request/nothing-to-tell": (command(512, 62), ACK, {"result": 1}),
+    "request/no-data": (command(512, 62), ACK, {"result": 1}),
     # component_metadata.html and standard_modes.html
     "metadata/announcement": (command(512, 397), "COMPONENT_METADATA", {}),
     "metadata/deprecated": (command(512, 395), ACK, UNSUPPORTED),

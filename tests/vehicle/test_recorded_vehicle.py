@@ -1,4 +1,4 @@
-"""A recorded vehicle answers what its log tells, and declines the rest."""
+"""A recorded vehicle answers with the contents of its log, and declines the rest."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -16,8 +16,8 @@ HOME = mavlink.MAVLINK_MSG_ID_HOME_POSITION
 VERSION = mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
 
 
-class Told:
-    """What a log tells."""
+class LogContents:
+    """Contents of a log."""
 
     def __init__(self, parameters: int = 0) -> None:
         self.mav = mavlink.MAVLink(None, SYSTEM, 1)
@@ -55,7 +55,7 @@ class Told:
 class Asking:
     """A ground station that speaks to a recorded vehicle on a clock of its own."""
 
-    def __init__(self, reported: Told) -> None:
+    def __init__(self, reported: LogContents) -> None:
         self.vehicle = RecordedVehicle(SYSTEM, reported)
         self.mav = mavlink.MAVLink(None, 255, 190)
         self.now_us = 0
@@ -82,7 +82,7 @@ class Asking:
 
 @pytest.fixture
 def asking() -> Asking:
-    return Asking(Told(26))
+    return Asking(LogContents(26))
 
 
 def kinds(messages: list[Any]) -> list[str]:
@@ -111,7 +111,7 @@ def test_a_parameter_stays_whoever_sets_it(asking: Asking) -> None:
 
 
 def test_without_parameters_the_list_is_declined() -> None:
-    found = Asking(Told()).ask(mavlink.MAVLink_param_request_list_message(SYSTEM, 1))
+    found = Asking(LogContents()).ask(mavlink.MAVLink_param_request_list_message(SYSTEM, 1))
     assert kinds(found) == ["PARAM_ERROR"]
 
 
@@ -171,8 +171,8 @@ def test_modes_are_denied(asking: Asking) -> None:
 def test_client_may_reduce_the_rate_of_a_played_message(asking: Asking) -> None:
     number, attitude = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE
     results = [
-        asking.command(number, message_id, wish)[0].result
-        for message_id, wish in ((attitude, 1e6), (HOME, -1), (VERSION, 1e6), (0, -1), (0, 0))
+        asking.command(number, message_id, interval)[0].result
+        for message_id, interval in ((attitude, 1e6), (HOME, -1), (VERSION, 1e6), (0, -1), (0, 0))
     ]
     accepted, denied = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED
     assert results == [accepted, accepted, mavlink.MAV_RESULT_UNSUPPORTED, denied, accepted]

@@ -78,9 +78,9 @@ def test_bursts_of_single_bytes_for_a_crowd_are_no_more_work_than_for_one(
 def test_sessions_of_an_untrusted_client_close_no_others(station: GroundStation) -> None:
     mine = Ftp(station)
     session = mine.ask(Opcode.OPEN_FILE_RO, b"/general.json").session
-    stranger = Ftp(GroundStation(station.vehicle, station.clock, client_id=8, trusted=False))
+    untrusted = Ftp(GroundStation(station.vehicle, station.clock, client_id=8, trusted=False))
     for _ in range(100):
-        assert stranger.ask(Opcode.OPEN_FILE_RO, b"/parameter.json.xz").opcode == ACK
+        assert untrusted.ask(Opcode.OPEN_FILE_RO, b"/parameter.json.xz").opcode == ACK
     assert mine.ask(Opcode.READ_FILE, session=session, size=9).opcode == ACK
 
 
@@ -90,9 +90,9 @@ def test_untrusted_sessions_give_way_to_a_trusted_client(
     monkeypatch.setattr(ftp_service, "MAX_SESSIONS", 12)
     vehicle, clock = station.vehicle, station.clock
     for client_id in range(100, 103):
-        stranger = Ftp(GroundStation(vehicle, clock, client_id=client_id, trusted=False))
+        untrusted = Ftp(GroundStation(vehicle, clock, client_id=client_id, trusted=False))
         for _ in range(4):
-            assert stranger.ask(Opcode.OPEN_FILE_RO, b"/general.json").opcode == ACK
+            assert untrusted.ask(Opcode.OPEN_FILE_RO, b"/general.json").opcode == ACK
     late = Ftp(GroundStation(vehicle, clock, client_id=103, trusted=False))
     refused = late.ask(Opcode.OPEN_FILE_RO, b"/general.json")
     assert refused.data == bytes([FtpError.NO_SESSIONS])
@@ -113,11 +113,11 @@ def test_only_the_trusted_may_have_an_answer_sent_to_all(
 def test_refusals_of_untrusted_clients_are_reported_at_a_limited_rate(
     station: GroundStation,
 ) -> None:
-    stranger = GroundStation(station.vehicle, station.clock, client_id=8, trusted=False)
+    untrusted = GroundStation(station.vehicle, station.clock, client_id=8, trusted=False)
     for _ in range(60 * 20):
-        stranger.command(mavlink.MAV_CMD_LOGGING_START)
-        stranger.wait(0.05)
+        untrusted.command(mavlink.MAV_CMD_LOGGING_START)
+        untrusted.wait(0.05)
     reported = [
-        f for f in stranger.frames if isinstance(f, Outgoing) and f.message_id == STATUSTEXT
+        f for f in untrusted.frames if isinstance(f, Outgoing) and f.message_id == STATUSTEXT
     ]
     assert 3 <= len(reported) <= 8

@@ -128,7 +128,7 @@ def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
     assert station.vehicle.signing_key is None
 
 
-def test_a_change_of_another_setting_forgets_no_replay(station: GroundStation) -> None:
+def test_change_of_another_setting_keeps_the_replay_protection(station: GroundStation) -> None:
     sign(station)
     frame = station.frame(SET)
     assert changed(station.send_bytes(frame)), "which is a change of the vehicle's settings"
@@ -186,7 +186,7 @@ def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
     assert 12 <= written <= 13, "a minute"
 
 
-def test_another_passphrase_and_back_forgets_no_replay(station: GroundStation) -> None:
+def test_another_passphrase_and_back_keeps_the_replay_protection(station: GroundStation) -> None:
     def change(passphrase: str) -> None:
         settings = VehicleSettings(signing_passphrase=passphrase)
         station.vehicle.take_settings("vehicle", settings)

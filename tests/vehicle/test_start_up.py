@@ -56,10 +56,10 @@ def load_parameters(station: GroundStation) -> dict[int, Any]:
     def had() -> dict[int, Any]:
         return {m.param_index: m for m in station.inbox if m.get_type() == "PARAM_VALUE"}
 
-    silence_s = 0.0
-    while len(had()) < count and silence_s < 0.1:
+    quiet_s = 0.0
+    while len(had()) < count and quiet_s < 0.1:
         fresh = "PARAM_VALUE" in kinds(station.wait(station.slice_s))
-        silence_s = 0.0 if fresh else silence_s + station.slice_s
+        quiet_s = 0.0 if fresh else quiet_s + station.slice_s
     for _ in range(20 * count):
         # What comes next may be another one: still of the list, or asked for before.
         if not (missing := set(range(count)) - set(had())):

@@ -82,7 +82,7 @@ def test_a_text_that_nobody_could_have_stored_is_refused(text: str, why: str) ->
 
 
 def restarted(station: GroundStation) -> GroundStation:
-    """Begin anew with what was kept last, as it comes out of a file."""
+    """Restart with the plan that was saved last, as read from a file."""
     text = encode_plan(station.of(SavePlan)[-1].plan)
     vehicle = Vehicle(VehicleSettings(), 1, stored=decode_plan(text))
     now_us = station.clock.now_us

@@ -97,7 +97,7 @@ def test_a_tilted_mounting_is_levelled(bench: Bench) -> None:
 
 
 def test_the_mounting_is_set_angle_by_angle(bench: Bench) -> None:
-    """A node that stands on its nose: in between, roll and yaw turn about the same axis."""
+    """A pitch of 90° on the way: there, roll and yaw turn about the same axis."""
     down_b = bench.run(0.1).sample.accel_b_mps2
     assert down_b == pytest.approx((0.0, 0.0, -9.80665), abs=1e-6)
     for name, angle in (("CAL_MNT_PIT", 90.0), ("CAL_MNT_ROLL", 30.0), ("CAL_MNT_YAW", -45.0)):
@@ -138,7 +138,7 @@ def test_an_accelerometer_bias_is_gone(bench: Bench) -> None:
 
 
 def test_a_new_weight_does_not_restart_the_estimator(bench: Bench) -> None:
-    """Turned by the gyroscope alone: a fresh estimator would forget the turn."""
+    """Turned by the gyroscope alone: a restarted estimator would lose the turn."""
     bench.run(2.0)
     turning = {"gyro_raw": (0, 0, -3280)}
     before = bench.run(0.5, **turning).state.q_nb

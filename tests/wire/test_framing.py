@@ -98,7 +98,7 @@ def test_garbage_gives_only_frames_or_faults(seed: int) -> None:
     assert events[-1] == Frame(b"after the storm")
 
 
-def test_reset_forgets_the_half_frame() -> None:
+def test_reset_discards_the_half_frame() -> None:
     decoder = FrameDecoder()
     decoder.feed(encode_frame(b"cut")[:-2])
     decoder.reset()

@@ -100,7 +100,7 @@ def test_far_behind_is_another_life() -> None:
 
 def test_imu_record() -> None:
     line, link = Line(3), Link()
-    assert link.feed(line.frame(1_000_000, IMU), 9_000_000) == [], "not believed yet"
+    assert link.feed(line.frame(1_000_000, IMU), 9_000_000) == [], "not accepted yet"
     record, second = link.feed(line.frame(1_010_000, IMU), 9_010_000)
     assert second.time_us == 9_010_000
     assert record == ImuRaw(

@@ -1,4 +1,4 @@
-"""Every message as JSON and back, beside pymavlink's own reading of its fields."""
+"""Every message as JSON and back, compared with pymavlink's reading of its fields."""
 
 import json
 import math
@@ -52,8 +52,8 @@ def fits(number: int, form: str) -> bool:
     return 0 <= number < 1 << bits
 
 
-def as_pymavlink_tells(message: Any) -> dict[str, Any]:
-    """Write pymavlink's own `to_dict` in the form that the door gives."""
+def as_pymavlink_reads(message: Any) -> dict[str, Any]:
+    """Write pymavlink's own `to_dict` in the form of the REST API."""
     found = message.to_dict()
     expected = {"type": found.pop("mavpackettype")}
     for name, value in found.items():
@@ -81,17 +81,17 @@ def as_value(message: Any, name: str, item: Any) -> Any:
     return {"type": entry.name} if entry else item
 
 
-def test_every_message_tells_what_pymavlink_reads() -> None:
+def test_every_message_has_the_fields_that_pymavlink_reads() -> None:
     link = mavlink.MAVLink(None, 1, 1)
     for name in sorted(CLASSES):
         chance = random.Random(name)
         for _ in range(2):
             message = random_message(CLASSES[name], chance)
-            told = to_json(message)
-            assert told == as_pymavlink_tells(message)
-            again = json.loads(json.dumps(told, allow_nan=False))
+            converted = to_json(message)
+            assert converted == as_pymavlink_reads(message)
+            again = json.loads(json.dumps(converted, allow_nan=False))
             back = link.decode(bytearray(from_json(again).pack(link)))
-            assert to_json(back) == told
+            assert to_json(back) == converted
 
 
 def test_every_template_can_be_sent() -> None:
@@ -177,6 +177,6 @@ def test_ways_to_write_a_text(text: Any) -> None:
         ({**template("HOME_POSITION"), "q": 1}, "array of 4"),
     ],
 )
-def test_what_is_no_message_is_reported(fields: Any, words: str) -> None:
+def test_invalid_message_is_reported(fields: Any, words: str) -> None:
     with pytest.raises(BadMessageError, match=words):
         from_json(fields)

@@ -161,7 +161,7 @@ def test_hostile_datagram_costs_a_bounded_number_of_checksums() -> None:
     assert len(data) > MAX_FALSE_STARTS
 
 
-def test_reset_forgets_a_half_frame() -> None:
+def test_reset_discards_a_half_frame() -> None:
     splitter = MavlinkSplitter()
     splitter.feed(V2[:7])
     splitter.reset()

@@ -32,8 +32,8 @@ def test_offset_and_drift(skew_ppm: float, start_us: int, seed: int) -> None:
         np.random.default_rng(seed), seconds=60, skew_ppm=skew_ppm, start_us=start_us
     )
     tracker = ClockTracker()
-    told = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
-    error_us = np.array(told) - true_us
+    observed = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
+    error_us = np.array(observed) - true_us
     settled = error_us[true_us - true_us[0] > 15e6]
     assert np.abs(settled).max() < 200.0
     assert tracker.skew_ppm == pytest.approx(skew_ppm, abs=10.0)
@@ -42,14 +42,14 @@ def test_offset_and_drift(skew_ppm: float, start_us: int, seed: int) -> None:
 
 @pytest.mark.parametrize("skew_ppm", [-5000.0, 5000.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_soonest_packet_is_so_beside_the_drift(skew_ppm: float, seed: int) -> None:
-    """By its delay alone it would be the first or the last of its bucket, in a queue or not."""
+def test_soonest_packet_is_chosen_after_removing_the_drift(skew_ppm: float, seed: int) -> None:
+    """By its raw delay it would be the first or the last of its bucket, queued or not."""
     rng = np.random.default_rng(seed)
     stamps, true_us, _ = packets(rng, seconds=60, skew_ppm=skew_ppm, rate_hz=250.0)
     arrivals = np.maximum.accumulate(true_us + rng.exponential(2000.0, true_us.size))
     tracker = ClockTracker()
-    told = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
-    settled = (np.array(told) - true_us)[true_us - true_us[0] > 15e6]
+    observed = [tracker.observe(int(s), int(a)) for s, a in zip(stamps, arrivals, strict=True)]
+    settled = (np.array(observed) - true_us)[true_us - true_us[0] > 15e6]
     assert np.sqrt(np.mean(settled**2)) < 6.0
 
 
@@ -69,26 +69,26 @@ def test_wrap_alone_is_no_restart() -> None:
 
 
 @pytest.mark.parametrize("gap_s", [10, 600, 71 * 60, 3 * 3600])
-def test_silence_of_any_length_is_no_restart(gap_s: int, rng: np.random.Generator) -> None:
+def test_outage_of_any_length_is_no_restart(gap_s: int, rng: np.random.Generator) -> None:
     """The node kept counting through several wraps; its clock is still known."""
     stamps, _, arrivals = packets(rng, seconds=20, skew_ppm=40.0)
     tracker = ClockTracker()
     for stamp, arrival in zip(stamps, arrivals, strict=True):
         last = tracker.observe(int(stamp), int(arrival))
     stamp = (int(stamps[-1]) + gap_s * 1_000_040) % WRAP_US
-    told = tracker.observe(stamp, int(arrivals[-1]) + gap_s * 1_000_000)
+    observed = tracker.observe(stamp, int(arrivals[-1]) + gap_s * 1_000_000)
     assert tracker.restarts == 0
-    assert told - last == pytest.approx(gap_s * 1_000_000, abs=10_000)
+    assert observed - last == pytest.approx(gap_s * 1_000_000, abs=10_000)
 
 
-def test_restart_is_learned_anew(rng: np.random.Generator) -> None:
+def test_clock_is_estimated_again_after_a_restart(rng: np.random.Generator) -> None:
     stamps, _, arrivals = packets(rng, seconds=20)
     tracker = ClockTracker()
     for stamp, arrival in zip(stamps, arrivals, strict=True):
         tracker.observe(int(stamp), int(arrival))
-    told = tracker.observe(150_000, int(arrivals[-1]) + 400_000)
+    observed = tracker.observe(150_000, int(arrivals[-1]) + 400_000)
     assert tracker.restarts == 1
-    assert told == int(arrivals[-1]) + 400_000
+    assert observed == int(arrivals[-1]) + 400_000
 
 
 def test_a_late_stamp_is_placed_in_the_past() -> None:
@@ -103,19 +103,21 @@ def test_a_late_stamp_is_placed_in_the_past() -> None:
 @pytest.mark.parametrize("ahead_us", [60_000, 600_000, 1_400_000])
 def test_one_stamp_ahead_moves_nothing(ahead_us: int) -> None:
     tracker = ClockTracker()
-    told = []
+    observed = []
     for step in range(300):
         arrival_us = 2_000_000 + step * 10_000
-        told.append(tracker.observe(step * 10_000 + ahead_us * (step == 150), arrival_us))
-    assert told == [2_000_000 + step * 10_000 for step in range(300)]
+        observed.append(tracker.observe(step * 10_000 + ahead_us * (step == 150), arrival_us))
+    assert observed == [2_000_000 + step * 10_000 for step in range(300)]
 
 
-def test_a_clock_learned_in_a_queue_is_learned_anew_from_two_packets() -> None:
+def test_a_clock_learned_in_a_queue_is_corrected_by_two_packets() -> None:
     tracker = ClockTracker()
     for step in range(10):
         tracker.observe(step * 10_000, 2_000_000 + 400_000 + step * 10_000)
-    told = [tracker.observe(step * 10_000, 2_000_000 + step * 10_000) for step in (100, 101, 102)]
-    assert told == [3_000_000, 3_010_000, 3_020_000]
+    observed = [
+        tracker.observe(step * 10_000, 2_000_000 + step * 10_000) for step in (100, 101, 102)
+    ]
+    assert observed == [3_000_000, 3_010_000, 3_020_000]
     assert tracker.observe(1_030_000, 3_330_000) == 3_030_000, "its queue is known again"
 
 

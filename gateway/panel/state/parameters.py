@@ -310,7 +310,7 @@ class ParameterClient:
             try:
                 found.append(self._set_message(self.entries[name], change.value))
             except ValueError as error:
-                # The vehicle tells another type than it did.
+                # The vehicle has reported another type since.
                 del self._changes[name]
                 self.refused[name] = str(error)
         return found

@@ -85,7 +85,7 @@ class RecordingsView:
     def _build_player(self) -> None:
         with ui.element("div").classes("line"):
             self._title = ui.label().classes("title spring")
-            self._fused_again = ui.switch("fused again beside it", on_change=self._on_fused_again)
+            self._fused_again = ui.switch("fused again next to it", on_change=self._on_fused_again)
             ui.button(icon="close", on_click=self._close).props(
                 'flat round dense aria-label="Close the recording"'
             )

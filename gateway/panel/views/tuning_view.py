@@ -1,4 +1,4 @@
-"""View 6: every parameter with its meaning, changed live, with its effect in plots beside it."""
+"""View 6: every parameter with its meaning, changed live, next to plots of its effect."""
 
 from typing import Any, Final
 
@@ -163,7 +163,7 @@ class _TuningView:
 
     def _reload(self) -> None:
         if self._context.system_id is not None:
-            self._context.parts.dialogues.load(self._context.system_id, anew=True)
+            self._context.parts.dialogues.load(self._context.system_id, reload=True)
 
     async def _store(self) -> None:
         try:

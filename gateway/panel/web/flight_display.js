@@ -11,7 +11,7 @@ const UNITS = {
 };
 const FULL_CLIMB = { metric: 6, imperial: 20, aviation: 1200 };
 const TAU_S = 0.04; // of the glide: below two frames of a slow screen
-const FORESEE_S = 0.12; // no longer do the newest rates hold
+const FORESEE_S = 0.12; // longest extrapolation by the newest rates
 const STALE_S = 2;
 const INK = "#f4f7fa";
 const AMBER = "#ffb000";

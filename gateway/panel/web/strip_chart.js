@@ -25,8 +25,8 @@ export default {
     this.sizes = new ResizeObserver(() => this.chart.resize());
     this.sizes.observe(this.$el);
     this.stop_theme = mavgate.watch_theme(() => this.layOut());
-    this.$el.addEventListener("wheel", () => this.wish(), { passive: true });
-    this.$el.addEventListener("pointerdown", () => this.wish());
+    this.$el.addEventListener("wheel", () => this.pauseByHand(), { passive: true });
+    this.$el.addEventListener("pointerdown", () => this.pauseByHand());
     this.timer = setInterval(() => this.follow(), FOLLOW_MS);
     this.$emit("ready");
   },
@@ -64,8 +64,8 @@ export default {
       if (paused) this.pausedAt = this.now();
       this.layOut();
     },
-    // Whoever turns the wheel or drags wants to look closer at what stands still.
-    wish() {
+    // The wheel and a drag zoom or move the chart, which must not scroll meanwhile.
+    pauseByHand() {
       if (this.paused || !this.fields.length) return;
       this.pause(true);
       this.$emit("paused");
@@ -84,7 +84,7 @@ export default {
     colour(name) {
       return getComputedStyle(document.body).getPropertyValue(`--${name}`).trim();
     },
-    // Beyond 2^53 a number has no exact digits to tell apart: a damaged field fills no half chart with noughts.
+    // Beyond 2^53 a number has no exact digits; all digits of a damaged field would fill half the chart.
     label(value) {
       return Math.abs(value) < 2 ** 53 ? value.toLocaleString("en", { maximumFractionDigits: 10 }) : value.toExponential(1);
     },

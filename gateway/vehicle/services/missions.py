@@ -61,11 +61,11 @@ from gateway.vehicle.plan import (
 
 REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S
-"""Of an upload that stands still; longer than the way there and back on a slow link."""
+"""Timeout of an upload without progress; longer than the round trip of a slow link."""
 OLD_FORM_EVERY: Final = 3
 """Of so many requests to a client of unknown form, one is in the older form."""
 MAX_CLIENTS: Final = 512
-"""Clients whose form is remembered."""
+"""Clients whose form is stored."""
 CHECKS: Final = 3
 """The last item is asked for so many times more where the ACK may have been lost."""
 KINDS: Final = (MISSION, FENCE, RALLY)

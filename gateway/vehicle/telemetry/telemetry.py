@@ -122,7 +122,7 @@ REQUESTED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_ALTITUDE,
 )
 """Carried by IMU samples too, but sent only to clients that request them: QGroundControl that has
-seen one ALTITUDE shows no other altitude any more."""
+received one ALTITUDE shows altitudes of no other message."""
 
 CARRIED_MESSAGES: Final = frozenset({*STATE_MESSAGES, *REQUESTED_MESSAGES})
 

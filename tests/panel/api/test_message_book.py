@@ -104,7 +104,7 @@ def test_forged_ids_do_not_fill_the_memory(
     assert book.look_up(f"{ATTITUDE}/message/roll") == 9
 
 
-def test_what_was_sent_stands_there_and_is_not_heard(book: MessageBook) -> None:
+def test_sent_message_is_listed_but_not_counted_as_received(book: MessageBook) -> None:
     assert book.has_heard(1, 1)
     book.take(attitude(3, 255, 0), is_sent=True)
     place = "vehicles/255/components/0/messages/ATTITUDE/message/roll"

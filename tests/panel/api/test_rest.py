@@ -1,4 +1,4 @@
-"""The JSON door as scripts use it: a server, a hub with a vehicle, and HTTP between them."""
+"""The REST API as scripts use it: a server, a hub with a vehicle, and HTTP between them."""
 
 import asyncio
 import json
@@ -198,7 +198,7 @@ class TestWriting:
         await world.until_json(f"{sent}/status/time/counter", 2)
 
     async def test_json5(self, world: World) -> None:
-        pytest.importorskip("pyjson5", reason="older than the lock file: install it anew")
+        pytest.importorskip("pyjson5", reason="older than the lock file: install it again")
         answer = await world.client.post("/v1/mavlink", content=COMMAND_IN_JSON5)
         assert (answer.status_code, answer.text) == (200, "Ok.")
         command = await world.until_commanded()
@@ -226,8 +226,8 @@ class TestWriting:
         ],
         ids=["empty", "list", "object", "deep", "missing", "no header", "id"],
     )  # fmt: skip
-    async def test_what_is_no_message(self, world: World, body: bytes) -> None:
-        pytest.importorskip("pyjson5", reason="older than the lock file: install it anew")
+    async def test_invalid_message_is_refused(self, world: World, body: bytes) -> None:
+        pytest.importorskip("pyjson5", reason="older than the lock file: install it again")
         answer = await world.client.post("/v1/mavlink", content=body)
         assert answer.status_code == 404
         assert answer.text == "Failed to parse message, not a valid MAVLinkMessage."
@@ -256,7 +256,7 @@ class TestWriting:
         command = await world.until_commanded()
         assert (command.target_system, command.target_component) == (0, 0)
 
-    async def test_what_is_no_text(self, world: World) -> None:
+    async def test_invalid_utf8_is_refused(self, world: World) -> None:
         answer = await world.client.post("/v1/mavlink", content=b"\xff")
         assert answer.status_code == 404
         assert answer.text.startswith("Failed to parse input as UTF-8 string: ")
@@ -294,7 +294,7 @@ class TestFollowing:
     @pytest.mark.parametrize(
         ("pattern", "word"), [("(", "missing"), ("(\\w%2B)%2B-", "too long"), ("A" * 2000, "1000")]
     )
-    async def test_a_filter_that_is_none(self, world: World, pattern: str, word: str) -> None:
+    async def test_invalid_filter_is_refused(self, world: World, pattern: str, word: str) -> None:
         """One that takes for ever is ended in its own process; everything else goes on."""
         async with websockets.connect(f"ws://{world.url}/v1/ws/mavlink?filter={pattern}") as stream:
             answer = asyncio.create_task(stream.recv())

@@ -65,7 +65,7 @@ class Bench:
                 self.run.take(self._mav.decode(bytearray(action.frame)), self.now_us)
 
 
-def test_gyro_tells_the_bias_before_and_after() -> None:
+def test_gyro_shows_the_bias_before_and_after() -> None:
     bench = Bench(CalibrationStep.GYRO)
     bench.send(bench.run.start_message())
     assert bench.run.state is RunState.RUNNING
@@ -80,7 +80,7 @@ def test_gyro_tells_the_bias_before_and_after() -> None:
     assert residual.after < 0.1
 
 
-def test_what_moves_fails_and_says_why() -> None:
+def test_motion_fails_with_the_reason() -> None:
     bench = Bench(CalibrationStep.GYRO)
     bench.send(bench.run.start_message())
     for n in range(40):
@@ -104,7 +104,7 @@ def test_six_sides_are_followed_one_by_one() -> None:
     assert residual.after < 0.02
 
 
-def test_magnetometer_shows_what_is_uncovered() -> None:
+def test_magnetometer_shows_uncovered_directions() -> None:
     bench = Bench(CalibrationStep.MAG)
     bench.send(bench.run.start_message())
     rng = np.random.default_rng(2)
@@ -131,7 +131,7 @@ def test_magnetometer_shows_what_is_uncovered() -> None:
     assert residual.after < 0.1
 
 
-def test_cancelling_and_silence_end_it() -> None:
+def test_cancelling_and_timeout_end_a_calibration() -> None:
     bench = Bench(CalibrationStep.MAG)
     bench.send(bench.run.start_message())
     bench.send(bench.run.cancel_message())
@@ -159,7 +159,7 @@ def test_every_direction_has_its_own_cell() -> None:
 @pytest.mark.parametrize(
     "kind", [mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_raw_imu_message]
 )
-def test_other_vehicles_tell_their_samples_in_thousandths(kind: Any) -> None:
+def test_other_vehicles_send_their_samples_in_thousandths(kind: Any) -> None:
     run = CalibrationRun(1, CalibrationStep.MAG, 0)
     run.state = RunState.RUNNING
     for mag in ((200, -30, 400), (0, 0, 0)):

@@ -26,8 +26,8 @@ def status(silent_s: float = 0.0, **changed: Any) -> dict[str, Any]:
     }
 
 
-def titles(told: dict[str, Any] | None, *alerts: Alert, vehicle_id: int = 1) -> list[str]:
-    return [alert.title for alert in with_status(alerts, told, vehicle_id)]
+def titles(reported: dict[str, Any] | None, *alerts: Alert, vehicle_id: int = 1) -> list[str]:
+    return [alert.title for alert in with_status(alerts, reported, vehicle_id)]
 
 
 def test_node_that_was_silent_before_the_panel_was_opened() -> None:
@@ -41,11 +41,11 @@ def test_node_of_another_aircraft_or_with_a_short_gap_is_none() -> None:
     assert titles(status(silent_s=1.0)) == []
 
 
-def test_status_takes_the_place_of_what_the_texts_said() -> None:
-    told = Alert("node GPS node 2", AlertLevel.CRITICAL, "GPS node 2 silent")
-    assert titles(status(), told, GPS_LOST) == ["GPS lost"]
-    assert titles(status(silent_s=9.0), told) == ["GPS node 2 silent"]
-    assert titles(None, told, GPS_LOST) == ["GPS node 2 silent", "GPS lost"]
+def test_status_replaces_alerts_of_status_texts() -> None:
+    reported = Alert("node GPS node 2", AlertLevel.CRITICAL, "GPS node 2 silent")
+    assert titles(status(), reported, GPS_LOST) == ["GPS lost"]
+    assert titles(status(silent_s=9.0), reported) == ["GPS node 2 silent"]
+    assert titles(None, reported, GPS_LOST) == ["GPS node 2 silent", "GPS lost"]
 
 
 def test_receiver_that_is_gone_hides_its_nodes() -> None:
@@ -54,5 +54,5 @@ def test_receiver_that_is_gone_hides_its_nodes() -> None:
 
 @pytest.mark.parametrize(("state", "found"), [("blocked", ["Recording failed"]), ("idle", [])])
 def test_recording_that_cannot_go_on(state: str, found: list[str]) -> None:
-    told = status() | {"recorder": {"state": state, "reason": "less than 100 MB free"}}
-    assert titles(told) == found
+    reported = status() | {"recorder": {"state": state, "reason": "less than 100 MB free"}}
+    assert titles(reported) == found

@@ -171,7 +171,7 @@ def test_a_value_must_fit_the_type() -> None:
     with pytest.raises(ValueError, match="N cannot hold"):
         client.change("N", 1e10, 0)
     assert client.change("N", 300.0, 0)
-    # Changed again, and then the vehicle tells of another type.
+    # Changed again, and then the vehicle reports another type.
     client.change("N", 301.0, 0)
     client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 1, 1, 0), 0)
     assert client.poll(2 * US_PER_S) == []

@@ -17,7 +17,7 @@ def vehicle() -> VehicleState:
     return VehicleState(1)
 
 
-def test_what_nobody_sent_is_not_known(vehicle: VehicleState) -> None:
+def test_values_that_were_never_sent_are_unknown(vehicle: VehicleState) -> None:
     now = vehicle.instant(0)
     assert math.isinf(now.silent_s)
     assert all(math.isnan(value) for value in (*now.q_nb, now.lat_deg, now.groundspeed_mps))
@@ -77,7 +77,7 @@ def test_mark_is_found_from_distance_and_bearing(vehicle: VehicleState) -> None:
     assert vehicle.instant(0).mark == Spot(1.0, 2.0, 3.0)
 
 
-def test_what_cannot_be_is_not_known(vehicle: VehicleState) -> None:
+def test_impossible_values_are_unknown(vehicle: VehicleState) -> None:
     vehicle.take(decoded(mavlink.MAVLink_attitude_message(0, math.inf, 0, 0, 1, 0, 0)), 0)
     vehicle.take(position(214.0, 8.0), 0)
     way = mavlink.MAVLink_nav_controller_output_message(0, 0, 90, 90, 1113, 0, 0, 0)

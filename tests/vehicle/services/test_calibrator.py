@@ -227,7 +227,7 @@ def test_none_goes_on_in_flight(station: GroundStation, params: tuple[int, ...])
         (MAG, lambda t: tumble((0.0, 0.0, 0.0), 48.0 * (1.0 + 0.3 * math.sin(50.0 * t)))(t)),
     ],
 )
-def test_what_no_sensor_shows_is_refused(
+def test_calibration_without_evidence_fails(
     station: GroundStation, params: tuple[int, ...], motion: Motion
 ) -> None:
     station.command(CALIBRATE, *params)
@@ -237,7 +237,7 @@ def test_what_no_sensor_shows_is_refused(
 
 @pytest.mark.parametrize(("turn_degps", "result"), [(0.0, ACCEPTED), (2.8, FAILED)])
 def test_a_steady_turn_is_no_rest(station: GroundStation, turn_degps: float, result: int) -> None:
-    """The gyroscope is as quiet as on a table; the field tells."""
+    """The gyroscope's noise is that of rest; only the magnetic field shows the turn."""
     rate = math.radians(turn_degps)
     lying = rest(gyro=(0.0, 0.0, rate))
     noise = np.random.default_rng(5)
@@ -288,11 +288,11 @@ def test_one_at_a_time(station: GroundStation) -> None:
 @pytest.mark.parametrize(
     "params", [(1, 1), (2,), (0, 0, 1), (0, 0, 0, 1), (0,) * 6 + (1,), (1, 0, 0, 0, 2)]
 )
-def test_what_cannot_be_calibrated(station: GroundStation, params: tuple[int, ...]) -> None:
+def test_unknown_calibrations_are_refused(station: GroundStation, params: tuple[int, ...]) -> None:
     assert acks(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
 
 
-def test_the_heartbeat_tells_of_it(station: GroundStation) -> None:
+def test_heartbeat_reports_a_running_calibration(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     beats = [m for m in station.wait(1.5) if m.get_type() == "HEARTBEAT"]
     assert beats[-1].system_status == mavlink.MAV_STATE_CALIBRATING

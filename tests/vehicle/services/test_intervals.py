@@ -38,7 +38,7 @@ def test_off_and_back_to_the_settings_rate(station: GroundStation) -> None:
     station.command(SET, ATTITUDE, 0)
     [_, reported] = station.command(GET, ATTITUDE)
     assert reported.interval_us == 20_000
-    assert [wish.interval_us for wish in station.requested_intervals] == [-1, 0]
+    assert [requested.interval_us for requested in station.requested_intervals] == [-1, 0]
 
 
 def test_faster_rate_is_sent_to_the_requesting_client_only(station: GroundStation) -> None:
@@ -98,9 +98,9 @@ def test_requested_intervals_end_with_the_client(station: GroundStation) -> None
     assert fly(station, 2.0)["ATTITUDE_QUATERNION"] == pytest.approx(100, abs=2)
 
 
-@pytest.mark.parametrize("wish", [-1, 2_000_000])
-def test_heartbeats_cannot_be_switched_off(station: GroundStation, wish: int) -> None:
-    assert station.command(SET, 0, wish)[0].result == DENIED
+@pytest.mark.parametrize("requested", [-1, 2_000_000])
+def test_heartbeats_cannot_be_switched_off(station: GroundStation, requested: int) -> None:
+    assert station.command(SET, 0, requested)[0].result == DENIED
     assert station.command(SET, 0, 1_000_000)[0].result == ACCEPTED
 
 
@@ -132,10 +132,10 @@ def test_data_streams_thin_their_groups_for_one_client(station: GroundStation) -
 
 def test_all_data_streams_never_make_anything_faster(station: GroundStation) -> None:
     station.send(stream_request(0, 4, 1))
-    wishes = {w.message_id: w.interval_us for w in station.requested_intervals}
-    assert wishes[33] == wishes[74] == 250_000
-    assert wishes[1] == 0, "SYS_STATUS is slower than that by itself"
-    assert 0 not in wishes
+    intervals = {w.message_id: w.interval_us for w in station.requested_intervals}
+    assert intervals[33] == intervals[74] == 250_000
+    assert intervals[1] == 0, "SYS_STATUS is slower than that by itself"
+    assert 0 not in intervals
 
 
 def test_data_streams_stop(station: GroundStation) -> None:

@@ -126,7 +126,7 @@ def test_client_without_the_int_form_is_asked_and_answered_in_the_older_one(
     assert (first.get_type(), first.frame) == ("MISSION_ITEM", 3)
     assert (first.x, first.y, first.z) == pytest.approx((48.1, -8.7, 50.0), abs=1e-5)
     [again] = station.send(count(1))
-    assert again.get_type() == "MISSION_REQUEST", "the form is remembered"
+    assert again.get_type() == "MISSION_REQUEST", "the form is stored"
 
 
 def test_client_of_the_int_form_is_never_answered_in_the_older_one(station: GroundStation) -> None:
@@ -374,8 +374,8 @@ def test_an_upload_on_a_slow_link_is_not_taken_over(station: GroundStation) -> N
     assert answers[0].type == ACCEPTED
 
 
-def test_an_upload_that_stands_still_gives_way(station: GroundStation) -> None:
-    """A ground station that was started anew is another client, and its old upload never ends."""
+def test_upload_without_progress_gives_way_after_the_timeout(station: GroundStation) -> None:
+    """A restarted ground station is another client, and its old upload never ends."""
     other = GroundStation(station.vehicle, station.clock, client_id=8, system_id=254)
     station.send(count(2))
     station.send(item(0))

@@ -126,7 +126,7 @@ def test_losses_of_this_aircraft_only() -> None:
     assert health.sys_status(0).drop_rate_comm == 0
 
 
-def test_stall_of_the_gateway_is_no_silence_of_a_sensor() -> None:
+def test_stall_of_the_gateway_is_no_outage_of_a_sensor() -> None:
     health = healthy()
     health.on_link(report(link(), link(GPS_NODE, last_time_us=-9_000_000)))
     health.on_stall(5_000_000, 6_500_000)

@@ -1,4 +1,4 @@
-"""An aircraft of which every figure is what a test says."""
+"""An aircraft whose every figure is set by the test."""
 
 import contextlib
 import math
@@ -12,7 +12,7 @@ from tests.ports import free_port
 RATE_HZ = 20
 
 
-class ToldVehicle(threading.Thread):
+class ScriptedVehicle(threading.Thread):
     """Sends what an aircraft sends, again and again, until it is ended."""
 
     def __init__(self) -> None:
