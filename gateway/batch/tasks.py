@@ -24,7 +24,7 @@ from gateway.analysis.fusion import fuse_states
 from gateway.analysis.key_figures import summarise, withheld_error_m
 from gateway.analysis.sources import flight_of_blocks
 from gateway.analysis.tuning.axis import Axis, SweepError, grid
-from gateway.analysis.tuning.contest import Trials, base_score, make_contest
+from gateway.analysis.tuning.contest import make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import began_text
 from gateway.batch.storage import (
@@ -183,9 +183,8 @@ class SweepTask(_ReadingTask):
             hold_out=self.hold_out,
             interval_s=self.interval_s,
         )
-        trials = Trials(contest)
-        scores = [trials.run(values)[self.metric_column] for values in grid(self.axes)]
-        base = base_score(contest, flight.fusion)[self.metric_column]
+        scores = [run_trial(contest, values)[self.metric_column] for values in grid(self.axes)]
+        base = score_of(contest, flight.fusion)[self.metric_column]
         values = [None if score != score else score for score in (base, *scores)]
         return Worked(read.vehicle, read.began, {"base": values[0], "scores": values[1:]})
 

@@ -38,7 +38,7 @@ COLUMN_OF: Final[dict[Metric, str]] = {
 SEED: Final = 1
 
 Trial = tuple[Values, Mapping[str, float]]
-"""What was tried, and its scores."""
+"""The values that were tried, and their scores."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,28 +77,15 @@ def make_contest(
     return Contest(fusion, tuple(keys), make_judge(flight, keep))
 
 
-def base_score(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
-    """Score a flight with unchanged settings, by the same fixes."""
+def score_of(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
+    """Fuse the flight with any settings, and score it by the fixes of the contest."""
     judge = rejudged(contest.judge, fusion)
     return _scores(fuse(judge.fused, fusion), judge)
 
 
-class Trials:
-    """Run trials of one contest, caching what neighbouring trials share."""
-
-    def __init__(self, contest: Contest) -> None:
-        self._contest = contest
-
-    def prepare(self) -> None:
-        """Filter and fuse the samples in advance, once for all processes."""
-        fusion, flight = self._contest.fusion, self._contest.judge.fused
-        fuse(flight, fusion)
-
-    def run(self, values: Sequence[Value]) -> dict[str, float]:
-        """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
-        settings = settings_at(self._contest, values)
-        judge = rejudged(self._contest.judge, settings)
-        return _scores(fuse(judge.fused, settings), judge)
+def run_trial(contest: Contest, values: Sequence[Value]) -> dict[str, float]:
+    """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
+    return score_of(contest, settings_at(contest, values))
 
 
 def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
@@ -138,7 +125,6 @@ def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
     Each is tried at its first, middle and last value, all others at their first, with every
     estimator that is varied.
     """
-    trials = Trials(contest)
     estimators = next((axis.values for axis in axes if axis.key == ESTIMATOR_KEY), (None,))
     bases = [
         tuple(name if axis.key == ESTIMATOR_KEY and name else axis.values[0] for axis in axes)
@@ -148,7 +134,10 @@ def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
     for k, axis in enumerate(axes):
         tried = {axis.values[0], axis.values[len(axis.values) // 2], axis.values[-1]}
         runs = [
-            [trials.run((*base[:k], value, *base[k + 1 :])) for value in sorted(tried, key=str)]
+            [
+                run_trial(contest, (*base[:k], value, *base[k + 1 :]))
+                for value in sorted(tried, key=str)
+            ]
             for base in bases
         ]
         if len(tried) > 1 and all(_is_alike(run[0], other) for run in runs for other in run):

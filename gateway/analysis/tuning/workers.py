@@ -5,25 +5,23 @@ from contextlib import contextmanager
 
 from gateway.analysis.processes import copies, cores
 from gateway.analysis.tuning.axis import Values
-from gateway.analysis.tuning.contest import Contest, Trials
+from gateway.analysis.tuning.contest import Contest, run_trial
 
 Scores = dict[str, float]
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
 
-_trials: Trials | None = None
+_contest: Contest | None = None
 """Of this process of the pool; it has no other place for it."""
 
 
 @contextmanager
 def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
     """Open a pool of processes."""
-    trials = Trials(contest)
-    trials.prepare()
     count = jobs or cores()
     if count == 1:
-        yield lambda points: ((k, trials.run(values)) for k, values in enumerate(points))
+        yield lambda points: ((k, run_trial(contest, values)) for k, values in enumerate(points))
         return
-    with copies(count, _begin, trials) as processes:
+    with copies(count, _begin, contest) as processes:
 
         def run(points: Sequence[Values]) -> Iterator[tuple[int, Scores]]:
             return processes.imap_unordered(_run, enumerate(points), _chunk(points, count))
@@ -32,16 +30,16 @@ def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
 
 
 def _chunk(points: Sequence[Values], jobs: int) -> int:
-    """Neighbouring trials share their filtered samples, so they go to one process."""
+    """Return how many points a process is given at once: few messages, and an even load."""
     return max(1, min(8, len(points) // (4 * jobs)))
 
 
-def _begin(trials: Trials) -> None:
-    global _trials
-    _trials = trials
+def _begin(contest: Contest) -> None:
+    global _contest
+    _contest = contest
 
 
 def _run(numbered: tuple[int, Values]) -> tuple[int, Scores]:
-    assert _trials is not None
+    assert _contest is not None
     index, values = numbered
-    return index, _trials.run(values)
+    return index, run_trial(_contest, values)

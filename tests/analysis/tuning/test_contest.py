@@ -10,7 +10,13 @@ from gateway.analysis.tuning.axis import (
     Values,
     grid,
 )
-from gateway.analysis.tuning.contest import Trials, make_contest, optimise, settings_at, tabulate
+from gateway.analysis.tuning.contest import (
+    make_contest,
+    optimise,
+    run_trial,
+    settings_at,
+    tabulate,
+)
 from gateway.analysis.tuning.workers import pool
 from tests.analysis.flights import short_case, short_flight
 
@@ -58,10 +64,10 @@ def test_withheld_fixes_find_the_latency() -> None:
     contest = make_contest(flight, fusion, [LATENCY])
     latencies = (0.0, 0.08, 0.16, 0.24, 0.32)
     points: list[Values] = [(latency,) for latency in latencies]
-    trials = Trials(contest)
-    table = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "held")
+    trials = [(point, run_trial(contest, point)) for point in points]
+    table = tabulate([LATENCY], trials, "held")
     assert table.iloc[0][LATENCY] == pytest.approx(0.16, abs=0.09)
-    copied = tabulate([LATENCY], [(p, trials.run(p)) for p in points], "interpolated")
+    copied = tabulate([LATENCY], trials, "interpolated")
     assert copied.iloc[0][LATENCY] <= table.iloc[0][LATENCY]
 
 
@@ -95,7 +101,6 @@ def test_the_optimiser_needs_a_range(values: Values) -> None:
 
 def test_an_attitude_is_judged_by_the_reference() -> None:
     contest = make_contest(short_flight(), short_case().fusion, ["estimation.paper.alpha_gyro"])
-    trials = Trials(contest)
-    close, far = trials.run((0.995,)), trials.run((0.1,))
+    close, far = run_trial(contest, (0.995,)), run_trial(contest, (0.1,))
     assert close["attitude_deg"] < far["attitude_deg"]
     assert np.isfinite(close["reference_m"])
