@@ -76,7 +76,7 @@ class Bandwidth:
     def __init__(self, bytes_per_s: int) -> None:
         self.share = 1.0
         """Part of the bandwidth that the radio behind it accepts."""
-        self._bytes_per_s = bytes_per_s
+        self.bytes_per_s = bytes_per_s
         self._offered: dict[Key, tuple[int, float, float]] = {}
         """Message id, and smoothed frames and bytes a second."""
         self._answered = 0.0
@@ -124,7 +124,7 @@ class Bandwidth:
 
     def _thinned(self) -> dict[Key, int]:
         fixed = sum(flow for i, _, flow in self._offered.values() if i in NEVER_THINNED)
-        room = max(0.0, self._bytes_per_s * self.share - fixed - self._answered)
+        room = max(0.0, self.bytes_per_s * self.share - fixed - self._answered)
         kinds = {key: each for key, each in self._offered.items() if each[0] not in NEVER_THINNED}
         least = {key: min(1.0, FLOOR_HZ / rate) for key, (_, rate, _) in kinds.items() if rate}
         floors = sum(least[key] * kinds[key][2] for key in least)

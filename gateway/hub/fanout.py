@@ -392,16 +392,13 @@ class Fanout:
         self.cache.remove(client_id)
         self._changed()
 
-    def reconfigure(self, client: Recipient, budget_before: int) -> None:
-        """Apply changed lists and rates from the next frame on."""
+    def reconfigure(self, client: Recipient) -> None:
+        """Apply changed options, or a changed MAVLink version, from the next frame on."""
         if subscription := self._subscriptions.get(client.client_id):
-            if client.endpoint.budget != budget_before:
-                subscription.bandwidth = _bandwidth(client.endpoint)
+            present, wanted = subscription.bandwidth, _bandwidth(client.endpoint)
+            if present is None or wanted is None or present.bytes_per_s != wanted.bytes_per_s:
+                subscription.bandwidth = wanted
             self._changed()
-
-    def change_version(self) -> None:
-        """Apply a changed MAVLink version of a client."""
-        self._changed()
 
     def set_interval(self, request: ClientInterval) -> None:
         """Apply a requested message interval; that of a client that has gone is ignored."""

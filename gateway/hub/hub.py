@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
-from gateway.hub.endpoint import Endpoint, parse_endpoint
+from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, Route, recipient_of
 from gateway.hub.limits import TokenBucket
 from gateway.hub.own_vehicles import OwnVehicles
@@ -361,9 +361,9 @@ class Hub:
         """Send the vehicles' greetings, heartbeat and home, to a new peer."""
         self._vehicles.await_greeting(client.client_id)
 
-    def reconfigure(self, client: Client, before: Endpoint) -> None:
+    def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options from the next frame on."""
-        self._fanout.reconfigure(client, before.budget)
+        self._fanout.reconfigure(client)
         self._router.reconfigure(client)
 
     def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:

@@ -144,7 +144,7 @@ class Router:
     def deliver(self, client: Client, frame: MavFrame, now_us: int) -> None:
         """Route one frame received from a client for which there is no cached route."""
         if client.update_version(frame, now_us):
-            self._fanout.change_version()
+            self._fanout.reconfigure(client)
         origin = frame.origin
         if self._rejects is not None and self._rejects(frame.data, now_us):
             return

@@ -407,7 +407,7 @@ class TestExpress:
             assert await world.first.receive() == frame
         assert (await late.receive())[7] == 30
         late_client = hub._clients[hub.clients()[-1].client_id]
-        hub.reconfigure(late_client, late_client.endpoint)
+        hub.reconfigure(late_client)
         hub.remove(f"udp:127.0.0.1:{late.port}")
         world.autopilot.say(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30

@@ -105,7 +105,7 @@ async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None
     assert await world.autopilot.receive() == request
     client = hub._clients[hub.clients()[-1].client_id]
     client.trusted = False
-    hub.reconfigure(client, client.endpoint)
+    hub.reconfigure(client)
     count = hub.counters().unroutable
     world.station_.say(world.station_.sender.command(42, 1))
     await world.until(lambda: hub.counters().unroutable == count + 1)

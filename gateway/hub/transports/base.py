@@ -85,7 +85,7 @@ class HubContext(Protocol):
     def greet(self, client: "Client") -> None:
         """Send the vehicles' greetings to a new peer."""
 
-    def reconfigure(self, client: "Client", before: Endpoint) -> None:
+    def reconfigure(self, client: "Client") -> None:
         """Apply a client's changed options."""
 
     def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
@@ -132,7 +132,7 @@ class Client:
     def __post_init__(self) -> None:
         """Fill in the remaining fields."""
         self.remote = self.remote or self.endpoint.address
-        self.trusted = _is_trusted(self.endpoint, self.remote)
+        self.trusted = _is_trusted(self.endpoint, self.host)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
         self.routes = self.context.routes_from(self.client_id)
@@ -165,8 +165,8 @@ class Client:
         elif self.name == before.name_of(self.remote):
             self.name = endpoint.name_of(self.remote)
         self.endpoint = endpoint
-        self.trusted = _is_trusted(endpoint, self.remote)
-        self.context.reconfigure(self, before)
+        self.trusted = _is_trusted(endpoint, self.host)
+        self.context.reconfigure(self)
 
     def tick(self, now_us: int) -> None:
         """Reconnect and expire; called a few times a second."""
@@ -398,7 +398,7 @@ class Listener(Generic[Peer]):
             log.info("%s is open", self.endpoint.name)
 
 
-def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
+def _is_trusted(endpoint: Endpoint, host: str) -> bool:
     """Return whether a peer may change state: as in the URL, else if configured or local.
 
     A fleet is not trusted by default: everyone who reaches its router can publish there.
@@ -406,5 +406,5 @@ def _is_trusted(endpoint: Endpoint, remote: str) -> bool:
     if endpoint.trusted is not None:
         return endpoint.trusted
     if endpoint.kind in OPEN_TO_ALL:
-        return is_loopback(remote.rpartition(":")[0].strip("[]"))
+        return is_loopback(host)
     return endpoint.kind != EndpointKind.ZENOH
