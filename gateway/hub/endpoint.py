@@ -86,17 +86,6 @@ class EndpointKind(StrEnum):
     SERIAL = "serial"
 
 
-OPEN_TO_ALL: Final = frozenset(
-    {
-        EndpointKind.UDP_LISTEN,
-        EndpointKind.UDP_BROADCAST,
-        EndpointKind.UDP_MULTICAST,
-        EndpointKind.TCP_LISTEN,
-        EndpointKind.WS_LISTEN,
-        EndpointKind.WSS_LISTEN,
-    }
-)
-"""Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
 LISTENING: Final = frozenset(
     {
         EndpointKind.UDP_LISTEN,
@@ -106,6 +95,8 @@ LISTENING: Final = frozenset(
     }
 )
 """Kinds that bind to their port; port 0 is any free one."""
+OPEN_TO_ALL: Final = LISTENING | {EndpointKind.UDP_BROADCAST, EndpointKind.UDP_MULTICAST}
+"""Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
 TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
 COMMON_OPTIONS: Final = frozenset(
@@ -119,12 +110,7 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
 }
 """Options that only some kinds have."""
-
-
-HOSTED: Final = frozenset(
-    {EndpointKind.UDP, EndpointKind.UDP_LISTEN, EndpointKind.TCP, EndpointKind.TCP_LISTEN}
-    | {EndpointKind.WS, EndpointKind.WS_LISTEN, EndpointKind.WSS, EndpointKind.WSS_LISTEN}
-)
+HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
 """Kinds whose frames go to hosts by their addresses, one by one."""
 ADDED_KINDS: Final[set[str]] = set()
 """Kinds of other packages, which parse the rest of the URL themselves."""
@@ -143,8 +129,6 @@ ALIASES: Final = {
     "wsserver": "ws-listen",
 }
 ANY_ADDRESS: Final = "0.0.0.0"
-_SENDING: Final = frozenset({"udp", "tcp", "ws", "wss"})
-_LISTENING: Final = frozenset({"udp-listen", "tcp-listen", "ws-listen", "wss-listen"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -402,9 +386,9 @@ def respell(address: str) -> tuple[str, str]:
     if slashes and word == "udp":
         raise ValueError(_either(word, rest))
     host, _, port = rest.rpartition(":")
-    if kind in _LISTENING and not host:
+    if kind in LISTENING and not host:
         rest = f"{ANY_ADDRESS}:{port}"
-    elif kind in _SENDING and port.isdecimal() and host in ("", ANY_ADDRESS, "[::]"):
+    elif kind in HOSTED - LISTENING and port.isdecimal() and host in ("", ANY_ADDRESS, "[::]"):
         raise ValueError(_either(kind, rest))
     return kind, rest
 

@@ -79,11 +79,7 @@ def is_name(host: str) -> bool:
 
 def is_numeric(host: str) -> bool:
     """Return whether a host is an address and not a name."""
-    try:
-        ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return False
-    return True
+    return _address(host) is not None
 
 
 def is_group(host: str) -> bool:
@@ -95,8 +91,5 @@ def is_loopback(host: str) -> bool:
     """Return whether an address is loopback; of the names only `localhost` is."""
     if host == "localhost":
         return True
-    if not is_numeric(host):
-        return False
-    address = ipaddress.ip_address(host.partition("%")[0])
-    mapped = getattr(address, "ipv4_mapped", None)
-    return (mapped or address).is_loopback
+    address = _address(host)
+    return address is not None and address.is_loopback
