@@ -175,6 +175,19 @@ def test_a_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
     assert flows[2] > 0.7 * flows[0]
 
 
+@pytest.mark.parametrize(("budget", "is_kept"), [(1500, True), (3000, False), (0, False)])
+def test_plan_of_a_link_lasts_until_its_bandwidth_changes(budget: int, is_kept: bool) -> None:
+    flight = Flight("udp:h:1?budget=1500")
+    flight.run(10)
+    sink = flight.sinks[0]
+    before = flight.fanout._subscriptions[1].bandwidth
+    sink.endpoint = parse_endpoint(f"udp:h:1?name=radio&budget={budget}")
+    flight.fanout.reconfigure(sink)
+    assert (flight.fanout._subscriptions[1].bandwidth is before) is is_kept
+    flow = sum(map(len, sink.since(flight.run(10)))) / 10
+    assert (flow <= 1.1 * 1500) is is_kept
+
+
 @pytest.mark.parametrize("how", ["answer", "deliver"])
 def test_answers_come_first(how: str) -> None:
     """Our own answers, and frames that others address to who is behind the link."""
