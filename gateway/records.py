@@ -170,7 +170,7 @@ class RadioState(IntEnum):
 
     OK = 0
     ABSENT = 1
-    FORGETS = 2
+    LOSES_SETTINGS = 2
     """It does not keep its configuration."""
     ACTIVATED = 3
     """It works, but needed ACTIVATE: it is no nRF24L01+."""
@@ -181,7 +181,7 @@ class RadioState(IntEnum):
         match self:
             case RadioState.ABSENT:
                 return "radio module does not answer"
-            case RadioState.FORGETS:
+            case RadioState.LOSES_SETTINGS:
                 return "radio module does not keep its configuration"
             case _:
                 return ""

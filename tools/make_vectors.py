@@ -203,7 +203,7 @@ RECEIVER_STATUS = {
         uart_dropped=0,
         reset_cause=1,
         pipes=(PipeCounters(0, 0, 0),) * 6,
-        radio=RadioState.FORGETS,
+        radio=RadioState.LOSES_SETTINGS,
     ),
 }
 

@@ -58,12 +58,12 @@ enum WireMagScale : uint8_t {
 
 constexpr int16_t WIRE_MAG_OVERFLOW = -4096;
 
-// The radio module of the board that reports: bits 4 to 7 beside the reset cause.
+// The radio module of the board that reports: bits 4 to 7, next to the reset cause.
 enum WireRadioState : uint8_t {
     WIRE_RADIO_OK = 0,
-    WIRE_RADIO_ABSENT = 1,     // does not answer
-    WIRE_RADIO_FORGETS = 2,    // does not keep its configuration
-    WIRE_RADIO_ACTIVATED = 3,  // works, but needed ACTIVATE: no nRF24L01+
+    WIRE_RADIO_ABSENT = 1,          // does not answer
+    WIRE_RADIO_LOSES_SETTINGS = 2,  // does not keep its configuration
+    WIRE_RADIO_ACTIVATED = 3,       // works, but needed ACTIVATE: no nRF24L01+
 };
 
 #define WIRE_PACKED __attribute__((packed))

@@ -204,7 +204,7 @@ WireRadioState nrf24_check() {
     fill_address(own_pipe, address);
     command(RX_ADDR_P0, nullptr, read, ADDRESS_SIZE);
     if (!kept || memcmp(read, address, ADDRESS_SIZE) != 0) {
-        return WIRE_RADIO_FORGETS;
+        return WIRE_RADIO_LOSES_SETTINGS;
     }
     return activated ? WIRE_RADIO_ACTIVATED : WIRE_RADIO_OK;
 }

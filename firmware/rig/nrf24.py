@@ -1,6 +1,6 @@
 """nRF24L01+ at its registers: Enhanced ShockBurst with dynamic lengths.
 
-Times and rules are those of the product specification 1.0; section numbers stand beside them.
+Times and rules are those of the product specification 1.0; comments cite its sections.
 """
 
 from collections import deque
@@ -46,10 +46,10 @@ RADIO_CHIPS: Final = {
     "nRF24L01": RadioChip(hides_features=True),
     "Si24R1": RadioChip(reverses_no_ack=True),
     "clone with ACTIVATE": RadioChip(hides_features=True, reverses_no_ack=True),
-    "forgets FEATURE": RadioChip(lost_registers=(FEATURE,)),
-    "forgets DYNPD": RadioChip(lost_registers=(DYNPD,)),
-    "forgets the rate": RadioChip(lost_registers=(RF_SETUP,)),
-    "forgets its address": RadioChip(lost_registers=(RX_ADDR_P0,)),
+    "loses FEATURE": RadioChip(lost_registers=(FEATURE,)),
+    "loses DYNPD": RadioChip(lost_registers=(DYNPD,)),
+    "loses the rate": RadioChip(lost_registers=(RF_SETUP,)),
+    "loses its address": RadioChip(lost_registers=(RX_ADDR_P0,)),
 }
 
 

@@ -312,10 +312,10 @@ def test_radio_clones_work_with_one_another(bench: MakeBench, receiver: str, nod
 @pytest.mark.parametrize(
     ("radio", "state"),
     [
-        ("forgets FEATURE", RadioState.FORGETS),
-        ("forgets DYNPD", RadioState.FORGETS),
-        ("forgets the rate", RadioState.FORGETS),
-        ("forgets its address", RadioState.FORGETS),
+        ("loses FEATURE", RadioState.LOSES_SETTINGS),
+        ("loses DYNPD", RadioState.LOSES_SETTINGS),
+        ("loses the rate", RadioState.LOSES_SETTINGS),
+        ("loses its address", RadioState.LOSES_SETTINGS),
     ],
 )
 def test_receiver_reports_a_radio_that_keeps_no_configuration(
