@@ -10,7 +10,7 @@ namespace {
 constexpr uint16_t LONGEST_GAP = 0x7FFF;
 
 // Payloads carry the time of their sample, so a slow sensor's may be a little older than the one
-// sent before it; only a node that began anew steps back further.
+// sent before it; only a restarted node steps back further.
 constexpr int32_t RESTART_US = -500000;
 
 LinkNode *find(LinkCounter *counter, uint8_t vehicle_node) {

@@ -33,7 +33,7 @@ void nrf24_send(const uint8_t *payload, uint8_t size, uint8_t pause, uint8_t ret
 // Sends the payload that was given up once more, with its packet identity unchanged.
 void nrf24_send_again(uint8_t pause, uint8_t retries);
 
-// Takes the radio off the air and forgets what it has not sent.
+// Takes the radio off the air and discards a payload not yet sent.
 void nrf24_stop_sending();
 
 // Interrupt causes; reading clears them.

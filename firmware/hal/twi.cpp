@@ -110,7 +110,7 @@ ISR(TWI_vect) {
 }
 
 void twi_start() {
-    PORTC |= SDA | SCL;  // the chip's weak pull-ups beside those of the sensor board
+    PORTC |= SDA | SCL;  // the chip's weak pull-ups, in addition to those of the sensor board
     TWSR = 0;
     TWBR = TWBR_VALUE;
     TWCR = 1 << TWEN;

@@ -5,10 +5,10 @@
 // | ------- | ------------------------ | ------------------------------------- | ------- |
 // | ABSENT  | 0.5 s passed             | set the chip up                       | IDLE    |
 // | IDLE    | a payload waits          | put it on the air                     | SENDING |
-// | SENDING | sent                     | forget it                             | IDLE    |
+// | SENDING | sent                     | discard it                            | IDLE    |
 // | SENDING | given up, rounds left    | draw some milliseconds to wait        | PAUSING |
 // | PAUSING | they have passed         | draw the chip's pause, again          | SENDING |
-// | SENDING | given up, no round left  | count it, forget it                   | IDLE    |
+// | SENDING | given up, no round left  | count it, discard it                  | IDLE    |
 // | SENDING | the same, set-up lost    | the same                              | ABSENT  |
 // | SENDING | nothing for 50 ms        | the chip is lost                      | ABSENT  |
 //

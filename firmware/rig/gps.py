@@ -244,7 +244,7 @@ class Gps:
         self._in = b""
         self._begin_solutions()
 
-    def store_silence(self) -> None:
+    def store_no_messages(self) -> None:
         """Let the stored settings be UBX without any message, as some makers leave them."""
         self.nmea_on = False
 

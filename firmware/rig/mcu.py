@@ -105,7 +105,7 @@ class Mcu:
     Parameters
     ----------
     program : Path
-        The `.hex` file, of a program or a bootloader; the `.elf` beside it gives the symbols.
+        The `.hex` file, of a program or a bootloader; the `.elf` of the same name has the symbols.
     frequency_hz : int
         What the program was built for.
     """

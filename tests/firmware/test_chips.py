@@ -224,7 +224,7 @@ def test_gps_is_found_at_its_stored_speed_and_sends_its_full_rate(
 @pytest.mark.parametrize("baud", [4800, 38_400, 57_600, 230_400])
 def test_gps_that_sends_nothing_is_found(bench: MakeBench, name: str, baud: int) -> None:
     rig = bench(parts=Parts(gps=name, gps_baud=baud))
-    rig.gps_node().gps.store_silence()
+    rig.gps_node().gps.store_no_messages()
     rig.run(FOUND_S + 1.0)
     assert rig.payloads(GpsFixPayload)
     assert len(rig.payloads(GpsFixPayload, since_s=FOUND_S)) == UBX_HZ

@@ -104,7 +104,7 @@ def test_a_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> N
     assert node.mcu.resets == 0
 
 
-def test_a_node_that_restarts_beside_a_configured_receiver(bench: MakeBench) -> None:
+def test_restarted_node_uses_a_receiver_that_is_already_configured(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S + 0.5)
