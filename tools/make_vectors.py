@@ -5,6 +5,7 @@ firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself ch
 """
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -17,20 +18,34 @@ from gateway.wire.framing import encode_frame
 
 TARGET = Path(__file__).resolve().parent.parent / "tests" / "vectors" / "frames.json"
 
+LEVEL = payloads.ImuPayload(
+    accel=(0, 0, 4096),
+    gyro=(-12, 3, 0),
+    mag=(218, 0, -431),
+    temperature=-3920,
+    flags=ImuFlags.MAG_NEW,
+    accel_range=2,
+    gyro_range=1,
+    mag_gain=1,
+)
+QMC5883L = msgspec.structs.replace(
+    LEVEL, gyro=(0, 0, 0), mag=(600, -4095, -32768), gyro_range=2, mag_gain=8
+)
+NODE_STATUS = payloads.NodeStatusPayload(
+    firmware_version=(1, 2),
+    reset_cause=8,
+    sensors_present=7,
+    sensors_failed=0,
+    bus_errors=3,
+    radio_failed=12,
+    radio_retries=65_535,
+    loop_max_us=812,
+    sample_rate_hz=100,
+    supply_mv=3300,
+)
+
 RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
-    "imu_level": (
-        payloads.Header(NodeId(1, 0), 7, 1_000_000),
-        payloads.ImuPayload(
-            accel=(0, 0, 4096),
-            gyro=(-12, 3, 0),
-            mag=(218, 0, -431),
-            temperature=-3920,
-            flags=ImuFlags.MAG_NEW,
-            accel_range=2,
-            gyro_range=1,
-            mag_gain=1,
-        ),
-    ),
+    "imu_level": (payloads.Header(NodeId(1, 0), 7, 1_000_000), LEVEL),
     "imu_extremes": (
         payloads.Header(NodeId(31, 7), 65535, 4_294_967_295),
         payloads.ImuPayload(
@@ -103,61 +118,19 @@ RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
         payloads.Header(NodeId(1, 1), 0, 249_000),
         payloads.GpsQualityPayload(0, 65_535, 65_535, 65_535, 65_535, 9_999, -32_768, None),
     ),
-    "node_status": (
-        payloads.Header(NodeId(1, 0), 512, 60_000_000),
-        payloads.NodeStatusPayload(
-            firmware_version=(1, 2),
-            reset_cause=8,
-            sensors_present=7,
-            sensors_failed=0,
-            bus_errors=3,
-            radio_failed=12,
-            radio_retries=65_535,
-            loop_max_us=812,
-            sample_rate_hz=100,
-            supply_mv=3300,
-        ),
-    ),
-    # Added later: the vectors above keep their bytes.
-    "imu_qmc5883l": (
-        payloads.Header(NodeId(1, 0), 9, 1_010_000),
-        payloads.ImuPayload(
-            accel=(0, 0, 4096),
-            gyro=(0, 0, 0),
-            mag=(600, -4095, -32768),
-            temperature=-3920,
-            flags=ImuFlags.MAG_NEW,
-            accel_range=2,
-            gyro_range=2,
-            mag_gain=8,
-        ),
-    ),
+    "node_status": (payloads.Header(NodeId(1, 0), 512, 60_000_000), NODE_STATUS),
+    "imu_qmc5883l": (payloads.Header(NodeId(1, 0), 9, 1_010_000), QMC5883L),
     "imu_qmc5883p_overflow": (
         payloads.Header(NodeId(1, 0), 10, 1_020_000),
-        payloads.ImuPayload(
-            accel=(0, 0, 4096),
-            gyro=(0, 0, 0),
-            mag=(-4096, -4096, -4096),
-            temperature=-3920,
-            flags=ImuFlags.MAG_NEW,
-            accel_range=2,
-            gyro_range=2,
-            mag_gain=9,
-        ),
+        msgspec.structs.replace(QMC5883L, mag=(-4096, -4096, -4096), mag_gain=9),
     ),
     "node_status_imu_chips": (
         payloads.Header(NodeId(1, 0), 513, 61_000_000),
-        payloads.NodeStatusPayload(
+        replace(
+            NODE_STATUS,
             firmware_version=(1, 1),
             reset_cause=1,
-            sensors_present=7,
             sensors_failed=2,
-            bus_errors=3,
-            radio_failed=12,
-            radio_retries=65_535,
-            loop_max_us=812,
-            sample_rate_hz=100,
-            supply_mv=3300,
             radio=RadioState.ACTIVATED,
             chips=Chips(imu=0x98, magnetometer=0x2C, barometer=0x60),
         ),
@@ -179,6 +152,7 @@ RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
         ),
     ),
 }
+"""Append new ones: the position of a vector is its frame's sequence number, and sets its pipe."""
 
 RECEIVER_STATUS = {
     "receiver_status": payloads.ReceiverStatusFrame(
