@@ -12,22 +12,17 @@ References
 .. [2] https://mavlink.io/en/guide/message_signing.html
 """
 
-import hashlib
 import hmac
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
 
+from gateway.vehicle.signing import NEW_STREAM_TICKS, TICKS_PER_S, SigningClock
+from gateway.wire.mavlink_signing import HASH_BYTES, TIMESTAMP_BYTES, signature_hash
 from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, is_signed, origin_of
 
-HASH_BYTES: Final = 6
-EPOCH_2015_US: Final = 1_420_070_400_000_000
-TICK_US: Final = 10
-TICKS_PER_S: Final = 1_000_000 // TICK_US
 WINDOW_TICKS: Final = 5 * TICKS_PER_S
 """Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
-NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
-"""Largest age of the first timestamp of a stream."""
 MAX_STREAMS: Final = 1024
 """Streams of one site; only a holder of the passphrase begins one."""
 
@@ -72,7 +67,7 @@ class SiteSignatures:
 
     def __init__(self, key: bytes, unix_us_at_zero: int) -> None:
         self._key = key
-        self._offset_us = unix_us_at_zero - EPOCH_2015_US
+        self._clock = SigningClock(unix_us_at_zero)
         self._windows: dict[tuple[int, int, int], _Window] = {}
 
     def check(self, frame: bytes, now_us: int) -> Rejection | None:
@@ -89,11 +84,11 @@ class SiteSignatures:
             return Rejection.UNSIGNED
         if not self.is_genuine(frame):
             return Rejection.FORGED
-        timestamp = int.from_bytes(frame[-HASH_BYTES * 2 : -HASH_BYTES], "little")
+        timestamp = int.from_bytes(frame[-HASH_BYTES - TIMESTAMP_BYTES : -HASH_BYTES], "little")
         stream = (frame[-SIGNATURE_SIZE], *origin_of(frame))
         window = self._windows.get(stream)
         if window is None:
-            oldest = (self._offset_us + now_us) // TICK_US - NEW_STREAM_TICKS
+            oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
             if timestamp < oldest or len(self._windows) >= MAX_STREAMS:
                 return Rejection.REPLAYED
             window = self._windows[stream] = _Window(timestamp)
@@ -101,7 +96,8 @@ class SiteSignatures:
 
     def is_genuine(self, frame: bytes) -> bool:
         """Return whether a signed frame was signed with the passphrase."""
-        return hmac.compare_digest(self._hash(frame[:-HASH_BYTES]), frame[-HASH_BYTES:])
+        found = signature_hash(self._key, frame[:-HASH_BYTES])
+        return hmac.compare_digest(found, frame[-HASH_BYTES:])
 
     def renewed(self, body: bytes, former: bytes) -> bytes:
         """Sign a changed frame with the link and the timestamp of the former one.
@@ -114,7 +110,4 @@ class SiteSignatures:
             The whole frame before the change.
         """
         signed = body + former[-SIGNATURE_SIZE:-HASH_BYTES]
-        return signed + self._hash(signed)
-
-    def _hash(self, data: bytes) -> bytes:
-        return hashlib.sha256(self._key + data).digest()[:HASH_BYTES]
+        return signed + signature_hash(self._key, signed)

@@ -105,7 +105,8 @@ SIGNATURE_BYTES: Final = 13
 KEY_BYTES: Final = 32
 EPOCH_2015_US: Final = 1_420_070_400_000_000
 TICK_US: Final = 10
-NEW_STREAM_TICKS: Final = 60_000_000 // TICK_US
+NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
+"""Largest age of the first timestamp of a stream."""
 GPS_TOLERANCE_US: Final = 2_000_000
 
 

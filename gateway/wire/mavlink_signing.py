@@ -107,4 +107,9 @@ def sign(data: bytes, sequence: int, key: bytes, timestamp: int) -> bytes:
     body = bytes((data[1], SIGNED, data[3], sequence)) + data[5:end]
     crc = mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
     signed = data[:1] + body + crc + LINK_ID + timestamp.to_bytes(TIMESTAMP_BYTES, "little")
-    return signed + hashlib.sha256(key + signed).digest()[:HASH_BYTES]
+    return signed + signature_hash(key, signed)
+
+
+def signature_hash(key: bytes, data: bytes) -> bytes:
+    """Return the hash that ends a signed frame, of all bytes before it."""
+    return hashlib.sha256(key + data).digest()[:HASH_BYTES]

@@ -19,10 +19,9 @@ from gateway.fleet import server as fleet_server
 from gateway.fleet.id_map import LAST_ID
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings
-from gateway.fleet.signatures import EPOCH_2015_US, TICK_US
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, request
-from gateway.vehicle.signing import key_from_passphrase
+from gateway.vehicle.signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, run
 from tests.hub.conftest import LIMIT_S
 

@@ -8,7 +8,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
-from gateway.fleet.signatures import EPOCH_2015_US, SiteSignatures
+from gateway.fleet.signatures import SiteSignatures
+from gateway.vehicle.signing import EPOCH_2015_US
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import target_of
 from tests.kit.mavlink import frames_in

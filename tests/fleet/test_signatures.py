@@ -5,16 +5,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.fleet.signatures import (
-    EPOCH_2015_US,
-    MAX_STREAMS,
-    NEW_STREAM_TICKS,
-    TICK_US,
-    TICKS_PER_S,
-    WINDOW_TICKS,
-    Rejection,
-    SiteSignatures,
-)
+from gateway.fleet.signatures import MAX_STREAMS, WINDOW_TICKS, Rejection, SiteSignatures
+from gateway.vehicle.signing import EPOCH_2015_US, NEW_STREAM_TICKS, TICK_US, TICKS_PER_S
 
 KEY = bytes(range(32))
 NOW_TICKS = 1_000_000_000
