@@ -22,13 +22,12 @@ from gateway.fleet.signatures import SiteSignatures
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, offset_of
 from gateway.wire.mavlink_splitter import (
+    PAYLOAD_V1,
+    PAYLOAD_V2,
     SIGNATURE_SIZE,
     START_V2,
-    is_signed,
-    message_id_of,
-    origin_of,
-    sequence_of,
-    target_of,
+    MavFrame,
+    frame_of,
 )
 
 SEQUENCE_MASK: Final = 0xFF
@@ -151,12 +150,12 @@ class FrameTranslation:
         for traffic in self.traffic.values():
             traffic.marks.append((now_us, traffic.frames))
 
-    def from_site(self, frame: bytes, now_us: int, *, is_own: bool = False) -> bytes | None:
+    def from_site(self, frame: MavFrame, now_us: int, *, is_own: bool = False) -> MavFrame | None:
         """Return a frame of the site with the ids of this side; None if it is dropped.
 
         Parameters
         ----------
-        frame : bytes
+        frame : MavFrame
             As it was published.
         now_us : int
             Gateway time.
@@ -166,15 +165,15 @@ class FrameTranslation:
 
         Returns
         -------
-        bytes or None
+        MavFrame or None
         """
         if self._signatures is not None and (rejection := self._signatures.check(frame, now_us)):
             self._count(rejection)
             return None
-        origin = origin_of(frame)
-        vehicle = (self._site, origin[0])
+        system_id = frame.origin[0]
+        vehicle = (self._site, system_id)
         if not is_own:
-            has_id = self.id_of(origin[0]) is not None
+            has_id = self.id_of(system_id) is not None
             if self._loops.is_returned(frame, vehicle, has_id=has_id, now_us=now_us):
                 self.counters.looped += 1
                 return None
@@ -182,25 +181,25 @@ class FrameTranslation:
         if own_id is None:
             self.counters.unmapped += 1
             return None
-        self._update_traffic(frame, origin, now_us)
+        self._update_traffic(frame, now_us)
         given = self._rewritten(frame, own_id, self._id_here)
         if given is not None:
             self._loops.record_given(given, vehicle, now_us)
         return given
 
-    def to_site(self, frame: bytes, now_us: int) -> tuple[int, bytes] | None:
+    def to_site(self, frame: MavFrame, now_us: int) -> tuple[int, MavFrame] | None:
         """Return the system at the site that a frame is for (0: all) and the frame for it.
 
         None for one that cannot be translated, or is for another site's vehicle: that one has got
         its id from a vehicle of this site, where it may be a third one's.
         """
-        sender, target = self._id_there(origin_of(frame)[0]), target_of(frame)[0]
+        sender, target = self._id_there(frame.origin[0]), frame.target[0]
         addressed = self._ids.vehicle_of(target)
         if addressed is not None and addressed[0] != self._site:
             return None
         signatures = self._signatures
         # The site itself checks for replays: it knows all its streams.
-        if signatures is not None and is_signed(frame) and not signatures.is_genuine(frame):
+        if signatures is not None and frame.signed and not signatures.is_genuine(frame):
             self._count("forged")
             return None
         changed = self._rewritten(frame, sender, self._id_there)
@@ -220,7 +219,9 @@ class FrameTranslation:
         vehicle = self._ids.vehicle_of(own_id)
         return vehicle[1] if vehicle is not None and vehicle[0] == self._site else own_id
 
-    def _rewritten(self, frame: bytes, sender: int, rename: Callable[[int], int]) -> bytes | None:
+    def _rewritten(
+        self, frame: MavFrame, sender: int, rename: Callable[[int], int]
+    ) -> MavFrame | None:
         try:
             return rewrite(frame, sender, rename, self._signatures)
         except _CannotPassError as error:
@@ -230,13 +231,13 @@ class FrameTranslation:
     def _count(self, counter: str) -> None:
         setattr(self.counters, counter, getattr(self.counters, counter) + 1)
 
-    def _update_traffic(self, frame: bytes, origin: tuple[int, int], now_us: int) -> None:
+    def _update_traffic(self, frame: MavFrame, now_us: int) -> None:
+        origin, sequence = frame.origin, frame.sequence
         traffic = self.traffic.setdefault(origin[0], VehicleTraffic())
         if not traffic.marks:
             traffic.marks.append((now_us, 0))
         traffic.frames += 1
         traffic.heard_us = now_us
-        sequence = sequence_of(frame)
         if (before := self._sequences.get(origin)) is not None:
             if 0 < (before - sequence & SEQUENCE_MASK) <= MAX_OVERTAKEN:
                 traffic.lost = max(0, traffic.lost - 1)
@@ -248,16 +249,16 @@ class FrameTranslation:
 
 
 def rewrite(
-    frame: bytes,
+    frame: MavFrame,
     sender: int,
     rename: Callable[[int], int],
     signatures: SiteSignatures | None,
-) -> bytes:
+) -> MavFrame:
     """Return a frame in which systems have other ids; the same object if nothing changes.
 
     Parameters
     ----------
-    frame : bytes
+    frame : MavFrame
         A complete frame.
     sender : int
         System id of its new sender.
@@ -268,45 +269,44 @@ def rewrite(
 
     Returns
     -------
-    bytes
+    MavFrame
 
     Raises
     ------
     _CannotPassError
         If it cannot be changed.
     """
-    signed = is_signed(frame)
-    target = rename(target_of(frame)[0])
+    data, message_id = frame.data, frame.message_id
+    target = rename(frame.target[0])
     names = changes_of_names(frame, rename)
-    if sender == origin_of(frame)[0] and target == target_of(frame)[0] and not names:
+    if sender == frame.origin[0] and target == frame.target[0] and not names:
         return frame
-    message_id = message_id_of(frame)
     if message_id not in CRC_EXTRA:
         raise _CannotPassError("unknown")
-    if signed and signatures is None:
+    if frame.signed and signatures is None:
         raise _CannotPassError("signed")
-    version_2 = frame[0] == START_V2
-    changed = bytearray(frame[: -SIGNATURE_SIZE if signed else len(frame)])
+    version_2 = data[0] == START_V2
+    changed = bytearray(data[: -SIGNATURE_SIZE if frame.signed else len(data)])
     changed[5 if version_2 else 3] = sender
-    head = 10 if version_2 else 6
+    head = PAYLOAD_V2 if version_2 else PAYLOAD_V1
     offset = TARGET_OFFSETS.get(message_id, (NO_TARGET, NO_TARGET))[0]
-    if NO_TARGET < offset < frame[1]:
+    if NO_TARGET < offset < data[1]:
         changed[head + offset] = target
     for at, value in names:
         changed[head + at : head + at + len(value)] = value
     crc = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(bytes(changed[1:-2])))
     changed[-2:] = crc.to_bytes(2, "little")
-    if not signed or signatures is None:
-        return bytes(changed)
-    return signatures.renewed(bytes(changed), frame)
+    if not frame.signed or signatures is None:
+        return frame_of(bytes(changed))
+    return frame_of(signatures.renewed(bytes(changed), frame))
 
 
-def changes_of_names(frame: bytes, rename: Callable[[int], int]) -> list[Change]:
+def changes_of_names(frame: MavFrame, rename: Callable[[int], int]) -> list[Change]:
     """Return the changes of a payload that names systems which get other ids.
 
     Parameters
     ----------
-    frame : bytes
+    frame : MavFrame
         A complete frame.
     rename : callable
         Turns the id of a system into its other one.
@@ -316,11 +316,10 @@ def changes_of_names(frame: bytes, rename: Callable[[int], int]) -> list[Change]
     list of (int, bytes)
         Offset in the payload, and the new bytes there.
     """
-    message_id = message_id_of(frame)
+    message_id = frame.message_id
     if message_id not in NAMING:
         return []
-    head, size = 10 if frame[0] == START_V2 else 6, frame[1]
-    payload = frame[head : head + size]
+    payload = frame.payload
     if message_id in FIELD_OFFSETS:
         return _bytes_changed(payload, FIELD_OFFSETS[message_id], rename)
     at = COMMAND_OFFSETS[message_id]

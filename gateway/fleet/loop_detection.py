@@ -14,7 +14,7 @@ import msgspec
 from gateway.fleet.id_map import Vehicle
 from gateway.hub.routing_table import FrameMemory
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of
+from gateway.wire.mavlink_splitter import MavFrame
 
 SPAN_US: Final = 3 * US_PER_S
 """Longest way through a site and back, over two slow links."""
@@ -53,33 +53,31 @@ class LoopDetection:
         self.looped = 0
         """Frames sent to a site that a client here returned."""
 
-    def record_given(self, frame: bytes, vehicle: Vehicle, now_us: int) -> None:
+    def record_given(self, frame: MavFrame, vehicle: Vehicle, now_us: int) -> None:
         """Remember a frame of a vehicle sent to the ground stations here."""
-        kind = (vehicle, origin_of(frame)[1], message_id_of(frame))
-        head = 10 if frame[0] == START_V2 else 6
-        payload = frame[head : head + frame[1]]
+        kind, payload = (vehicle, frame.origin[1], frame.message_id), frame.payload
         before = self._newest.get(kind)
         if before is None and len(self._newest) >= MAX_KINDS:
             self._newest.clear()
         self._newest[kind] = payload
         self._given.turn(now_us)
-        self._given.put(frame, _Sent(now_us, vehicle, before not in (None, payload)))
+        self._given.put(frame.data, _Sent(now_us, vehicle, before not in (None, payload)))
 
-    def record_sent(self, frame: bytes, changed: bytes, now_us: int) -> None:
+    def record_sent(self, frame: MavFrame, changed: MavFrame, now_us: int) -> None:
         """Remember a frame of a client here, as received and as sent to a site."""
-        station = (NO_SITE, origin_of(frame)[0])
+        station = (NO_SITE, frame.origin[0])
         self.record_given(frame, station, now_us)
-        if changed != frame:
+        if changed.data != frame.data:
             self.record_given(changed, station, now_us)
             self._sent.turn(now_us)
-            self._sent.put(changed, now_us + 2 * SPAN_US)
+            self._sent.put(changed.data, now_us + 2 * SPAN_US)
 
-    def is_returned(self, frame: bytes, vehicle: Vehicle, *, has_id: bool, now_us: int) -> bool:
+    def is_returned(self, frame: MavFrame, vehicle: Vehicle, *, has_id: bool, now_us: int) -> bool:
         """Return whether a frame of a site has been here before.
 
         Parameters
         ----------
-        frame : bytes
+        frame : MavFrame
             As it was published.
         vehicle : Vehicle
             Its sender, by its key and its header.
@@ -88,7 +86,7 @@ class LoopDetection:
         now_us : int
             Gateway time.
         """
-        known = self._given.get(frame)
+        known = self._given.get(frame.data)
         if known is None or known.vehicle == vehicle or now_us - known.time_us > 2 * SPAN_US:
             self._runs.pop(vehicle, None)
             self._proven.discard(vehicle)

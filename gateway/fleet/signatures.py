@@ -19,7 +19,7 @@ from typing import Final
 
 from gateway.vehicle.signing import NEW_STREAM_TICKS, TICKS_PER_S, SigningClock
 from gateway.wire.mavlink_signing import HASH_BYTES, TIMESTAMP_BYTES, signature_hash
-from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, is_signed, origin_of
+from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, MavFrame
 
 WINDOW_TICKS: Final = 5 * TICKS_PER_S
 """Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
@@ -70,22 +70,23 @@ class SiteSignatures:
         self._clock = SigningClock(unix_us_at_zero)
         self._windows: dict[tuple[int, int, int], _Window] = {}
 
-    def check(self, frame: bytes, now_us: int) -> Rejection | None:
+    def check(self, frame: MavFrame, now_us: int) -> Rejection | None:
         """Return why a frame of the site is rejected; None if it is accepted.
 
         Parameters
         ----------
-        frame : bytes
-            A complete frame as it was published.
+        frame : MavFrame
+            As it was published.
         now_us : int
             Gateway time.
         """
-        if not is_signed(frame):
+        if not frame.signed:
             return Rejection.UNSIGNED
         if not self.is_genuine(frame):
             return Rejection.FORGED
-        timestamp = int.from_bytes(frame[-HASH_BYTES - TIMESTAMP_BYTES : -HASH_BYTES], "little")
-        stream = (frame[-SIGNATURE_SIZE], *origin_of(frame))
+        data = frame.data
+        timestamp = int.from_bytes(data[-HASH_BYTES - TIMESTAMP_BYTES : -HASH_BYTES], "little")
+        stream = (data[-SIGNATURE_SIZE], *frame.origin)
         window = self._windows.get(stream)
         if window is None:
             oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
@@ -94,20 +95,20 @@ class SiteSignatures:
             window = self._windows[stream] = _Window(timestamp)
         return None if window.accepts(timestamp) else Rejection.REPLAYED
 
-    def is_genuine(self, frame: bytes) -> bool:
+    def is_genuine(self, frame: MavFrame) -> bool:
         """Return whether a signed frame was signed with the passphrase."""
-        found = signature_hash(self._key, frame[:-HASH_BYTES])
-        return hmac.compare_digest(found, frame[-HASH_BYTES:])
+        wanted = signature_hash(self._key, frame.data[:-HASH_BYTES])
+        return hmac.compare_digest(wanted, frame.data[-HASH_BYTES:])
 
-    def renewed(self, body: bytes, former: bytes) -> bytes:
+    def renewed(self, body: bytes, former: MavFrame) -> bytes:
         """Sign a changed frame with the link and the timestamp of the former one.
 
         Parameters
         ----------
         body : bytes
             The changed frame up to its checksum.
-        former : bytes
-            The whole frame before the change.
+        former : MavFrame
+            The frame before the change.
         """
-        signed = body + former[-SIGNATURE_SIZE:-HASH_BYTES]
+        signed = body + former.data[-SIGNATURE_SIZE:-HASH_BYTES]
         return signed + signature_hash(self._key, signed)

@@ -9,7 +9,7 @@ from gateway.hub.transports.base import Client
 from gateway.hub.transports.zenoh.keys import in_key
 from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
+from gateway.wire.mavlink_splitter import MavFrame, SplitFault, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
 """No message has this number. No site receives the telemetry of another: it gets frames addressed
@@ -66,22 +66,22 @@ class SiteClient(Client):
             if isinstance(event, SplitFault):
                 self.receive([event], event.size, now_us)
                 continue
-            frame = self.translation.from_site(event.data, now_us, is_own=is_own)
+            frame = self.translation.from_site(event, now_us, is_own=is_own)
             if frame is not None:
-                self.receive([frame_of(frame)], len(frame), now_us)
+                self.receive([frame], len(frame.data), now_us)
 
     def transmit(self, frame: MavFrame) -> None:
         """Publish a frame for a vehicle of the site."""
         publishers = self.publishers()
-        found = self.translation.to_site(frame.data, self.context.now_us())
+        found = self.translation.to_site(frame, self.context.now_us())
         if publishers is None or found is None:
             self.counters.dropped += 1
             return
         system_id, changed = found
         key = in_key(self.endpoint.site, system_id)
-        if publishers.publish(key, changed, reliable=frame.message_id in RELIABLE_IDS):
+        if publishers.publish(key, changed.data, reliable=frame.message_id in RELIABLE_IDS):
             self.counters.sent += 1
-            self.counters.bytes_sent += len(changed)
+            self.counters.bytes_sent += len(changed.data)
         else:
             self.counters.dropped += 1
 

@@ -11,7 +11,7 @@ from gateway.fleet.id_map import IdMap
 from gateway.fleet.signatures import SiteSignatures
 from gateway.vehicle.signing import EPOCH_2015_US
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import target_of
+from gateway.wire.mavlink_splitter import frame_of, target_of
 from tests.kit.mavlink import frames_in
 
 KEY = bytes(range(32))
@@ -46,6 +46,16 @@ def translation(key: bytes | None = None) -> FrameTranslation:
     return FrameTranslation("b", ids, signatures)
 
 
+def from_site(there: FrameTranslation, frame: bytes, now_us: int = 0) -> bytes | None:
+    given = there.from_site(frame_of(frame), now_us)
+    return None if given is None else given.data
+
+
+def to_site(there: FrameTranslation, frame: bytes) -> tuple[int, bytes] | None:
+    found = there.to_site(frame_of(frame), 0)
+    return None if found is None else (found[0], found[1].data)
+
+
 def attitude() -> Any:
     return mavlink.MAVLink_attitude_message(5, 0.5, 0, 0, 0, 0, 0.25)
 
@@ -57,13 +67,13 @@ def command(target: int) -> Any:
 @pytest.mark.parametrize("v1", [False, True])
 def test_sender_of_a_frame_from_the_site_is_translated(v1: bool) -> None:
     there = translation()
-    got = read(there.from_site(packed(attitude(), 1, v1=v1), 0) or b"")
+    got = read(from_site(there, packed(attitude(), 1, v1=v1)) or b"")
     assert (got.get_srcSystem(), got.roll, got.yawspeed) == (2, 0.5, 0.25)
 
 
 @pytest.mark.parametrize("v1", [False, True])
 def test_target_of_a_frame_to_the_site_is_translated(v1: bool) -> None:
-    system_id, frame = translation().to_site(packed(command(2), 255, v1=v1), 0) or (0, b"")
+    system_id, frame = to_site(translation(), packed(command(2), 255, v1=v1)) or (0, b"")
     got = read(frame)
     assert (system_id, got.target_system, got.get_srcSystem()) == (1, 1, 255)
     assert (got.command, got.param7) == (400, 7)
@@ -90,10 +100,10 @@ def follow(leader: int, kind: Any) -> Any:
 )
 def test_system_named_in_a_command_is_translated(kind: Any, v1: bool) -> None:
     both = translation()
-    _, frame = both.to_site(packed(follow(2, kind), 255, v1=v1), 0) or (0, b"")
+    _, frame = to_site(both, packed(follow(2, kind), 255, v1=v1)) or (0, b"")
     there = read(frame)
     assert (there.target_system, there.param1, there.param2, there.param4) == (1, 1, 2, 4)
-    back = read(both.from_site(packed(follow(1, kind), 1, v1=v1), 0) or b"")
+    back = read(from_site(both, packed(follow(1, kind), 1, v1=v1)) or b"")
     assert (back.get_srcSystem(), back.param1, back.param2) == (2, 2, 2)
 
 
@@ -102,7 +112,7 @@ def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
     message = mavlink.MAVLink_command_long_message(
         2, 1, mavlink.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE, 0, 2, 2, value, 2, 0, 0, 0
     )
-    _, frame = translation().to_site(packed(message, 255), 0) or (0, b"")
+    _, frame = to_site(translation(), packed(message, 255)) or (0, b"")
     got = read(frame)
     assert (got.param1, got.param2, got.param4) == (1, 2, 2)
     assert got.param3 == pytest.approx(value, nan_ok=True)
@@ -110,20 +120,20 @@ def test_parameter_that_names_no_vehicle_is_unchanged(value: float) -> None:
 
 def test_controlling_systems_of_a_gimbal_are_translated() -> None:
     message = mavlink.MAVLink_gimbal_manager_status_message(5, 0, 1, 1, 1, 255, 190)
-    got = read(translation().from_site(packed(message, 1), 0) or b"")
+    got = read(from_site(translation(), packed(message, 1)) or b"")
     assert (got.primary_control_sysid, got.secondary_control_sysid) == (2, 255)
     assert (got.primary_control_compid, got.get_srcSystem()) == (1, 2)
 
 
 def test_target_of_an_answer_is_unchanged() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 190)
-    got = read(translation().from_site(packed(ack, 1), 0) or b"")
+    got = read(from_site(translation(), packed(ack, 1)) or b"")
     assert (got.get_srcSystem(), got.target_system, got.target_component) == (2, 255, 190)
 
 
 def test_target_within_the_site_is_translated() -> None:
     """As an autopilot its gimbal, or one aircraft the next."""
-    got = read(translation().from_site(packed(command(1), 30), 0) or b"")
+    got = read(from_site(translation(), packed(command(1), 30)) or b"")
     assert (got.get_srcSystem(), got.target_system) == (30, 2)
 
 
@@ -147,7 +157,7 @@ ANSWERED: list[Any] = [
 
 @pytest.mark.parametrize("message", ASKED, ids=lambda each: each.get_type())
 def test_parameter_and_mission_requests_reach_the_vehicle(message: Any) -> None:
-    system_id, frame = translation().to_site(packed(message, 255), 0) or (0, b"")
+    system_id, frame = to_site(translation(), packed(message, 255)) or (0, b"")
     got = read(frame)
     assert (system_id, got.get_srcSystem(), got.target_system) == (1, 255, 1)
     assert got.to_dict() == message.to_dict() | {"target_system": 1}
@@ -155,7 +165,7 @@ def test_parameter_and_mission_requests_reach_the_vehicle(message: Any) -> None:
 
 @pytest.mark.parametrize("message", ANSWERED, ids=lambda each: each.get_type())
 def test_parameter_and_mission_answers_reach_the_station(message: Any) -> None:
-    got = read(translation().from_site(packed(message, 1), 0) or b"")
+    got = read(from_site(translation(), packed(message, 1)) or b"")
     assert got.get_srcSystem() == 2
     assert got.to_dict() == message.to_dict()
 
@@ -164,37 +174,37 @@ def test_parameter_and_mission_answers_reach_the_station(message: Any) -> None:
 def test_wrong_time_in_a_message_is_unchanged(unix_us: int) -> None:
     message = mavlink.MAVLink_system_time_message(unix_us, 5)
     frame = packed(message, 1)
-    given = translation().from_site(frame, 0) or b""
+    given = from_site(translation(), frame) or b""
     assert read(given).time_unix_usec == unix_us
     assert given[6:-2] == frame[6:-2], "all but the sender and the checksum"
 
 
 def test_broadcast_of_a_station_is_unchanged() -> None:
     beat = packed(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3), 255)
-    assert translation().to_site(beat, 0) == (0, beat)
+    assert to_site(translation(), beat) == (0, beat)
 
 
 def test_target_cut_off_by_mavlink_2_remains_zero() -> None:
     ack = mavlink.MAVLink_command_ack_message(400, 0)
-    assert read(translation().from_site(packed(ack, 1), 0) or b"").target_system == 0
+    assert read(from_site(translation(), packed(ack, 1)) or b"").target_system == 0
 
 
 def test_frame_without_a_change_passes_byte_for_byte() -> None:
     there = FrameTranslation("a", IdMap({("a", 1): 1}))
     frame = packed(attitude(), 1, key=KEY)
-    assert there.from_site(frame, 0) is frame
+    assert from_site(there, frame) is frame
 
 
 class TestSigned:
     def test_signature_is_renewed_with_the_same_timestamp(self) -> None:
         frame = packed(attitude(), 1, key=KEY)
-        got = translation(KEY).from_site(frame, 0)
+        got = from_site(translation(KEY), frame)
         assert got is not None
         assert read(got, KEY).get_srcSystem() == 2
         assert got[-13:-6] == frame[-13:-6]
 
     def test_target_of_a_frame_to_the_site_is_translated(self) -> None:
-        found = translation(KEY).to_site(packed(command(2), 255, key=KEY), 0)
+        found = to_site(translation(KEY), packed(command(2), 255, key=KEY))
         assert found is not None
         assert read(found[1], KEY).target_system == 1
 
@@ -203,12 +213,12 @@ class TestSigned:
         frame = bytearray(packed(attitude(), 1, key=KEY))
         frame[place] ^= 1
         there = translation(KEY)
-        assert there.from_site(bytes(frame), 0) is None
+        assert from_site(there, bytes(frame)) is None
         assert there.counters.forged == 1
 
     def test_signed_frame_that_changes_is_dropped_without_a_passphrase(self) -> None:
         there = translation()
-        assert there.from_site(packed(attitude(), 1, key=KEY), 0) is None
+        assert from_site(there, packed(attitude(), 1, key=KEY)) is None
         assert there.counters.signed == 1
 
 
@@ -216,7 +226,7 @@ def test_unknown_message_that_changes_is_dropped() -> None:
     frame = bytearray(packed(attitude(), 1))
     frame[7:10] = (16_000_000).to_bytes(3, "little")
     there = translation()
-    assert there.from_site(bytes(frame), 0) is None
+    assert from_site(there, bytes(frame)) is None
     assert there.counters.unknown == 1
 
 
@@ -225,10 +235,10 @@ def test_command_for_an_id_passed_to_another_site_is_not_sent_to_the_former() ->
     ids = IdMap()
     there = FrameTranslation("b", ids)
     assert ids.id_of("b", 30) == 30
-    assert there.to_site(packed(command(30), 255), 0) is not None
+    assert to_site(there, packed(command(30), 255)) is not None
     ids.set_by_hand("a", 1, 30)
-    assert there.to_site(packed(command(30), 255), 0) is None
-    found = FrameTranslation("a", ids).to_site(packed(command(30), 255), 0)
+    assert to_site(there, packed(command(30), 255)) is None
+    found = to_site(FrameTranslation("a", ids), packed(command(30), 255))
     assert found is not None
     assert found[0] == 1
 
@@ -238,13 +248,13 @@ def test_frame_of_a_vehicle_without_id_is_counted() -> None:
     for n in range(260):
         ids.id_of(f"site-{n}", 1)
     there = FrameTranslation("site-259", ids)
-    assert there.from_site(packed(attitude(), 1), 0) is None
+    assert from_site(there, packed(attitude(), 1)) is None
     assert there.counters.unmapped == 1
 
 
 def test_system_0_gets_no_id() -> None:
     there = translation()
-    assert there.from_site(packed(attitude(), 0), 0) is None
+    assert from_site(there, packed(attitude(), 0)) is None
     assert there.counters.unmapped == 1
     assert there.traffic == {}
 
@@ -263,7 +273,7 @@ def test_loss_is_counted_by_sequence_numbers(numbers: tuple[int, ...], lost: int
     for number in numbers:
         frame = bytearray(packed(attitude(), 1))
         frame[4] = number
-        there.from_site(bytes(frame), number)
+        from_site(there, bytes(frame), number)
     assert (there.traffic[1].frames, there.traffic[1].lost) == (len(numbers), lost)
 
 
@@ -288,11 +298,11 @@ def test_target_of_every_message_is_translated(message_id: int) -> None:
     crc.accumulate(bytes((kind.crc_extra,)))
     frame += crc.crc.to_bytes(2, "little")
     there = translation()
-    system_id, changed = there.to_site(frame, 0) or (0, b"")
+    system_id, changed = to_site(there, frame) or (0, b"")
     assert system_id == 1
     assert frames_in(changed) == [changed]
     assert target_of(changed)[0] == 1
-    back = translation().from_site(changed, 0)
+    back = from_site(translation(), changed)
     assert back is not None
     assert target_of(back)[0] == 2
     differing = sum(a != b for a, b in zip(changed, frame, strict=True))

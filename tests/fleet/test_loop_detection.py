@@ -5,7 +5,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
 from gateway.fleet.loop_detection import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopDetection
-from gateway.wire.mavlink_splitter import origin_of
+from gateway.wire.mavlink_splitter import frame_of, origin_of
 from tests.hub.conftest import Sender
 
 STEP_US = 20_000
@@ -27,7 +27,8 @@ class Ring:
         return self.vehicles[name].pack(mavlink.MAVLink_attitude_message(time_ms, 0, 0, 0, 0, 0, 0))
 
     def give(self, name: str, frame: bytes, *, is_own: bool = False) -> bytes | None:
-        return self.sites[name].from_site(frame, self.now_us, is_own=is_own)
+        given = self.sites[name].from_site(frame_of(frame), self.now_us, is_own=is_own)
+        return None if given is None else given.data
 
 
 def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
@@ -108,13 +109,14 @@ def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
 def test_returned_command_ends_on_both_ways() -> None:
     ring = Ring(IdMap({("a", 1): 7}))
     said = Sender(255, 190).command(7, 1)
-    found = ring.sites["a"].to_site(said, 0)
+    found = ring.sites["a"].to_site(frame_of(said), 0)
     assert found is not None
-    assert found[0] == 1
-    for frame in (said, found[1]):
+    system_id, sent = found[0], found[1].data
+    assert system_id == 1
+    for frame in (said, sent):
         assert ring.give("c", frame) is None
     assert ring.ids.known_id("c", 255) is None
-    assert ring.loops.is_returned_by_client(found[1], 0), "for another vehicle's id"
+    assert ring.loops.is_returned_by_client(sent, 0), "for another vehicle's id"
     assert not ring.loops.is_returned_by_client(said, 0), "a program may say the same again"
     assert ring.loops.looped == 1
 
@@ -127,6 +129,6 @@ def test_memory_is_bounded_in_time_and_number() -> None:
     assert ring.give("c", given) is not None
     loops = LoopDetection()
     for number in range(3 * MAX_FRAMES):
-        frame = b"\xfd\x04" + bytes(8) + number.to_bytes(4, "little")
+        frame = frame_of(b"\xfd\x04" + bytes(8) + number.to_bytes(4, "little"))
         loops.record_given(frame, ("a", 1), 0)
     assert len(loops._given._recent) + len(loops._given._older) <= 2 * MAX_FRAMES

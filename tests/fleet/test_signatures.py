@@ -6,20 +6,23 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.signatures import MAX_STREAMS, WINDOW_TICKS, Rejection, SiteSignatures
-from gateway.vehicle.signing import EPOCH_2015_US, NEW_STREAM_TICKS, TICK_US, TICKS_PER_S
+from gateway.vehicle.signing import EPOCH_2015_US, TICK_US, TICKS_PER_S
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 KEY = bytes(range(32))
 NOW_TICKS = 1_000_000_000
 NOW_US = NOW_TICKS * TICK_US
+MINUTE_TICKS = 60 * 100_000
+"""In units of 10 us."""
 
 
-def signed(timestamp: int, *, link: int = 1, system: int = 1, key: bytes = KEY) -> bytes:
+def signed(timestamp: int, *, link: int = 1, system: int = 1, key: bytes = KEY) -> MavFrame:
     writer = mavlink.MAVLink(None, system, 1)
     writer.signing.secret_key = key
     writer.signing.link_id = link
     writer.signing.timestamp = timestamp
     writer.signing.sign_outgoing = True
-    return bytes(mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0).pack(writer))
+    return frame_of(bytes(mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0).pack(writer)))
 
 
 @pytest.fixture
@@ -31,7 +34,7 @@ def test_unsigned_frame_is_rejected(site: SiteSignatures) -> None:
     message: Any = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
     for force_v1 in (False, True):
         frame = bytes(message.pack(mavlink.MAVLink(None, 1, 1), force_mavlink1=force_v1))
-        assert site.check(frame, NOW_US) is Rejection.UNSIGNED
+        assert site.check(frame_of(frame), NOW_US) is Rejection.UNSIGNED
 
 
 def test_frame_of_another_passphrase_is_rejected_and_begins_no_stream(site: SiteSignatures) -> None:
@@ -50,7 +53,7 @@ def test_recorded_frame_is_rejected_at_any_later_time(site: SiteSignatures, age_
 
 @pytest.mark.parametrize(
     ("age_ticks", "rejection"),
-    [(NEW_STREAM_TICKS, None), (NEW_STREAM_TICKS + 1, Rejection.REPLAYED), (-(10**9), None)],
+    [(MINUTE_TICKS, None), (MINUTE_TICKS + 1, Rejection.REPLAYED), (-(10**9), None)],
 )
 def test_first_frame_of_a_stream_is_at_most_a_minute_old(
     site: SiteSignatures, age_ticks: int, rejection: Rejection | None
@@ -90,6 +93,6 @@ def test_memory_of_a_window_is_bounded(site: SiteSignatures) -> None:
 
 def test_renewed_signature_is_genuine_and_keeps_link_and_timestamp(site: SiteSignatures) -> None:
     frame = signed(NOW_TICKS, link=7)
-    changed = site.renewed(frame[:-13], frame)
-    assert changed == frame
-    assert site.is_genuine(changed)
+    changed = site.renewed(frame.data[:-13], frame)
+    assert changed == frame.data
+    assert site.is_genuine(frame_of(changed))
