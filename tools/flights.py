@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -60,9 +60,6 @@ class Flight:
     """(n,) whether the sample is scored."""
     free_heading: bool = False
     """The reference's heading holds only up to a constant."""
-    truth: dict[str, np.ndarray] = field(default_factory=dict)
-    """Of a simulated flight: velocity NED and depth. Of one that an estimator judges: how unsure
-    the reference is, `attitude_std` in rad and `place_std` in m; see `score_honesty.judged_by`."""
 
     def with_gps(self, keep: np.ndarray) -> "Flight":
         """Leave out fixes."""
@@ -171,7 +168,6 @@ def simulated_flight(seed: int, *, calibrated: bool) -> Flight:
         pos_ne_m=np.empty((0, 2)),
         origin_deg=origin,
         counts=log.imu_time_us > SETTLED_S * 1e6,
-        truth={"vel": truth.vel_n_mps, "down": -truth.alt_amsl_m},
     )
     return replace(flight, pos_ne_m=north_east_m(flight, truth.lat_deg, truth.lon_deg))
 

@@ -1,6 +1,6 @@
-"""Spoil a flight as flights are spoilt in the field, and tell how an estimator gets over it.
+"""Spoil a flight with a disturbance that occurs in the field.
 
-    python tools/spoil_flight.py FLIGHT.csv.gz --how silence -o SPOILT.csv.gz
+    python tools/spoil_flight.py FLIGHT.csv.gz --how imu_gap -o SPOILT.csv.gz
 
 The spoilt log has the form of the tracker logs that `mavgate fuse` reads.
 """
@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.estimation.columns import (
@@ -26,18 +25,13 @@ from gateway.estimation.columns import (
     GYRO,
     GYRO_UNCALIBRATED,
     MAG,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_LON,
 )
-from gateway.geometry.angle import wrap_pi
-from gateway.records import NavFlags
-from tools.flights import GPS_NAMES, IMU_NAMES, Flight, north_east_m, read_flight
+from tools.flights import GPS_NAMES, IMU_NAMES, Flight, read_flight
 
-SILENCE_S = 4.0
+IMU_GAP_S = 4.0
 HANG_S = 1.5
 RECOVERY_S = 20.0
-"""So long after the disturbance an estimator has to be back."""
+"""Time after a disturbance within which an estimator has to recover."""
 GYRO_OFF_RADPS = math.radians(1.0)
 UNCALIBRATED_RADPS = np.radians([9.0, -8.0, 12.0])
 UNCALIBRATED_MPS2 = (0.4, -0.35, 0.5)
@@ -60,23 +54,23 @@ class Spoilt:
 
 
 def first_fix_s(flight: Flight) -> float:
-    """Tell when GPS, or without any the log, begins."""
+    """Return the time of the first fix, or of the first sample without GPS."""
     times = flight.log.gps_time_us if len(flight.log.gps) else flight.log.imu_time_us
     return float(times[0]) * 1e-6
 
 
 def middle_s(flight: Flight) -> float:
-    """Tell the middle of what counts."""
+    """Return the middle of the scored samples."""
     counted = flight.log.imu_time_us[flight.counts] * 1e-6
     return float(counted[len(counted) // 2])
 
 
 def turn_s(flight: Flight) -> float:
-    """Tell the begin of the span of `SILENCE_S` that turns most, with time left after it."""
+    """Return the begin of the `IMU_GAP_S` that turn most, with time to recover after them."""
     time_s, log = flight.log.imu_time_us * 1e-6, flight.log
     dt = np.diff(time_s, prepend=time_s[0]).clip(0.0, 0.1)
     turned = np.cumsum(np.abs(np.linalg.norm(log.imu[:, GYRO : GYRO + 3], axis=1)) * dt)
-    span = np.interp(time_s + SILENCE_S, time_s, turned) - turned
+    span = np.interp(time_s + IMU_GAP_S, time_s, turned) - turned
     counted = time_s[flight.counts]
     usable = (time_s > counted[0] + 30.0) & (time_s < counted[-1] - 3.0 * RECOVERY_S)
     return float(time_s[np.argmax(np.where(usable, span, -1.0))])
@@ -128,7 +122,7 @@ def no_baro(flight: Flight) -> Spoilt:
 
 
 def cut(flight: Flight, keep: np.ndarray) -> Flight:
-    """Keep some of the IMU's samples, and with them the truth about them."""
+    """Keep some of the IMU's samples, and their references."""
     log = replace(flight.log, imu_time_us=flight.log.imu_time_us[keep], imu=flight.log.imu[keep])
     return replace(
         flight,
@@ -136,15 +130,14 @@ def cut(flight: Flight, keep: np.ndarray) -> Flight:
         q_nb=flight.q_nb[keep],
         pos_ne_m=flight.pos_ne_m[keep],
         counts=flight.counts[keep],
-        truth={name: values[keep] for name, values in flight.truth.items()},
     )
 
 
-def silence(flight: Flight) -> Spoilt:
-    """Let the IMU fall silent in the sharpest turn; GPS and barometer go on."""
+def imu_gap(flight: Flight) -> Spoilt:
+    """Lose the IMU's samples in the sharpest turn; GPS and barometer continue."""
     time_s, begin_s = flight.log.imu_time_us * 1e-6, turn_s(flight)
-    spoilt = cut(flight, (time_s <= begin_s) | (time_s > begin_s + SILENCE_S))
-    return Spoilt(spoilt, begin_s + SILENCE_S)
+    spoilt = cut(flight, (time_s <= begin_s) | (time_s > begin_s + IMU_GAP_S))
+    return Spoilt(spoilt, begin_s + IMU_GAP_S)
 
 
 def mid_air(flight: Flight) -> Spoilt:
@@ -206,8 +199,8 @@ def imu_hangs(flight: Flight) -> Spoilt:
 def mag_hangs(flight: Flight) -> Spoilt:
     """Let the magnetometer repeat one field from the middle of the flight on."""
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
-    told = np.flatnonzero((flight.log.imu_time_us * 1e-6 > begin_s) & np.isfinite(imu[:, MAG]))
-    imu[told, MAG : MAG + 3] = imu[told[0], MAG : MAG + 3]
+    hung = np.flatnonzero((flight.log.imu_time_us * 1e-6 > begin_s) & np.isfinite(imu[:, MAG]))
+    imu[hung, MAG : MAG + 3] = imu[hung[0], MAG : MAG + 3]
     return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), begin_s)
 
 
@@ -218,7 +211,7 @@ SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "no_height": no_height,
     "no_mag": no_mag,
     "no_baro": no_baro,
-    "silence": silence,
+    "imu_gap": imu_gap,
     "mid_air": mid_air,
     "gyro_off": gyro_off,
     "uncalibrated": uncalibrated,
@@ -231,84 +224,13 @@ GPS_SPOILS = ("late_gps", "no_velocity", "no_height")
 
 
 def applies(how: str, flight: Flight) -> bool:
-    """Tell whether a flight has what a way of spoiling takes."""
+    """Return whether a flight has the sensor that a way of spoiling changes."""
     log = flight.log
     if how in GPS_SPOILS:
         return len(log.gps) > 0
     if how in ("no_mag", "mag_hangs"):
         return bool(np.isfinite(log.imu[:, MAG]).any())
     return how != "no_baro" or len(log.baro_alt_m) > 0
-
-
-@dataclass(frozen=True)
-class Departure:
-    """How far a spoilt run is from the unspoilt one, by the instant."""
-
-    time_s: np.ndarray
-    tilt_deg: np.ndarray
-    heading_deg: np.ndarray
-    """NaN where the unspoilt run knows none itself."""
-    place_m: np.ndarray
-    told: np.ndarray
-    """Whether the spoilt run tells its heading as valid."""
-
-    def after(self, since_s: float, percent: float = 95.0) -> tuple[float, float, float]:
-        """Tell what tilt, heading and place keep below most of the time; 0 where there is none."""
-        late = self.time_s >= since_s
-
-        def usual(values: np.ndarray) -> float:
-            known = values[late & ~np.isnan(values)]
-            return float(np.percentile(known, percent, method="higher")) if len(known) else 0.0
-
-        return usual(self.tilt_deg), usual(self.heading_deg), usual(self.place_m)
-
-    def told_share(self, since_s: float) -> float:
-        """Tell for which share of the time the spoilt run tells a heading that can be compared."""
-        counted = (self.time_s >= since_s) & np.isfinite(self.heading_deg)
-        return float(self.told[counted].mean()) if counted.any() else 0.0
-
-    def as_told(self) -> "Departure":
-        """Leave out the headings that the spoilt run itself does not tell as valid."""
-        return replace(self, heading_deg=np.where(self.told, self.heading_deg, math.nan))
-
-
-def departure(flight: Flight, out: np.ndarray, spoilt: Flight, spoilt_out: np.ndarray) -> Departure:
-    """Compare a spoilt run with the unspoilt one at the instants that count in both."""
-    _, left, right = np.intersect1d(
-        flight.log.imu_time_us, spoilt.log.imu_time_us, return_indices=True
-    )
-    use = flight.counts[left]
-    left, right = left[use], right[use]
-    told = np.isfinite(spoilt_out[right, 0])
-    quats = np.where(told[:, None], spoilt_out[right, :4], (1.0, 0.0, 0.0, 0.0))
-    found = Rotation.from_quat(quats, scalar_first=True)
-    off = found * Rotation.from_quat(out[left, :4], scalar_first=True).inv()
-    w, z = off.as_quat(scalar_first=True)[:, [0, 3]].T
-    heading = wrap_pi(2.0 * np.arctan2(z, w))
-    place = np.full(len(left), np.nan)
-    if out.shape[1] > NAV_LON:
-        ours = north_east_m(flight, out[left, NAV_LAT], out[left, NAV_LON])
-        theirs = north_east_m(flight, spoilt_out[right, NAV_LAT], spoilt_out[right, NAV_LON])
-        place = np.hypot(*(theirs - ours).T)
-        place[np.isnan(theirs[:, 0]) & np.isfinite(ours[:, 0])] = math.inf
-    # Nothing told where the other tells something is as far off as can be.
-    tilt = np.where(told, 2.0 * np.arccos(np.hypot(w, z).clip(max=1.0)), math.inf)
-    heading = np.where(told, np.abs(heading), math.inf)
-    return Departure(
-        time_s=spoilt.log.imu_time_us[right] * 1e-6,
-        tilt_deg=np.degrees(tilt),
-        heading_deg=np.degrees(np.where(knows_heading(out[left]), heading, math.nan)),
-        place_m=place,
-        told=knows_heading(spoilt_out[right]),
-    )
-
-
-def knows_heading(out: np.ndarray) -> np.ndarray:
-    """Tell where an estimator calls its heading valid; one without flags always does."""
-    if out.shape[1] <= NAV_FLAGS:
-        return np.ones(len(out), bool)
-    flags = out[:, NAV_FLAGS]
-    return np.isnan(flags) | (np.nan_to_num(flags).astype(int) & int(NavFlags.HEADING_VALID) != 0)
 
 
 def write_flight(flight: Flight, path: Path) -> None:
@@ -340,7 +262,7 @@ def main() -> None:
     arguments = parser.parse_args()
     flight = read_flight(arguments.flight)
     if not applies(arguments.how, flight):
-        parser.error(f"{flight.name} has not what {arguments.how} takes from a flight")
+        parser.error(f"{flight.name} lacks the sensor that {arguments.how} changes")
     spoilt = SPOILS[arguments.how](flight)
     write_flight(spoilt.flight, arguments.out)
     print(f"{arguments.out}: the disturbance ends at {spoilt.ends_s:.2f} s")
