@@ -6,8 +6,8 @@
 # make lint   formatting, lint and types
 # make firmware   the ready-made images of `mavgate flash`; make deb builds them too
 # make deb    a Debian package with the service, in dist/
-# make fuzz   odd input to all that reads any, with new values, for five minutes
-# make lock   write the lock files anew from pyproject.toml
+# make fuzz   random and damaged input to every reader, for five minutes
+# make lock   resolve the dependencies of pyproject.toml and write the lock files
 
 .PHONY: demo kernels test lint deb wheel image fuzz lock firmware clean
 
@@ -21,8 +21,8 @@ kernels: .venv/.run
 	@.venv/bin/python -m tools.build_kernels
 
 # Tests that need the AVR tool chain or a browser skip, and say so, where it could not be installed.
-# A third of their time they wait, so there are three workers for two cores; and they start hundreds of
-# processes, which shall not each compile all sources anew.
+# Tests wait for a third of their time, so there are three workers for two cores. They start hundreds of
+# processes, each of which would compile all sources again without bytecode files.
 test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
@@ -32,7 +32,7 @@ test: .venv/.dev kernels
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
 
-# Of the library of kernels, each wheel has the one of its processor; Python's version is free.
+# Each wheel contains the kernels for its processor, and runs with any supported version of Python.
 wheel: .venv/.run
 	@.venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes --no-deps \
 		--requirement requirements-linker.lock
@@ -64,7 +64,7 @@ COMPILE = .venv/bin/uv pip compile --quiet $(UPGRADE) --universal --generate-has
 # UPGRADE= keeps the versions that are locked.
 UPGRADE = --upgrade
 
-# What MAVProxy draws windows and maps with: half a gigabyte that a test never opens.
+# Packages with which MAVProxy draws windows and maps: half a gigabyte that no test uses.
 HEADLESS := $(foreach package,opencv-python vtk wxpython quantized-mesh-tile shapely, \
 	--no-emit-package $(package))
 

@@ -18,7 +18,7 @@ class BuildWithKernels(build_py):
     """Adds the library to the packages, unless they are used from the source tree."""
 
     def run(self) -> None:
-        """Copy the packages, and compile the kernels beside them."""
+        """Copy the packages, and add the compiled kernels."""
         super().run()
         if not self.editable_mode:
             library = Path(self.build_lib).resolve() / LIBRARY

@@ -1,4 +1,4 @@
-"""Plain technical English: words of the project's former language do not come back."""
+"""Plain technical English: words that an engineer of the field would not expect are not used."""
 
 import re
 from pathlib import Path

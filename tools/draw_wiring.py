@@ -25,7 +25,7 @@ COLOURS: Final = (
     (r"IRQ|INTA", "#e69f00"),
     (r"TX|RX", "#cc79a7"),
 )
-"""Colour of a wire by its pin, of a palette that everybody can tell apart."""
+"""Colour of a wire by its pin, from a palette that people with colour blindness can distinguish."""
 
 WIDTH: Final = 980
 ROW: Final = 26

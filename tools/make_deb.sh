@@ -1,6 +1,6 @@
 #!/bin/sh
 # Build a Debian package that holds mavgate with every locked package it needs: it installs without
-# a network, beside Debian's own Python packages, and runs with the Python version that it was built
+# a network, separate from Debian's own Python packages, and runs with the Python version that it was built
 # with.
 # usage: tools/make_deb.sh OUTPUT_FOLDER
 # PYTHON names the interpreter (with pip and setuptools); LOCK= leaves the dependencies out.
