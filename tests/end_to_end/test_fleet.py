@@ -30,7 +30,7 @@ SITES = ("field-1", "field-2", "field-3")
 DATAGRAMS = 50_000
 YEAR_S = 31_556_952
 OFF_S = {"field-2": 20 * YEAR_S, "field-3": -2 * YEAR_S}
-"""No GPS tells a date before 2024."""
+"""No GPS reports a date before 2024."""
 WRONG_CLOCK = Path(__file__).with_name("wrong_clock.c")
 SITE = """
 [hub]
@@ -153,19 +153,19 @@ async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
         mavproxy.process.communicate(timeout=START_LIMIT_S)
 
 
-def times_told(client: Client) -> dict[int, float]:
-    """Return the civil time that each vehicle tells, once all do, and have a place."""
-    told_s: dict[int, float] = {}
+def times_reported(client: Client) -> dict[int, float]:
+    """Return the civil time that each vehicle reports, once all report it and a position."""
+    time_s: dict[int, float] = {}
     fused: set[int] = set()
     for _ in range(DATAGRAMS):
         for message in client.receive():
             if message.get_type() == "SYSTEM_TIME" and message.time_unix_usec:
-                told_s[message.get_srcSystem()] = message.time_unix_usec / 1e6
+                time_s[message.get_srcSystem()] = message.time_unix_usec / 1e6
             elif message.get_type() == "GLOBAL_POSITION_INT" and message.lat:
                 fused.add(message.get_srcSystem())
-        if len(told_s) == len(fused) == len(SITES):
-            return told_s
-    raise AssertionError(f"only {sorted(told_s)} tell the time, {sorted(fused)} the place")
+        if len(time_s) == len(fused) == len(SITES):
+            return time_s
+    raise AssertionError(f"only {sorted(time_s)} report the time, {sorted(fused)} the position")
 
 
 def test_clocks_that_are_wrong_by_years(
@@ -175,10 +175,10 @@ def test_clocks_that_are_wrong_by_years(
     if wrong_clock is None:
         pytest.skip("no C compiler")
     client, now_s = Client(fleet.ports[2]), time.time()
-    told_s = times_told(client)
+    time_s = times_reported(client)
     client.sock.close()
     for site, system_id in fleet.ids().items():
-        assert abs(told_s[system_id] - now_s - OFF_S.get(site, 0)) < YEAR_S / 365
+        assert abs(time_s[system_id] - now_s - OFF_S.get(site, 0)) < YEAR_S / 365
     until(lambda: set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES))
     logs: dict[str, list[bytes]] = {}
 
@@ -193,6 +193,6 @@ def test_clocks_that_are_wrong_by_years(
         until(partial(fetched, site))
     assert [gateway.stop() for gateway in fleet.sites.values()] == [0, 0, 0]
     for site, off_s in OFF_S.items():
-        # A second part begins where GPS tells another time than the clock, as in a late start.
+        # A second part begins where GPS reports another time than the clock, as in a late start.
         first_s = int.from_bytes(logs[site][0][:8], "big") / 1e6
         assert abs(first_s - now_s - off_s) < YEAR_S / 365

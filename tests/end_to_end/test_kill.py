@@ -12,7 +12,7 @@ TOOL = Path(__file__).resolve().parents[2] / "tools" / "kill_recorder.py"
 @pytest.mark.io
 @pytest.mark.slow
 def test_kills_and_cuts_lose_nothing_that_was_written() -> None:
-    """How much of the rest is lost depends on the disk; the tool tells it."""
+    """How much of the rest is lost depends on the disk; the tool prints it."""
     done = subprocess.run(
         [sys.executable, str(TOOL), "--kills", "3", "--seed", "7", "--any-loss"],
         capture_output=True,

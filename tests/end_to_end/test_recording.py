@@ -150,8 +150,10 @@ async def test_the_table_alone_gives_the_recorded_states_to_the_last_bit(
         assert reader.header is not None
         assert reader.header.cold_start is (number == 0)
     assert repr([row.state for row in rows if row.state is not None]) == repr(states)
-    wishes = ReadOptions(PipelineSettings(flight.settings.default_aircraft))
-    again = [row for row in RecordedFusion(paths, wishes).table().rows if isinstance(row, TableRow)]
+    options = ReadOptions(PipelineSettings(flight.settings.default_aircraft))
+    again = [
+        row for row in RecordedFusion(paths, options).table().rows if isinstance(row, TableRow)
+    ]
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.
     out = folder / "again.csv"

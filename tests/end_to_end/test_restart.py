@@ -59,19 +59,19 @@ def find(port: int) -> tuple[int, int, int]:
 
 def hear_of_trouble(client: Client) -> list[str]:
     """Return what is said up to the trouble, its texts in words."""
-    told = [""]
-    while "1.places.json" not in told[-1]:
-        assert len(told) < 20_000, told
-        told += [getattr(m, "text", m.get_type()) for m in client.receive()]
-        told = told[: next((n + 1 for n, t in enumerate(told) if "1.places.json" in t), None)]
-    return told
+    texts = [""]
+    while "1.places.json" not in texts[-1]:
+        assert len(texts) < 20_000, texts
+        texts += [getattr(m, "text", m.get_type()) for m in client.receive()]
+        texts = texts[: next((n + 1 for n, t in enumerate(texts) if "1.places.json" in t), None)]
+    return texts
 
 
-async def run(folder: Path, use: Callable[[int], Any], *beside: str) -> Any:
-    """Let the gateway run for as long as somebody uses its TCP port, or an endpoint beside it."""
+async def run(folder: Path, use: Callable[[int], Any], *others: str) -> Any:
+    """Let the gateway run for as long as somebody uses its TCP port, or another endpoint."""
     port = free_port()
     settings = GatewaySettings(
-        hub=HubSettings(endpoints=(f"tcp-listen:127.0.0.1:{port}", *beside)),
+        hub=HubSettings(endpoints=(f"tcp-listen:127.0.0.1:{port}", *others)),
         aircraft_folder=str(folder / "aircraft"),
     )
     line = simulate(settings.simulator, START_UNIX_US).frames()
@@ -80,7 +80,7 @@ async def run(folder: Path, use: Callable[[int], Any], *beside: str) -> Any:
     begin, daemon._receiver.start = daemon._receiver.start, lambda: None
     daemon.start()
     try:
-        # Endpoints open beside the loop: no aircraft is heard before all of them listen.
+        # Endpoints open off the loop: no aircraft is heard before all of them listen.
         async with asyncio.timeout(START_LIMIT_S):
             while any(client.state != "open" for client in daemon._hub.clients()):
                 await asyncio.sleep(0.01)
@@ -106,9 +106,9 @@ async def test_a_broken_file_is_reported_when_the_aircraft_appears(
     file.write_text("{")
     # It listens before the gateway begins: who connects later may miss the text.
     client = connect(port := free_port())
-    told = await run(folder, lambda _: hear_of_trouble(client), f"udp:127.0.0.1:{port}")
-    assert told[-1].startswith("Mission, mark and home not kept: 1.places.json")
-    assert "HEARTBEAT" in told, "before which ground stations hear nothing"
+    texts = await run(folder, lambda _: hear_of_trouble(client), f"udp:127.0.0.1:{port}")
+    assert texts[-1].startswith("Mission, mark and home not kept: 1.places.json")
+    assert "HEARTBEAT" in texts, "before which ground stations hear nothing"
     assert file.read_text() == "{"
 
 

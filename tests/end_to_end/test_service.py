@@ -27,11 +27,11 @@ metrics_port = {metrics}
 
 
 class Systemd:
-    """Takes what a service tells as soon as it is told: the kernel would keep only a few of it."""
+    """Receives the notifications of a service at once: the kernel would keep only a few of them."""
 
     def __init__(self, path: Path) -> None:
         self.signs_of_life = 0
-        self._told: queue.Queue[bytes] = queue.Queue()
+        self._notified: queue.Queue[bytes] = queue.Queue()
         self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._sock.bind(str(path))
         self._path = str(path)
@@ -43,17 +43,17 @@ class Systemd:
             if text == b"WATCHDOG=1":
                 self.signs_of_life += 1
             else:
-                self._told.put(text)
+                self._notified.put(text)
 
-    def told(self) -> bytes:
-        """Wait for what is told next, but for signs of life."""
-        return self._told.get(timeout=START_LIMIT_S)
+    def notified(self) -> bytes:
+        """Wait for the next notification other than a sign of life."""
+        return self._notified.get(timeout=START_LIMIT_S)
 
     def is_alive(self) -> None:
         """Wait for two signs of life, and for nothing else."""
         wanted = self.signs_of_life + 2
         until(lambda: self.signs_of_life >= wanted)
-        assert self._told.empty()
+        assert self._notified.empty()
 
     def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as last:
@@ -78,7 +78,7 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     tmp_path: Path,
 ) -> None:
     gateway = start_gateway("demo")
-    assert systemd.told() == b"READY=1"
+    assert systemd.notified() == b"READY=1"
     steady = connect(gateway.port)
     steady.until(lambda seen: "ATTITUDE_QUATERNION" in seen)
     extra, metrics = free_ports(2)
@@ -95,7 +95,7 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     systemd.is_alive()
     settings.write_text(CHANGED.format(port=gateway.port, extra=extra, metrics=metrics))
     gateway.process.send_signal(signal.SIGHUP)
-    assert [systemd.told(), systemd.told()] == [b"RELOADING=1", b"READY=1"]
+    assert [systemd.notified(), systemd.notified()] == [b"RELOADING=1", b"READY=1"]
     follow(50)
     newcomer = connect(extra)
     seen = newcomer.until(lambda seen: {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= set(seen))
@@ -112,7 +112,7 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert steps == {1}
     systemd.is_alive()
     assert gateway.stop() == 0
-    assert systemd.told() == b"STOPPING=1"
+    assert systemd.notified() == b"STOPPING=1"
 
 
 def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
@@ -174,7 +174,7 @@ def test_a_recording_is_accepted_only_when_it_runs(
     in_progress = mavlink.MAV_RESULT_IN_PROGRESS
 
     def order() -> list[int]:
-        """Ask for a recording; the results told up to the final one."""
+        """Request a recording; return its results up to the final one."""
         number = mavlink.MAV_CMD_LOGGING_START
         start = mavlink.MAVLink_command_long_message(1, 1, number, 0, *[0] * 7)
         client.send(start, gateway.listen_port)
@@ -184,11 +184,11 @@ def test_a_recording_is_accepted_only_when_it_runs(
             results += [m.result for m in found]
         return results
 
-    def told(seen: dict[str, mavlink.MAVLink_message]) -> bool:
+    def is_reported(seen: dict[str, mavlink.MAVLink_message]) -> bool:
         return "STATUSTEXT" in seen and "Cannot record: Not a directory" in seen["STATUSTEXT"].text
 
     assert order() == [in_progress, mavlink.MAV_RESULT_FAILED]
-    client.until(told)
+    client.until(is_reported)
     in_the_way.unlink()
     assert order() == [in_progress, mavlink.MAV_RESULT_ACCEPTED]
     assert list(in_the_way.glob("today/*.tlog"))

@@ -133,5 +133,7 @@ async def test_the_control_socket_waits_and_logs_it_once(
         async with asyncio.timeout(LIMIT_S):
             assert await asyncio.get_running_loop().sock_recv(caller, 4096)
     server.close()
-    told = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
-    assert told == ["control socket: Too many open files; it is tried again"]
+    warnings = [
+        record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
+    ]
+    assert warnings == ["control socket: Too many open files; it is tried again"]

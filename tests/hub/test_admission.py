@@ -98,7 +98,7 @@ class TestShares:
         assert [presence is not None for presence in others] == [True] * 24 + [False] * 6
         assert table.find(("10.0.0.6", 0)), "who came first stays"
 
-    def test_nobody_who_holds_his_share_makes_room_for_a_stranger(self) -> None:
+    def test_client_within_the_share_of_its_host_is_not_removed_for_a_new_one(self) -> None:
         table = self.full(["10.0.0.1", "10.0.0.1", *(f"10.0.2.{n}" for n in range(6))])
         assert table.admit(("10.0.9.9", 9), 99, 1) == (None, None)
         assert table.is_full(1)

@@ -45,7 +45,7 @@ class Sink:
 
 
 class Flight:
-    """A vehicle at its default rates, and outlets of some widths."""
+    """A vehicle at its default rates, and clients of some bandwidths."""
 
     def __init__(self, *urls: str) -> None:
         self.fanout = Fanout(FrameSigner())

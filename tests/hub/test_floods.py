@@ -1,4 +1,4 @@
-"""Clients that send without end: the others are served, and strangers are read slowly."""
+"""Clients that send without end: others are served, and untrusted ones are read slowly."""
 
 import asyncio
 import contextlib
@@ -52,7 +52,7 @@ async def test_one_wake_up_takes_a_little_of_a_flood(rig: Any, kind: str) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS)
-async def test_strangers_together_are_read_slowly(rig: Any, kind: str) -> None:
+async def test_untrusted_clients_share_one_read_rate(rig: Any, kind: str) -> None:
     (other,) = KINDS.keys() - {kind}
     hub = rig.hub(f"{kind}:127.0.0.1:0?trusted=no", f"{other}:127.0.0.1:0?trusted=yes")
     port, quiet_port = hub.listening_ports()
@@ -97,7 +97,7 @@ async def test_who_becomes_trusted_is_read_at_once(rig: Any) -> None:
     await rig.until(lambda: client.counters.bytes_received == before + len(NOISE))
 
 
-async def test_a_stranger_that_leaves_while_it_waits_is_forgotten(rig: Any) -> None:
+async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0?trusted=no")
     sock = await caller(rig, "tcp-listen", hub.listening_ports()[0])
     await rig.until(lambda: bool(rig.incoming))

@@ -180,15 +180,15 @@ async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     trusted = rig.station()
     hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
     await rig.until_open(hub)
-    stranger = rig.station(hub.listening_ports()[0])
-    stranger.sender = rig.sender(42, 1)
+    outsider = rig.station(hub.listening_ports()[0])
+    outsider.sender = rig.sender(42, 1)
     hub.send(rig.out(rig.vehicle.heartbeat()))
     assert await trusted.receive()
-    for frame in (stranger.sender.heartbeat(), stranger.sender.command(1, 1)):
-        stranger.say(frame)
+    for frame in (outsider.sender.heartbeat(), outsider.sender.command(1, 1)):
+        outsider.say(frame)
         await rig.until(lambda frame=frame: [i.frame for i in rig.incoming][-1:] == [frame])
         assert not rig.incoming[-1].trusted
-    stranger.say(stranger.sender.command(255, 190))
+    outsider.say(outsider.sender.command(255, 190))
     await rig.until(lambda: hub.counters().unroutable == 1)
     assert trusted.is_silent()
     assert rig.foreign == []

@@ -30,7 +30,8 @@ class Chaos:
     async def step(self) -> None:
         await self.rng.choice(
             (self.publish, self.publish, self.forward, self.call, self.say, self.hang_up,
-             self.connect, self.break_off, self.add, self.remove, self.reload, self.wish, self.jump)
+             self.connect, self.break_off, self.add, self.remove, self.reload, self.request,
+             self.jump)
         )()  # fmt: skip
         await asyncio.sleep(0)
 
@@ -96,7 +97,7 @@ class Chaos:
         endpoints = (f"udp-listen:127.0.0.1:0{options}", "tcp-listen:127.0.0.1:0")
         self.hub.apply(msgspec.structs.replace(self.hub.settings, endpoints=endpoints))
 
-    async def wish(self) -> None:
+    async def request(self) -> None:
         client_id = self.rng.randrange(1, 20)
         interval_us = self.rng.choice((-1, 0, 100_000))
         self.hub.set_interval(ClientInterval(client_id, 1, 30, interval_us))

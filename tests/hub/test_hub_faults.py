@@ -64,7 +64,7 @@ class Healthy:
             self.listen()
 
     def listen(self) -> bool:
-        """Read what has come to the clients; tell whether that is all."""
+        """Read the frames received by the clients; return whether those are all."""
         for station, heard in zip(self.stations, self.heard, strict=True):
             heard += _sequences(station.socket)
         return all(len(heard) >= len(self.sent) for heard in self.heard)
@@ -140,11 +140,11 @@ async def test_a_port_is_refused_and_a_name_unknown(
 async def test_odd_datagrams_rain(rig: Any) -> None:
     flight = Healthy(rig)
     await flight.start()
-    caller, stranger = flight.stations[-1], rig.station(flight.hub.listening_ports()[0])
+    caller, unknown = flight.stations[-1], rig.station(flight.hub.listening_ports()[0])
     for _ in range(20):
         for data in (b"", b"\xfe" * 65507, b"\xfd" * 65507, bytes(65507)):
             caller.say(data)
-            stranger.say(data)
+            unknown.say(data)
         await flight.fly(20)
     assert await flight.lost() == 0
     assert len(flight.hub.clients()) == 3
@@ -181,8 +181,8 @@ async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None
     await flight.start()
     target = ("127.0.0.1", flight.hub.listening_ports()[0])
     for visit in range(1000):
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as visitor:
-            visitor.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as newcomer:
+            newcomer.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
         if visit % 10 == 0:
             rig.clock.us += 1_000_000
             caller = flight.stations[-1]
@@ -219,7 +219,7 @@ async def test_settings_are_reloaded_under_load(rig: Any) -> None:
 )
 @pytest.mark.slow
 async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
-    """Run in a network namespace of its own: see `interface_world.py` beside this file."""
+    """Run in a network namespace of its own: see `interface_world.py`."""
     program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
     run = await asyncio.to_thread(
         subprocess.run,
@@ -319,15 +319,15 @@ async def test_heartbeats_cut_short_do_no_harm(rig: Any) -> None:
     assert errors == []
 
 
-async def test_strangers_without_number_do_not_flood_the_log(
+async def test_unlimited_new_clients_do_not_flood_the_log(
     rig: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, logger="gateway")
     many = CONNECTIONS_IN_FULL + 10
     hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
     for _ in range(many):
-        stranger = rig.station(hub.listening_ports()[0])
-        stranger.say(stranger.sender.heartbeat())
+        client = rig.station(hub.listening_ports()[0])
+        client.say(client.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == many)
     assert len(caplog.messages) == CONNECTIONS_IN_FULL
     hub.add("udp:127.0.0.1:9")

@@ -1,11 +1,11 @@
-"""Clients come, go, stall and lie in any order; a good one misses nothing, and no stranger harms.
+"""Clients connect, stall and forge in any order: a good one misses nothing, no other harms it.
 
 Hypothesis draws the order and shrinks what fails to the fewest steps. After each of them:
 
 * the good client gets every frame of our vehicle without a gap, and every frame of the autopilot;
 * what it asks reaches our vehicle and the autopilot, and is answered;
-* nothing that a stranger said reaches it or the autopilot, and nothing of ours has changed;
-* a stranger gets telemetry and answers to itself, and nothing that is addressed to another.
+* no frame of an untrusted client reaches it or the autopilot, and nothing of ours has changed;
+* an untrusted client gets telemetry and answers to itself, nothing addressed to another.
 """
 
 import asyncio
@@ -91,7 +91,7 @@ class HubMachine(RuleBasedStateMachine):
         self.answers = 0
         self.lies: set[bytes] = set()
         self.said: set[bytes] = set()
-        self.strangers: list[Station] = []
+        self.outsiders: list[Station] = []
         self.readers: list[socket.socket] = []
 
     def run(self, steps: Coroutine[Any, Any, None]) -> None:
@@ -133,7 +133,7 @@ class HubMachine(RuleBasedStateMachine):
             if isinstance(action, Outgoing):
                 self.hub.send(action)
             else:
-                assert isinstance(action, ClientInterval), "strangers change nothing"
+                assert isinstance(action, ClientInterval), "untrusted clients change nothing"
                 self.hub.set_interval(action)
 
     async def _second(self) -> None:
@@ -177,9 +177,11 @@ class HubMachine(RuleBasedStateMachine):
             assert frame not in self.lies
             if origin_of(frame) == GOOD:
                 assert frame == self.requests.pop(0)
-        for stranger in self.strangers:
-            for frame in received(stranger):
-                assert frame not in self.said, "what the good client says is not for strangers"
+        for outsider in self.outsiders:
+            for frame in received(outsider):
+                assert frame not in self.said, (
+                    "what the good client says is not for untrusted clients"
+                )
 
     @rule(seconds=st.integers(1, 7))
     def time_passes(self, seconds: int) -> None:
@@ -224,10 +226,10 @@ class HubMachine(RuleBasedStateMachine):
         self.run(steps())
 
     @rule()
-    def a_stranger_comes(self) -> None:
-        stranger = self.rig.station()
-        stranger.target = (UNTRUSTED, self.untrusted)
-        self.strangers.append(stranger)
+    def an_untrusted_client_connects(self) -> None:
+        outsider = self.rig.station()
+        outsider.target = (UNTRUSTED, self.untrusted)
+        self.outsiders.append(outsider)
 
     @rule(
         data=st.data(),
@@ -235,12 +237,12 @@ class HubMachine(RuleBasedStateMachine):
         kinds=st.lists(st.sampled_from(sorted(lies(Rig().sender(1), b""))), min_size=1, max_size=9),
         times=st.integers(1, 8),
     )
-    def a_stranger_lies(
+    def an_untrusted_client_forges(
         self, data: st.DataObject, name: tuple[int, int], kinds: list[str], times: int
     ) -> None:
-        if not self.strangers:
+        if not self.outsiders:
             return
-        stranger = data.draw(st.sampled_from(self.strangers))
+        outsider = data.draw(st.sampled_from(self.outsiders))
         sender = self.rig.sender(*name)
         sender.link.seq = data.draw(st.integers(0, 255))
 
@@ -253,17 +255,17 @@ class HubMachine(RuleBasedStateMachine):
                 frame = lies(sender, guessed)[kind]
                 if kind != "copy in advance":
                     self.lies.add(frame)
-                stranger.say(frame)
+                outsider.say(frame)
                 await asyncio.sleep(0)
             await self._settle()
 
         self.run(steps())
 
     @rule(data=st.data())
-    def a_stranger_goes(self, data: st.DataObject) -> None:
-        if self.strangers:
-            gone = data.draw(st.sampled_from(self.strangers))
-            self.strangers.remove(gone)
+    def an_untrusted_client_leaves(self, data: st.DataObject) -> None:
+        if self.outsiders:
+            gone = data.draw(st.sampled_from(self.outsiders))
+            self.outsiders.remove(gone)
             gone.socket.close()
 
     @rule()
@@ -304,7 +306,7 @@ class HubMachine(RuleBasedStateMachine):
         assert self.vehicle.plan.missions.items[0] == ()
 
     @invariant()
-    def strangers_are_in_no_table(self) -> None:
+    def untrusted_clients_are_in_no_table(self) -> None:
         if hasattr(self, "hub"):
             trusted = {client.client_id for client in self.hub.clients() if client.trusted}
             assert set(self.hub._router._table._of_client) <= trusted

@@ -1,4 +1,4 @@
-"""Who is not trusted gets telemetry and answers, and changes nothing that anybody else sees."""
+"""Untrusted clients get telemetry and answers, and change nothing that other clients see."""
 
 from typing import Any
 
@@ -11,26 +11,26 @@ pytestmark = pytest.mark.io
 
 @pytest.fixture
 async def world(rig: Any) -> Any:
-    """An autopilot and a station whom the hub trusts, and a stranger who has been let in."""
+    """A hub with a trusted autopilot, a trusted station and an untrusted client."""
     hub = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0?trusted=no")
     trusted, untrusted = hub.listening_ports()
     hub.send(rig.out(rig.vehicle.heartbeat()))
     rig.world = hub
     rig.autopilot, rig.station_ = rig.station(trusted), rig.station(trusted)
     rig.autopilot.sender = rig.sender(42, 1)
-    rig.stranger = rig.station()
-    rig.stranger.target = ("127.0.0.2", untrusted)
-    rig.stranger.sender = rig.sender(200, 190)
-    for number, client in enumerate((rig.stranger, rig.station_, rig.autopilot), start=1):
+    rig.untrusted = rig.station()
+    rig.untrusted.target = ("127.0.0.2", untrusted)
+    rig.untrusted.sender = rig.sender(200, 190)
+    for number, client in enumerate((rig.untrusted, rig.station_, rig.autopilot), start=1):
         client.say(client.sender.heartbeat())
         await rig.until(lambda number=number: len(rig.incoming) == number)
-    for client in (rig.stranger, rig.station_):
+    for client in (rig.untrusted, rig.station_):
         assert (await client.receive())[5] == 42
     return rig
 
 
 async def lie(world: Any, *frames: bytes) -> None:
-    """Let the stranger say something, and see to it that it was heard."""
+    """Send frames as the untrusted client, and wait until they are received."""
     hub = world.world
 
     def heard() -> int:
@@ -38,11 +38,11 @@ async def lie(world: Any, *frames: bytes) -> None:
 
     before = heard()
     for frame in frames:
-        world.stranger.say(frame)
+        world.untrusted.say(frame)
     await world.until(lambda: heard() == before + len(frames))
 
 
-async def test_a_vehicle_that_a_stranger_calls_a_station_is_heard_all_the_same(world: Any) -> None:
+async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(world: Any) -> None:
     forged = world.sender(42, 190)
     forged.link.srcComponent = 1
     for _ in range(20):
@@ -73,8 +73,8 @@ async def test_a_command_goes_to_the_system_and_not_to_who_claims_a_component_of
     world.station_.say(request)
     assert await world.autopilot.receive() == request
     await world.quiet()
-    while not world.stranger.is_silent():
-        assert world.stranger.socket.recv(100) != request
+    while not world.untrusted.is_silent():
+        assert world.untrusted.socket.recv(100) != request
 
 
 async def test_forged_stations_without_number_take_nobodys_place(world: Any) -> None:
@@ -91,11 +91,11 @@ async def test_forged_stations_without_number_take_nobodys_place(world: Any) -> 
     assert world.station_.is_silent(), "what a station says to all goes to vehicles only"
 
 
-async def test_what_a_stranger_is_called_is_shown_and_bounded(world: Any) -> None:
+async def test_systems_shown_for_an_untrusted_client_are_bounded(world: Any) -> None:
     for number in range(100):
         await lie(world, world.sender(100 + number, 1).attitude())
-    stranger = next(c for c in world.world.clients() if not c.trusted)
-    assert 1 <= len(stranger.systems) <= 8
+    untrusted = next(c for c in world.world.clients() if not c.trusted)
+    assert 1 <= len(untrusted.systems) <= 8
 
 
 async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None:
@@ -113,13 +113,11 @@ async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None
 
 
 class TestRequests:
-    async def test_strangers_are_answered_as_far_as_their_common_share_goes(
-        self, world: Any
-    ) -> None:
+    async def test_untrusted_clients_share_one_quota_of_answers(self, world: Any) -> None:
         before = len(world.incoming)
         hub = world.world
         hub._router.charge(hub.clients()[0].client_id, UNTRUSTED_BURST)
-        await lie(world, *(world.stranger.sender.command(1, 1) for _ in range(100)))
+        await lie(world, *(world.untrusted.sender.command(1, 1) for _ in range(100)))
         await world.quiet()
         assert len(world.incoming) == before
         assert hub.counters().unserved == 100 - 64

@@ -64,7 +64,7 @@ class TestSendQueue:
         order = [frame[0] for frame in drain(queue)]
         assert order == [COMMAND_ACK, HEARTBEAT, ATTITUDE, PARAM_VALUE, RAW_IMU]
 
-    def test_all_parameters_find_room_beside_the_telemetry_of_the_slowest_line(self) -> None:
+    def test_all_parameters_fit_next_to_the_telemetry_of_the_slowest_line(self) -> None:
         queue = SendQueue(100)
         for n in range(300):
             assert queue.push(raw_frame(PARAM_VALUE, n.to_bytes(2, "big") * 18)) == 0

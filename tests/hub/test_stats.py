@@ -1,4 +1,4 @@
-"""What is told of clients in trouble, on the manual clock."""
+"""Alerts of clients with problems, on the manual clock."""
 
 import dataclasses
 
@@ -87,7 +87,7 @@ def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
     assert look(watch, client(dropped=20), 2 * S) == []
 
 
-def test_a_client_that_left_is_forgotten() -> None:
+def test_state_of_a_client_that_left_is_discarded() -> None:
     watch = ClientAlerts()
     for n in range(10):
         look(watch, client(state="unreachable", dropped=n), n * S)
@@ -97,21 +97,21 @@ def test_a_client_that_left_is_forgotten() -> None:
     assert not watch._dropped
 
 
-def test_strangers_are_summed_up_and_a_configured_client_is_named() -> None:
+def test_alerts_of_unknown_clients_are_summed_up_and_of_a_configured_one_named() -> None:
     watch, port = ClientAlerts(), "udp-listen:0.0.0.0:14551"
     listeners = (ListenerStats("port", port, "open", "", 14551, 0, 0),)
     texts = []
     for n in range(100):
-        strangers = tuple(
+        unknown = tuple(
             dataclasses.replace(
-                TABLET, client_id=100 + number, name=f"stranger {number}", endpoint=port, dropped=n
+                TABLET, client_id=100 + number, name=f"unknown {number}", endpoint=port, dropped=n
             )
             for number in range(n * 10, n * 10 + 20)
         )
-        clients = (*client(dropped=100 * (n >= 50)), *strangers)
+        clients = (*client(dropped=100 * (n >= 50)), *unknown)
         texts += [text for _, text in watch.update(clients, listeners, n * S)]
     assert texts.count("tablet is too slow: telemetry dropped") == 1
-    assert len([text for text in texts if text.startswith("stranger")]) == 2 * 3
+    assert len([text for text in texts if text.startswith("unknown")]) == 2 * 3
     (summed,) = [text for text in texts if "more alerts" in text]
     assert int(summed.split()[0]) > 500
     assert len(texts) == 8

@@ -48,7 +48,7 @@ async def test_whoever_speaks_to_the_port_is_served_and_greeted_without_a_gap(ri
     assert rig.incoming[0].trusted
 
 
-async def test_clients_of_one_port_are_told_apart(rig: Any) -> None:
+async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
     for place, station in enumerate(stations):
@@ -66,8 +66,8 @@ async def test_clients_of_one_port_are_told_apart(rig: Any) -> None:
     answered = hub.clients()[2]
     frame = rig.vehicle.attitude()
     hub.send(rig.out(frame, answered.client_id))
-    told = [station for station in stations if not station.is_silent()]
-    assert [f"127.0.0.1:{station.port}" for station in told] == [answered.remote]
+    receivers = [station for station in stations if not station.is_silent()]
+    assert [f"127.0.0.1:{station.port}" for station in receivers] == [answered.remote]
 
 
 async def test_noise_and_odd_sizes_make_no_client(rig: Any) -> None:
@@ -450,8 +450,8 @@ async def test_a_thousand_come_and_go(rig: Any) -> None:
     for visit in range(1000):
         rig.clock.us += 1_000_000
         steady.say(steady.sender.heartbeat())
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as visitor:
-            visitor.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), steady.target)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as newcomer:
+            newcomer.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), steady.target)
         await rig.until(lambda count=2 * visit + 3: len(rig.incoming) == count)
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))

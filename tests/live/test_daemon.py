@@ -78,7 +78,7 @@ def frame(message: mavlink.MAVLink_message, sequence: int = 0) -> bytes:
     return bytes(message.pack(mav))
 
 
-def test_of_a_stranger_only_what_was_taken_is_recorded(
+def test_of_an_untrusted_client_only_requests_with_an_effect_are_recorded(
     daemon: Daemon, recorded: list[bytes]
 ) -> None:
     daemon._on_frame(Incoming(5, frame(HEARTBEAT), False))
@@ -99,13 +99,13 @@ def test_untrusted_client_that_floods_requests_fills_no_disk(
     for n in range(5000):
         daemon._on_frame(Incoming(5, frame(PING, n % 256), False))
     assert sum(map(len, recorded)) <= UNTRUSTED_RATE * (BURST_S + 1)
-    told = Outgoing(b"telemetry", 30, None)
-    daemon._perform([told])
+    telemetry = Outgoing(b"telemetry", 30, None)
+    daemon._perform([telemetry])
     assert recorded[-1] == b"telemetry", "all the same"
 
 
 @pytest.mark.parametrize("due_us", [0, 999_000_000])
-async def test_what_is_due_is_neither_asked_for_without_rest_nor_forgotten(
+async def test_due_time_is_polled_neither_without_pause_nor_too_late(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, due_us: int
 ) -> None:
     """Something that stays due must not turn the loop into a busy one."""
@@ -154,9 +154,9 @@ async def test_a_reload_tells_of_what_needs_a_new_start(
     now = daemon._settings
     changed = replace(now, estimation=replace(now.estimation, estimator=estimator))
     monkeypatch.setattr(daemon, "_read", lambda: changed)
-    told = await daemon.reload()
-    assert told.startswith("settings of the hub and of signing applied")
-    assert ("others need a new start" in told) == (estimator != now.estimation.estimator)
+    status = await daemon.reload()
+    assert status.startswith("settings of the hub and of signing applied")
+    assert ("others need a new start" in status) == (estimator != now.estimation.estimator)
     daemon._metrics.close()
     daemon._hub.close()
 
@@ -197,7 +197,7 @@ async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
     daemon._hub.close()
 
 
-async def test_files_of_settings_are_read_and_written_beside_the_loop(
+async def test_files_of_settings_are_read_and_written_off_the_loop(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     threads: list[int] = []

@@ -1,4 +1,4 @@
-"""Files of places: whole or not at all, told when not, and left alone when broken."""
+"""Files of places: written completely or not at all, failures reported, broken ones kept."""
 
 import asyncio
 import errno
@@ -23,8 +23,8 @@ SECOND = StoredPlan(mark=Location(4.0, 5.0, 6.0))
 class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.told: list[tuple[int, str | None]] = []
-        self.files = PlaceFiles(folder, lambda *told: self.told.append(told))
+        self.reports: list[tuple[int, str | None]] = []
+        self.files = PlaceFiles(folder, lambda *report: self.reports.append(report))
 
     async def save(self, vehicle_id: int, places: StoredPlan) -> None:
         self.files.save(vehicle_id, places)
@@ -81,12 +81,12 @@ async def test_a_disk_that_refuses_is_counted_and_reported(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         await bench.save(1, SECOND)
-    assert bench.told == [(1, "No space left on device")]
+    assert bench.reports == [(1, "No space left on device")]
     assert bench.files.failures == 1
     assert bench.read() == {1: FIRST}, "the old file is whole"
     await bench.save(1, SECOND)
     assert bench.read() == {1: SECOND}
-    assert bench.told[1:] == [(1, None)]
+    assert bench.reports[1:] == [(1, None)]
 
 
 async def test_what_could_not_be_written_is_tried_again_and_reported_once(
@@ -106,9 +106,9 @@ async def test_what_could_not_be_written_is_tried_again_and_reported_once(
     await bench.save(1, FIRST)
     assert len(attempts) == 1, "the next attempt is not made at once"
     async with asyncio.timeout(60):
-        while bench.told[-1:] != [(1, None)]:
+        while bench.reports[-1:] != [(1, None)]:
             await asyncio.sleep(0)
-    assert bench.told == [(1, "Input/output error"), (1, None)]
+    assert bench.reports == [(1, "Input/output error"), (1, None)]
     assert bench.files.failures == 1
     assert bench.read() == {1: FIRST}
     assert bench.files._retry is None
@@ -141,7 +141,7 @@ async def test_a_broken_file_is_reported_and_left_alone(
     assert f"{file} cannot be read and is left alone: " in caplog.text
     await bench.save(1, FIRST)
     assert file.read_bytes() == content
-    assert bench.told == [(1, "1.places.json is broken: repair or remove it")]
+    assert bench.reports == [(1, "1.places.json is broken: repair or remove it")]
     file.unlink()
     await bench.save(1, FIRST)
     assert bench.read() == {1: FIRST, 2: SECOND}
@@ -152,7 +152,7 @@ async def test_strange_names_are_none_of_ours(bench: Bench) -> None:
     for name in ("x.places.json", "1.places.json.bak", "12345.places.json", "1.places.new"):
         (bench.folder / name).write_text("nonsense")
     assert bench.files.load() == {1: FIRST}
-    assert bench.told == []
+    assert bench.reports == []
 
 
 def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:

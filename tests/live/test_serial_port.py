@@ -178,7 +178,7 @@ async def test_unplugged_and_plugged_again(
     link.close()
     assert not link.connected
     warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warnings) == len(set(warnings)), "each trouble is told once"
+    assert len(warnings) == len(set(warnings)), "each problem is logged once"
     assert any("is gone" in text for text in warnings)
     missing = f"receiver {bench.link}: No such file or directory; trying again until it works"
     assert missing in warnings

@@ -1,4 +1,4 @@
-"""What systemd is told, seen from the socket that it would listen at."""
+"""Notifications to systemd, read from the socket that it would listen at."""
 
 import asyncio
 import os
@@ -31,10 +31,10 @@ async def test_life_of_a_service(systemd: socket.socket) -> None:
     notifier.status("2 clients")
     notifier.reloading()
     notifier.stopping()
-    told = [systemd.recv(200).decode() for _ in range(4)]
-    assert told[:2] == ["READY=1", "STATUS=2 clients"]
-    assert told[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
-    assert told[3] == "STOPPING=1"
+    notified = [systemd.recv(200).decode() for _ in range(4)]
+    assert notified[:2] == ["READY=1", "STATUS=2 clients"]
+    assert notified[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
+    assert notified[3] == "STOPPING=1"
 
 
 async def test_the_watchdog_is_fed_at_twice_its_rate(
@@ -44,8 +44,8 @@ async def test_the_watchdog_is_fed_at_twice_its_rate(
     notifier = ServiceNotifier()
     notifier.ready()
     loop = asyncio.get_running_loop()
-    told = [await asyncio.wait_for(loop.sock_recv(systemd, 200), 60) for _ in range(4)]
-    assert told == [b"READY=1"] + [b"WATCHDOG=1"] * 3
+    notified = [await asyncio.wait_for(loop.sock_recv(systemd, 200), 60) for _ in range(4)]
+    assert notified == [b"READY=1"] + [b"WATCHDOG=1"] * 3
     notifier.stopping()
     await asyncio.sleep(0)
     assert notifier._timer is None

@@ -64,7 +64,7 @@ class Page:
         return isinstance(self.events[0], AcceptConnection)
 
     async def take(self) -> bool:
-        """Take what comes next; tell whether anything came before the end."""
+        """Take the next bytes; return whether there were any before the end."""
         try:
             data = await asyncio.wait_for(self.reader.read(65536), LIMIT_S)
         except ConnectionError:
@@ -138,7 +138,7 @@ def plug(rig: Rig) -> Callable[..., Any]:
 
 
 async def hung_up(sock: socket.socket) -> bool:
-    """Tell whether the hub closes a bare connection without a word."""
+    """Return whether the hub closes a bare connection without an answer."""
     try:
         return await asyncio.wait_for(asyncio.get_running_loop().sock_recv(sock, 1), LIMIT_S) == b""
     except ConnectionError:

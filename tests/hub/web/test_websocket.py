@@ -160,7 +160,7 @@ class TestTrouble:
         await rig.until(lambda: not hub.clients())
 
     async def test_a_page_that_no_longer_answers_is_dropped(self, rig: Rig, visit: Visit) -> None:
-        """Half-open: its machine is gone, and nothing tells us."""
+        """Half-open: its machine is gone, and no packet reports it."""
         hub = rig.hub(LISTEN, idle_timeout_s=9)
         page, mute = [await visit(hub.listening_ports()[0]) for _ in range(2)]
         mute.answers_pings = False
@@ -336,7 +336,9 @@ class TestTls:
         frames = await page.frames(1)
         assert [frame[4] for frame in frames] == [n & 255 for n in range(slow.sent)]
 
-    async def test_a_stranger_is_not_believed(self, rig: Rig, certificate: Path) -> None:
+    async def test_server_without_a_valid_certificate_is_refused(
+        self, rig: Rig, certificate: Path
+    ) -> None:
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         hub = rig.hub(f"wss:127.0.0.1:{server.listening_ports()[0]}")
         await rig.until(lambda: hub.clients()[0].state == "refused")

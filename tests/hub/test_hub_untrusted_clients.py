@@ -1,4 +1,4 @@
-"""Ten thousand strangers at the listening port: the telemetry goes on and nothing grows."""
+"""Ten thousand untrusted clients at a port: telemetry continues and memory does not grow."""
 
 import asyncio
 import gc
@@ -23,9 +23,9 @@ from tests.vehicle.samples import FIX, sample_at, state_at
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
-STRANGERS = 10_000
+CLIENTS = 10_000
 MAX_CLIENTS = 16
-GROWTH_LIMIT_BLOCKS = STRANGERS // 4
+GROWTH_LIMIT_BLOCKS = CLIENTS // 4
 """Half a block of memory for each of the second half: whoever is remembered takes one or more."""
 FLIGHT_EVERY = 5
 STEP_US = 1_000_000
@@ -125,9 +125,9 @@ async def test_ten_thousand_unknown_addresses(
 
     async def assail(first: int, last: int) -> None:
         for number in range(first, last):
-            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-                stranger.bind((address(number), 0))
-                stranger.sendto(datagrams[number % len(datagrams)], target)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+                client.bind((address(number), 0))
+                client.sendto(datagrams[number % len(datagrams)], target)
             if number % FLIGHT_EVERY == 0:
                 gateway.fly()
                 await asyncio.sleep(0)
@@ -135,9 +135,9 @@ async def test_ten_thousand_unknown_addresses(
                 assert len(gateway.hub.clients()) <= 1 + MAX_CLIENTS
         gc.collect()
 
-    await assail(0, STRANGERS // 2)
+    await assail(0, CLIENTS // 2)
     before = sys.getallocatedblocks()
-    await assail(STRANGERS // 2, STRANGERS)
+    await assail(CLIENTS // 2, CLIENTS)
     assert sys.getallocatedblocks() - before < GROWTH_LIMIT_BLOCKS
 
     def is_all_heard() -> bool:

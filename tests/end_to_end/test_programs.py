@@ -1,5 +1,6 @@
-"""The doors for programs, of a gateway and its panel as processes: what docs/programs.md shows runs
-as it stands there, and the JSON is what UDP clients decode.
+"""The programs of docs/programs.md, run unchanged on processes of a gateway and its panel.
+
+The JSON of the WebSocket API is also compared with the messages that UDP clients decode.
 """
 
 import json
@@ -43,8 +44,8 @@ ASKED = {"PARAM_VALUE", "AUTOPILOT_VERSION", "MISSION_COUNT", "COMMAND_ACK"}
 
 
 @dataclass
-class Doors:
-    """A gateway with its panel, a station that hears it, and where the doors are."""
+class Apis:
+    """A gateway with its panel, a station that receives it, and the addresses of its APIs."""
 
     station: Client
     udp: str
@@ -72,9 +73,9 @@ def panel(listen_port: int, folder: Path) -> Iterator[str]:
 
 
 @pytest.fixture(scope="module")
-def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
+def apis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Apis]:
     """Both once for all of them: each start takes seconds, and none leaves them changed."""
-    folder = tmp_path_factory.mktemp("doors")
+    folder = tmp_path_factory.mktemp("apis")
     web = free_port()
     gateway = Gateway(folder, "demo", config=CONFIG.format(web=web))
     station = Client(gateway.port)
@@ -82,7 +83,7 @@ def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Doors]:
         station.until(lambda seen: "GLOBAL_POSITION_INT" in seen)
         with panel(gateway.listen_port, folder) as place:
             listen = f"127.0.0.1:{gateway.listen_port}"
-            yield Doors(station, listen, f"127.0.0.1:{web}", place)
+            yield Apis(station, listen, f"127.0.0.1:{web}", place)
     finally:
         station.sock.close()
         gateway.stop()
@@ -103,7 +104,7 @@ def requests() -> list[dict[str, Any]]:
 
 
 class Ear:
-    """What a UDP client decodes, in the form that the door gives."""
+    """The messages that a UDP client decodes, in the form of the API."""
 
     def __init__(self, client: Client) -> None:
         self._sock = client.sock
@@ -121,30 +122,30 @@ class Ear:
 
 def hear(stream: Any, ear: Ear) -> dict[str, list[dict[str, Any]]]:
     """Follow the vehicle until every kind of message has come."""
-    told: dict[str, list[dict[str, Any]]] = {}
-    while not told.keys() >= EXPECTED | ASKED:
+    received: dict[str, list[dict[str, Any]]] = {}
+    while not received.keys() >= EXPECTED | ASKED:
         text = str(stream.recv(timeout=START_LIMIT_S))
         ear.read(0)
         if text.startswith("{"):
             heard = json.loads(text)
             if heard["header"]["system_id"] == 1:
-                told.setdefault(heard["message"]["type"], []).append(heard["message"])
-    return told
+                received.setdefault(heard["message"]["type"], []).append(heard["message"])
+    return received
 
 
-def test_json_is_what_pymavlink_reads(doors: Doors) -> None:
-    ear = Ear(doors.station)
+def test_json_is_what_pymavlink_reads(apis: Apis) -> None:
+    ear = Ear(apis.station)
     ear.read(0)
-    with follow(f"ws://{doors.panel}/v1/ws/mavlink") as stream:
+    with follow(f"ws://{apis.panel}/v1/ws/mavlink") as stream:
         for request in requests():
             stream.send(json.dumps(request))
-        told = hear(stream, ear)
+        received = hear(stream, ear)
     path = "/v1/mavlink/vehicles/1/components/1/messages/PARAM_VALUE/message/param_count"
-    with urllib.request.urlopen(f"http://{doors.panel}{path}") as answer:
+    with urllib.request.urlopen(f"http://{apis.panel}{path}") as answer:
         count = json.load(answer)
-    assert count == told["PARAM_VALUE"][0]["param_count"]
+    assert count == received["PARAM_VALUE"][0]["param_count"]
     to_one_client = ASKED | {"HOME_POSITION", "TIMESYNC", "PING"}
-    compared = [fields for kind in told.keys() - to_one_client for fields in told[kind]]
+    compared = [fields for kind in received.keys() - to_one_client for fields in received[kind]]
     assert len(compared) > len(EXPECTED)
     # What was said in the last moment may be on its way to the other client.
     deadline_s = time.monotonic() + START_LIMIT_S
@@ -153,12 +154,12 @@ def test_json_is_what_pymavlink_reads(doors: Doors) -> None:
         ear.read(0.5)
 
 
-def block(heading: str, doors: Doors) -> str:
+def block(heading: str, apis: Apis) -> str:
     """Return the code below a heading as it stands there, for ports of ours."""
     section = re.search(rf"^## {heading}\n(.*?)^## ", PROGRAMS.read_text(), re.M | re.S)
     assert section is not None
     code = "\n".join(re.findall(r"^```\w+\n(.*?)^```$", section[1], re.M | re.S))
-    places = {"14551": doors.udp, "56781": doors.web, "14590": doors.panel}
+    places = {"14551": apis.udp, "56781": apis.web, "14590": apis.panel}
     for port, ours in places.items():
         code = code.replace(f"127.0.0.1:{port}", ours)
     return code
@@ -188,19 +189,19 @@ def run_until(code: str, pattern: str) -> re.Match[str]:
     raise AssertionError(f"no {pattern!r} in:\n{printed}")
 
 
-def test_mavsdk(doors: Doors) -> None:
-    place = run_until(block("MAVSDK", doors), r"^(-?\d+\.\d+) (-?\d+\.\d+) (-?\d+\.\d+)$")
+def test_mavsdk(apis: Apis) -> None:
+    place = run_until(block("MAVSDK", apis), r"^(-?\d+\.\d+) (-?\d+\.\d+) (-?\d+\.\d+)$")
     assert float(place[1]) == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     assert float(place[2]) == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
 
 
-def test_pymavlink(doors: Doors) -> None:
-    assert run_until(block("pymavlink", doors), r"PARAM_VALUE {param_id : PAPER_ACC_CUTOFF,")
+def test_pymavlink(apis: Apis) -> None:
+    assert run_until(block("pymavlink", apis), r"PARAM_VALUE {param_id : PAPER_ACC_CUTOFF,")
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl on this machine")
-def test_curl(doors: Doors, tmp_path: Path) -> None:
-    script = "set -e\n" + block("curl", doors).replace("curl ", "curl --fail-with-body -sS ")
+def test_curl(apis: Apis, tmp_path: Path) -> None:
+    script = "set -e\n" + block("curl", apis).replace("curl ", "curl --fail-with-body -sS ")
     done = subprocess.run(
         ["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
     )
@@ -212,7 +213,7 @@ def test_curl(doors: Doors, tmp_path: Path) -> None:
     assert abs(float(rest[1])) < math.radians(STEEPEST_DEG)
     asked = json.loads((tmp_path / "command.json").read_text())["message"]
     assert asked["command"] == {"type": "MAV_CMD_REQUEST_MESSAGE"}
-    messages = f"http://{doors.panel}/v1/mavlink/vehicles/1/components/1/messages"
+    messages = f"http://{apis.panel}/v1/mavlink/vehicles/1/components/1/messages"
     place = f"{messages}/AUTOPILOT_VERSION/message/type"
     deadline_s = time.monotonic() + START_LIMIT_S
     while urllib.request.urlopen(place).read() != b'"AUTOPILOT_VERSION"':
