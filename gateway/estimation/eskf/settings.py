@@ -31,7 +31,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 1.4
     gyro_scale: Annotated[
         float, setting("Relative scale error of each gyroscope axis.", ge=0.0, le=0.1)
-    ] = 0.088
+    ] = 0.04
     gyro_turn_deg: Annotated[
         float,
         setting(
