@@ -188,7 +188,7 @@ class Aircraft:
         ]
         if isinstance(self._estimator, KernelEstimator):
             imu = imu_rows(log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.flags)
-            states = self._estimator.run_as_heard(log.time_us, imu, samples)
+            states = self._estimator.run_in_arrival_order(log.time_us, imu, samples)
         else:
             states = fuse_singly(self._estimator, log.samples(), samples)
         if self._correct is not None:

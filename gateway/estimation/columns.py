@@ -47,15 +47,15 @@ GPS_LAT: Final = 1
 GPS_LON: Final = 2
 GPS_ALT: Final = 3
 GPS_VEL: Final = 4
-"""Velocity NED, m/s: three columns, NaN where the receiver tells none."""
+"""Velocity NED, m/s: three columns, NaN where the receiver reports none."""
 GPS_H_ACC: Final = 7
 GPS_V_ACC: Final = 8
 GPS_SPEED_ACC: Final = 9
-"""The receiver's own standard deviations; NaN where it tells none."""
+"""The receiver's own standard deviations; NaN where it reports none."""
 GPS_DECLINATION: Final = 10
 """Declination in rad; NaN while not known."""
 GPS_DIP: Final = 11
-"""Dip of the Earth's field at the place, positive down, rad; NaN while not known."""
+"""Dip of the Earth's field at the position, positive down, rad; NaN while not known."""
 GPS_COLUMNS: Final = 12
 
 NAV_QUAT: Final = 0
@@ -122,16 +122,16 @@ def imu_vectors(row: FloatArray) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:
-    """Lay out a fix together with the Earth's magnetic field at its place.
+    """Lay out a fix together with the Earth's magnetic field at its position.
 
     Parameters
     ----------
     fix : GpsFix
         As it arrived.
     settings : ReferenceSettings
-        Tells which fixes are usable.
+        Limits of usable fixes.
     earth : EarthField
-        Called with the place of a usable fix.
+        Updated with the position of a usable fix.
 
     Returns
     -------

@@ -8,30 +8,30 @@ from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 class Estimator(Protocol):
     """A causal fusion of samples into navigation states, one aircraft each.
 
-    Samples come in the order of their `time_us`; a sample from the past, a gap, a value that is
-    not finite are the estimator's own to survive. No method raises on data.
+    Samples come in the order of their `time_us`; the estimator handles a sample from the past, a
+    gap, and a value that is not finite. No method raises on data.
     """
 
     def update_imu(self, sample: ImuSample) -> NavState:
-        """Advance by one IMU sample and tell the state at its time."""
+        """Advance by one IMU sample and return the state at its time."""
         ...
 
     def update_baro(self, sample: BaroSample) -> None:
-        """Take in one barometer sample."""
+        """Use one barometer sample."""
         ...
 
     def update_gps(self, fix: GpsFix) -> None:
-        """Take in one GPS fix at its arrival; the latency is the estimator's to compensate."""
+        """Use one GPS fix at its arrival; the estimator compensates the latency."""
         ...
 
     def snapshot(self) -> bytes:
-        """Write down all that is remembered."""
+        """Return the whole state."""
         ...
 
     def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot to the last bit; raises ValueError if it is not its own."""
+        """Continue from a snapshot to the last bit; raises ValueError for another estimator's."""
         ...
 
     def reset(self) -> None:
-        """Forget everything but the settings."""
+        """Discard everything except the settings."""
         ...

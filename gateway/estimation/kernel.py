@@ -1,4 +1,4 @@
-"""What a compiled estimator looks like from outside: one sample live, or a whole log."""
+"""The compiled estimator behind the interface of all: one sample live, or a whole log."""
 
 import struct
 from collections.abc import Sequence
@@ -32,13 +32,13 @@ from gateway.estimation.record import (
     pack_record,
     unpack_record,
 )
-from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings
+from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings
 from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 _ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
 """Fills the row of one sample in half the time that numpy takes for a tuple."""
 
-Heard = tuple[int, BaroSample | GpsFix]
+Aiding = tuple[int, BaroSample | GpsFix]
 """A height or a fix, and the number of the IMU sample before which it arrived."""
 
 
@@ -89,15 +89,10 @@ class KernelEstimator:
         self._row_view = self._row.data
         self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
         self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
-        # A first call on a scrap state loads, or compiles, what a sample would wait for.
-        self._begin()
-        kernels.imu_steps(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
-        kernels.baro_step(self._at, self._gains_at, 0.0)
-        kernels.gps_step(self._at, self._gains_at, 0, self._fix_at)
         self._begin()
 
     def reset(self) -> None:
-        """Forget everything but the settings."""
+        """Discard everything except the settings."""
         self._earth.reset()
         self._begin()
 
@@ -110,7 +105,7 @@ class KernelEstimator:
 
     @property
     def state(self) -> State:
-        """A copy of all that the kernel remembers; may be set back."""
+        """A copy of the whole state; may be restored."""
         return copy_record(self._state)
 
     @state.setter
@@ -147,12 +142,12 @@ class KernelEstimator:
         return self._gains
 
     def snapshot(self) -> bytes:
-        """Write down all that is remembered, the place on the Earth included."""
+        """Return the whole state, including the position on the Earth."""
         return msgspec.msgpack.encode((pack_record(self._state), self._earth.state))
 
     def restore(self, snapshot: bytes) -> None:
-        """Go on from a snapshot; raises ValueError if it is none of this estimator."""
-        kind = tuple[Packed, EarthPlace | None]
+        """Continue from a snapshot; raises ValueError for another estimator's."""
+        kind = tuple[Packed, EarthLocation | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
         self._use(unpack_record(State, packed))
 
@@ -175,7 +170,7 @@ class KernelEstimator:
         return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
-        """Take in one barometer sample.
+        """Use one barometer sample.
 
         Parameters
         ----------
@@ -185,7 +180,7 @@ class KernelEstimator:
         kernels.baro_step(self._at, self._gains_at, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
-        """Take in one GPS fix at its arrival.
+        """Use one GPS fix at its arrival.
 
         Parameters
         ----------
@@ -232,8 +227,8 @@ class KernelEstimator:
         kernels.run(self._at, self._gains_at, *arguments, address_of(out))  # type: ignore[call-arg]
         return out
 
-    def run_as_heard(
-        self, time_us: IntArray, imu: FloatArray, heard: Sequence[Heard]
+    def run_in_arrival_order(
+        self, time_us: IntArray, imu: FloatArray, aiding: Sequence[Aiding]
     ) -> FloatArray:
         """Advance over samples and what arrived between them, in the order of arrival.
 
@@ -242,7 +237,7 @@ class KernelEstimator:
         time_us : ndarray, shape (n,)
             Of the IMU samples.
         imu : ndarray, shape (n, IMU_COLUMNS)
-        heard : sequence of tuple
+        aiding : sequence of tuple
             Heights and fixes in their order, each with the number of the sample before which it
             arrived: up to n.
 
@@ -252,21 +247,23 @@ class KernelEstimator:
             One row per IMU sample.
         """
         # The compiled loop takes heights first: it is interrupted where one came after a fix.
-        cuts = {k for (k, a), (m, b) in pairwise(heard) if k == m and _is_fix(a) > _is_fix(b)}
+        cuts = {k for (k, a), (m, b) in pairwise(aiding) if k == m and _is_fix(a) > _is_fix(b)}
         pieces = []
         begin = 0
         for end in [*sorted(cuts - {len(time_us)}), len(time_us)]:
-            within = [(k - begin, r) for k, r in heard if begin <= k < end and k not in cuts]
+            within = [(k - begin, r) for k, r in aiding if begin <= k < end and k not in cuts]
             pieces.append(self._run_piece(time_us[begin:end], imu[begin:end], within))
-            for k, record in heard:
+            for k, record in aiding:
                 if k == end:
                     self._take(record)
             begin = end
         return np.concatenate(pieces)
 
-    def _run_piece(self, time_us: IntArray, imu: FloatArray, heard: Sequence[Heard]) -> FloatArray:
-        heights = [(k, r.alt_pressure_m) for k, r in heard if isinstance(r, BaroSample)]
-        fixes = [(k, r.time_us, self.fix_row(r)) for k, r in heard if isinstance(r, GpsFix)]
+    def _run_piece(
+        self, time_us: IntArray, imu: FloatArray, aiding: Sequence[Aiding]
+    ) -> FloatArray:
+        heights = [(k, r.alt_pressure_m) for k, r in aiding if isinstance(r, BaroSample)]
+        fixes = [(k, r.time_us, self.fix_row(r)) for k, r in aiding if isinstance(r, GpsFix)]
         log = SampleLog(
             imu_time_us=time_us,
             imu=imu,

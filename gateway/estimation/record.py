@@ -5,7 +5,6 @@ without conversion. The declaration is a class that is never instantiated: mypy 
 by it, while the memory behind it is a plain structured scalar whose fields numba compiles.
 """
 
-import inspect
 import zlib
 from collections.abc import Hashable
 from functools import cache
@@ -35,24 +34,14 @@ def layout(declaration: type) -> np.dtype[np.void]:
     -------
     numpy.dtype
         Structured type with one 8-byte aligned field per annotation, in their order.
-
-    Raises
-    ------
-    TypeError
-        If two classes that it is made of declare a field that they share differently.
     """
     return _layout(cast(Hashable, declaration))
 
 
 @cache
 def _layout(declaration: Hashable) -> np.dtype[np.void]:
-    hints = get_type_hints(declaration, include_extras=True)
-    for part in cast(type, declaration).__mro__:
-        for name, hint in inspect.get_annotations(part, eval_str=True).items():
-            if hint != hints[name]:
-                raise TypeError(f"{name} is declared as {hint} and as {hints[name]}")
     fields: list[tuple[str, str, tuple[int, ...]]] = []
-    for name, hint in hints.items():
+    for name, hint in get_type_hints(declaration, include_extras=True).items():
         if hint is float:
             fields.append((name, "f8", ()))
         elif hint is int:

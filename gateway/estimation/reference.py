@@ -68,7 +68,7 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
     Returns
     -------
     bool
-        False for no fix, a receiver that does not vouch for it, or values that cannot be.
+        False for no fix, a fix that the receiver does not confirm, or values that cannot be.
     """
     return (
         fix.fix_ok
@@ -78,7 +78,7 @@ def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
     )
 
 
-EarthPlace = tuple[float, float, MagneticField]
+EarthLocation = tuple[float, float, MagneticField]
 """Latitude and longitude in degrees, and the model's field there."""
 
 
@@ -96,13 +96,13 @@ class EarthField:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the place."""
-        self.state: EarthPlace | None = None
-        """The last place that was looked up; None before the first fix. May be set back."""
+        """Discard the position."""
+        self.state: EarthLocation | None = None
+        """The last position that was looked up; None before the first fix. May be restored."""
 
     @property
     def field(self) -> MagneticField | None:
-        """The model's field at the last place; None before the first fix."""
+        """The model's field at the last position; None before the first fix."""
         return None if self.state is None else self.state[2]
 
     @property
@@ -113,7 +113,7 @@ class EarthField:
         return math.nan if self.state is None else self.state[2].declination_rad
 
     def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
-        """Return the place.
+        """Look up the field at a position, if it is far from the last one.
 
         Parameters
         ----------
@@ -125,7 +125,7 @@ class EarthField:
         Returns
         -------
         bool
-            Whether the field was looked up anew.
+            Whether the field was looked up again.
         """
         if self.state is not None:
             north_m, east_m = displacement_m(*self.state[:2], lat_deg, lon_deg, alt_m)

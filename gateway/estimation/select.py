@@ -22,7 +22,7 @@ def add_estimator(name: str, make: Maker) -> None:
     Parameters
     ----------
     name : str
-        What `[estimation] estimator` is set to.
+        Value of `[estimation] estimator`.
     make : callable
         Builds one for one aircraft from the settings of all; see `Estimator` for what it offers.
 
@@ -144,4 +144,4 @@ FORMER_KEYS: Final = frozenset(
 FILTER_KEYS: Final = frozenset(PaperSettings.__struct_fields__)
 
 OWN_ESTIMATORS: Final = tuple(ESTIMATORS)
-"""Those of the package itself."""
+"""The estimators of this package, without those of extensions."""

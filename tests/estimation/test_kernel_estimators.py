@@ -1,7 +1,7 @@
 """What holds for every compiled estimator: same bits live, offline and in pieces; no nonsense."""
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.eskf import filter as kernels
 from gateway.estimation.kernel import KernelEstimator, SampleLog
-from gateway.estimation.record import FloatArray, layout
+from gateway.estimation.record import layout
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import displacement_m
@@ -305,28 +305,6 @@ def test_layout_follows_the_declaration() -> None:
         b: float
 
     assert layout(Declared).names == ("a", "b")
-
-
-def test_parts_share_a_field_that_they_declare_alike_and_no_other() -> None:
-    class Clock:
-        time_s: float
-
-    class Place:
-        time_s: float
-        pos_n: Annotated[FloatArray, (3,)]
-
-    class Course:
-        pos_n: Annotated[FloatArray, (2,)]
-
-    class Joined(Clock, Place):
-        pass
-
-    class Torn(Course, Place):
-        pass
-
-    assert sorted(layout(Joined).names or ()) == ["pos_n", "time_s"]
-    with pytest.raises(TypeError, match="pos_n is declared as"):
-        layout(Torn)
 
 
 def test_velocity_of_an_aircraft_at_rest_is_zero(estimator: KernelEstimator) -> None:

@@ -23,7 +23,13 @@ from gateway.compiled import compiled
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import MOMENTS, NEVER_S, State
 from gateway.estimation.record import as_quat, write_quat, write_vec
-from gateway.geometry.quaternion import multiply, normalise, rotate_inverse
+from gateway.geometry.angle import wrap_pi
+from gateway.geometry.quaternion import (
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate_inverse,
+)
 from gateway.records import Quat, Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
@@ -255,8 +261,7 @@ def align(s: State, bias_radps: float) -> float:
     q_ni, misfit = solve_rotation(s)
     s.aligned_std[0] = level_std(s, misfit)
     turn_rad, s.aligned_std[1], noise = heading_of_pairs(s, q_ni, bias_radps)
-    half = 0.5 * turn_rad
-    q_ni = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), q_ni)
+    q_ni = multiply(from_rotation_vector((0.0, 0.0, turn_rad)), q_ni)
     write_quat(s.aligned_q_nb, normalise(multiply(q_ni, as_quat(s.q_ib))))
     return noise
 
@@ -272,5 +277,4 @@ def level_difference(q_a: Quat, q_b: Quat) -> float:
 def heading_difference(q_a: Quat, q_b: Quat) -> float:
     """Return the turn about down from the second attitude to the first, rad."""
     turn = multiply(q_a, (q_b[0], -q_b[1], -q_b[2], -q_b[3]))
-    angle = 2.0 * math.atan2(turn[3], turn[0])
-    return math.atan2(math.sin(angle), math.cos(angle))
+    return wrap_pi(2.0 * math.atan2(turn[3], turn[0]))

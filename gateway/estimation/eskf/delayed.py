@@ -68,7 +68,7 @@ EXCESS_S: Final = 1.0
 
 
 @compiled
-def remember(s: State) -> None:
+def store_integrals(s: State) -> None:
     """Store the present integrals."""
     newest = (s.ring_count - 1) % SLOTS
     if s.ring_count > 0 and s.time_s - s.ring[newest, 0] < SPACING_S:

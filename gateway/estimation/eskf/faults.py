@@ -158,13 +158,13 @@ def check_sensors(
     """Return whether gyroscope and accelerometer can be used, and set the fault."""
     same_gyro = change_of(gyro, s.imu_last, 0) == 0.0
     same_accel = change_of(accel, s.imu_last, 3) == 0.0
-    turned = check_sensor(s, 0, gyro, GYRO_LIMIT_RADPS, same_accel, dt)
-    pulled = check_sensor(s, 1, accel, ACCEL_LIMIT_MPS2, same_gyro, dt)
-    s.fault = 1 if turned == 2 or pulled == 2 or clipped != 0.0 else 0
+    gyro_fault = check_sensor(s, 0, gyro, GYRO_LIMIT_RADPS, same_accel, dt)
+    accel_fault = check_sensor(s, 1, accel, ACCEL_LIMIT_MPS2, same_gyro, dt)
+    s.fault = 1 if gyro_fault == 2 or accel_fault == 2 or clipped != 0.0 else 0
     s.sound_s = s.sound_s + dt if s.fault == 0 else 0.0
     # A bus error changes both sensors; a blow changes the force alone.
-    odd = turned == 1 or is_zero_sample(gyro, accel)
-    good_gyro, good_accel = turned == 0 and not odd, pulled == 0 and not odd
+    odd = gyro_fault == 1 or is_zero_sample(gyro, accel)
+    good_gyro, good_accel = gyro_fault == 0 and not odd, accel_fault == 0 and not odd
     for k in range(3):
         s.imu_last[k], s.imu_last[3 + k] = gyro[k], accel[k]
         if good_gyro:
@@ -308,8 +308,8 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     if s.aided == 1:
         # Fixes in the gap have moved position and velocity already.
         flown_s = min(s.time_s - s.fix_s, dt)
-        half = 0.5 * about * flown_s
-        write_vec(s.vel_n, rotate((math.cos(half), 0.0, 0.0, math.sin(half)), as_vec(s.vel_n)))
+        turn = from_rotation_vector((0.0, 0.0, about * flown_s))
+        write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
         for k in range(3):
             s.pos_n[k] += s.vel_n[k] * flown_s
         add_gap_variance(s, turned_var, flown_s)

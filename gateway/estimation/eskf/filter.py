@@ -21,7 +21,7 @@ from gateway.estimation.columns import (
     NAV_COLUMNS,
     imu_vectors,
 )
-from gateway.estimation.eskf.delayed import remember
+from gateway.estimation.eskf.delayed import store_integrals
 from gateway.estimation.eskf.faults import (
     ACCEL_LIMIT_MPS2,
     GAP_S,
@@ -86,6 +86,8 @@ from gateway.records import NAN, Vec3
 
 UNAIDED_SCALE: Final = 0.01
 """Gyroscope scale error before the first fix, a third of an MPU6050's tolerance."""
+HIGHEST_M: Final = 30_000.0
+"""Largest pressure altitude of a sound barometer."""
 
 STATE_LAYOUT: Final = layout(State)
 GAINS_LAYOUT: Final = layout(Gains)
@@ -245,7 +247,7 @@ def move(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, dt: float)
     integrate(s, p, gyro, accel, dt)
     if clipped != 0.0:
         add_clipping_noise(s, dt)
-    remember(s)
+    store_integrals(s)
     return sound
 
 
@@ -287,10 +289,6 @@ def take_baro(s: State, p: Gains, alt_m: float) -> None:
     else:
         update_height(s, p)
     s.baro_s = s.time_s
-
-
-HIGHEST_M: Final = 30_000.0
-"""Largest pressure altitude of a sound barometer."""
 
 
 @compiled
@@ -338,23 +336,23 @@ def run(
     imu_times_us: int,
     imu_rows: int,
     baro_count: int,
-    baro_places: int,
+    baro_before_at: int,
     baro_alts_m: int,
     gps_count: int,
-    gps_places: int,
+    gps_before_at: int,
     gps_times_us: int,
     gps_rows: int,
     outputs: int,
 ) -> None:
     """Advance over a log: at each IMU sample first the heights, then the fixes before it.
 
-    The places are the numbers of the IMU samples before which each height and fix arrived.
+    Heights and fixes come with the number of the IMU sample before which each arrived.
     """
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     imu_time_us = array_at(imu_times_us, (imu_count,), INT)
-    baro_before = array_at(baro_places, (baro_count,), INT)
+    baro_before = array_at(baro_before_at, (baro_count,), INT)
     baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
-    gps_before = array_at(gps_places, (gps_count,), INT)
+    gps_before = array_at(gps_before_at, (gps_count,), INT)
     gps_time_us = array_at(gps_times_us, (gps_count,), INT)
     baros = fixes = 0
     for i in range(imu_count):

@@ -27,9 +27,9 @@ from gateway.estimation.eskf.delayed import (
     update_fix,
 )
 from gateway.estimation.eskf.faults import gap_limit_s, is_sound
-from gateway.estimation.eskf.integrity import lose_attitude, review_attitude
+from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import watch_latency
-from gateway.estimation.eskf.magnetometer import raise_iron_by_dip, turn_heading
+from gateway.estimation.eskf.magnetometer import raise_hard_iron_by_dip, turn_heading
 from gateway.estimation.eskf.measurements import restart_baro
 from gateway.estimation.eskf.predict import propagate
 from gateway.estimation.eskf.settings import Gains
@@ -227,7 +227,7 @@ def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float)
     at_s = look_back(s, vel_s)
     dt = add_velocity(s, p, at_s, vel, as_vec(s.then), noise_mps)
     if dt > 0.0:
-        review_attitude(s, p, dt, s.sound_s >= MEMORY_S)
+        check_attitude(s, p, dt, s.sound_s >= MEMORY_S)
 
 
 @compiled
@@ -297,7 +297,7 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
         s.was_aided = 1
         for k in range(3):
             reset_state(s, GYRO_SCALE + k, p.gyro_scale_var)
-        raise_iron_by_dip(s, s.earth_field[1])
+        raise_hard_iron_by_dip(s, s.earth_field[1])
 
 
 @compiled

@@ -128,7 +128,7 @@ def find_level(s: State, p: Gains, dt: float) -> None:
 
 
 @compiled
-def review_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
+def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
     """Compare the attitude with the alignment after a new pair of `dt` seconds."""
     bias_var = 0.5 * (s.P[GYRO_BIAS, GYRO_BIAS] + s.P[GYRO_BIAS + 1, GYRO_BIAS + 1])
     noise = align(s, math.sqrt(bias_var))
@@ -140,7 +140,7 @@ def review_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
         if level < FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S):
             take_alignment(s, p)
         return
-    s.mismatch_s = s.mismatch_s + dt if is_contradicted(s) else 0.0
+    s.mismatch_s = s.mismatch_s + dt if differs_from_alignment(s) else 0.0
     if s.mismatch_s > MISMATCH_S:
         if s.was_aided == 1:
             discard_calibration(s, p)
@@ -152,7 +152,7 @@ def review_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
 
 
 @compiled
-def is_contradicted(s: State) -> bool:
+def differs_from_alignment(s: State) -> bool:
     """Return whether the alignment and the attitude cannot both be right."""
     found, q_nb = as_quat(s.aligned_q_nb), as_quat(s.q_nb)
     allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[0] ** 2 + level_variance(s))
@@ -174,8 +174,8 @@ def take_alignment(s: State, p: Gains) -> None:
     if s.heading_known == 1:
         s.heading_true = 1
     else:
-        half = 0.5 * heading_difference(as_quat(s.q_nb), found)
-        found = normalise(multiply((math.cos(half), 0.0, 0.0, math.sin(half)), found))
+        turn_rad = heading_difference(as_quat(s.q_nb), found)
+        found = normalise(multiply(from_rotation_vector((0.0, 0.0, turn_rad)), found))
     write_quat(s.q_nb, found)
     require_bias_variance(s, p.gyro_bias_change_radps)
     begin_attitude(s, p, s.aligned_std[0] ** 2, heading_std * heading_std)

@@ -353,7 +353,7 @@ def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
 
 
 @compiled
-def raise_iron_by_dip(s: State, earth_dip_rad: float) -> None:
+def raise_hard_iron_by_dip(s: State, earth_dip_rad: float) -> None:
     """Raise the variance of the hard iron by the difference of the dip from the Earth model's.
 
     Hard iron that changes the dip changes the heading as much. A heading that follows the compass
@@ -395,8 +395,7 @@ def hard_iron_var(s: State, p: Gains) -> float:
 @compiled
 def turn_heading(s: State, turn_rad: float) -> None:
     """Turn the whole attitude about down."""
-    half = 0.5 * turn_rad
-    turn = (math.cos(half), 0.0, 0.0, math.sin(half))
+    turn = from_rotation_vector((0.0, 0.0, turn_rad))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
     s.resets[ATT + 2] += 1.0
     # The integrals in NED contain the old heading.

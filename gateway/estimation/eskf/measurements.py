@@ -59,8 +59,8 @@ def sustained_sq(s: State) -> float:
 @compiled
 def gravity_variance(s: State, p: Gains) -> float:
     """Return the variance of one horizontal axis of the filtered force, m2/s4."""
-    young = 2.0 * p.gravity_tau_s / s.force_lp_s
-    motion = p.gravity_motion_sq * (1.0 + young * young) * s.force_dev_sq
+    settling = 2.0 * p.gravity_tau_s / s.force_lp_s
+    motion = p.gravity_motion_sq * (1.0 + settling * settling) * s.force_dev_sq
     return p.gravity_var + motion + sustained_sq(s)
 
 

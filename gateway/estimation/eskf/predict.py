@@ -147,16 +147,16 @@ def propagate(s: State, p: Gains) -> None:
     mirror(s.P)
     apply_transition(s, s.P, MOVING_STATES)
     symmetrise(s.P)
-    turned, pulled = s.pending_noise[0], s.pending_noise[1]
+    angle_var, velocity_var = s.pending_noise[0], s.pending_noise[1]
     kept = math.exp(-dt / p.gps_error_s)
     for k in range(3):
-        s.P[ATT + k, ATT + k] += turned + p.gyro_density * dt
+        s.P[ATT + k, ATT + k] += angle_var + p.gyro_density * dt
         s.P[GYRO_BIAS + k, GYRO_BIAS + k] += p.gyro_bias_density * dt
         raise_bias_variance(s, p, k, unexpected_bias_density(s, k) * dt)
         s.P[ACCEL_BIAS + k, ACCEL_BIAS + k] += p.accel_bias_density * dt
         s.P[HARD_IRON + k, HARD_IRON + k] += p.hard_iron_density * dt
         if s.aided == 1:
-            s.P[VEL + k, VEL + k] += pulled + p.accel_density * dt
+            s.P[VEL + k, VEL + k] += velocity_var + p.accel_density * dt
             s.P[POS + k, POS + k] += s.pos_density[k] * dt
         scale_state(s.P, GPS_ERROR + k, kept)
         s.P[GPS_ERROR + k, GPS_ERROR + k] += s.gps_error_var[k] * (1.0 - kept * kept)

@@ -88,7 +88,7 @@ class EskfSettings(Settings, frozen=True):
         float,
         setting(
             "Time constant of each of two low-passes that find gravity without GPS. Small follows "
-            "accelerations, large the gyroscope's drift.",
+            "accelerations, large the drift of the gyroscope.",
             "s",
             ge=0.1,
             le=20.0,

@@ -18,16 +18,16 @@ def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> Non
     The second difference contains the noise of three samples, the middle one twice: six variances
     on each of three axes.
     """
-    turned = pulled = 0.0
+    gyro_sq = accel_sq = 0.0
     for k in range(3):
         change = gyro[k] - s.imu_before[k]
-        turned += (change - s.imu_change[k]) ** 2
+        gyro_sq += (change - s.imu_change[k]) ** 2
         s.imu_change[k] = change
         change = accel[k] - s.imu_before[3 + k]
-        pulled += (change - s.imu_change[3 + k]) ** 2
+        accel_sq += (change - s.imu_change[3 + k]) ** 2
         s.imu_change[3 + k] = change
         s.imu_before[k], s.imu_before[3 + k] = gyro[k], accel[k]
-    if turned < STEP_LIMIT and pulled < STEP_LIMIT:
+    if gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
         share = dt * dt / 18.0
-        s.pending_noise[0] += p.gyro_vibration_sq * share * turned
-        s.pending_noise[1] += p.accel_vibration_sq * share * pulled
+        s.pending_noise[0] += p.gyro_vibration_sq * share * gyro_sq
+        s.pending_noise[1] += p.accel_vibration_sq * share * accel_sq

@@ -28,7 +28,7 @@ import msgspec
 
 from gateway.estimation.columns import FRESH_GPS_S
 from gateway.estimation.paper.filters import Kind, VectorFilter, design_highpass, design_lowpass
-from gateway.estimation.reference import EarthField, EarthPlace, ReferenceSettings, is_usable
+from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings, is_usable
 from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import (
@@ -204,7 +204,7 @@ class PaperEstimator:
 
     def restore(self, snapshot: bytes) -> None:
         """Continue from a snapshot; raises ValueError for another estimator's."""
-        kind = tuple[PaperState, EarthPlace | None]
+        kind = tuple[PaperState, EarthLocation | None]
         state, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
         self._use(state)
 
