@@ -50,7 +50,6 @@ COMPARED_STEP_US: Final = US_PER_S // 2
 MAX_ROWS: Final = 80_000
 """States of one aircraft: more than five hours; of a longer flight every n-th is kept."""
 MAX_TEXTS: Final = 2000
-AUTOPILOT: Final = 1
 READ: Final = frozenset(
     getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
     for name in (
@@ -145,7 +144,7 @@ def _read_source(track: Track, flight: PageFlight) -> None:
     while (time_us := track.peek_us()) is not None:
         frame = track.take()
         system_id, component_id = origin_of(frame)
-        if component_id != AUTOPILOT or message_id_of(frame) not in READ:
+        if component_id != mavlink.MAV_COMP_ID_AUTOPILOT1 or message_id_of(frame) not in READ:
             continue
         try:
             message = reader.decode(bytearray(frame))

@@ -31,7 +31,6 @@ SYSTEM_ID: Final = 253
 FIRST_COMPONENT: Final = 25
 USER_COMPONENTS: Final = 75
 """MAV_COMP_ID_USER1 and on: two panels of one gateway must not be taken for one."""
-AUTOPILOT: Final = 1
 HEARTBEAT_S: Final = 1.0
 KNOCK_S: Final = 0.2
 """Between heartbeats while nothing is received: the first one may come before the socket is
@@ -157,7 +156,11 @@ class Uplink:
         """
         filled = (*params, *(0.0,) * (7 - len(params)))
         message = mavlink.MAVLink_command_long_message(
-            system_id, AUTOPILOT, number, 0, *(float(value) for value in filled)
+            system_id,
+            mavlink.MAV_COMP_ID_AUTOPILOT1,
+            number,
+            0,
+            *(float(value) for value in filled),
         )
         await self._until_acknowledged(system_id, number, message)
 
@@ -167,7 +170,7 @@ class Uplink:
         """Send a command with a position; raises as `command`."""
         message = mavlink.MAVLink_command_int_message(
             system_id,
-            AUTOPILOT,
+            mavlink.MAV_COMP_ID_AUTOPILOT1,
             mavlink.MAV_FRAME_GLOBAL,
             number,
             *(0, 0, 0.0, 0.0, 0.0, 0.0),

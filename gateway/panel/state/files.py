@@ -20,7 +20,6 @@ MAX_ATTEMPTS: Final = 6
 """Half a minute: a radio link may be silent for so long."""
 MAX_FILE: Final = 4_000_000
 """Metadata of the largest autopilots has two; more is refused."""
-AUTOPILOT: Final = 1
 
 
 @dataclass(slots=True)
@@ -134,5 +133,5 @@ class FileClient:
 
     def _message(self, packet: Packet) -> Any:
         return mavlink.MAVLink_file_transfer_protocol_message(
-            0, self.system_id, AUTOPILOT, packet.encode()
+            0, self.system_id, mavlink.MAV_COMP_ID_AUTOPILOT1, packet.encode()
         )

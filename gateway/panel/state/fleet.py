@@ -8,11 +8,9 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.vehicle import VehicleState
+from gateway.recordings.answers import FIRST_GROUND_STATION
 from gateway.units import US_PER_S
 
-AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1: messages of a camera of the same system are ignored."""
-FIRST_GROUND_STATION: Final = 250
 MAX_VEHICLES: Final = 32
 """More are forged; each may take some MB."""
 
@@ -84,8 +82,10 @@ class FleetState:
         now_us : int
             The panel's clock.
         """
-        system_id = message.get_srcSystem()
-        if message.get_srcComponent() != AUTOPILOT or not 0 < system_id < FIRST_GROUND_STATION:
+        system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
+        # Other components, such as a camera, have the system id of their vehicle.
+        is_vehicle = component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+        if not is_vehicle or not 0 < system_id < FIRST_GROUND_STATION:
             return
         vehicle = self.vehicles.get(system_id)
         if vehicle is None:

@@ -128,7 +128,7 @@ MAX_PARAMETERS: Final = 5000
 """Large autopilots have some 1500; more are forged."""
 NOT_REQUESTED: Final = 65_535
 """The index that a value may have which nobody asked for by its index."""
-AUTOPILOT: Final = 1
+AUTOPILOT: Final = mavlink.MAV_COMP_ID_AUTOPILOT1
 
 ERRORS: Final = {
     mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST: "there is no such parameter",
