@@ -17,12 +17,17 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import OVERHEAD_V2, START_V1, START_V2
+from gateway.wire.mavlink_splitter import (
+    OVERHEAD_V2,
+    PAYLOAD_V2,
+    START_V1,
+    START_V2,
+    message_id_of,
+)
 
-PAYLOAD_V2: Final = 10
-"""Where the payload of a MAVLink 2 frame begins."""
 MAX_ID: Final = 255
-_SIZES: Final = {"d": 8, "q": 8, "Q": 8, "f": 4, "i": 4, "I": 4, "h": 2, "H": 2}
+WIDEST: Final = 8
+"""Bytes of the widest type of a field."""
 
 
 def to_mavlink1(frame: bytes) -> bytes | None:
@@ -40,7 +45,7 @@ def to_mavlink1(frame: bytes) -> bytes | None:
     """
     if frame[0] != START_V2:
         return frame
-    message_id = int.from_bytes(frame[7:PAYLOAD_V2], "little")
+    message_id = message_id_of(frame)
     size = base_size(message_id)
     if size is None:
         return None
@@ -60,18 +65,18 @@ def base_size(message_id: int) -> int | None:
     types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
     seed = mcrf4xx(f"{message.msgname} ".encode())
     size, found = 0, None
-    last = max(_SIZES.values())
+    last = WIDEST
     for name, code, length in zip(
         message.ordered_fieldnames, message.native_format[1:], message.array_lengths, strict=True
     ):
-        width = _SIZES.get(chr(code), 1)
+        width = struct.calcsize(f"<{chr(code)}")
         if width > last:
             # The fields of the first definition are in descending order of their width.
             break
         last = width
         seed = mcrf4xx(f"{types[name]} {name} ".encode(), seed)
         seed = mcrf4xx(bytes((length,)), seed) if length else seed
-        size += struct.calcsize("<" + chr(code)) * max(1, length)
+        size += width * max(1, length)
         if (seed & 0xFF) ^ (seed >> 8) == message.crc_extra:
             found = size
     return found
