@@ -61,7 +61,7 @@ STEPS: Final = 20
 """Of the bisection: the factor to a millionth."""
 
 Key = bytes
-"""System, component and message of a frame, as `key_of` gives them."""
+"""System, component and message of a frame, as in `MavFrame.key`."""
 
 
 class Bandwidth:

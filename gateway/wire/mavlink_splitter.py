@@ -206,11 +206,6 @@ def message_id_of(data: bytes) -> int:
     return data[5]
 
 
-def key_of(data: bytes) -> bytes:
-    """Return the header bytes with system, component and message, as a dictionary key."""
-    return frame_of(data).key
-
-
 def is_station_heartbeat(data: bytes) -> bool:
     """Return whether a HEARTBEAT reports that its sender is a ground station."""
     return frame_of(data).is_station_heartbeat
