@@ -28,6 +28,7 @@ from gateway.vehicle.requests import RequestReader
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
+    SHORTHANDS,
     UNSUPPORTED,
     Command,
     read_command,
@@ -48,12 +49,6 @@ from gateway.vehicle.services.parameters import Metadata
 from gateway.vehicle.services.queries import QueryService
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
-SHORTHANDS: Final = {
-    mavlink.MAV_CMD_GET_HOME_POSITION: mavlink.MAVLINK_MSG_ID_HOME_POSITION,
-    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
-    mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: 300,
-}
-"""Older commands for single messages."""
 
 RecordedAction = Outgoing | ClientInterval
 

@@ -23,10 +23,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import Answer, RecordingRequest, Reply, Request
-from gateway.vehicle.location import GLOBAL_FRAMES
+from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
+from gateway.vehicle.location import DEGE7, GLOBAL_FRAMES
 from gateway.vehicle.services.intervals import IntervalService
-
-DEGE7: Final = 1e7
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
 DENIED: Final[int] = mavlink.MAV_RESULT_DENIED
@@ -45,6 +44,12 @@ REFUSALS: Final = {
     mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "The gateway is restarted on its own machine",
 }
 """Commands that are understood but denied, and why."""
+SHORTHANDS: Final = {
+    mavlink.MAV_CMD_GET_HOME_POSITION: mavlink.MAVLINK_MSG_ID_HOME_POSITION,
+    mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+    mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: MAVLINK_MSG_ID_PROTOCOL_VERSION,
+}
+"""Older commands for single messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,11 +149,7 @@ class CommandService:
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
-            mavlink.MAV_CMD_GET_HOME_POSITION: self._fixed(mavlink.MAVLINK_MSG_ID_HOME_POSITION),
-            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._fixed(
-                mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION
-            ),
-            mavlink.MAV_CMD_REQUEST_PROTOCOL_VERSION: self._fixed(300),
+            **{number: self._fixed(message_id) for number, message_id in SHORTHANDS.items()},
         }
         self._changing: set[int] = set(REFUSALS)
         for number in REFUSALS:

@@ -24,7 +24,7 @@ from gateway.records import (
 from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
 from gateway.vehicle import encoding
 from gateway.vehicle.identity import CUSTOM_MODES
-from gateway.vehicle.location import Home, Location, distance_and_bearing, is_3d
+from gateway.vehicle.location import DEGE7, Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
@@ -41,7 +41,6 @@ MIN_COS_SQ: Final = 1e-4
 UNKNOWN_TERRAIN_M: Final = -10_000.0
 """In ALTITUDE a terrain altitude below -1000 is unknown."""
 DEGE5: Final = 1e5
-DEGE7: Final = 1e7
 MS_US: Final = 1000
 
 FIX_TYPES: Final = {
