@@ -1,13 +1,14 @@
 """The context of every view: the aircraft, requests to the gateway, units, the role.
 
 A view is a file in `gateway/panel/views/` with a function `build(context: ViewContext) -> None`
-that creates its NiceGUI elements, inside the tab's panel; `shell.py` lists them. One `ViewContext`
+that creates its NiceGUI elements, inside the tab's panel; `page.py` lists them. One `ViewContext`
 belongs to one open page (browser tab).
 
 There are two ways from the aircraft to the screen:
 
-*Moving displays* are drawn in the browser. The page opens one WebSocket (`feed.py`), over which
-the `Instant` of every aircraft comes up to 30 times a second, and passes it to `window.mavgate`:
+*Moving displays* are drawn in the browser. The page opens one WebSocket (`telemetry_feed.py`), over
+which the `Instant` of every aircraft comes up to 30 times a second, and passes it to
+`window.mavgate`:
 
     const stop = mavgate.subscribe((state) => { ... });   // state: newest Instant, by its names
     mavgate.state          the selected aircraft's newest, or null

@@ -220,7 +220,7 @@ def encode_plan(plan: StoredPlan) -> str:
 
 
 def decode_plan(text: str) -> StoredPlan:
-    """Read plan.
+    """Read a plan.
 
     Parameters
     ----------
@@ -234,8 +234,8 @@ def decode_plan(text: str) -> StoredPlan:
     Raises
     ------
     ValueError
-        If it is not such a text, or holds what no ground station could have stored; the error says
-        what.
+        If it is not such a text, or contains values that no ground station could have stored; the
+        error names the first.
     """
     try:
         plan = msgspec.convert(json.loads(text), StoredPlan)

@@ -36,7 +36,7 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     time_us: int
     """When the newest attitude or position came, on the panel's clock."""
     model: str
-    """`plane`, `copter`, `heli`, `rover`, `boat` or `none`; see `VehicleState`."""
+    """Its 3D model, see `VehicleState.model`."""
     origin: str
     """`live`, `recorded` or `fused again`."""
     generation: int
