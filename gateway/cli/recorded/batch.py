@@ -1,11 +1,13 @@
 """`mavgate batch`: one work on many recordings, here or on a cluster."""
 
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
+from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
 from gateway.cli.support.batch_work import (
     JobsOption,
     SchedulerOption,
@@ -27,13 +29,10 @@ from gateway.output import write_new
 from gateway.units import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from gateway.batch.statistics import Versus
-    from gateway.batch.tasks import FlightResult
 
 FAILED: Final = 1
-"""What the command ends with where a recording failed."""
+"""Exit code of the command if a recording failed."""
 FLIGHTS_CSV: Final = "flights.csv"
 BEST_TOML: Final = "best.toml"
 SWEEP_CSV: Final = "sweep.csv"
@@ -78,8 +77,6 @@ def _add_judging(name: Literal["fuse", "report"], text: str) -> None:
         scheduler: SchedulerOption = None,
         config: ConfigOption = None,
     ) -> None:
-        from gateway.batch.tasks import FuseTask, ReportTask
-
         if name == "report" and not _can_make_pages():
             refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
         work = SeasonWork(files, config, jobs, scheduler)
@@ -107,7 +104,6 @@ def info(
 ) -> None:
     """Describe many files, one by one, as `mavgate info` does."""
     from gateway.batch.page import flight_table
-    from gateway.batch.tasks import InfoTask
 
     work = SeasonWork(files, config, jobs, scheduler)
     task = InfoTask(season_options(config, columns, "recorded"))
@@ -154,8 +150,7 @@ def sweep(
     force: ForceOption = False,
 ) -> None:
     """Find one set of settings for many flights; those of other days judge what was chosen."""
-    from gateway.cli.support.batch_work import run_season_sweep
-    from gateway.cli.support.sweeping import SweepOptions
+    from gateway.cli.support.sweeping import SweepOptions, run_season_sweep
 
     work = SeasonWork(files, config, jobs, scheduler)
     options = SweepOptions(
@@ -166,7 +161,7 @@ def sweep(
     _end(run_season_sweep(work, read, read_settings(config), options, output))
 
 
-def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | None) -> None:
+def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
     from gateway.batch.page import errors_of, flight_table, write_season_page
     from gateway.batch.statistics import errors_by_group
@@ -195,10 +190,9 @@ def _finish(results: "Sequence[FlightResult]", output: Path, against: Path | Non
     _end(results)
 
 
-def _compare(results: "Sequence[FlightResult]", against: Path) -> "Versus":
+def _compare(results: Sequence[FlightResult], against: Path) -> "Versus":
     from gateway.batch.page import errors_of
     from gateway.batch.statistics import versus
-    from gateway.batch.tasks import read_results
 
     with refusing():
         found = versus(errors_of(results), errors_of([*read_results(against)]))
@@ -218,7 +212,7 @@ def _show_versus(compared: "Versus") -> None:
         )
 
 
-def _end(results: "Sequence[FlightResult]") -> None:
+def _end(results: Sequence[FlightResult]) -> None:
     if count := failures(results):
         console_of(stderr=True).print(f"{count} of {counted(len(results), 'recording')} failed")
         raise typer.Exit(FAILED)

@@ -77,7 +77,7 @@ def sweep(
     aircraft and days.
     """
     # It imports pandas and the optimisers, for which no other command should wait.
-    from gateway.cli.support.sweeping import SweepOptions, run_sweep
+    from gateway.cli.support.sweeping import SweepOptions, run_season_sweep, run_sweep
 
     current = or_refuse(lambda: load_settings(config))
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
@@ -86,7 +86,7 @@ def sweep(
     )
     given = flights or []
     if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
-        from gateway.cli.support.batch_work import SeasonWork, run_season_sweep, season_options
+        from gateway.cli.support.batch_work import SeasonWork, season_options
 
         if reference is not None or system is not None:
             refuse("--reference and --system belong to one flight")

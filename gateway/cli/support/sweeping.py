@@ -1,4 +1,4 @@
-"""A sweep as a command: axes from texts, a progress bar, the best as a table and a file."""
+"""A sweep as a command, of one flight or many: axes from texts, progress, the best as a file."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 import msgspec
+import numpy as np
 import pandas as pd
 from rich import box
 from rich.progress import (
@@ -19,14 +20,27 @@ from rich.table import Table
 
 from gateway.analysis.flight_arrays import FusionSettings
 from gateway.analysis.tuning import contest as sweeping
-from gateway.analysis.tuning.axis import ESTIMATOR_KEY, Axis, SweepError, Values, grid, parse_axis
+from gateway.analysis.tuning.axis import (
+    ESTIMATOR_KEY,
+    Axis,
+    SweepError,
+    Values,
+    grid,
+    parse_axis,
+    with_estimator_of,
+    with_values,
+)
 from gateway.analysis.tuning.contest import COLUMN_OF, Contest, Metric, Trial
 from gateway.analysis.tuning.workers import Run, pool
-from gateway.cli.support.loading import Loading, load_flight
+from gateway.batch.statistics import Choice, FloatArray, choose, group_of
+from gateway.batch.tasks import FlightResult, SweepTask
+from gateway.cli.support.batch_work import SeasonWork
+from gateway.cli.support.loading import Loading, fusion_of, load_flight
 from gateway.cli.support.recording_options import refusing
-from gateway.cli.support.terminal import console_of, refuse
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
+from gateway.recordings.reading import ReadOptions
 from gateway.units import counted
 
 SHOWN: Final = 10
@@ -63,11 +77,9 @@ class SweepOptions:
 def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
     """Try the settings, show the best, and write it as a settings file."""
     with refusing():
-        for out in (options.output, options.table):
-            if out is not None:
-                check_output(out, [path], overwrite=options.overwrite)
+        _check_outputs(options, path)
     try:
-        axes = parse_axes(options)
+        axes = _parse_axes(options)
         flight = load_flight(path, loading)
         contest = sweeping.make_contest(
             flight,
@@ -87,16 +99,35 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
         refuse(str(error))
     _show(results, contest, options.metric)
     best = sweeping.best_of(trials, options.metric)
+    _write(options, _merged(loading.settings, contest, best), results, path)
+
+
+def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
+    """Raise OSError if an output cannot be written, or is the flight itself."""
+    for out in (options.output, options.table):
+        if out is not None:
+            check_output(out, [path], overwrite=options.overwrite)
+
+
+def _write(
+    options: SweepOptions, best: GatewaySettings, table: pd.DataFrame, path: Path | None = None
+) -> None:
+    """Write the best settings, and the table if it is wanted."""
     with refusing():
-        text = render(_merged(loading.settings, contest, best))
-        write_new(options.output, [text.encode()], overwrite=options.overwrite, inputs=[path])
+        write_new(
+            options.output, [render(best).encode()], overwrite=options.overwrite, inputs=[path]
+        )
         print(options.output)
         if options.table is not None:
-            rows = results.to_csv(index=False).encode()
+            rows = table.to_csv(index=False).encode()
             write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
 
 
-def parse_axes(options: SweepOptions) -> list[Axis]:
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _parse_axes(options: SweepOptions) -> list[Axis]:
     """Read the axes to vary; raises SweepError for invalid ones."""
     wanted = list(options.named)
     for item in options.vary:
@@ -169,7 +200,7 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
     for name in names:
         shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
     for row in results[names].head(SHOWN).itertuples(index=False):
-        shown.add_row(*(f"{v:.4g}" if isinstance(v, float) else str(v) for v in row))
+        shown.add_row(*map(_cell, row))
     console_of().print(shown)
 
 
@@ -177,3 +208,93 @@ def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> Gatewa
     """Put the best values into the whole settings."""
     fusion: FusionSettings = sweeping.settings_at(contest, best)
     return msgspec.structs.replace(settings, estimation=fusion.estimation)
+
+
+def run_season_sweep(
+    work: SeasonWork,
+    read: ReadOptions,
+    settings: GatewaySettings,
+    options: SweepOptions,
+    kept: Path | None = None,
+) -> list[FlightResult]:
+    """Score every point on every flight, show what is best for all, and write it."""
+    with refusing():
+        if kept is not None:
+            kept.mkdir(parents=True, exist_ok=True)
+        _check_outputs(options)
+    if options.generations:
+        refuse("--optimise searches on one flight; give a grid for many")
+    fusion = fusion_of(settings)
+    try:
+        axes = tuple(_parse_axes(options))
+        points, keys = grid(axes), [axis.key for axis in axes]
+        fusion = with_estimator_of(fusion, keys)
+    except SweepError as error:
+        refuse(str(error))
+    column = COLUMN_OF[options.metric]
+    task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
+    results = work.run(task, work.items(), kept)
+    swept = [result for result in results if result.error is None]
+    if not swept:
+        refuse("no flight could be swept")
+    base, choice = _chosen(swept)
+    _show_choice(axes, points, choice, column, len(swept))
+    best = with_values(fusion, keys, points[choice.winner])
+    merged = msgspec.structs.replace(settings, estimation=best.estimation)
+    _write(options, merged, _table_of(swept, base, choice))
+    return results
+
+
+def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
+    """Return the errors with the settings that the flights came with, and what is best."""
+    errors = np.array([_numbers(result.figures["scores"]) for result in swept])
+    base = np.array(_numbers([result.figures["base"] for result in swept]))
+    groups = [group_of(result.vehicle, result.began, result.digest) for result in swept]
+    try:
+        return base, choose(errors, base, groups)
+    except ValueError as error:
+        refuse(f"{error}; choose another --metric")
+
+
+def _numbers(values: Sequence[float | None]) -> list[float]:
+    """Read scores back: what is not known is null in JSON."""
+    return [float("nan") if value is None else value for value in values]
+
+
+def _show_choice(
+    axes: Sequence[Axis], points: Sequence[Values], choice: Choice, column: str, flights: int
+) -> None:
+    console = console_of()
+    grid_ = table_of(
+        *(axis.key.rsplit(".", 1)[-1] for axis in axes), f"mean {HEADINGS[column]}", left=0
+    )
+    for number in np.argsort(choice.means, kind="stable")[:SHOWN].tolist():
+        grid_.add_row(*map(_cell, points[number]), _cell(float(choice.means[number])))
+    console.print(grid_)
+    console.print(
+        f"{counted(len(points), 'point')} on {counted(flights, 'flight')}, "
+        f"in {choice.folds} folds by aircraft and day; "
+        f"the same point wins without {choice.stable} of the {choice.folds}"
+    )
+    if choice.over_base is not None:
+        console.print(
+            "against the settings that the flights came with, each flight judging only what the "
+            f"others chose: {choice.over_base.text}",
+        )
+    if choice.over_second is not None:
+        console.print(
+            f"the winner against the second, on the flights that chose both: "
+            f"{choice.over_second.text}",
+        )
+
+
+def _table_of(swept: Sequence[FlightResult], base: FloatArray, choice: Choice) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "recording": [result.place for result in swept],
+            "aircraft": [result.vehicle for result in swept],
+            "began": [result.began for result in swept],
+            "as it came": base,
+            "as others chose": choice.judged,
+        }
+    )
