@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
-from gateway.recordings.answers import is_station
+from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID, is_station
 from gateway.recordings.columns import TableRow
 from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import (
     GLOBAL_POSITION_INT_ID,
-    HEARTBEAT_ID,
     STEP_US,
     GroundDistance,
     TimesSpan,
 )
 from gateway.recordings.table import TableEvent, TableFault, TableHeader, TableReader
-from gateway.recordings.tlog import DAY_US, Batch, TlogIndex, payload_of
+from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, payload_of
 from gateway.records import NavFlags, NodeStatus
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 
@@ -283,9 +282,7 @@ def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
 
 
 SYS_STATUS_ID: Final = 1
-PARAM_VALUE_ID: Final = 22
 GPS_RAW_INT_ID: Final = 24
-AUTOPILOT_VERSION_ID: Final = 148
 STATUSTEXT_ID: Final = 253
 LOOKED_AT: Final = np.array(
     [

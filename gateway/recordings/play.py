@@ -47,9 +47,6 @@ CONTEXT_RECORDS: Final = 20 * STRIDE
 CONTEXT_IDS: Final = (0, 1, 24, 30, 31, 33, 49, 74, 148, 242, 245)
 """HEARTBEAT, SYS_STATUS, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
 HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
-PARAM_VALUE_ID: Final = 22
-PARAM_NAME: Final = slice(18, 34)
-"""Where the parameter's name stands in a MAVLink 2 frame; close enough in the older ones."""
 
 
 class Source(Protocol):
@@ -148,7 +145,7 @@ class Track:
             heartbeats, home and the like, the newest of each.
         """
         wanted_us = time_us - self._shift_us
-        newest: dict[tuple[int, int, int, bytes], bytes] = {}
+        newest: dict[tuple[int, int, int], bytes] = {}
         batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
         self._records = iter(())
         for batch in batches:
@@ -158,7 +155,7 @@ class Track:
             known = known[(known < begin) & np.isin(batch.message_ids[known], CONTEXT_IDS)]
             for i in known.tolist():
                 frame = batch.frame(i)
-                key = _key_of(frame)
+                key = (*origin_of(frame), message_id_of(frame))
                 # Taken out first, so that the newest come last.
                 newest.pop(key, None)
                 newest[key] = frame
@@ -214,13 +211,6 @@ class Track:
             offset += len(data)
             size = BLOCK_BYTES
         yield timeline.apply(scanner.feed(b"", final=True))
-
-
-def _key_of(frame: bytes) -> tuple[int, int, int, bytes]:
-    """Return a key, equal for frames that replace one another; each parameter has its own."""
-    message_id = message_id_of(frame)
-    name = frame[PARAM_NAME] if message_id == PARAM_VALUE_ID else b""
-    return (*origin_of(frame), message_id, name)
 
 
 LEAST_SPEED: Final = 0.1

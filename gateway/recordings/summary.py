@@ -48,7 +48,14 @@ from gateway.recordings.files import (
     read_ends,
 )
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
-from gateway.recordings.tlog import DAY_US, Batch, TlogIndex, TlogScanner, payload_of
+from gateway.recordings.tlog import (
+    DAY_US,
+    HEARTBEAT_ID,
+    Batch,
+    TlogIndex,
+    TlogScanner,
+    payload_of,
+)
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -66,7 +73,6 @@ LEAST_STEP_M: Final = 1.0
 """Shorter steps are not summed: at rest the noise of positions would be a distance."""
 
 MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
-HEARTBEAT_ID: Final = 0
 GLOBAL_POSITION_INT_ID: Final = 33
 _POSITION: Final = struct.Struct("<Iii")
 

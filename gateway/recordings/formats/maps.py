@@ -13,11 +13,12 @@ from xml.sax import saxutils
 
 from gateway.aircraft import AircraftSettings
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.answers import is_station
+from gateway.recordings.answers import HOME_POSITION_ID, is_station
 from gateway.recordings.columns import TableRow
 from gateway.recordings.reading import RecordedTable
+from gateway.recordings.summary import GLOBAL_POSITION_INT_ID
 from gateway.recordings.table import REMARK, TableMark
-from gateway.recordings.tlog import TlogRecord, payload_of
+from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, payload_of
 from gateway.records import FusionState, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 from gateway.vehicle.location import is_good_enough, location_of
@@ -258,11 +259,8 @@ def _position(point: TrackPoint) -> list[float]:
     return [*place, round(point.alt_amsl_m, 2)] if math.isfinite(point.alt_amsl_m) else place
 
 
-HEARTBEAT_ID: Final = 0
 ATTITUDE_ID: Final = 30
 ATTITUDE_QUATERNION_ID: Final = 31
-GLOBAL_POSITION_INT_ID: Final = 33
-HOME_POSITION_ID: Final = 242
 STATUSTEXT_ID: Final = 253
 
 _ATTITUDE: Final = struct.Struct("<Ifff")

@@ -31,7 +31,7 @@ from gateway.recordings.columns import (
     FloatArray,
 )
 from gateway.recordings.stream_clock import STREAMS, times_on_clock
-from gateway.recordings.tlog import Batch
+from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
 from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
@@ -93,8 +93,6 @@ UNKNOWN_U16: Final = 65535
 UNKNOWN_U8: Final = 255
 MAG_FIELDS: Final = 0b111 << 6
 """HIGHRES_IMU's bits of what is new."""
-UNIX_YEAR_2000_US: Final = 946_684_800 * US_PER_S
-"""Later times are civil time, earlier ones count from the start of the autopilot."""
 FIX_2D, FIX_3D = 2, 3
 GPS_NODE: Final = 1
 
@@ -154,7 +152,7 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     has_fix = fix_type != int(GpsFixType.NONE)
     satellites = values["satellites_visible"]
     utc_us = values["time_usec"]
-    is_civil = (utc_us > UNIX_YEAR_2000_US) & (utc_us <= LARGEST_WHOLE)
+    is_civil = (utc_us > FIRST_CIVIL_US) & (utc_us <= LARGEST_WHOLE)
     down_mps = _of_place(places, np.where(reported == FIX_3D, place_at, -1), "vz", CENTI)
     north_mps, east_mps = _velocity(values, has_fix)
     return np.column_stack(
@@ -336,7 +334,7 @@ class AutopilotReader:
         for message_id, values in fields.items():
             if "time_usec" in (values.dtype.names or ()):
                 sent = values["time_usec"]
-                own = np.where(sent > UNIX_YEAR_2000_US, 0, sent).astype(np.int64)
+                own = np.where(sent > FIRST_CIVIL_US, 0, sent).astype(np.int64)
             else:
                 own = values["time_boot_ms"].astype(np.int64) * 1000
             own_us[message_ids == message_id] = own

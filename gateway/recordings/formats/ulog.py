@@ -28,8 +28,9 @@ from pyulog.exceptions import ULogException
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, TableRow
 from gateway.recordings.files import FlightError, read_chunks, temporary_copy
-from gateway.recordings.formats.mavlink import UNIX_YEAR_2000_US, UT_PER_GAUSS, VELOCITY_AGE_US
+from gateway.recordings.formats.mavlink import UT_PER_GAUSS, VELOCITY_AGE_US
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
+from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,
@@ -98,7 +99,7 @@ class Px4Log:
         found = [
             row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
             for row in self._rows(*_GPS_TOPICS)
-            if UNIX_YEAR_2000_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
+            if FIRST_CIVIL_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
         ]
         return self._zero_us + median_low(found) if found else None
 
@@ -202,7 +203,7 @@ class Px4Log:
             speed_acc_mps=row.get("s_variance_m_s", NAN) or NAN,
             course_acc_deg=math.degrees(row.get("c_variance_rad", NAN)) or NAN,
             pdop=math.hypot(row.get("hdop", NAN), row.get("vdop", NAN)) or NAN,
-            utc_us=utc_us if UNIX_YEAR_2000_US < utc_us < LARGEST_WHOLE else None,
+            utc_us=utc_us if FIRST_CIVIL_US < utc_us < LARGEST_WHOLE else None,
         )
 
     def _states(self) -> Iterator[NavState]:
