@@ -62,7 +62,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     ),
     "doctor": CommandEntry(
         "live.doctor",
-        "Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.",
+        "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
     ),
     "map": CommandEntry(
         "live.map", "Fetch an area of a map for the panel, for use without a network."

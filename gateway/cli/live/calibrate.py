@@ -16,9 +16,10 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 from gateway.cli.support.asking import ask, is_running
-from gateway.cli.support.recording_options import files_of, folder_of, refusing
+from gateway.cli.support.recording_options import files_of, refusing
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     read_aircraft,
     read_options,
     read_settings,

@@ -9,10 +9,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from gateway.cli.command_table import GATEWAY
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
+    UNKNOWN,
     JsonOption,
     console_of,
     print_json,
@@ -23,8 +25,6 @@ from gateway.reasons import receiver_state
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
-PANEL: Final = "A running gateway"
-UNKNOWN: Final = "—"
 US_PER_MS: Final = 1000
 MV_PER_V: Final = 1000
 
@@ -36,10 +36,10 @@ group = AskingTyper(help="List, add and remove clients and sources.", no_args_is
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command(rich_help_panel=PANEL)(with_socket(status))
-    app.add_typer(group, name="clients", rich_help_panel=PANEL)
-    app.command(rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(with_socket(mark))
-    app.command(rich_help_panel=PANEL)(with_socket(reload))
+    app.command(rich_help_panel=GATEWAY)(with_socket(status))
+    app.add_typer(group, name="clients", rich_help_panel=GATEWAY)
+    app.command(rich_help_panel=GATEWAY, context_settings=NEGATIVE_NUMBERS)(with_socket(mark))
+    app.command(rich_help_panel=GATEWAY)(with_socket(reload))
 
 
 def status(

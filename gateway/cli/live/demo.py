@@ -21,13 +21,13 @@ from gateway.cli.support.panel_process import PanelProcess, is_installed
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     files_of,
-    folder_of,
     progress_of,
     read_column_map,
     refusing,
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     load_settings,
     or_refuse,
     read_options,

@@ -18,7 +18,7 @@ from typing import Final
 
 import typer
 
-from gateway.cli.support.settings_options import ConfigOption, read_settings
+from gateway.cli.support.settings_options import ConfigOption, folder_of, read_settings
 from gateway.cli.support.terminal import console_of, how_to_add
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
@@ -164,7 +164,7 @@ def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
 
 def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether there is room for recordings."""
-    folder = Path(settings.recording.folder).expanduser()
+    folder = folder_of(settings)
     try:
         free_mb = free_bytes_near(folder) / 1e6
     except OSError as error:
@@ -283,7 +283,7 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(*, config: ConfigOption = None) -> None:
-    """Check this machine and suggest fixes: rights, ports, latency, cache, time, disk.
+    """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
     It changes nothing. The exit code is 1 if something is wrong.
     """

@@ -34,6 +34,7 @@ from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.workbench import Workbench
+from gateway.wire.chips import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 from gateway.wire.link import Link
 
 LOOK_S: Final = 5.0
@@ -45,7 +46,12 @@ LOSSY_PERCENT: Final = 5.0
 FEW_LOST: Final = 3
 """So many may be chance in so short a time."""
 WEAK_SATELLITES: Final = 6
-SENSORS: Final = {1: "IMU", 2: "compass", 4: "barometer", 8: "GPS"}
+SENSORS: Final = {
+    SENSOR_IMU: "IMU",
+    SENSOR_MAG: "compass",
+    SENSOR_BARO: "barometer",
+    SENSOR_GPS: "GPS",
+}
 """Bits of a node's report."""
 STEPS: Final = (Step.GYRO, Step.LEVEL, Step.MAG)
 
@@ -54,7 +60,7 @@ console = console_of()
 
 @dataclass
 class Observed:
-    """What was received within a time."""
+    """The records that were received within a time."""
 
     report: LinkReport
     statuses: dict[tuple[int, int], NodeStatus] = field(default_factory=dict)

@@ -15,6 +15,7 @@ from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
 from gateway.cli.support.fetching import FetchError, RecordingFetch
 from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import (
+    UNKNOWN,
     JsonOption,
     console_of,
     how_to_add,
@@ -205,7 +206,7 @@ def recordings(
                 each["name"],
                 str(len(each["files"])),
                 f"{_size_of(each) / 1e6:.2f}",
-                "—" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+                UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
             )
     console_of().print(grid)
 

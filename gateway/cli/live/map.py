@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from gateway.cli.support.recording_options import files_of, folder_of, refusing
+from gateway.cli.support.recording_options import files_of, refusing
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     load_settings,
     or_refuse,
     read_options,

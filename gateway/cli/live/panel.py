@@ -2,7 +2,6 @@
 
 import logging
 import sys
-from pathlib import Path
 from types import TracebackType
 from typing import Annotated
 
@@ -13,6 +12,7 @@ from gateway.cli.support.asking import SocketOption
 from gateway.cli.support.panel_process import LINK, OneLineFormatter
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     read_settings,
 )
 from gateway.cli.support.terminal import how_to_add, refuse
@@ -68,7 +68,7 @@ def panel(
             handler.setFormatter(OneLineFormatter("%(message)s"))
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
-    folder = Path(settings.recording.folder).expanduser()
+    folder = folder_of(settings)
     try:
         if connect is not None:
             parse_endpoint(connect)

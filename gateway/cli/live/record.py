@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
@@ -11,10 +11,18 @@ from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.asking import AskingTyper, ask, is_running
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
+from gateway.cli.support.terminal import (
+    UNKNOWN,
+    JsonOption,
+    console_of,
+    print_json,
+    refuse,
+    table_of,
+)
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,
@@ -35,7 +43,6 @@ if TYPE_CHECKING:
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
-UNKNOWN: Final = "—"
 
 group = AskingTyper(
     help="Start, stop, name, list and delete recordings.",
@@ -152,7 +159,7 @@ def _recording(fields: dict[str, Any]) -> Recording:
 
 
 def _folder(config: Path | None) -> Path:
-    return Path(read_settings(config).recording.folder).expanduser()
+    return folder_of(read_settings(config))
 
 
 def _show(status: dict[str, Any]) -> None:

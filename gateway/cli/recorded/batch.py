@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.batch_work import (
     JobsOption,
     SchedulerOption,
@@ -17,7 +18,6 @@ from gateway.cli.support.batch_work import (
     season_options,
 )
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     ForceOption,
     SettingsOption,
@@ -59,7 +59,7 @@ AgainstOption = Annotated[
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.add_typer(group, name="batch", rich_help_panel=PANEL)
+    app.add_typer(group, name="batch", rich_help_panel=RECORDINGS)
 
 
 def _add_judging(name: Literal["fuse", "report"], text: str) -> None:

@@ -12,20 +12,30 @@ from typer.core import TyperGroup
 from gateway.batch.catalogue import CatalogueError, Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
-    folder_of,
     read_column_map,
     refusing,
 )
-from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
-from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
+from gateway.cli.support.settings_options import (
+    ConfigOption,
+    folder_of,
+    read_options,
+    read_settings,
+)
+from gateway.cli.support.terminal import (
+    UNKNOWN,
+    JsonOption,
+    console_of,
+    print_json,
+    refuse,
+    table_of,
+)
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.units import counted
 
 INDEX: Final = "index"
-UNKNOWN: Final = "—"
 DIGITS: Final = {
     "duration": 1, "distance": 0, "highest": 1, "fastest": 1, "gps_lost": 1, "loss": 4,
     **dict.fromkeys(("lat_min", "lat_max", "lon_min", "lon_max", "takeoff_lat", "takeoff_lon"), 6),
@@ -61,7 +71,7 @@ GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for 
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.add_typer(group, name="catalogue", rich_help_panel=PANEL)
+    app.add_typer(group, name="catalogue", rich_help_panel=RECORDINGS)
 
 
 @group.command(INDEX)

@@ -5,8 +5,8 @@ from typing import Annotated, Final
 
 import typer
 
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     Files,
     ForceOption,
@@ -42,7 +42,7 @@ FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 
 def register(app: typer.Typer) -> None:
     """Add the command of this file."""
-    app.command("convert", rich_help_panel=PANEL)(convert)
+    app.command("convert", rich_help_panel=RECORDINGS)(convert)
 
 
 def convert(

@@ -9,8 +9,8 @@ import numpy as np
 import typer
 
 from gateway.aircraft import Aircraft, AircraftSettings
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     ForceOption,
     SensorOption,
@@ -55,7 +55,7 @@ LEAST_RATE_HZ: Final = 10.0
 
 def register(app: typer.Typer) -> None:
     """Add the command of this file."""
-    app.command("fuse", rich_help_panel=PANEL)(fuse_log)
+    app.command("fuse", rich_help_panel=RECORDINGS)(fuse_log)
 
 
 def _known_estimator(name: str | None) -> str | None:

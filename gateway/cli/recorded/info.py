@@ -11,8 +11,8 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     ForceOption,
     files_of,
@@ -53,8 +53,8 @@ Report = Callable[[str], None]
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command("info", rich_help_panel=PANEL)(info)
-    app.command("recover", rich_help_panel=PANEL)(recover)
+    app.command("info", rich_help_panel=RECORDINGS)(info)
+    app.command("recover", rich_help_panel=RECORDINGS)(recover)
 
 
 def info(

@@ -6,13 +6,12 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     ForceOption,
     SettingsOption,
     files_of,
-    folder_of,
     print_remarks,
     progress_of,
     read_column_map,
@@ -20,6 +19,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.settings_options import (
     ConfigOption,
+    folder_of,
     load_settings,
     or_refuse,
     read_options,
@@ -30,7 +30,7 @@ from gateway.output import write_new
 
 def register(app: typer.Typer) -> None:
     """Add the command of this file."""
-    app.command("page", rich_help_panel=PANEL)(page)
+    app.command("page", rich_help_panel=RECORDINGS)(page)
 
 
 def page(

@@ -12,13 +12,13 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
+from gateway.cli.command_table import RECORDINGS
 from gateway.cli.live.run import (
     EndpointOption,
     with_endpoints,
 )
 from gateway.cli.support.asking import AskingTyper, ask, with_socket
 from gateway.cli.support.recording_options import (
-    PANEL,
     ColumnsOption,
     Files,
     FromOption,
@@ -67,9 +67,11 @@ LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file."""
-    app.command("play", rich_help_panel=PANEL)(play)
-    app.command("seek", rich_help_panel=PANEL, context_settings=NEGATIVE_NUMBERS)(with_socket(seek))
-    app.add_typer(group, name="player", rich_help_panel=PANEL)
+    app.command("play", rich_help_panel=RECORDINGS)(play)
+    app.command("seek", rich_help_panel=RECORDINGS, context_settings=NEGATIVE_NUMBERS)(
+        with_socket(seek)
+    )
+    app.add_typer(group, name="player", rich_help_panel=RECORDINGS)
 
 
 def play(

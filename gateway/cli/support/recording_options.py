@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
 import typer
@@ -19,15 +19,13 @@ from rich.progress import (
 )
 
 from gateway.cli.support.asking import ask, is_running
-from gateway.cli.support.settings_options import read_settings
+from gateway.cli.support.settings_options import folder_of, read_settings
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.reasons import reason_of
 from gateway.recordings.files import FlightError, Position, SettingsChoice
 from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
-
-PANEL: Final = "Recordings"
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
 SmoothOption = Annotated[
@@ -154,7 +152,7 @@ def refusing() -> Iterator[None]:
 
 
 if TYPE_CHECKING:
-    from gateway.config import GatewaySettings
+    pass
 
 Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""
@@ -165,11 +163,6 @@ def recordings_folder(config: Path | None) -> Path:
     if config is None and is_running():
         return Path(ask("record.status")["folder"])
     return folder_of(read_settings(config))
-
-
-def folder_of(settings: GatewaySettings) -> Path:
-    """Return the folder of recordings in these settings."""
-    return Path(settings.recording.folder).expanduser()
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:

@@ -56,6 +56,11 @@ def read_settings(file: Path | None) -> GatewaySettings:
     return or_refuse(lambda: load_settings(file))
 
 
+def folder_of(settings: GatewaySettings) -> Path:
+    """Return the folder of recordings in these settings."""
+    return Path(settings.recording.folder).expanduser()
+
+
 def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
     """Load the settings of single aircraft."""
     from gateway.config import ConfigError, load_aircraft
