@@ -54,7 +54,7 @@ class FusionSettings(Settings, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class FlightTrack:
-    """Attitude, place and velocity at N times."""
+    """Attitude, position and velocity at N times."""
 
     time_us: IntArray
     q_nb: FloatArray
@@ -66,7 +66,7 @@ class FlightTrack:
     """Shape (N, 3), NED."""
 
     def where_valid(self, flags: IntArray) -> "FlightTrack":
-        """Set to NaN what the estimator does not flag as valid.
+        """Set values to NaN that the estimator does not flag as valid.
 
         An attitude counts as known without a heading only if there never is one.
         """
@@ -196,7 +196,7 @@ def fixes_of(flight: Flight) -> Fixes:
 
 @dataclass(frozen=True, slots=True)
 class LocalFrame:
-    """Metres north and east of one place."""
+    """Metres north and east of one position."""
 
     lat_deg: float
     lon_deg: float

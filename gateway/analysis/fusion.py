@@ -18,6 +18,7 @@ from gateway.estimation.columns import (
     NAV_COLUMNS,
     NAV_FLAGS,
     NAV_LAT,
+    NAV_LON,
     NAV_QUAT,
     NAV_VEL,
     GpsRow,
@@ -48,7 +49,7 @@ def fuse(flight: Flight, settings: FusionSettings) -> FlightTrack:
     """Fuse a flight with the estimator selected in the settings."""
     estimator = make_estimator(settings.estimation)
     if isinstance(estimator, KernelEstimator):
-        return _fuse_at_once(flight, estimator)
+        return _track_of_rows(flight, estimator.run(sample_log(flight, estimator.fix_row)))
     return track_of_states(_states_by_sample(flight, estimator))
 
 
@@ -92,25 +93,16 @@ def sample_log(flight: Flight, fix_row: Callable[[GpsFix], GpsRow]) -> SampleLog
     )
 
 
-def _fuse_at_once(flight: Flight, estimator: KernelEstimator) -> FlightTrack:
-    return _track_of_rows(flight, estimator.run(sample_log(flight, estimator.fix_row)))
-
-
 def _track_of_rows(flight: Flight, out: FloatArray) -> FlightTrack:
-    return _track(
-        flight,
-        out[:, NAV_QUAT : NAV_QUAT + 4],
-        out[:, NAV_LAT : NAV_ALT + 1],
-        out[:, NAV_VEL : NAV_VEL + 3],
-        out[:, NAV_FLAGS],
+    track = FlightTrack(
+        time_us=flight.time_us,
+        q_nb=out[:, NAV_QUAT : NAV_QUAT + 4],
+        lat_deg=out[:, NAV_LAT],
+        lon_deg=out[:, NAV_LON],
+        alt_amsl_m=out[:, NAV_ALT],
+        vel_n_mps=out[:, NAV_VEL : NAV_VEL + 3],
     )
-
-
-def _track(
-    flight: Flight, q_nb: FloatArray, place: FloatArray, vel: FloatArray, flags: FloatArray
-) -> FlightTrack:
-    track = FlightTrack(flight.time_us, q_nb, place[:, 0], place[:, 1], place[:, 2], vel)
-    return track.where_valid(flags.astype(np.int64))
+    return track.where_valid(out[:, NAV_FLAGS].astype(np.int64))
 
 
 def _states_by_sample(flight: Flight, estimator: Estimator) -> list[NavState]:

@@ -155,7 +155,7 @@ def flight_of_blocks(
 
 @dataclass(frozen=True, slots=True)
 class _Arrays:
-    """What a flight takes of a block."""
+    """The columns of a flight in one block of a recording."""
 
     time_us: IntArray
     accel_b_mps2: FloatArray
@@ -199,7 +199,7 @@ def _arrays_of(cells: FloatArray, calibration: NodeCalibration) -> _Arrays:
 
 
 def _track_of_cells(states: FloatArray) -> FlightTrack:
-    """Take a track out of cells of `NAV_COLUMNS`, only what the states vouch for."""
+    """Make a track of cells of `NAV_COLUMNS`, with the values that their flags mark as valid."""
     at = {name.removeprefix("nav_"): k for k, name in enumerate(NAV_CODEC.columns)}
     track = FlightTrack(
         time_us=states[:, at["time_us"]].astype(np.int64),

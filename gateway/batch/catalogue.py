@@ -72,7 +72,7 @@ _FILE_COLUMNS: Final = {
 _SQL: Final = {int | None: "INTEGER", float | None: "REAL", str | None: "TEXT"}
 _FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(FlightFacts).items()}
 COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
-"""What a query may use."""
+"""Columns that a query may use."""
 _PLACE: Final = struct.Struct("<iii")
 """Latitude and longitude in 1e-7 deg, height in cm."""
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
@@ -90,12 +90,12 @@ Row = dict[str, Any]
 
 
 class CatalogueError(Exception):
-    """A catalogue that cannot be read, or a question that it does not understand."""
+    """A catalogue that cannot be read, or an invalid query."""
 
 
 @dataclass(frozen=True, slots=True)
 class CataloguedFile:
-    """One file of the catalogue, and what is in it."""
+    """One file of the catalogue, and its flights."""
 
     path: str
     """From the folder of the catalogue on."""
@@ -117,40 +117,40 @@ class Catalogue:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder / CATALOGUE_NAME
-        with _told(self.path), ExitStack() as opened:
+        with _with_advice(self.path), ExitStack() as opened:
             self._db = opened.enter_context(closing(sqlite3.connect(self.path, timeout=BUSY_S)))
             if not self._is_made():
                 self._make()
             opened.pop_all()
 
     def close(self) -> None:
-        """Keep what was added."""
-        with _told(self.path), closing(self._db):
+        """Commit the changes, and close the catalogue."""
+        with _with_advice(self.path), closing(self._db):
             self._db.commit()
 
     def known(self) -> dict[str, tuple[int, int, str]]:
         """Return size, time of modification and digest of every file."""
-        with _told(self.path):
+        with _with_advice(self.path):
             rows = self._db.execute("SELECT DISTINCT path, size, modified, digest FROM flights")
             return {path: (size, modified, digest) for path, size, modified, digest in rows}
 
     def put(self, files: Iterable[CataloguedFile]) -> None:
-        """Put files in the place of what was known of them, all or none."""
-        with _told(self.path), self._db:
+        """Replace the rows of files, all or none."""
+        with _with_advice(self.path), self._db:
             for file in files:
-                self._forget(file.path)
+                self._delete(file.path)
                 self._insert(file)
 
     def touch(self, path: str, modified_ns: int) -> None:
         """Note that a file has another time of modification and the same bytes."""
-        with _told(self.path), self._db:
+        with _with_advice(self.path), self._db:
             self._db.execute("UPDATE flights SET modified = ? WHERE path = ?", (modified_ns, path))
 
     def discard(self, paths: Iterable[str]) -> None:
         """Drop files that are gone."""
-        with _told(self.path), self._db:
+        with _with_advice(self.path), self._db:
             for path in paths:
-                self._forget(path)
+                self._delete(path)
 
     def _is_made(self) -> bool:
         return bool(self._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA)
@@ -170,7 +170,7 @@ class Catalogue:
             self._db.execute("CREATE TABLE tracks (id INTEGER PRIMARY KEY, places BLOB NOT NULL)")
             self._db.execute(f"PRAGMA user_version = {SCHEMA}")
 
-    def _forget(self, path: str) -> None:
+    def _delete(self, path: str) -> None:
         ids = "SELECT id FROM flights WHERE path = ?"
         self._db.execute(f"DELETE FROM tracks WHERE id IN ({ids})", (path,))
         self._db.execute("DELETE FROM flights WHERE path = ?", (path,))
@@ -189,7 +189,7 @@ class Catalogue:
 
 
 def find_flights(folder: Path, where: str = "") -> list[Row]:
-    """Ask a catalogue.
+    """Return the flights of a catalogue for which a condition holds.
 
     Raises CatalogueError if there is no catalogue, or the condition is none.
     """
@@ -249,12 +249,12 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
 def _asked(folder: Path) -> Iterator[sqlite3.Connection]:
     """Open a catalogue for reading alone."""
     path = folder / CATALOGUE_NAME
-    # An indexing that found no room leaves an empty file.
+    # An indexing on a full disk leaves an empty file.
     if not path.exists() or not path.stat().st_size:
         raise CatalogueError(
             f"{folder} has no catalogue yet; `mavgate catalogue {folder}` makes one"
         )
-    with _told(path):
+    with _with_advice(path):
         db = sqlite3.connect(
             f"file:{quote(str(path.absolute()))}?mode=ro", uri=True, timeout=BUSY_S
         )
@@ -313,8 +313,8 @@ def _select(db: sqlite3.Connection, columns: str, where: str) -> Sequence[tuple[
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Say which catalogue SQLite cannot work with, and what to do."""
+def _with_advice(path: Path) -> Iterator[None]:
+    """Raise SQLite's errors as CatalogueError, with the catalogue's path and what to do."""
     try:
         yield
     except sqlite3.Error as error:
@@ -339,7 +339,7 @@ CHUNK_FILES: Final = 8
 LATEST_NS: Final = 2**63 - 1
 """The greatest number that SQLite keeps; a file's time may lie beyond it."""
 KEEP_S: Final = 1.0
-"""What is read is stored so often: an interruption costs no more than that."""
+"""Interval of storing the files that were read: an interruption loses no more."""
 
 Wanted = tuple[str, str]
 """Path from the folder on, and the digest that is known of it or nothing."""
@@ -347,7 +347,7 @@ Wanted = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class IndexReport:
-    """What an indexing did."""
+    """Counts of an indexing."""
 
     read: int = 0
     unchanged: int = 0
@@ -394,7 +394,7 @@ def recordings_below(folder: Path) -> Iterator[Path]:
 
 
 def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedFile:
-    """Read one file for the catalogue; whatever is wrong with it stands in its `error`."""
+    """Read one file for the catalogue; its `error` is the reason why it cannot be read."""
     name, known_digest = wanted
     path = folder / name
     found = CataloguedFile(as_text(name), as_text(recording_name(path)), None, 0, 0, "")

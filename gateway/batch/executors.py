@@ -32,7 +32,7 @@ Result = TypeVar("Result")
 
 
 class WorkError(Exception):
-    """What the work says in words of its own when it cannot be done."""
+    """Work that cannot be done; the text says why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class Executor(Protocol):
     def run(
         self, work: Callable[[Item], Result], items: Sequence[Item]
     ) -> Iterator[tuple[int, Result | WorkFailed]]:
-        """Yield the number of each item and what came out, as it is done.
+        """Yield the number of each item and its result, as it is done.
 
         An exception of the work fails that item alone; where a process or machine dies, its items
         are done again by others, and one that kills all who take it fails.
@@ -95,7 +95,7 @@ class LocalProcesses:
 def _run_in_one_pool(
     work: Callable[[Item], Result], items: Sequence[Item], queue: deque[int], jobs: int
 ) -> Any:
-    """Work the queue off as long as no process dies; return what was being worked at then."""
+    """Work the queue off until a process dies; return the items that were in work then."""
     running: dict[Future[Result], int] = {}
     with _processes(jobs) as pool:
         while queue or running:
@@ -114,7 +114,7 @@ def _run_in_one_pool(
 
 
 def failure_of(error: BaseException) -> WorkFailed:
-    """Say what was wrong."""
+    """Describe the error of an item."""
     if isinstance(error, WorkError):
         return WorkFailed(str(error))
     if isinstance(error, OSError) and error.filename:
@@ -203,7 +203,7 @@ class DaskCluster:
             raise
 
     def close(self) -> None:
-        """Leave the cluster; what it still does for this client is given up."""
+        """Leave the cluster; its unfinished work for this client is cancelled."""
         self._client.close()
 
     def run(
@@ -260,7 +260,7 @@ def prepare_worker() -> str:
 
 
 def _keep_freed_memory() -> None:
-    """Have the C library keep what is freed, up to `KEPT_BYTES`, for the next flight.
+    """Have the C library keep freed memory, up to `KEPT_BYTES`, for the next flight.
 
     Dask's nanny sets MALLOC_TRIM_THRESHOLD_ to 64 KiB, so that every large array costs new pages:
     a third of the time that a flight takes.

@@ -114,16 +114,16 @@ def _distances_m(
 
 POINT_US: Final = US_PER_S // 10
 """Positions nearer in time than this add nothing new of a flight."""
-SILENCE_STEPS: Final = 2.5
+OUTAGE_STEPS: Final = 2.5
 """So many usual intervals without a fix are an outage, where fixes come seldom."""
 EARLIEST_US: Final = 315_532_800 * US_PER_S
-"""1980, when GPS began: what is earlier counts from the start of a clock."""
+"""1980, when GPS began: an earlier time counts from the start of a clock."""
 LOST_STEP: Final = 1.5
 """So many usual intervals between two samples are a loss."""
 
 
 class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """One flight in the catalogue; None is what is not known.
+    """One flight in the catalogue; None is unknown.
 
     The names are those of the columns that a query may use.
     """
@@ -153,7 +153,7 @@ class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
     takeoff_lon: float | None = None
     """Where it left the ground, deg."""
     gps_outages: int | None = None
-    """Silences of the GPS."""
+    """GPS outages."""
     gps_lost: float | None = None
     """All of them together, s."""
     faults: int | None = None
@@ -177,7 +177,7 @@ UNITS: Final = {
 
 
 class FlightTally:
-    """Gathers what is known of one vehicle while its recording goes by."""
+    """Collect the facts of one vehicle while its recording is read."""
 
     def __init__(self) -> None:
         self.way = GroundDistance()
@@ -238,11 +238,11 @@ class FlightTally:
         if not len(fixed):
             return None, None
         usual_s = float(np.median(np.diff(times))) / US_PER_S if len(times) > 1 else 0.0
-        longest_s = max(OUTAGE_S, SILENCE_STEPS * usual_s)
+        longest_s = max(OUTAGE_S, OUTAGE_STEPS * usual_s)
         last_us = max(end_us or 0, int(fixed[-1]))
-        silences_s = np.diff(np.append(fixed, last_us)) / US_PER_S
+        gaps_s = np.diff(np.append(fixed, last_us)) / US_PER_S
         # A clock that jumps by days is no gap.
-        outages = silences_s[(silences_s > longest_s) & (silences_s <= DAY_US / US_PER_S)]
+        outages = gaps_s[(gaps_s > longest_s) & (gaps_s <= DAY_US / US_PER_S)]
         return len(outages), float(outages.sum())
 
 
@@ -291,7 +291,7 @@ LOOKED_AT: Final = np.array(
     ]
 )  # fmt: skip
 ERROR: Final = 3
-"""MAV_SEVERITY_ERROR; what is less is worse."""
+"""MAV_SEVERITY_ERROR; lower numbers are more severe."""
 FIX_2D: Final = 2
 
 _POSITION: Final = struct.Struct("<Iiiiihh")
@@ -303,7 +303,7 @@ _PARAMETER: Final = struct.Struct("<4s4x16s")
 CHECKSUM_DIGITS: Final = 12
 
 Flown = tuple[FlightFacts, list[Place]]
-"""What is known of a flight, and its track."""
+"""The facts of a flight, and its track."""
 
 
 class RowsTally:
@@ -335,7 +335,7 @@ class RowsTally:
             self._states.add_position(row.time_us, place3, speed_mps)
 
     def add_status(self, status: NodeStatus) -> None:
-        """Count what a node reports as failed since its last report."""
+        """Count the failures of a node since its last report."""
         before = self._nodes.get(status.node.node_id)
         errors, failed = (before.bus_errors, before.sensors_failed) if before else (0, 0)
         # A restart sets the counter back.
@@ -488,7 +488,7 @@ class TlogTally:
 
 
 class _Sent:
-    """What one vehicle sent."""
+    """Facts of one vehicle from the messages that it sent."""
 
     def __init__(self) -> None:
         self._tally = FlightTally()

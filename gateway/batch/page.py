@@ -66,7 +66,7 @@ def write_season_page(
     Path
         The page.
     """
-    # They need what may be missing: see the command.
+    # They need the extra plot, for which the command has looked.
     from gateway.analysis.reporting.page import Fact, Report, ReportTable, Section, write_report
 
     errors = errors_of(results)

@@ -35,7 +35,7 @@ class Lead:
 
     @property
     def text(self) -> str:
-        """Say it in one sentence."""
+        """Describe it in one sentence."""
         change = f"{_percent(self.ratio)} error over {counted(self.flights, 'flight')}"
         if self.p is None or self.low is None or self.high is None:
             return f"{change}, all of one aircraft and day: it cannot be separated from chance"
@@ -70,7 +70,7 @@ def lead_of(
     Returns
     -------
     Lead or None
-        None if no flight knows both.
+        None if both are known of no flight.
     """
     known = np.isfinite(errors) & np.isfinite(others) & (errors > 0.0) & (others > 0.0)
     if not known.any():
@@ -105,7 +105,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What a season's sweep found."""
+    """Result of a season's sweep."""
 
     winner: int
     """Point of the grid with the least mean error over all flights."""
@@ -117,7 +117,7 @@ class Choice:
     stable: int
     """Folds without which the same point wins."""
     over_base: Lead | None
-    """Lead of what the other folds chose over the settings that the flights came with."""
+    """Lead of the other folds' choice over the settings that the flights came with."""
     over_second: Lead | None
     """Lead of the winner over the second; both were chosen by the same flights."""
 
@@ -141,7 +141,7 @@ def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choic
     Raises
     ------
     ValueError
-        If no flight knows the errors of all points.
+        If the errors of all points are known of no flight.
     """
     known = np.asarray((np.isfinite(errors) & (errors > 0.0)).all(axis=1))
     if not known.any():

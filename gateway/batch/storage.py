@@ -20,22 +20,22 @@ from gateway.recordings.files import CHUNK, GZIP
 from gateway.recordings.index import parts_together, recording_name
 
 MARK: Final = "://"
-"""What makes a name a URL."""
+"""Separates the scheme of a URL from the rest; no local path has it."""
 OF_ONE_PROCESS: Final = "memory"
 """A file system that no other process sees: its files travel with the work."""
 HERE: Final = "file"
 """The file system that needs no package."""
 REMOTE_ENDINGS: Final = (*ENDINGS, ".parquet", ".ulg", ".bin")
-"""Of recordings in a folder elsewhere, whose files are not opened only to see what they are."""
+"""Of recordings in a folder elsewhere, whose files are not opened to recognise their format."""
 STAMPS: Final = (
     "ETag", "etag", "md5Hash", "generation", "mtime", "LastModified", "last_modified", "updated",
 )  # fmt: skip
-"""What storages call that by which a changed file is known."""
+"""Keys under which storages report the version or the last change of a file."""
 PACKAGES: Final = {
     "s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "sftp": "paramiko",
     "ssh": "paramiko", "az": "adlfs", "abfs": "adlfs", "http": "aiohttp", "https": "aiohttp",
 }  # fmt: skip
-"""What fsspec needs in addition, by the scheme of the URL."""
+"""Packages that fsspec needs in addition, by the scheme of the URL."""
 _USER: Final = re.compile(r"(?<=://)[^/@]*@")
 
 
@@ -59,7 +59,7 @@ class BatchItem(msgspec.Struct, frozen=True):
 
     @property
     def place(self) -> str:
-        """Where its first part is: what it is called; without a user's name and password."""
+        """Path or URL of its first part, without a user's name and password."""
         return without_user(self.parts[0].place)
 
     @property
@@ -74,7 +74,7 @@ def is_url(name: str) -> bool:
 
 
 def without_user(url: str) -> str:
-    """Return a URL as it may be shown and kept: what logs in is left out."""
+    """Return a URL without user name and password, as it may be shown and kept."""
     return _USER.sub("", url)
 
 
@@ -100,10 +100,10 @@ def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem
 
 
 def stamp_of_item(item: BatchItem) -> str:
-    """Return what changes when a recording does, in hexadecimal digits.
+    """Return a digest that changes when a recording does, in hexadecimal digits.
 
-    That is the SHA-256 of its files, or of what their storage says of them, where they need not be
-    fetched for it; raises OSError and StorageError.
+    That is the SHA-256 of its files, or of the versions that their storage reports, so that
+    nothing is fetched for it; raises OSError and StorageError.
     """
     if item.is_fetched:
         stamps = [_stamp_of(part) for part in item.parts]

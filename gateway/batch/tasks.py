@@ -47,7 +47,7 @@ HELD: Final = "held_m"
 
 
 class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out for one recording, as it is kept."""
+    """Result of a task on one recording, as it is stored."""
 
     place: str
     """Path or URL of its first file."""
@@ -63,7 +63,7 @@ class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     figures: dict[str, Any] = {}
     """JSON alone."""
     files: tuple[str, ...] = ()
-    """What was written, from the folder of the results on."""
+    """Files that were written, relative to the folder of the results."""
 
 
 Files = Mapping[str, bytes]
@@ -71,7 +71,7 @@ Files = Mapping[str, bytes]
 
 @dataclass(frozen=True, slots=True)
 class Worked:
-    """What a task gives for one recording."""
+    """Outcome of a task on one recording, before it is stored."""
 
     vehicle: int | None
     began: str | None
@@ -89,7 +89,7 @@ class FlightTask(Protocol):
 
     @property
     def fingerprint(self) -> bytes:
-        """All that changes what comes out, but for the recording and the version."""
+        """All that affects the result, except the recording and the version."""
         ...
 
     def do(self, files: list[Path], name: str) -> Worked:
@@ -145,7 +145,7 @@ class ReportTask(_JudgingTask):
     name: ClassVar[str] = "report"
 
     def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:  # noqa: ARG002
-        # They need what may be missing, and load for a second.
+        # They need the extra plot, and take a second to import.
         from gateway.analysis.reporting.compose import make_report
         from gateway.analysis.reporting.page import write_report
 
@@ -191,7 +191,7 @@ class SweepTask(_ReadingTask):
 
 @dataclass(frozen=True)
 class InfoTask(_ReadingTask):
-    """Describe what is in each file."""
+    """Describe the content of each file."""
 
     name: ClassVar[str] = "info"
 
@@ -209,7 +209,7 @@ class InfoTask(_ReadingTask):
 
 @dataclass(frozen=True, slots=True)
 class ReadFlight:
-    """A flight, and what its file holds in addition to the samples."""
+    """A flight, and the facts in the head of its file."""
 
     flight: Flight
     header: Any
@@ -237,7 +237,7 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
 
 
 def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[FlightResult, Files]:
-    """Do a task on one recording; whatever is wrong with it stands in the result."""
+    """Do a task on one recording; the `error` of the result is the reason of a failure."""
     item, stamp, key, name = known
     result = FlightResult(
         place=as_text(item.place), digest=stamp, key=key, task=task.name, version=__version__
@@ -281,7 +281,7 @@ def options_bytes(options: ReadOptions) -> bytes:
 
 
 def without_secrets(options: ReadOptions) -> ReadOptions:
-    """Take out what no other machine needs to know: the passphrase that signs."""
+    """Leave out the signing passphrase, which no other machine needs."""
     current = options.current
 
     def plain(aircraft: Any) -> Any:
@@ -297,7 +297,7 @@ def without_secrets(options: ReadOptions) -> ReadOptions:
 
 
 def name_of(item: BatchItem) -> str:
-    """Return what a recording is called in the folder of the results."""
+    """Return the name of a recording in the folder of the results."""
     name = as_text(recording_name(Path(item.place)))
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
@@ -305,7 +305,7 @@ def name_of(item: BatchItem) -> str:
 
 
 def _figures(case: Case) -> dict[str, Any]:
-    """Sum one flight up; what is not known is left out, for JSON has no word for it."""
+    """Sum one flight up; unknown values are left out, since JSON has none."""
     known = {name: value for name, value in summarise(case).items() if value == value}
     held = {name: withheld_error_m(case, name) for name in case.tracks}
     return {"summary": known, HELD: {name: m for name, m in held.items() if m == m}}
@@ -328,7 +328,7 @@ class ResultFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs out, and remove what was left half written: by a killed one, or by this.
+        """Keep other runs out, and remove partial files, of a killed run or of this one.
 
         Raises OSError if another run is at work in it.
         """
@@ -360,7 +360,7 @@ class ResultFolder:
             path = staged / name
             path.parent.mkdir(parents=True, exist_ok=True)
             write_new(path, [content])
-        # What belongs together (a page and its figures) is a folder, and is put in place at once.
+        # Files that belong together (a page and its figures) are a folder, put in place at once.
         for unit in {Path(*Path(name).parts[:2]) for name in files}:
             target = self.folder / unit
             target.parent.mkdir(exist_ok=True)
@@ -371,7 +371,7 @@ class ResultFolder:
         write_new(self._path(result.key), [msgspec.json.encode(result)], overwrite=True)
 
     def _clear(self) -> None:
-        """Remove what was not put in its place."""
+        """Remove the files that were not put in their place."""
         shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
 
     def _path(self, key: str) -> Path:
@@ -409,9 +409,9 @@ def _read(path: Path) -> FlightResult | None:
 
 
 Report = Callable[[str, int, int], None]
-"""Called with what was done last, how many are done, and of how many."""
+"""Called with the item that was done last, how many are done, and of how many."""
 LOOKING: Final = "looking for changes"
-"""What is done first: it decides which recordings are to be worked on."""
+"""The first step: it decides which recordings are to be worked on."""
 
 
 def run_season(

@@ -1,4 +1,4 @@
-"""What a recording answers to ground stations, and which of its frames must not be played.
+"""The answers of a recording to ground stations, and the frames that must not be played.
 
 A tlog holds the answers that the vehicle gave in flight. They are collected while the file is
 indexed, each with the time from which it was valid, so that a player can give them again: as of

@@ -267,7 +267,7 @@ def check_times(row: TableRow) -> None:
 
 
 Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
-"""What the log of another program holds."""
+"""Records of another program's log."""
 
 
 class RowBuilder:
@@ -317,7 +317,7 @@ class RowBuilder:
 
 
 def _calibrated(fused: FusedSample) -> ImuCalibrated:
-    """Take from a sample what the table keeps; filtered values can be computed again."""
+    """Return the part of a sample that the table keeps."""
     sample = fused.sample
     return ImuCalibrated(
         sample.time_us,
@@ -430,7 +430,7 @@ def settle(cells: FloatArray) -> dict[int, str]:
     Returns
     -------
     dict
-        What is wrong, by the number of the row.
+        The reason why a row is invalid, by its number.
     """
     for group in (RAW, SI, MAG, BARO, GPS, NAV):
         cells[np.isnan(cells[:, group.start]), group] = np.nan
@@ -458,7 +458,7 @@ def _is_bad(cells: FloatArray) -> BoolArray:
 
 
 def _fault(row: FloatArray) -> str:
-    """Say what is wrong with a row that cannot be."""
+    """Return why a row is invalid."""
     for k in _WHOLE.tolist():
         if not np.isnan(row[k]) and not (abs(row[k]) <= LARGEST_WHOLE and row[k] == int(row[k])):
             return f"{COLUMNS[k]}: {row[k]:.17g} is no whole number that can be"
@@ -492,7 +492,7 @@ def write_lines(cells: FloatArray, is_whole: BoolArray = IS_WHOLE) -> bytes:
 
 
 def _texts(column: FloatArray, is_whole: bool) -> list[object]:
-    """Return what JSON's writer gives the digits of a column for."""
+    """Return the values whose digits JSON's writer gives for a column."""
     empty = np.isnan(column)
     if empty.all():
         return [None] * len(column)

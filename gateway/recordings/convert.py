@@ -124,7 +124,7 @@ WRITERS: Final[dict[str, Write]] = {}
 
 @dataclass(frozen=True, slots=True)
 class Lacks:
-    """What a format cannot hold, as text."""
+    """The content that a format cannot hold, as text."""
 
     of_tables: str = ""
     of_tlogs: str = ""

@@ -67,11 +67,11 @@ NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of 
 
 
 class FlightError(Exception):
-    """A file without the data that a command needs; the text says what and where."""
+    """A file without the data that a command needs; the text names the data and the file."""
 
 
 class FileKind(StrEnum):
-    """What a file holds."""
+    """Kind of a file, by its first bytes."""
 
     TLOG = "tlog"
     TABLE = "table"
@@ -355,7 +355,7 @@ class TlogSource:
     layout: Layout
     timeline: Timeline
     remarks: tuple[str, ...] = ()
-    """What the user should know of its times."""
+    """Remarks for the user about its times."""
     civil_us_at_zero: int = 0
     by_size: bool = False
     """Whether frames of a bare capture are spaced by their size."""

@@ -94,7 +94,7 @@ from gateway.sensing.imu_log import ImuLog, IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.actions import INFO, StatusText
 
-LONGEST_SILENCE_US: Final = 1_000_000
+LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""
 
 
@@ -146,7 +146,7 @@ class Replay:
     def _wait(self, until_us: int) -> Iterator[tuple[int, Action]]:
         """Run the timed actions before the next record; the clock never goes back."""
         now_us = until_us if self._now_us is None else max(self._now_us, until_us)
-        if self._now_us is None or now_us - self._now_us > LONGEST_SILENCE_US:
+        if self._now_us is None or now_us - self._now_us > LONGEST_GAP_US:
             self._now_us = now_us
         while (due_us := max(self._pipeline.next_due_us(), self._now_us)) < now_us:
             self._now_us = due_us
@@ -374,8 +374,8 @@ def _sample_log(cells: FloatArray, chain: SensorChain, estimator: KernelEstimato
 
 
 HEAD_LINES: Final = 20
-DOUBTFUL_S: Final = 0.03
-"""A position may be so much later than the velocity of the same fix, which alone is compared."""
+LATENCY_TOLERANCE_S: Final = 0.03
+"""The position may lag the velocity of the same fix by this much; only the velocity is compared."""
 _KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
 USUAL: Final = ReferenceSettings()
 
@@ -437,7 +437,9 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
     """Add a remark where the motion of a recording speaks against the latency that is set."""
     set_s = aircraft.estimation.reference.gps_latency_s
     found = estimate_latency(_samples_of(table, aircraft))
-    if found is not None and abs(found.latency_s - set_s) > max(DOUBTFUL_S, 3.0 * found.std_s):
+    if found is None:
+        return
+    if abs(found.latency_s - set_s) > max(LATENCY_TOLERANCE_S, 3.0 * found.std_s):
         table.remarks.append(
             f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
             f"but gps_latency_s is {set_s:.2f} s"
@@ -513,7 +515,7 @@ class RowFusion:
         """Why states of the file were not restored."""
 
     def blocks(self, blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
-        """Yield what a file holds, with the new states; a row that holds nothing is left out."""
+        """Yield the blocks of a file with the new states; rows without a record are left out."""
         for block in blocks:
             cells = block.cells
             held = np.any([has_group(cells, group) for group in (BARO, GPS, RAW, SI)], axis=0)
@@ -554,9 +556,9 @@ class RowFusion:
         samples = cells[has_sample]
         log = imu_log_of(samples, self._aircraft.chain)
         states = self._aircraft.fuse(log, heard_of(cells, self._aircraft.vehicle_id))
-        # A row that stands without an IMU sample has the time of its newest record.
-        told_us = np.where(has_group(cells, GPS), cells[:, GPS.start], cells[:, BARO.start])
-        found[~has_sample, 0] = told_us[~has_sample]
+        # A row without an IMU sample has the time of its newest record.
+        newest_us = np.where(has_group(cells, GPS), cells[:, GPS.start], cells[:, BARO.start])
+        found[~has_sample, 0] = newest_us[~has_sample]
         found[has_sample & ~has_counts, NODE_ID] = 0.0
         found[has_sample, SI] = np.column_stack(
             [log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.temperature_degc]

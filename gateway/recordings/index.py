@@ -68,7 +68,7 @@ def recording_name(path: Path) -> str:
 
 
 def as_text(name: str) -> str:
-    r"""Return a file's name as it can be printed and stored: what is not UTF-8 as `\xNN`."""
+    r"""Return a file's name as it can be printed and stored: bytes that are not UTF-8 as `\xNN`."""
     return os.fsencode(name).decode(errors="backslashreplace")
 
 
@@ -156,7 +156,7 @@ def move_recording(folder: Path, name: str, to_name: str) -> Recording:
 
 
 def delete_recording(folder: Path, name: str) -> Recording:
-    """Delete the files of a recording and return what they were.
+    """Delete the files of a recording, and return it.
 
     Raises RecordingError if there is no such recording.
     """

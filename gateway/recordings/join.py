@@ -93,7 +93,7 @@ def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
 
 
 def _without(block: TableBlock, count: int) -> TableBlock:
-    """Leave out the first rows, and what was remarked there; what was changed still holds."""
+    """Leave out the first rows and their remarks, but keep changes of settings."""
     comments = tuple(
         (max(row - count, 0), comment)
         for row, comment in block.comments

@@ -67,7 +67,7 @@ class TlogFile:
         self.path = path
         source = open_tlog(path)
         self.remarks = source.remarks
-        """What the user should know of its times."""
+        """Remarks for the user about its times."""
         is_plain = source.layout is Layout.TLOG and not is_packed(path)
         self._file = open_descriptor(path) if is_plain else _plain_copy(source, unpacked_limit)
         self.index = TlogIndex(source.timeline)
@@ -156,7 +156,7 @@ class FusedTlog:
     def close(self) -> None:
         """Delete the generated frames."""
         with suppress(OSError):
-            # What found no room is written again.
+            # Closing tries again to write the bytes that a full disk had refused.
             self._file.close()
 
     def _make(self) -> bool:
@@ -186,7 +186,7 @@ class OpenFlight:
     sources: list[Source] = field(default_factory=list)
     answers: LogAnswers = field(default_factory=LogAnswers)
     remarks: list[str] = field(default_factory=list)
-    """What the user should know."""
+    """Remarks for the user."""
 
     @property
     def first_us(self) -> int:
@@ -256,7 +256,7 @@ def open_flights(
 
 
 def lay_out(
-    flights: Sequence[OpenFlight], wished: Sequence[int] = (), *, with_commands: bool
+    flights: Sequence[OpenFlight], wanted_ids: Sequence[int] = (), *, with_commands: bool
 ) -> list[PlayedFlight]:
     """Give each vehicle its own system id, and recordings of different days the same start."""
     begin_us, end_us = flights[0].first_us, flights[0].last_us
@@ -267,7 +267,7 @@ def lay_out(
         shift_us = 0 if together else begin_us - flight.first_us
         system_ids: dict[int, int] = {}
         for place, system_id in enumerate(flight.vehicles):
-            wanted = wished[number] + place if number < len(wished) else system_id
+            wanted = wanted_ids[number] + place if number < len(wanted_ids) else system_id
             while wanted in used or wanted >= FIRST_GROUND_STATION:
                 wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
             used.add(wanted)

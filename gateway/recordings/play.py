@@ -171,7 +171,7 @@ class Track:
         return telemetry_of(batch, begin, self._source.index.stations)
 
     def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
-        """Yield what is played, numbered as if the left out answers had never been sent.
+        """Yield the records to play; sequence numbers have no gap where answers are left out.
 
         `begin` is the first record of the first batch.
         """
@@ -389,7 +389,7 @@ class Player:
             if track is None:
                 self._end(now_us)
                 break
-            self._skip_silence(track, now_us)
+            self._skip_gap(track, now_us)
             if self._due_us(track) > now_us:
                 break
             frames.append(self._take(track))
@@ -438,13 +438,13 @@ class Player:
         # Rounded up: a frame must not be due before its time.
         return anchor_now_us + math.ceil((time_us - anchor_time_us) / self._speed)
 
-    def _skip_silence(self, track: Track, now_us: int) -> None:
+    def _skip_gap(self, track: Track, now_us: int) -> None:
         """Set a new anchor if the next frame is too far away, or the recorded clock went back."""
         time_us = track.peek_us() or 0
-        silence_us = time_us - self._last_us
+        gap_us = time_us - self._last_us
         longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
-        fell = silence_us < -US_PER_S
-        if silence_us <= longest_us and not fell:
+        fell = gap_us < -US_PER_S
+        if gap_us <= longest_us and not fell:
             return
         kept_us = 0 if fell or self.max_gap_us is None else self.max_gap_us
         due_last_us = self._anchor[0] + math.ceil((self._last_us - self._anchor[1]) / self._speed)

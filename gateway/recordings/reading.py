@@ -1,4 +1,7 @@
-"""What commands say of flights before they read one; it imports nothing that takes time."""
+"""Open any recording as a table: the reader of its format, and the settings to fuse it with.
+
+Readers that need large packages are imported with the first file of their format.
+"""
 
 import codecs
 import heapq
@@ -85,8 +88,8 @@ class RecordedTable:
 
     header: TableHeader
     blocks: Iterator[TableBlock]
-    """A header among the rows holds settings that were changed in flight, a state of what the
-    fusion remembered there, a mark of what somebody remarked."""
+    """A header among the rows is a change of settings in flight, a state is that of the fusion at
+    this row, and a mark is a remark of the operator."""
     remarks: list[str] = field(default_factory=list)
     """Remarks about the file for the user; complete once the rows are read."""
 

@@ -97,7 +97,7 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class VehicleInfo:
-    """What one system of a recording sent."""
+    """Summary of one system of a recording."""
 
     system_id: int
     mav_type: int | None
@@ -109,7 +109,7 @@ class VehicleInfo:
 
 @dataclass(frozen=True, slots=True)
 class FileInfo:
-    """What a recording holds."""
+    """Summary of a recording."""
 
     kind: str
     size: int
@@ -167,11 +167,11 @@ class TimesSpan:
 
     first_us: int | None = None
     _begin_us: int = 0
-    """Of what is between two leaps."""
+    """Begin of the stretch since the last leap."""
     _newest_us: int = 0
     _last_us: int = 0
     _before_us: int = 0
-    """Length of what was before that."""
+    """Length of the stretches before that."""
 
     @property
     def length_us(self) -> int:
@@ -450,7 +450,7 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
     Parameters
     ----------
     file : Path
-        A tlog, a table, or what can be read as one.
+        A tlog, a table, or a file that can be read as one.
     progress : callable or None
         Called with the number of further bytes read.
     options : callable

@@ -147,12 +147,12 @@ def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeSt
 
 
 TableComment = TableHeader | TableMark | TableFault | FusionState | NodeStatus
-"""What stands between rows."""
+"""A line between rows."""
 
 
 @dataclass(frozen=True, slots=True)
 class TableBlock:
-    """Rows of a stretch of a table as columns, and what stands between them."""
+    """Rows of a stretch of a table as columns, and the lines between them."""
 
     cells: FloatArray
     """Shape (n, len(COLUMNS)); NaN is an empty cell."""
@@ -163,7 +163,7 @@ class TableBlock:
         return len(self.cells)
 
     def events(self, vehicle_id: int) -> Iterator[TableEvent]:
-        """Yield rows and what stands between them, one by one, as of this aircraft."""
+        """Yield rows and the lines between them, one by one, as of this aircraft."""
         begin = 0
         for row, comment in (*self.comments, (len(self), None)):
             for cells in self.cells[begin:row].tolist():
@@ -174,7 +174,7 @@ class TableBlock:
 
 
 def block_of(events: Iterable[TableEvent]) -> TableBlock:
-    """Lay rows, and what stands between them, out as columns."""
+    """Lay rows out as columns, and keep the lines between them."""
     rows: list[tuple[Cell, ...]] = []
     comments: list[tuple[int, TableComment]] = []
     for event in events:
@@ -187,7 +187,7 @@ def block_of(events: Iterable[TableEvent]) -> TableBlock:
 
 
 def encode_block(block: TableBlock) -> bytes:
-    """Write rows and what stands between them, but for faults."""
+    """Write rows and the lines between them, except faults."""
     text, begin = b"", 0
     for row, comment in (*block.comments, (len(block), None)):
         text += write_lines(block.cells[begin:row])
@@ -222,7 +222,7 @@ class TableReader:
         return 1 if self.header is None else self.header.vehicle_id
 
     def feed(self, data: bytes, *, final: bool = False) -> list[TableEvent]:
-        """Take the next bytes of the file, and return what is in them one by one.
+        """Take the next bytes of the file, and return their rows and other lines one by one.
 
         See `feed_block`.
         """
@@ -283,7 +283,7 @@ class TableReader:
     def _joined(
         self, rows: list[bytes], lines: IntArray, comments: list[tuple[int, TableComment]]
     ) -> TableBlock:
-        """Read rows, and put what is none of them to where it stands by the numbers of lines."""
+        """Read rows, and put the other lines in their places by the numbers of lines."""
         if not rows:
             return TableBlock(NO_ROWS, tuple((0, comment) for _, comment in comments))
         text = b"\n".join([*rows, b""])

@@ -38,7 +38,7 @@ from gateway.wire.mavlink_splitter import (
 )
 
 DAY_US: Final = 86_400 * US_PER_S
-"""Records that lie further apart are of different days: nothing is said of what is between."""
+"""Records that lie further apart are of different days: nothing is known of the time between."""
 ORDER_US: Final = 2 * US_PER_S
 """A time that is further before the record before, or behind the next one, is damaged."""
 

@@ -34,7 +34,7 @@ _Accel = Annotated[float, msgspec.Meta(ge=-50, le=50)]
 _Rate = Annotated[float, msgspec.Meta(ge=-10, le=10)]
 _Field = Annotated[float, msgspec.Meta(ge=-1000, le=1000)]
 _Share = Annotated[float, msgspec.Meta(ge=-10, le=10)]
-"""What a sensor can err by: of its full scale the third in acceleration and rate, all in field."""
+"""Bounds of the errors: a third of full scale in acceleration and rate, all of it in field."""
 _Rows = tuple[
     tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share], tuple[_Share, _Share, _Share]
 ]
@@ -189,7 +189,7 @@ def vectors_from_counts(
     counts : ndarray, shape (n, 3)
         Whole numbers.
     ranges : ndarray, shape (n,)
-        What `scaled` takes beside them.
+        Second argument of `scaled` for each.
 
     Returns
     -------
@@ -221,9 +221,9 @@ def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
     ndarray, shape (n, 3)
         NaN unless it is new, none of its axes overflowed, and not all are zero.
     """
-    told = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
+    state = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
     field = vectors_from_counts(mag_from_counts, counts[:, 6:9], counts[:, 12])
-    return np.where((told == int(ImuFlags.MAG_NEW))[:, np.newaxis], field, np.nan)
+    return np.where((state == int(ImuFlags.MAG_NEW))[:, np.newaxis], field, np.nan)
 
 
 class Correction:

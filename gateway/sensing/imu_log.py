@@ -19,7 +19,7 @@ class ImuLog:
     accel_b_mps2: FloatArray
     gyro_b_radps: FloatArray
     mag_b_ut: FloatArray
-    """NaN unless sampled anew."""
+    """NaN unless newly sampled."""
     temperature_degc: FloatArray
     flags: IntArray
     """`ImuFlags`."""

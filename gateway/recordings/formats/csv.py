@@ -40,7 +40,7 @@ MAX_HEAD_LINES: Final = 200
 MAX_SHOWN: Final = 200
 """Characters of the found names in an error."""
 LATE_US: Final = 60 * US_PER_S
-"""What was measured so long before or after its line has a damaged time, or another clock's."""
+"""A value measured this long before or after its line has a damaged time, or another clock's."""
 
 
 class Column(Settings, frozen=True):

@@ -144,7 +144,7 @@ class ArdupilotReader:
         return self._follow() if len(self._held) == AGREEING else []
 
     def flush(self) -> list[Imported]:
-        """Return what still waits at the end of the log."""
+        """Return the records that still wait at the end of the log."""
         held = self._follow() if len(self._held) >= LEAST_AGREEING else []
         self._drop_held()
         return [*held, *self._flush_fix()]

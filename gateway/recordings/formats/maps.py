@@ -222,7 +222,7 @@ def _features(vehicle: VehicleTrack) -> Iterator[dict[str, Any]]:
 
 
 def _parts(points: list[TrackPoint]) -> list[list[TrackPoint]]:
-    """Cut a track at the antimeridian, as the standard asks."""
+    """Cut a track at the antimeridian, as RFC 7946 requires."""
     parts: list[list[TrackPoint]] = [[]]
     before: TrackPoint | None = None
     for point in points:
@@ -270,7 +270,7 @@ _HOME: Final = struct.Struct("<iii")
 _TEXT: Final = struct.Struct("<B50sHB")
 """STATUSTEXT: severity, text, and of a long one its number and which chunk of it."""
 INFO: Final = 6
-"""MAV_SEVERITY_INFO; what is less is for programmers."""
+"""MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
 """The gateway's STATUSTEXT for a marked place."""
 INTERVAL_US: Final = US_PER_S // 5
@@ -287,7 +287,7 @@ class _Drawn:
     attitude_deg: tuple[float, float, float] | None = None
     home: tuple[int, int] | None = None
     early: list[tuple[int, str]] = field(default_factory=list)
-    """What happened before the first position."""
+    """Events before the first position."""
     text_id: int = 0
 
     def add(self, point: TrackPoint) -> None:

@@ -71,7 +71,7 @@ def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
     Returns
     -------
     ndarray, shape (n,)
-        See `layout_of`; what a sender cut off or did not know is zero.
+        See `layout_of`; fields that a sender cut off or did not know are zero.
     """
     layout = layout_of(kind)
     data = np.frombuffer(batch.data, np.uint8)
@@ -92,7 +92,7 @@ DEG_PER_HDG_ACC: Final = 1e-5
 UNKNOWN_U16: Final = 65535
 UNKNOWN_U8: Final = 255
 MAG_FIELDS: Final = 0b111 << 6
-"""HIGHRES_IMU's bits of what is new."""
+"""Bits of the magnetometer in `fields_updated` of HIGHRES_IMU."""
 FIX_2D, FIX_3D = 2, 3
 GPS_NODE: Final = 1
 
@@ -249,10 +249,10 @@ _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
 _PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
 
 _STREAMS: Final = {FIX: 1, PRESSURE: 2, ATTITUDE: 3}
-"""What has a clock of its own besides the IMU, which is 0."""
+"""Streams with a clock of their own, in addition to the IMU, which is 0."""
 
 _BARO, _GPS, _IMU = 1, 2, 3
-"""The order of a row: what is not behind its predecessor in it begins a row."""
+"""The order of a row: a record that is not behind its predecessor in it begins a row."""
 _HEAD: Final = slice(0, 4)
 
 
@@ -265,11 +265,11 @@ class AutopilotReader:
         """Civil time of the rows' time zero, by the times of the recording."""
         self._rank = 0
         self._zero_us = np.zeros(2, np.int64)
-        """What the vehicle's own time, and that of the recording, were at the rows' zero."""
+        """The vehicle's own time, and that of the recording, at the rows' zero."""
         self._newest_us = np.zeros(STREAMS, np.int64)
         """Of each stream, on the rows' clock."""
         self._sampled_us = np.zeros(1, np.int64)
-        """When the newest IMU sample was recorded, or what was first."""
+        """When the newest IMU sample was recorded, or else the first message."""
         self._places = np.empty(0, _PLACE)
         self._places_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
@@ -308,7 +308,7 @@ class AutopilotReader:
         return rows
 
     def _taken(self, batch: Batch) -> IntArray:
-        """Choose what is of the vehicle, and no poorer than others of its kind."""
+        """Choose the messages of the vehicle that are no poorer than others of their kind."""
         wanted = np.flatnonzero(np.isin(batch.message_ids, _WANTED))
         ranks = np.zeros(len(wanted), np.int64)
         for message_id, rank in IMU_RANK.items():
@@ -421,8 +421,8 @@ class AutopilotReader:
                 rows[row, _HEAD], rows[row, SI] = imu_cells(message_id, values, now_us)
         rows[row_of[kinds == _IMU], NAV] = states
         has_sample = np.isin(np.arange(len(rows)), row_of[kinds == _IMU])
-        told_us = np.where(np.isnan(rows[:, GPS.start]), rows[:, BARO.start], rows[:, GPS.start])
-        rows[~has_sample, 0] = told_us[~has_sample]
+        newest_us = np.where(np.isnan(rows[:, GPS.start]), rows[:, BARO.start], rows[:, GPS.start])
+        rows[~has_sample, 0] = newest_us[~has_sample]
         whole = len(rows) - (len(rows) > 0 and not has_sample[-1])
         self._open = rows[whole:]
         return rows[:whole]

@@ -58,7 +58,7 @@ class Pieces:
         self.closed = True
 
     def taken(self) -> bytes:
-        """Return what was written since the last time."""
+        """Return the bytes that were written since the last call."""
         data = b"".join(self._written)
         self._written.clear()
         return data

@@ -323,7 +323,7 @@ BROKEN: Final = (
     *(ValueError, TypeError, LookupError, AttributeError, OverflowError),
     *(struct.error, RecursionError),
 )
-"""What damage makes pyulog raise, in addition to its own error."""
+"""Exceptions of pyulog on a damaged log, in addition to its own."""
 
 
 class _Content(io.BufferedReader):

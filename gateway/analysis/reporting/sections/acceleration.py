@@ -18,8 +18,8 @@ AXIS_NAMES: Final = "xyz"
 
 def acceleration(case: Case) -> Section:
     """Build the section; if the flight's rate is too low for the filters, only their design."""
-    sensing, rate_hz = case.fusion.estimation.paper, case.flight.rate_hz
-    cutoff = sensing.accel_cutoff_hz
+    paper, rate_hz = case.fusion.estimation.paper, case.flight.rate_hz
+    cutoff = paper.accel_cutoff_hz
     if cutoff >= 0.5 * rate_hz:
         return Section(
             "Acceleration filters",
@@ -50,7 +50,7 @@ def acceleration(case: Case) -> Section:
         [
             ReportTable(
                 "filters_flight",
-                compare(sensing, rate_hz),
+                compare(paper, rate_hz),
                 f"At this flight's {rate_hz:.0f} samples/s; times were taken on this machine for "
                 "three axes.",
             ),
