@@ -299,8 +299,7 @@ def main() -> None:
         raise SystemExit("no flight has such a name")
     for flight in track(flights, "scoring", console=Console(stderr=True)):
         board[flight.name] = {
-            name: score(flight, run, whole=name in ("eskf", "smoothed"))
-            for name, run in runs.items()
+            name: score(flight, run, whole=name in OWN) for name, run in runs.items()
         }
         if options.spoilt:
             spoilt[flight.name] = spoilt_scores(flight, run_eskf)
