@@ -57,11 +57,11 @@ def frames(*, v1: bool = False, timed: bool = True) -> Iterator[tuple[int, bytes
 
 def tlog(path: Path, stamps: "list[int] | None" = None, pad: bytes = b"") -> Path:
     """Write a tlog with given stamps, and bytes behind each stamp."""
-    told = [*frames()]
-    times = [BEGIN_US + time_us for time_us, _ in told] if stamps is None else stamps
+    flight = [*frames()]
+    times = [BEGIN_US + time_us for time_us, _ in flight] if stamps is None else stamps
     path.write_bytes(
         b"".join(
-            struct.pack(">Q", t) + pad + frame for t, (_, frame) in zip(times, told, strict=True)
+            struct.pack(">Q", t) + pad + frame for t, (_, frame) in zip(times, flight, strict=True)
         )
     )
     return path
