@@ -1,4 +1,4 @@
-"""Measure a report and a sweep of the simulated flight, beside fusing it sample by sample.
+"""Measure a report and a sweep of the simulated flight.
 
     python tools/bench_analysis.py
 

@@ -1,15 +1,15 @@
 """Measure work on many recordings: one after the other, in processes, on a Dask cluster.
 
     python tools/bench_batch.py                        # all of it, in some 20 minutes
-    python tools/bench_batch.py fuse --flights 24      # or report, sweep: serial beside processes
-    python tools/bench_batch.py dask --flights 24      # fuse: a cluster of two beside processes
+    python tools/bench_batch.py fuse --flights 24      # or report, sweep: serial and in processes
+    python tools/bench_batch.py dask --flights 24      # fuse: a cluster of two, and processes
     python tools/bench_batch.py growth --flights 200   # cost and memory against the number of files
     python tools/bench_batch.py catalogue --files 10000   # a catalogue: index, index again, ask
     python tools/bench_batch.py --quick                # all of it with few, short flights
 
 Recordings are simulated once and stay in --folder. Each measurement has a fresh process of its own,
-so that memory is that of this work alone. `start` is what is paid once: to load or compile the
-estimators, to start a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
+so that memory is that of this work alone. `start` is what is paid once: to load the estimators, to
+start a cluster; `wall` and `CPU` are of the work, CPU of all processes together.
 """
 
 import argparse
@@ -115,7 +115,7 @@ def main() -> None:
 
 
 def work(folder: Path, part: str, flights: int) -> None:
-    """Measure the parts that work on flights, and tell what is to be told of them together."""
+    """Measure the parts that work on flights, and print their comparisons at the end."""
     print("\n" + ROW.format(*HEAD), flush=True)
     done: dict[tuple[str, str, int], Cost] = {}
 
@@ -125,31 +125,31 @@ def work(folder: Path, part: str, flights: int) -> None:
             print(ROW.format(task, by, count, *found.cells(count)), flush=True)
         return done[task, by, count]
 
-    told: list[str] = []
+    compared: list[str] = []
     for task, share in SHARE.items():
         if part in ("all", task):
             count = max(flights // share, WORKERS) if part == "all" else flights
             serial, pool = cost(task, "serial", count), cost(task, "processes", count)
-            told.append(
+            compared.append(
                 f"{task} by {WORKERS} processes: {serial.wall_s / pool.wall_s:.2f} times as fast "
                 f"as one after the other (goal 1.8), CPU {pool.cpu_s / serial.cpu_s:.2f} times"
             )
     if part in ("all", "dask"):
         pool, dask = cost("fuse", "processes", flights), cost("fuse", "dask", flights)
-        told.append(
+        compared.append(
             f"fuse on a cluster of {WORKERS}: {100 * (dask.wall_s / pool.wall_s - 1):+.1f} % wall "
-            f"beside the local processes (goal below +15 %)"
+            f"relative to the local processes (goal below +15 %)"
         )
     if part in ("all", "growth"):
         counts = sorted({max(flights // share, 1) for share in (8, 4, 2, 1)})
         least, *_, most = (cost("fuse", "processes", count) for count in counts)
-        told.append(
-            f"fuse of {counts[-1]} flights beside {counts[0]}: "
+        compared.append(
+            f"fuse of {counts[-1]} flights relative to {counts[0]}: "
             f"{most.wall_s / counts[-1] / (least.wall_s / counts[0]):.2f} times the wall a flight, "
             f"largest worker {most.worker_mb - least.worker_mb:+.0f} MB, "
             f"this process {most.here_mb - least.here_mb:+.0f} MB"
         )
-    print("\n" + "\n".join(told))
+    print("\n" + "\n".join(compared))
 
 
 @dataclass(frozen=True)
@@ -217,8 +217,8 @@ def executor_of(by: str) -> Iterator[tuple[Executor, Used]]:
         dict(client.run(_ready, range(4 * WORKERS)))
 
         def used() -> tuple[float, float]:
-            told = cluster.get_client().run(_own_usage).values()
-            return sum(cpu for cpu, _ in told) + time.process_time(), max(mb for _, mb in told)
+            usages = cluster.get_client().run(_own_usage).values()
+            return sum(cpu for cpu, _ in usages) + time.process_time(), max(mb for _, mb in usages)
 
         try:
             yield client, used
@@ -357,11 +357,11 @@ def progress_of(part: str) -> Callable[[str, int, int], None]:
     """Return what shows on a terminal how far a part is."""
     show = _bar(part)
 
-    def tell(what: str, done: int, total: int) -> None:
+    def show_part(what: str, done: int, total: int) -> None:
         if what != LOOKING:
             show(done, total)
 
-    return tell
+    return show_part
 
 
 def _bar(part: str) -> Callable[[int, int], None]:

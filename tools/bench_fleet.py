@@ -4,7 +4,7 @@ For each number of sites: frames lost, latency from the load generator's clock b
 to this process's clock when the ground station reads (p50 and p99), CPU of router and fleet in per
 cent of a core, their memory. The sites are load generators, several in each of a few processes:
 they publish ATTITUDE frames that carry the time; no gateway runs behind them. `--plain` measures
-one site that comes to a plain hub over TCP, without Zenoh, beside them.
+one site that comes to a plain hub over TCP, without Zenoh, as the baseline.
 
 `--unsubscribed N` adds sites whose names no pattern matches: what they publish must cost the fleet
 nothing. `--fleets 2` splits the sites between two fleets on one router.
@@ -163,7 +163,7 @@ class GroundStation:
             return False
         try:
             while True:
-                # A frame a datagram, so that the reader costs little beside what is measured.
+                # A frame a datagram, so that the reader costs little of the measured time.
                 frame = self._sock.recv(2048)
                 now_us = time.time_ns() // 1000
                 if message_id_of(frame) == ATTITUDE:

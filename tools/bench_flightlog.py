@@ -1,7 +1,7 @@
 """Measure recordings: opening and seeking, replay, and what recording costs.
 
-Each figure stands beside pymavlink's `mavlogfile` (what MAVProxy and mavlogdump read with) in the
-same run, on the same file. Nothing leaves this machine.
+Each figure is compared with pymavlink's `mavlogfile`, with which MAVProxy and mavlogdump read, in
+the same run, on the same file. Nothing leaves this machine.
 
     python tools/bench_flightlog.py [--messages 1000000] [--json FILE]
 """
@@ -136,7 +136,7 @@ def cpu_of(*command: str) -> float:
 
 
 def measure_files(folder: Path, count: int) -> dict[str, float]:
-    """Convert and sum up a flight, beside mavlogdump, which writes out one of its messages."""
+    """Convert and sum up a flight; the baseline, mavlogdump, writes out one of its messages."""
     path, table = folder / "flight.tlog", folder / "flight.csv"
     write_flight(path, count)
     mavgate = (sys.executable, "-m", "gateway.cli")
@@ -188,7 +188,7 @@ print(json.dumps({"memory_kept_mb": own, "memory_at_most_with_the_mapped_file_mb
 def memory_of_opening(path: Path) -> dict[str, float]:
     """Measure in a process that has opened nothing but a tiny file: no freed memory is used again.
 
-    The kernel is told to forget the peak of before.
+    The kernel resets its record of the peak before.
     """
     tiny = path.with_name("tiny.tlog")
     write_tlog(tiny, 16)
@@ -276,7 +276,7 @@ class Counter:
 
 
 def measure_replay(path: Path) -> dict[str, float]:
-    """Play as fast as possible to UDP clients, beside a loop that only sends."""
+    """Play as fast as possible to UDP clients; the baseline is a loop that only sends."""
     counter = Counter()
     sent_s, sent = asyncio.run(play_all(path, counter.ports))
     delivered = counter.result()
@@ -302,7 +302,7 @@ def measure_replay(path: Path) -> dict[str, float]:
 
 
 async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
-    """Play a tlog to the ports, and tell how long it took and how many frames it sent."""
+    """Play a tlog to the ports; return how long it took and how many frames it sent."""
     clock = GatewayClock()
     hub = Hub(
         HubSettings(endpoints=tuple(f"udp:127.0.0.1:{port}" for port in ports)),
@@ -328,7 +328,7 @@ async def play_all(path: Path, ports: list[int]) -> tuple[float, int]:
 
 
 def measure_recording(folder: Path) -> dict[str, float]:
-    """Record frames and fused samples; the disk's own time is told apart."""
+    """Record frames and fused samples; the disk's own time is given separately."""
     return asyncio.run(record_all(folder))
 
 

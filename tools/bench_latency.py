@@ -9,7 +9,7 @@ rates. Programs take turns in short rounds, so that other load on the machine me
 median round counts. The baseline is a program that reads the same line and sends a datagram of the
 same size for every frame, without decoding, fusing or encoding anything; `--forwarder` names
 another such, written in whatever language. The greatest latency at the highest rate is the longest
-pause, the machine's own included: the baseline tells those.
+pause, the machine's own included: the baseline has those too.
 """
 
 import argparse
@@ -47,7 +47,7 @@ from gateway.wire.framing import encode_frame
 RATES_HZ = (100, 1000)
 VEHICLES = 3
 BARO_HZ, FIX_HZ, REPORT_HZ = 25, 5, 1
-"""Of each aircraft, beside its IMU samples; the receiver's report comes with its own."""
+"""Of each aircraft, in addition to its IMU samples; the receiver's report comes with its own."""
 WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
@@ -238,7 +238,7 @@ class Line:
             os.write(self._master, frame)
 
     def _receive(self) -> bool:
-        """Take one datagram; tell whether it answers something."""
+        """Take one datagram; return whether it answers something."""
         arrival, datagram, system = time.perf_counter(), self._sock.recv(2048), 0
         if self._is_gateway:
             message_id = int.from_bytes(datagram[7:10], "little")

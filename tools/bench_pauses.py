@@ -5,8 +5,8 @@
 It flies simulated aircraft, records all in files that are soon full, serves metrics, and is visited
 by stations by UDP, TCP and WebSocket that ask for all there is. Printed are the longest turns of
 its loop by the program's own doing, apart from what the machine takes: first until all aircraft are
-heard, then while telemetry flows. The baseline, beside it the whole time, is a loop whose turns are
-all alike.
+heard, then while telemetry flows. The baseline, which runs at the same time, is a loop whose turns
+are all alike.
 """
 
 import argparse
@@ -92,7 +92,7 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
 
 
 def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
-    """Fly, with stations beside it."""
+    """Fly while ground stations come and go."""
     ports = free_ports(4)
     settings = settings_in(folder, options.vehicles, ports)
     load_entry_points()

@@ -253,13 +253,13 @@ def through_an_outage(site: Field, outage_s: float) -> tuple[list[WayFigures], l
     found = site.feed(
         f"router gone for {outage_s:.0f} s", whole_s, sorted(events, key=lambda event: event[0])
     )
-    told = [
+    lines = [
         f"{name}: {kib[0] / 1024:.1f} MiB before, {max(kib) / 1024:.1f} at most"
         for name, kib in memory.items()
     ]
     first = min(ns for _, ns in site.stations[FLEET].got if ns > returned[0])
-    told.append(f"fleet: frames {(first - returned[0]) / 1e9:.1f} s after the router's start")
-    return found, told
+    lines.append(f"fleet: frames {(first - returned[0]) / 1e9:.1f} s after the router's start")
+    return found, lines
 
 
 def show(rows: list[WayFigures], rate_hz: int) -> Iterator[Table]:
@@ -287,16 +287,16 @@ def main() -> None:
         rows = site.feed("quiet", options.seconds, [])
         fetched, rate = with_fetch(site, options.seconds)
         rows += fetched
-        told = [f"fetched at {rate / 1e6:.1f} MB/s"]
+        lines = [f"fetched at {rate / 1e6:.1f} MB/s"]
         if options.outage:
             found, more = through_an_outage(site, options.outage)
-            rows, told = rows + found, told + more
+            rows, lines = rows + found, lines + more
     for each in show(rows, options.rate):
         console.print(each)
-    for line in told:
+    for line in lines:
         console.print(line)
     if options.json:
-        report = {"rows": [asdict(row) for row in rows], "told": told}
+        report = {"rows": [asdict(row) for row in rows], "lines": lines}
         options.json.write_text(json.dumps(report, indent=1) + "\n")
 
 

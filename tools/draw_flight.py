@@ -22,7 +22,7 @@ import matplotlib.pyplot as plt
 
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "flight.png"
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#888888"
-"""Okabe and Ito's colours: told apart by everybody."""
+"""Okabe and Ito's colours, which people with colour blindness can distinguish."""
 
 
 def fly(settings: GatewaySettings) -> dict[str, np.ndarray]:
@@ -48,7 +48,7 @@ def fly(settings: GatewaySettings) -> dict[str, np.ndarray]:
 
 
 def main() -> None:
-    """Fly, and draw the track and the attitude beside the truth."""
+    """Fly, and draw the track and the attitude with the true ones."""
     settings = GatewaySettings()
     seen = fly(settings)
     home = (settings.simulator.home_lat_deg, settings.simulator.home_lon_deg)

@@ -52,7 +52,7 @@ def draw(panel: plt.Axes, board: Board, score: str) -> None:
 
 
 def _short(flight: str) -> str:
-    """Keep the first words of a flight's name: they tell them apart."""
+    """Keep the first words of a flight's name: they distinguish them."""
     return " ".join(flight.replace("_", " ").split()[:3]).removesuffix(" undisturbed")
 
 

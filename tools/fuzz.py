@@ -1,4 +1,4 @@
-"""Throw odd bytes, frames, orders, settings and files at whatever reads them; nothing may raise.
+"""Feed random and damaged bytes, frames, commands, settings and files to readers; none may raise.
 
     python -m tools.fuzz                     # five minutes, all targets in turn
     python -m tools.fuzz --minutes 30 table  # one of them for longer
@@ -293,7 +293,7 @@ def tlog(data: bytes, cuts: list[int], strict: bool) -> None:
     scanner = TlogScanner(strict=strict)
     found = [r for chunk in chunks_of(data, cuts) for r in scanner.feed(chunk).records()]
     found += scanner.feed(b"", final=True).records()
-    # Which times are damaged is judged by the records beside them, also in the chunk before.
+    # Which times are damaged is judged by the neighbouring records, also in the chunk before.
     assert [record.frame for record in found] == [record.frame for record in whole.records()]
     assert whole.damage or found == list(whole.records())
     assert all(record.frame in data for record in found)
@@ -419,7 +419,7 @@ def bounded(name: str, examples: int, *, always_the_same: bool) -> Property:
 
 
 def main() -> int:
-    """Run the targets in turn until the time is up; what failed is told at the end."""
+    """Run the targets in turn until the time is up; print which failed at the end."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"of {', '.join(TARGETS)}")
     parser.add_argument("--minutes", type=float, default=5.0, help="in all (5)")

@@ -51,18 +51,18 @@ SHORTEST_S = 0.3
 MAX_LOST_S = 1.0
 CUT_BYTES = 6000
 NUMBERS = struct.Struct("QQ")
-"""What a child tells: its samples, and the bytes of its larger file as the recorder knows it."""
+"""Shared with a child: its samples, and the bytes of its larger file as the recorder knows it."""
 PATIENCE_S = 240.0
 LOOK_S = 0.001
 
 
 def make_frame(mav: mavlink.MAVLink, number: int) -> bytes:
-    """Make a frame that tells its number."""
+    """Make a frame that contains its number."""
     return bytes(mavlink.MAVLink_system_time_message(0, number).pack(mav))
 
 
 def make_sample(number: int) -> FusedSample:
-    """Make a sample that tells its number."""
+    """Make a sample that contains its number."""
     v = (0.1, 0.2, number / 3)
     time_us = number * 1000
     raw = ImuRaw(
@@ -79,8 +79,8 @@ def never_sync(_: int) -> None:
     threading.Event().wait()
 
 
-async def record_for_ever(folder: Path, told: mmap.mmap) -> None:
-    """Record numbered frames and samples until somebody ends it; tell how many samples."""
+async def record_for_ever(folder: Path, shared: mmap.mmap) -> None:
+    """Record numbered frames and samples until it is killed; share the counts."""
     os.fsync = os.fdatasync = never_sync  # type: ignore[assignment]
     settings = RecordingSettings(folder=str(folder), mode="always", free_floor_mb=0)
     clock = GatewayClock()
@@ -94,7 +94,7 @@ async def record_for_ever(folder: Path, told: mmap.mmap) -> None:
         for frame in (2 * number, 2 * number + 1):
             recorder.frame(make_frame(mav, frame))
         number += 1
-        told[:] = NUMBERS.pack(number, recorder.status().part_bytes)
+        shared[:] = NUMBERS.pack(number, recorder.status().part_bytes)
         await asyncio.sleep(1 / RATE_HZ)
 
 
@@ -106,18 +106,18 @@ def kill_one(folder: Path, life_s: float) -> float:
     AssertionError
         If something is wrong with what it left.
     """
-    told = mmap.mmap(-1, NUMBERS.size)
+    shared = mmap.mmap(-1, NUMBERS.size)
     child = os.fork()
     if child == 0:
-        asyncio.run(record_for_ever(folder, told))
+        asyncio.run(record_for_ever(folder, shared))
     end_s = time.monotonic() + PATIENCE_S
     recorded = in_file = 0
     while (recorded < life_s * RATE_HZ or not in_file) and time.monotonic() < end_s:
         time.sleep(LOOK_S)
-        recorded, in_file = NUMBERS.unpack(told[:])
+        recorded, in_file = NUMBERS.unpack(shared[:])
     os.kill(child, signal.SIGKILL)
     os.waitpid(child, 0)
-    recorded, in_file = NUMBERS.unpack(told[:])
+    recorded, in_file = NUMBERS.unpack(shared[:])
     assert recorded >= life_s * RATE_HZ, f"only {recorded} samples in {PATIENCE_S} s"
     assert 0 < in_file <= max(path.stat().st_size for path in folder.iterdir())
     written = sum(check_tlog(path.read_bytes()) for path in folder.glob("*.tlog"))
@@ -168,7 +168,7 @@ def cut_everywhere(folder: Path) -> tuple[int, int]:
 
 
 def main() -> None:
-    """Kill, cut, and tell how it went."""
+    """Kill, cut, and print the result."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
@@ -176,7 +176,7 @@ def main() -> None:
     args = parser.parse_args()
     lives_s = np.random.default_rng(args.seed).uniform(SHORTEST_S, LONGEST_S, args.kills)
     lost_s = []
-    # Compiled here once, so that no child spends its short life on it.
+    # The kernels are loaded here once, so that no child spends its short life on it.
     check_tlog(b"")
     with tempfile.TemporaryDirectory(prefix="mavgate-kill-") as name:
         for number, life_s in enumerate(lives_s.tolist()):

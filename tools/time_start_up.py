@@ -54,7 +54,7 @@ def cpu_of(*arguments: str) -> float:
 
 
 def process_figures(pid: int) -> str:
-    """Tell the processor time and the memory of a process and of those that it waited for."""
+    """Return the processor time and the memory of a process and of those that it waited for."""
     text = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     own, waited = (sum(map(int, text[k : k + 2])) / os.sysconf("SC_CLK_TCK") for k in (11, 13))
     status = Path(f"/proc/{pid}/status").read_text()
@@ -103,7 +103,7 @@ def time_run(folder: Path) -> None:
 
 
 def time_gateway(folder: Path) -> None:
-    """Print what small commands and starts take, beside programs that do less."""
+    """Print the costs of small commands and starts, and those of programs that do less."""
     mavgate, dump = ("-m", "gateway.cli"), str(Path(sys.executable).with_name("mavlogdump.py"))
     print(f"python -c pass: CPU {cpu_of('-c', 'pass'):.2f} s")
     print(f"mavlogdump.py --help: CPU {cpu_of(dump, '--help'):.2f} s")

@@ -50,7 +50,7 @@ class TurnWatch(selectors.EpollSelector):
         self.longest_collection_us = [0.0, 0.0, 0.0]
         """Of the garbage collector, by generation."""
         self.marks: list[tuple[float, str]] = []
-        """What was noted beside the turns, and when."""
+        """Times, in s since the start, and texts of noted events."""
         self._run = asyncio.Handle._run  # noqa: SLF001
         self._schedule = os.open("/proc/thread-self/schedstat", os.O_RDONLY)
         self._waited_ns = self._waits = self._computed_ns = 0
@@ -59,7 +59,7 @@ class TurnWatch(selectors.EpollSelector):
         self.restart()
 
     def restart(self) -> None:
-        """Begin, and forget what was seen."""
+        """Begin, and discard what was seen."""
         self._is_on = True
         self.worst.clear()
         self.turns = self.long_turns = 0
@@ -74,7 +74,7 @@ class TurnWatch(selectors.EpollSelector):
         self._is_on = False
 
     def mark(self, what: str) -> None:
-        """Note what happens now, to be read beside the longest turns."""
+        """Note what happens now, to be compared with the longest turns."""
         self.marks.append((self.seconds_at(time.perf_counter_ns()), what))
 
     def seconds_at(self, time_ns: int) -> float:

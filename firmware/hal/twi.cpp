@@ -50,7 +50,7 @@ void want_next_byte() {
     TWCR = last ? CONTINUE : static_cast<uint8_t>(CONTINUE | 1 << TWEA);
 }
 
-// Clocks a slave that holds SDA out of the byte it believes to be sending, then sends a stop.
+// Clocks a slave that holds SDA out of the byte that it still sends, then sends a stop.
 void recover() {
     TWCR = 0;
     PORTC &= static_cast<uint8_t>(~(SDA | SCL));
