@@ -141,7 +141,7 @@ def measure_files(folder: Path, count: int) -> dict[str, float]:
     write_flight(path, count)
     mavgate = (sys.executable, "-m", "gateway.cli")
     dump = str(Path(sys.executable).with_name("mavlogdump.py"))
-    # What is compiled is kept: the first run is another thing.
+    # The first run may write bytecode files: it is not measured.
     write_flight(folder / "tiny.tlog", 1000)
     cpu_of(*mavgate, "convert", str(folder / "tiny.tlog"), "--out", str(folder / "tiny.csv"))
     found = {
@@ -199,7 +199,7 @@ def memory_of_opening(path: Path) -> dict[str, float]:
 
 def measure_index(path: Path, count: int) -> dict[str, float]:
     """Open and seek, ours and pymavlink's."""
-    # Compiles, and brings the file into the page cache for all.
+    # Bring the file into the page cache for all.
     TlogFile(path).close()
     open_s, file = timed(lambda: TlogFile(path))
     assert file.index.count == count

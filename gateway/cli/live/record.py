@@ -176,7 +176,7 @@ def _show(status: dict[str, Any]) -> None:
 
 
 def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":
-    # Imported here: it imports the compiler, for which the other commands must not wait.
+    # Imported here: it imports NumPy, for which the other commands must not wait.
     from gateway.recordings.summary import glance
 
     return ((recording, glance(recording.files)) for recording in recordings)

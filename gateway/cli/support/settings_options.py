@@ -1,7 +1,7 @@
 """The settings of a command: which file, and errors for a wrong one.
 
-The settings import every stage, and with them the compiler: a command that never reads them must
-not wait for that, so they are imported where they are read.
+The settings import every stage, and with them NumPy: a command that never reads them must not wait
+for that, so they are imported where they are read.
 """
 
 from __future__ import annotations
