@@ -27,7 +27,7 @@ from gateway.wire.mavlink_json import template
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
 from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
 from tests.ports import free_port
-from tests.wire.test_mavlink_json import as_pymavlink_tells
+from tests.wire.test_mavlink_json import as_pymavlink_reads
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -117,7 +117,7 @@ class Ear:
         with suppress(TimeoutError, BlockingIOError):
             for _ in range(500):
                 for message in self._reader.parse_buffer(self._sock.recv(65_536)) or []:
-                    self.decoded.add(json.dumps(as_pymavlink_tells(message)))
+                    self.decoded.add(json.dumps(as_pymavlink_reads(message)))
 
 
 def hear(stream: Any, ear: Ear) -> dict[str, list[dict[str, Any]]]:
