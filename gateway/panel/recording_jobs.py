@@ -120,20 +120,18 @@ class RecordingJobs:
             return FileResponse(made.file, filename=made.file.name)
 
     async def _export(self, folder: Path, name: str, kind: str) -> str:
-        _, command, suffix = FORMATS[kind]
         self._delete_old()
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
         token = secrets.token_urlsafe(16)
         place = self._folder / token
         place.mkdir()
-        with _settings_for(folder, place) as config:
-            target = place / f"{name}{suffix}"
-            output = place / name if kind == "report" else target
-            arguments = ["--config", str(config), "-o", str(output), "--", name]
-            await _run([*own_command(command), *arguments])
-        if kind == "report":
-            await asyncio.to_thread(_pack, output, target)
+        try:
+            target = await _make(folder, place, name, kind)
+        except BaseException:
+            # Half a file of a large recording may take gigabytes.
+            shutil.rmtree(place, ignore_errors=True)
+            raise
         self._made[token] = _Made(target, time.monotonic())
         return f"{PATH}{token}"
 
@@ -150,6 +148,20 @@ class RecordingJobs:
             log.info("the recordings in %s are not indexed: %s", folder, error)
 
 
+async def _make(folder: Path, place: Path, name: str, kind: str) -> Path:
+    """Export a recording into an empty folder, and return the only file in it."""
+    _, command, suffix = FORMATS[kind]
+    target = place / f"{name}{suffix}"
+    output = place / name if kind == "report" else target
+    with _settings_for(folder, place) as config:
+        arguments = ["--config", str(config), "-o", str(output), "--", name]
+        await _run([*own_command(command), *arguments])
+    if kind == "report":
+        await asyncio.to_thread(_pack, output, target)
+        shutil.rmtree(output, ignore_errors=True)
+    return target
+
+
 @contextmanager
 def _settings_for(folder: Path, place: Path) -> Iterator[Path]:
     """Write settings with the folder of the recordings, which commands take names from."""
@@ -164,7 +176,7 @@ def _settings_for(folder: Path, place: Path) -> Iterator[Path]:
 
 
 async def _run(command: list[str]) -> None:
-    """Run a command; raises ExportError with its last line if it fails."""
+    """Run a command; raises ExportError with its last line, or after the longest time."""
     child = await asyncio.create_subprocess_exec(
         *LOWEST,
         *command,
@@ -175,11 +187,16 @@ async def _run(command: list[str]) -> None:
     try:
         async with asyncio.timeout(EXPORT_S):
             _, text = await child.communicate()
-    except BaseException:
-        with suppress(ProcessLookupError):
-            child.kill()
-        await child.wait()
-        raise
+    except TimeoutError as error:
+        raise ExportError(
+            f"not finished after {EXPORT_S / 60.0:.0f} min, and stopped: choose a shorter "
+            "recording or another format"
+        ) from error
+    finally:
+        if child.returncode is None:
+            with suppress(ProcessLookupError):
+                child.kill()
+            await child.wait()
     if child.returncode:
         lines = text.decode(errors="replace").strip().splitlines()
         raise ExportError(lines[-1] if lines else f"the command ended with {child.returncode}")

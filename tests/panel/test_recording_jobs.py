@@ -1,12 +1,14 @@
 """Exports of recordings by the commands that make them, and the catalogue that fills itself."""
 
 import asyncio
+import tempfile
 from pathlib import Path
 
 import httpx
 import pytest
 from fastapi import FastAPI
 
+from gateway.panel import recording_jobs
 from gateway.panel.recording_facts import RecordingFacts
 from gateway.panel.recording_jobs import FORMATS, MAX_WAITING, ExportError, RecordingJobs
 from gateway.recordings.index import RecordingError, list_recordings
@@ -44,14 +46,29 @@ async def test_export_is_made_and_fetched_under_an_address_of_its_own(
         assert (await client.get(url)).status_code == 404
 
 
-async def test_export_that_fails_says_why(folder: Path) -> None:
+async def test_failed_export_says_why_and_leaves_no_file(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     (folder / "broken_01.tlog").write_bytes(b"no recording at all\n" * 10)
     jobs = RecordingJobs()
     with pytest.raises(ExportError, match="broken_01"):
         await jobs.export(folder, "broken", "kml")
     with pytest.raises(RecordingError):
         await jobs.export(folder, "../../etc/passwd", "kml")
+    monkeypatch.setattr(recording_jobs, "EXPORT_S", 0.05)
+    with pytest.raises(ExportError, match=r"not finished after .* another format"):
+        await jobs.export(folder, NAME, "report")
+    cancelled = asyncio.create_task(jobs.export(folder, NAME, "page"))
+    # Its command runs as soon as its folder holds the settings.
+    async with asyncio.timeout(60.0):
+        while not list(tmp_path.glob("mavgate-export-*/*/settings.toml")):
+            await asyncio.sleep(0)
+    cancelled.cancel()
+    await asyncio.wait([cancelled])
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
     jobs.close()
+    assert list(tmp_path.glob("mavgate-export-*")) == []
 
 
 async def test_number_of_waiting_exports_is_limited(folder: Path) -> None:
