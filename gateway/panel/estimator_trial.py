@@ -22,7 +22,6 @@ from gateway.analysis.flight_arrays import (
 )
 from gateway.analysis.fusion import fuse
 from gateway.analysis.metrics import euler_rad, rms
-from gateway.analysis.sources import flight_of_blocks
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
@@ -127,6 +126,10 @@ async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) ->
 
 
 def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:
+    # Imported in the separate process: with the simulator it loads all of SciPy, for which the
+    # panel's start would take twice as long.
+    from gateway.analysis.sources import flight_of_blocks
+
     reader = AutopilotReader()
     data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
     rows = reader.feed(TlogScanner(strict=True).feed(data, final=True))

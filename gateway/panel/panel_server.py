@@ -4,7 +4,6 @@ import asyncio
 import errno
 import inspect
 import logging
-import os
 import socket
 import ssl
 from collections.abc import Callable
@@ -44,8 +43,6 @@ from gateway.panel.view_context import WEB, PanelParts
 
 log = logging.getLogger(__name__)
 
-NICENESS: Final = 5
-"""The gateway has priority over the panel."""
 WS_QUEUE: Final = 4
 """Messages of a WebSocket that may wait to be handled, of at most 1 MB each."""
 MAX_PENDING_PAGES: Final = 16
@@ -90,7 +87,6 @@ def run_panel(
     PanelError
         If the port or the certificate cannot be used.
     """
-    os.nice(NICENESS)
     certificate, key = tls_files(settings)
     sock = _bound(settings, or_any=attached)
     parts = make_parts(settings, recordings, connect, control_socket)

@@ -1,6 +1,7 @@
 """The panel's port, and what it logs as a part of a gateway."""
 
 import logging
+import os
 import socket
 from collections.abc import Iterator
 
@@ -42,4 +43,6 @@ def test_the_gateway_alone_stamps_lines_of_its_panel(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(logging.root, "handlers", [])
     monkeypatch.setattr(logging.root, "level", logging.WARNING)
     monkeypatch.setattr(panel_server, "run_panel", run_panel)
-    assert CliRunner().invoke(app, ["panel", "--attached"]).output == "the port is taken\n"
+    monkeypatch.setattr(os, "nice", lambda _: 0)
+    attached = CliRunner().invoke(app, ["panel", "--attached"], input="run.sock\n")
+    assert attached.output == "the port is taken\n"

@@ -17,7 +17,7 @@ from gateway.cli.live.run import (
     serve,
     with_endpoints,
 )
-from gateway.cli.support.panel_process import PanelProcess, is_installed
+from gateway.cli.support.panel_process import is_installed, launched_panel
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     files_of,
@@ -39,12 +39,7 @@ from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
 from gateway.live.daemon import Daemon
 from gateway.live.service import run_event_loop
-from gateway.recordings.flown import open_flown
-from gateway.recordings.fuse import with_reference
 from gateway.sensing.calibration import NodeCalibration
-from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.receiver import simulate
-from gateway.simulator.recorded import in_rounds, replay
 from gateway.simulator.timed_frame import TimedFrame
 
 log = logging.getLogger(__name__)
@@ -81,6 +76,8 @@ def demo(
         return with_endpoints(load_settings(config), endpoint)
 
     settings = or_refuse(read)
+    # First of all, as it loads for seconds; so the simulator is imported after this.
+    page = launched_panel(config, wanted=panel and is_installed())
     load_entry_points()
     daemons: list[Daemon] = []
 
@@ -96,6 +93,8 @@ def demo(
             line = made_ahead(firmware_line(settings.simulator, unix_time_us()))
             aircraft = calibrated_aircraft(settings)
         else:
+            from gateway.simulator.receiver import simulate
+
             line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
             aircraft = calibrated_aircraft(settings)
     except (BenchError, ValueError) as error:
@@ -112,7 +111,6 @@ def demo(
             daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line))
             return daemons[0]
 
-        page = PanelProcess(config) if panel and is_installed() else None
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
 
 
@@ -135,6 +133,10 @@ def recorded_line(
     report : callable
         Called with a text at every end.
     """
+    from gateway.recordings.flown import open_flown
+    from gateway.recordings.fuse import with_reference
+    from gateway.simulator.recorded import in_rounds, replay
+
     with refusing():
         files = files_of([name], folder_of(settings), "tables")
     with progress_of(files) as advance, refusing():
@@ -152,6 +154,8 @@ def recorded_line(
 
 def calibrated_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
     """Calibrate the simulated aircraft, as their owner would do before the flight."""
+    from gateway.simulator.flight import SimulatedAircraft
+
     found = {}
     for index in range(settings.simulator.vehicles):
         simulated = SimulatedAircraft(settings.simulator, index)

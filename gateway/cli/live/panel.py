@@ -1,9 +1,11 @@
 """`mavgate panel`: the page in a browser."""
 
 import logging
+import os
 import sys
+from pathlib import Path
 from types import TracebackType
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 from msgspec.structs import replace
@@ -19,6 +21,9 @@ from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.hub.endpoint import parse_endpoint
 
 log = logging.getLogger(__name__)
+
+NICENESS: Final = 5
+"""The gateway has priority over the panel, from the panel's imports on."""
 
 
 def register(app: typer.Typer) -> None:
@@ -50,6 +55,7 @@ def panel(
     """
     if not (attached or hash_password):
         log.info("the panel is loading; its address follows")
+    os.nice(NICENESS)
     try:
         from gateway.panel.panel_server import PanelError, run_panel
     except ModuleNotFoundError as error:
@@ -66,6 +72,11 @@ def panel(
         logging.getLogger().setLevel(logging.WARNING)
         for handler in logging.getLogger().handlers:
             handler.setFormatter(OneLineFormatter("%(message)s"))
+        # The gateway sends the path once its socket listens, later than this process starts.
+        line = sys.stdin.buffer.readline()
+        if not line:
+            return
+        socket = Path(os.fsdecode(line.removesuffix(b"\n")))
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = folder_of(settings)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from gateway.cli.support.panel_process import PanelProcess
+from gateway.cli.support.panel_process import PanelProcess, launched_panel
 from gateway.cli.support.settings_options import (
     ConfigOption,
     load_settings,
@@ -72,8 +72,8 @@ def run_gateway(
 
     settings = or_refuse(read)
     aircraft = read_aircraft(settings)
+    page = launched_panel(config, wanted=panel or settings.panel.enabled)
     load_entry_points()
-    page = PanelProcess(config) if panel or settings.panel.enabled else None
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)
 
@@ -197,7 +197,7 @@ async def _live_view(
         keyboard.start()
         try:
             while not await _is_set_within(stopped, VIEW_INTERVAL_S):
-                view.link = "" if panel is None else panel.link
+                view.link = "" if panel is None else panel.link or "loading; its address follows"
                 if not held:
                     live.update(view.draw(daemon.snapshot()), refresh=True)
         finally:

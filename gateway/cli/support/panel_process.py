@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import os
+import subprocess
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.util import find_spec
@@ -33,6 +34,15 @@ def is_installed() -> bool:
     return find_spec("nicegui") is not None
 
 
+def launched_panel(config: Path | None, *, wanted: bool) -> "PanelProcess | None":
+    """Return the panel, which begins to load, or None if it is not wanted."""
+    if not wanted:
+        return None
+    panel = PanelProcess(config)
+    panel.launch()
+    return panel
+
+
 class OneLineFormatter(PrintableFormatter):
     """Formats each record as one line, so that the gateway logs a traceback as one record."""
 
@@ -61,10 +71,21 @@ class PanelProcess:
         if config is not None:
             self._command += ["--config", str(config)]
         self._task: asyncio.Task[None] | None = None
-        self._child: asyncio.subprocess.Process | None = None
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def launch(self) -> None:
+        """Start the process; it loads its libraries, then waits for the control socket's path."""
+        log.info("the panel is loading; its address follows")
+        self._child = subprocess.Popen(
+            self._command,
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
 
     def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
-        """Start it; needs a running event loop.
+        """Connect it to the gateway, and keep it running; needs a running event loop.
 
         Parameters
         ----------
@@ -79,42 +100,50 @@ class PanelProcess:
             self._task.cancel()
             await asyncio.wait([self._task])
         child = self._child
-        if child is None or child.returncode is not None:
+        if child is None:
             return
-        with suppress(ProcessLookupError):
+        with child:
             child.terminate()
-        try:
-            await asyncio.wait_for(child.wait(), END_S)
-        except TimeoutError:
-            with suppress(ProcessLookupError):
+            try:
+                await asyncio.to_thread(child.wait, END_S)
+            except subprocess.TimeoutExpired:
                 child.kill()
-            await child.wait()
+                await asyncio.to_thread(child.wait)
 
     async def _keep(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
-        environment = os.environ | {"MAVGATE_SOCKET": str(await control_socket())}
+        path = os.fsencode(await control_socket())
         wait_s = RESTART_S
-        log.info("the panel is starting")
         while True:
-            self._child = await asyncio.create_subprocess_exec(
-                *self._command,
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                stderr=asyncio.subprocess.STDOUT,
-                env=environment,
-            )
-            await self._read(self._child)
-            code = await self._child.wait()
+            if self._child is None:
+                self.launch()
+            assert self._child is not None
+            code = await self._attend(self._child, path)
             wait_s = RESTART_S if self.link else min(2 * wait_s, LONGEST_RESTART_S)
-            self.link = ""
+            self.link, self._child = "", None
             log.warning("the panel has ended (%d); starting it again in %.0f s", code, wait_s)
             await asyncio.sleep(wait_s)
 
-    async def _read(self, child: asyncio.subprocess.Process) -> None:
-        if child.stdout is None:
-            return
-        while not child.stdout.at_eof():
+    async def _attend(self, child: subprocess.Popen[bytes], path: bytes) -> int:
+        """Pass the path of the control socket, read all output, and return the exit code."""
+        assert child.stdin is not None
+        with suppress(BrokenPipeError):
+            child.stdin.write(path + b"\n")
+        output = asyncio.StreamReader()
+        transport, _ = await asyncio.get_running_loop().connect_read_pipe(
+            lambda: asyncio.StreamReaderProtocol(output), child.stdout
+        )
+        try:
+            await self._read(output)
+        finally:
+            transport.close()
+        code = await asyncio.to_thread(child.wait)
+        child.stdin.close()
+        return code
+
+    async def _read(self, output: asyncio.StreamReader) -> None:
+        while not output.at_eof():
             try:
-                line = await child.stdout.readline()
+                line = await output.readline()
             except ValueError:
                 continue  # too long a line, which is gone
             text = line.decode(errors="replace").rstrip()

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -47,6 +46,30 @@ async def test_a_line_of_any_length_leaves_the_next_to_be_read() -> None:
     await panel.close()
 
 
+@pytest.mark.io
+async def test_launched_panel_receives_the_path_of_the_control_socket() -> None:
+    panel = PanelProcess(None)
+    code = "print('panel: ' + input(), flush=True); input()"
+    panel._command = [sys.executable, "-c", code]
+    panel.launch()
+    panel.start(control_socket)
+    async with asyncio.timeout(60.0):
+        while not panel.link:
+            await asyncio.sleep(0.01)
+    assert panel.link == "no.sock"
+    await panel.close()
+
+
+@pytest.mark.io
+async def test_panel_that_is_launched_but_not_started_ends_when_closed() -> None:
+    panel = PanelProcess(None)
+    panel._command = [sys.executable, "-c", SAYING]
+    panel.launch()
+    await panel.close()
+    assert panel._child is not None
+    assert panel._child.returncode == -15
+
+
 async def test_it_is_closed_while_it_waits_for_the_gateway() -> None:
     panel = PanelProcess(None)
     panel.start(asyncio.get_running_loop().create_future)  # type: ignore[arg-type]
@@ -84,7 +107,7 @@ async def test_traceback_of_the_panel_is_one_record_that_ends_with_its_error(
     stream.feed_eof()
     limit = LogLimit()
     caplog.handler.addFilter(limit)
-    await PanelProcess(None)._read(SimpleNamespace(stdout=stream))  # type: ignore[arg-type]
+    await PanelProcess(None)._read(stream)
     caplog.handler.removeFilter(limit)
     (logged,) = caplog.records
     assert logged.getMessage().startswith("panel: It failed\n")
