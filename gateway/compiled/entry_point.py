@@ -8,7 +8,7 @@ import ast
 import ctypes
 import hashlib
 from collections.abc import Callable
-from functools import cache, update_wrapper
+from functools import cache, partial, update_wrapper
 from inspect import signature
 from pathlib import Path
 from typing import Any, Final, Generic, ParamSpec
@@ -60,6 +60,7 @@ class EntryPoint(Generic[Parameters]):
 
     def __init__(self, function: Callable[Parameters, None]) -> None:
         self._loaded: Callable[..., None] | None = None
+        self._library: ctypes.PyDLL | None = None
         self.symbol = f"{function.__module__}.{function.__qualname__}"
         update_wrapper(self, compiled(function))
         ENTRY_POINTS.append(self)
@@ -90,7 +91,20 @@ class EntryPoint(Generic[Parameters]):
             raise LibraryError(path or LIBRARY, f"lacks {self.symbol}") from None
         loaded.argtypes = [C_TYPES[p.annotation] for p in self.parameters]
         loaded.restype = None
-        self._loaded = loaded
+        self._loaded, self._library = loaded, library
+
+    def bound(self, *arguments: int) -> Callable[[], None]:
+        """Return a call with fixed integers, which are converted once, for steps in a hot loop.
+
+        Whoever calls it keeps the memory that is passed by address. Raises LibraryError as `load`.
+        """
+        if self._loaded is None:
+            self.load()
+        assert self._library is not None
+        # A function of its own, without argument types: they would be converted at every call.
+        function = self._library[self.symbol]
+        function.restype = None
+        return partial(function, *map(ctypes.c_int64, arguments))
 
     @property
     def parameters(self) -> list[Any]:

@@ -3,7 +3,9 @@
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
 from itertools import pairwise
+from operator import or_
 from typing import Final
 
 import msgspec
@@ -14,6 +16,7 @@ from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
     NAV_COLUMNS,
+    ROW_FLAGS,
     GpsRow,
     gps_row,
     imu_row,
@@ -33,10 +36,14 @@ from gateway.estimation.record import (
     unpack_record,
 )
 from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings
-from gateway.records import BaroSample, GpsFix, ImuSample, NavState
+from gateway.records import UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState
 
 _ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
 """Fills the row of one sample in half the time that numpy takes for a tuple."""
+
+_ROW_FLAGS: Final = reduce(or_, map(int, ROW_FLAGS))
+_FLAG_COLUMNS: Final[dict[int, tuple[float, ...]]] = {}
+"""The last columns of a row by the flags that they show: they are the same for many samples."""
 
 Aiding = tuple[int, BaroSample | GpsFix]
 """A height or a fix, and the number of the IMU sample before which it arrived."""
@@ -102,6 +109,9 @@ class KernelEstimator:
 
     def _use(self, record: State) -> None:
         self._state, self._at = record, address_of(record)
+        self._step = kernels.imu_steps.bound(
+            self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at
+        )
 
     @property
     def state(self) -> State:
@@ -165,8 +175,16 @@ class KernelEstimator:
             State at its time.
         """
         self._time_us[0] = sample.time_us
-        _ROW.pack_into(self._row_view, 0, *imu_row(sample))
-        kernels.imu_steps(self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at)
+        flags = sample.flags & _ROW_FLAGS
+        _ROW.pack_into(
+            self._row_view,
+            0,
+            *sample.accel_b_mps2,
+            *sample.gyro_b_radps,
+            *(sample.mag_b_ut or UNKNOWN_VEC3),
+            *(_FLAG_COLUMNS.get(flags) or _flag_columns(sample)),
+        )
+        self._step()
         return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
@@ -280,6 +298,12 @@ class KernelEstimator:
             self.update_baro(record)
         else:
             self.update_gps(record)
+
+
+def _flag_columns(sample: ImuSample) -> tuple[float, ...]:
+    """Return the columns of a sample's row that show its flags, and keep them."""
+    columns = _FLAG_COLUMNS[sample.flags & _ROW_FLAGS] = imu_row(sample)[-len(ROW_FLAGS) :]
+    return columns
 
 
 def _is_fix(record: BaroSample | GpsFix) -> bool:

@@ -237,7 +237,14 @@ class Correction:
         """Correct one vector and turn it into body axes."""
         x, y, z = v
         bias_x, bias_y, bias_z = self._bias
-        return transform(self._matrix, (x - bias_x, y - bias_y, z - bias_z))
+        x, y, z = x - bias_x, y - bias_y, z - bias_z
+        # `transform` without the call: this runs for every sensor of every sample.
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._matrix
+        return (
+            xx * x + xy * y + xz * z,
+            yx * x + yy * y + yz * z,
+            zx * x + zy * y + zz * z,
+        )
 
     def apply_all(self, vectors: FloatArray) -> FloatArray:
         """Correct an array of shape (n, 3); bit for bit what `apply` gives for each."""

@@ -1,6 +1,5 @@
 """The sensing stage of one aircraft: raw records in, calibrated samples out."""
 
-from functools import cache
 from typing import Final
 
 import numpy as np
@@ -30,6 +29,10 @@ from gateway.sensing.imu_log import FloatArray, IntArray
 
 BLANK: Final = (0, 0, 0)
 """The accelerometer's counts after a reset of the MPU6050; its gyroscope gives none then either."""
+NEW_FIELD: Final = int(ImuFlags.MAG_NEW)
+FIELD_FLAGS: Final = NEW_FIELD | int(ImuFlags.MAG_ABSENT)
+ALL_FLAGS: Final = sum(map(int, ImuFlags))
+"""Plain numbers: a test with them costs a sixth, and hashing an enumeration calls Python."""
 
 
 class SensorChain:
@@ -47,6 +50,7 @@ class SensorChain:
         self._gyro = Correction(cal.mounting, IDENTITY3, cal.gyro_bias_radps)
         self._mag = Correction(cal.mag_mounting, cal.mag_soft_iron, cal.mag_hard_iron_ut)
         self._added_flags = cal.missing
+        self._flags: dict[int, ImuFlags] = {}
 
     def imu(self, raw: ImuRaw) -> ImuSample:
         """Turn one IMU payload into a sample in body FRD.
@@ -66,7 +70,7 @@ class SensorChain:
             accel = self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g))
             gyro = self._gyro.apply(gyro_from_counts(raw.gyro_raw, raw.gyro_range_dps))
         mag = None
-        if raw.flags & ImuFlags.MAG_NEW and not raw.flags & ImuFlags.MAG_ABSENT:
+        if raw.flags & FIELD_FLAGS == NEW_FIELD:
             counts = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
             mag = None if counts is None else self._mag.apply(counts)
         return ImuSample(
@@ -75,8 +79,13 @@ class SensorChain:
             gyro_b_radps=gyro,
             mag_b_ut=mag,
             temperature_degc=temperature_from_counts(raw.temperature_raw),
-            flags=_joined_flags(raw.flags, self._added_flags),
+            flags=self._flags.get(raw.flags & ALL_FLAGS) or self._join(raw.flags),
         )
+
+    def _join(self, flags: ImuFlags) -> ImuFlags:
+        """Add the calibration's flags; kept, for they are the same for many samples."""
+        joined = self._flags[flags & ALL_FLAGS] = flags | self._added_flags
+        return joined
 
     def imu_calibrated(self, imu: ImuCalibrated) -> ImuSample:
         """Return a sample that is calibrated already, such as one of another program's log."""
@@ -134,9 +143,3 @@ class SensorChain:
             temperature_degc=raw.temperature_degc,
             alt_pressure_m=pressure_altitude_m(raw.pressure_pa),
         )
-
-
-@cache
-def _joined_flags(flags: ImuFlags, more: ImuFlags) -> ImuFlags:
-    """Join two sets of flags; they are the same for many samples, and a lookup costs a tenth."""
-    return flags | more

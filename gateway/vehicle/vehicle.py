@@ -220,13 +220,13 @@ class Vehicle:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
         messages = self.telemetry.on_state(state, sample)
-        messages += self._announcements.on_sample(sample, now_us)
-        messages += self._announcements.on_flags(state.flags, now_us)
-        answers = self._replies(messages) if messages else []
-        answers += self._intervals.on_state(state.time_us)
+        messages += self._announcements.on_state(state, sample, now_us)
+        actions: list[Action] = [self._encoder.encode(message) for message in messages]
+        if self._intervals.has_fast:
+            actions += self._finish(self._intervals.on_state(state.time_us))
         if self._calibrator.busy:
-            answers += self._calibrator.on_sample(sample)
-        return self._finish(answers) if answers else []
+            actions += self._finish(self._calibrator.on_sample(sample))
+        return actions
 
     def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
         """Take in one barometer sample."""

@@ -111,7 +111,12 @@ class FrameDecoder:
             raises on data.
         """
         *complete, rest = data.split(DELIMITER)
-        events = [event for piece in complete if (event := self._finish(piece))]
+        events: list[Frame | Fault] = []
+        for piece in complete:
+            if self._partial or self._skipped or len(piece) > MAX_ENCODED:
+                events += self._finish(piece)
+            elif piece:
+                events.append(_open(piece))
         if rest:
             self._keep(rest)
         return events
@@ -128,16 +133,14 @@ class FrameDecoder:
         else:
             self._partial += piece
 
-    def _finish(self, piece: bytes) -> Frame | Fault | None:
-        """End a frame, of which most often nothing came before this piece."""
-        if self._partial or len(piece) > MAX_ENCODED or self._skipped:
-            self._keep(piece)
-            piece, self._partial = self._partial, b""
-        if self._skipped:
-            fault = Fault(FaultKind.TOO_LONG, self._skipped)
-            self._skipped = 0
-            return fault
-        return _open(piece) if piece else None
+    def _finish(self, piece: bytes) -> list[Frame | Fault]:
+        """End a frame that came in several pieces, or is too long."""
+        self._keep(piece)
+        whole, self._partial = self._partial, b""
+        skipped, self._skipped = self._skipped, 0
+        if skipped:
+            return [Fault(FaultKind.TOO_LONG, skipped)]
+        return [_open(whole)] if whole else []
 
 
 def _open(stuffed: bytes) -> Frame | Fault:
@@ -147,7 +150,7 @@ def _open(stuffed: bytes) -> Frame | Fault:
         return Fault(FaultKind.COBS, len(stuffed))
     if len(checked) <= CRC_SIZE:
         return Fault(FaultKind.TOO_SHORT, len(stuffed))
-    content, crc = checked[:-CRC_SIZE], checked[-CRC_SIZE:]
-    if crc16(content) != int.from_bytes(crc, "little"):
+    content = checked[:-CRC_SIZE]
+    if binascii.crc_hqx(content, CRC_START) != checked[-2] | checked[-1] << 8:
         return Fault(FaultKind.CRC, len(stuffed))
     return Frame(content)

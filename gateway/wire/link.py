@@ -149,15 +149,17 @@ class Link:
         self._bytes_received += len(data)
         records: list[RawRecord] = []
         for event in self._decoder.feed(data):
-            decoded = event if isinstance(event, Fault) else payloads.decode_content(event.content)
-            if isinstance(decoded, Fault):
-                self._faults[decoded.kind] += 1
+            frame = event if isinstance(event, Fault) else payloads.decode_content(event.content)
+            if isinstance(frame, Fault):
+                self._faults[frame.kind] += 1
                 continue
-            heard_us = self._hear(decoded, arrival_us)
-            if isinstance(decoded, payloads.ReceiverStatusFrame):
-                self._receiver_status = _receiver_status(decoded, heard_us)
-            else:
-                records += self._take_radio(decoded, heard_us, arrival_us)
+            heard_us = self._hear(frame, arrival_us)
+            if isinstance(frame, payloads.ReceiverStatusFrame):
+                self._receiver_status = _receiver_status(frame, heard_us)
+            elif (node := self._nodes.get(frame.header.node)) is None:
+                records += self._hear_new_node(frame, heard_us, arrival_us)
+            elif (record := _hear_node(node, frame, heard_us, arrival_us)) is not None:
+                records.append(record)
         return records
 
     def reopened(self) -> None:
@@ -201,23 +203,20 @@ class Link:
         self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
     ) -> int:
         """Count a frame and return when the receiver received it, on the gateway clock."""
-        restarts = self._receiver_clock.restarts
-        heard_us = self._receiver_clock.observe(frame.receiver_time_us, arrival_us)
-        if self._last_frame_seq is not None and self._receiver_clock.restarts == restarts:
-            self._frames_lost += (frame.frame_seq - self._last_frame_seq - 1) % 256
+        clock, last = self._receiver_clock, self._last_frame_seq
+        restarts = clock.restarts
+        heard_us = clock.observe(frame.receiver_time_us, arrival_us)
+        if last is not None and clock.restarts == restarts:
+            self._frames_lost += (frame.frame_seq - last - 1) % 256
         self._last_frame_seq = frame.frame_seq
         self._frames += 1
         return heard_us
 
-    def _take_radio(
+    def _hear_new_node(
         self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
     ) -> list[RawRecord]:
         """Return a payload's records; a node is accepted from the second one that agrees."""
         header = frame.header
-        node = self._nodes.get(header.node)
-        if node is not None:
-            record = _hear_node(node, frame, heard_us, arrival_us)
-            return [] if record is None else [record]
         node, first = self._unproven.pop(header.node, (_Node(), None))
         second = _hear_node(node, frame, heard_us, arrival_us)
         if node.clock.restarts:
@@ -235,21 +234,24 @@ def _hear_node(
     node: _Node, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
 ) -> RawRecord | None:
     """Count a payload of a node, and return its record if it is new."""
-    header = frame.header
-    restarts = node.clock.restarts
-    time_us = node.clock.observe(header.node_time_us, heard_us)
-    if node.clock.restarts != restarts:
+    header, clock = frame.header, node.clock
+    stamp_us, restarts = header.node_time_us, clock.restarts
+    time_us = clock.observe(stamp_us, heard_us)
+    if clock.restarts != restarts:
         node.sequence.reset()
         node.last_stamp_us = None
     # A late payload is counted but not used: every stage behind relies on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
-        node.faults["sequence"] += _is_later(header.node_time_us, node.last_stamp_us)
+        node.faults["sequence"] += _is_later(stamp_us, node.last_stamp_us)
         return None
     node.pipe = frame.pipe
     node.arrivals_us.append(arrival_us)
-    node.last_time_us = _never_back(node, header.node_time_us, time_us)
-    node.last_stamp_us = header.node_time_us
-    return _to_record(header, frame.payload, node)
+    node.last_time_us = time_us = _never_back(node, stamp_us, time_us)
+    node.last_stamp_us = stamp_us
+    payload = frame.payload
+    if isinstance(payload, payloads.ImuPayload):
+        return _imu(header, payload, time_us)
+    return _to_record(header, payload, node)
 
 
 def _is_later(stamp_us: int, last_us: int | None) -> bool:
@@ -263,18 +265,24 @@ def _never_back(node: _Node, stamp_us: int, time_us: int) -> int:
     The sample then follows the last one a little sooner than the node's clock shows, until the
     times agree: an estimator must not get many samples of one time, nor a stream send them at once.
     """
+    last_us = node.last_time_us
     if node.last_stamp_us is not None:
         elapsed_us = (stamp_us - node.last_stamp_us) % WRAP_US
-        slowed_us = node.last_time_us + elapsed_us - elapsed_us // SLOWED
+        slowed_us = last_us + elapsed_us - elapsed_us // SLOWED
         if time_us < slowed_us <= time_us + MOST_AHEAD_US:
             return slowed_us
-    return max(time_us, node.last_time_us + 1)
+    return time_us if time_us > last_us else last_us + 1
 
 
-def _to_record(header: payloads.Header, payload: payloads.Payload, node: _Node) -> RawRecord | None:
+def _to_record(
+    header: payloads.Header,
+    payload: payloads.BaroPayload
+    | payloads.GpsFixPayload
+    | payloads.GpsQualityPayload
+    | payloads.NodeStatusPayload,
+    node: _Node,
+) -> RawRecord | None:
     match payload:
-        case payloads.ImuPayload():
-            return _imu(header, payload, node.last_time_us)
         case payloads.BaroPayload():
             return BaroRaw(
                 time_us=node.last_time_us,

@@ -49,6 +49,8 @@ class PayloadKind(IntEnum):
 
 _FRAME_HEADER: Final = struct.Struct("<BBBI")
 _HEADER: Final = struct.Struct("<BBHI")
+_RADIO_HEAD: Final = struct.Struct("<BBBIBBHI")
+"""A frame's header and that of the payload in it."""
 _IMU: Final = struct.Struct("<3h3h3hhHB")
 _BARO: Final = struct.Struct("<Ih")
 _GPS_FIX: Final = struct.Struct("<Iiii3hBB")
@@ -61,6 +63,9 @@ _PIPE: Final = struct.Struct("<IIH")
 
 _NODES: Final = tuple(NodeId(address >> 3, address & 0x7) for address in range(256))
 """Indexed by the address byte."""
+_LEAST_ADDRESS: Final = 1 << 3
+"""No vehicle has the id 0."""
+_RADIO_FIRST: Final = bytes((PROTOCOL_VERSION << 4 | FrameKind.RADIO,))
 _imu_flags = cache(ImuFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
 
@@ -220,22 +225,30 @@ def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | Fault:
         The fault names what does not fit: version, kind, length or a value.
     """
     size = len(content)
+    if content[:1] == _RADIO_FIRST and size >= _RADIO_HEAD.size:
+        return _decode_radio(content, size)
     if size < _FRAME_HEADER.size:
         return Fault(FaultKind.TOO_SHORT, size)
-    first, frame_seq, pipe, receiver_time_us = _FRAME_HEADER.unpack_from(content)
+    first, frame_seq, _, receiver_time_us = _FRAME_HEADER.unpack_from(content)
     if first >> 4 != PROTOCOL_VERSION:
         return Fault(FaultKind.VERSION, size)
-    body = content[_FRAME_HEADER.size :]
     if first & 0xF == FrameKind.RADIO:
-        decoded = decode_payload(body)
-        if isinstance(decoded, Fault):
-            return Fault(decoded.kind, size)
-        if pipe >= PIPES:
-            return Fault(FaultKind.VALUE, size)
-        return RadioFrame(frame_seq, pipe, receiver_time_us, *decoded)
+        return Fault(FaultKind.PAYLOAD, size)
     if first & 0xF == FrameKind.RECEIVER_STATUS:
+        body = content[_FRAME_HEADER.size :]
         return _decode_receiver_status(frame_seq, receiver_time_us, body, size)
     return Fault(FaultKind.KIND, size)
+
+
+def _decode_radio(content: bytes, size: int) -> RadioFrame | Fault:
+    """Read a frame with a payload; the headers of both are unpacked at once."""
+    _, frame_seq, pipe, receiver_us, first, address, seq, node_us = _RADIO_HEAD.unpack_from(content)
+    payload = _read_body(first, address, content, _RADIO_HEAD.size)
+    if isinstance(payload, FaultKind):
+        return Fault(payload, size)
+    if pipe >= PIPES:
+        return Fault(FaultKind.VALUE, size)
+    return RadioFrame(frame_seq, pipe, receiver_us, Header(_NODES[address], seq, node_us), payload)
 
 
 def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
@@ -250,23 +263,36 @@ def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
     -------
     tuple of Header and Payload, or Fault
     """
-    if not _HEADER.size <= len(data) <= MAX_PAYLOAD:
+    if len(data) < _HEADER.size:
         return Fault(FaultKind.PAYLOAD, len(data))
     first, address, seq, node_time_us = _HEADER.unpack_from(data)
-    if first >> 4 != PROTOCOL_VERSION:
-        return Fault(FaultKind.VERSION, len(data))
-    if address >> 3 == 0:
-        return Fault(FaultKind.VALUE, len(data))
-    layout = _BODIES.get((first & 0xF, len(data) - _HEADER.size))
-    if layout is None:
-        kind = FaultKind.PAYLOAD if first & 0xF in _KINDS else FaultKind.KIND
-        return Fault(kind, len(data))
+    payload = _read_body(first, address, data, _HEADER.size)
+    if isinstance(payload, FaultKind):
+        return Fault(payload, len(data))
+    return Header(_NODES[address], seq, node_time_us), payload
+
+
+def _read_body(first: int, address: int, data: bytes, begin: int) -> Payload | FaultKind:
+    """Read the body of a payload, or return why that is impossible."""
+    layout = _BODIES.get((first, len(data) - begin))
+    if layout is None or address < _LEAST_ADDRESS:
+        return _fault_of(first, address, len(data) - begin)
     body_struct, read = layout
     try:
-        payload = read(body_struct.unpack_from(data, _HEADER.size))
+        return read(body_struct.unpack_from(data, begin))
     except ValueError:
-        return Fault(FaultKind.VALUE, len(data))
-    return Header(_NODES[address], seq, node_time_us), payload
+        return FaultKind.VALUE
+
+
+def _fault_of(first: int, address: int, body_size: int) -> FaultKind:
+    """Return what is wrong with a payload whose layout or address does not exist."""
+    if body_size > MAX_PAYLOAD - _HEADER.size:
+        return FaultKind.PAYLOAD
+    if first >> 4 != PROTOCOL_VERSION:
+        return FaultKind.VERSION
+    if address < _LEAST_ADDRESS:
+        return FaultKind.VALUE
+    return FaultKind.PAYLOAD if first & 0xF in _KINDS else FaultKind.KIND
 
 
 def _decode_receiver_status(
@@ -352,16 +378,16 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
 
 
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
-    ranges = words[11]
+    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, flags, ranges = words
     mag_gain = ranges >> _MAG_SHIFT
     if mag_gain >= len(MAG_LSB_PER_GAUSS):
         raise ValueError("unknown scale of the magnetometer")
     return ImuPayload(
-        accel=(words[0], words[1], words[2]),
-        gyro=(words[3], words[4], words[5]),
-        mag=(words[6], words[7], words[8]),
-        temperature=words[9],
-        flags=_imu_flags(words[10]),
+        accel=(ax, ay, az),
+        gyro=(gx, gy, gz),
+        mag=(mx, my, mz),
+        temperature=temperature,
+        flags=_imu_flags(flags),
         accel_range=ranges & 3,
         gyro_range=ranges >> _GYRO_SHIFT & 3,
         mag_gain=mag_gain,
@@ -425,7 +451,7 @@ _RADIO_STATES: Final = frozenset(RadioState)
 _BODIES: Final[
     dict[tuple[int, int], tuple[struct.Struct, Callable[[tuple[int, ...]], Payload]]]
 ] = {
-    (kind, layout.size): (layout, read)
+    (PROTOCOL_VERSION << 4 | kind, layout.size): (layout, read)
     for kind, layout, read in (
         (PayloadKind.IMU, _IMU, _read_imu),
         (PayloadKind.BARO, _BARO, _read_baro),
@@ -435,4 +461,4 @@ _BODIES: Final[
         (PayloadKind.NODE_STATUS, _NODE_STATUS, _read_node_status),
     )
 }
-"""By kind and size of the body: a payload that has grown is still read in its old size."""
+"""By first byte and size of the body: a payload that has grown is still read in its old size."""

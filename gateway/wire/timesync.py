@@ -28,6 +28,7 @@ from typing import Final
 import msgspec
 
 WRAP_US: Final = 1 << 32
+HALF_WRAP_US: Final = WRAP_US // 2
 BUCKET_US: Final = 250_000
 """Only the soonest packet of a bucket is kept: at any rate a window costs the same."""
 MAX_BUCKETS: Final = 120
@@ -96,20 +97,21 @@ class ClockTracker:
         remote_us = self._unwrap(remote_u32, arrival_us)
         local_us = self._to_local(remote_us) if self._buckets else arrival_us
         late_us = arrival_us - local_us
-        if late_us >= -AHEAD_US:
+        if -AHEAD_US <= late_us <= RESTART_JUMP_US:
+            self._suspect_us = self._late_since_us = None
+        elif late_us > RESTART_JUMP_US:
             self._suspect_us = None
-            if late_us <= RESTART_JUMP_US:
-                self._late_since_us = None
-            elif self._is_stale(arrival_us):
+            if self._is_stale(arrival_us):
                 self._restart()
                 remote_us, local_us = remote_u32, arrival_us
         elif self._is_unconfirmed(arrival_us - remote_us):
             return arrival_us
         if self._last_remote_us is None or remote_us > self._last_remote_us:
             self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
-        if self._add(remote_us, arrival_us - remote_us):
+        if self._is_soonest(remote_us, arrival_us - remote_us):
+            self._add(remote_us, arrival_us - remote_us)
             local_us = self._to_local(remote_us)
-        return min(local_us, arrival_us)
+        return local_us if local_us < arrival_us else arrival_us
 
     def _is_unconfirmed(self, delta_us: int) -> bool:
         """Return whether a packet is far too early, and no other has confirmed its offset yet."""
@@ -122,11 +124,11 @@ class ClockTracker:
     def _unwrap(self, remote_u32: int, arrival_us: int) -> int:
         if self._last_remote_us is not None:
             elapsed_us = arrival_us - self._last_arrival_us
-            error_us = remote_u32 - self._last_remote_us - elapsed_us
-            error_us = (error_us + WRAP_US // 2) % WRAP_US - WRAP_US // 2
-            remote_us = self._last_remote_us + elapsed_us + error_us
+            expected_us = self._last_remote_us + elapsed_us
+            error_us = (remote_u32 - expected_us + HALF_WRAP_US) % WRAP_US - HALF_WRAP_US
+            remote_us = expected_us + error_us
             slack_us = RESTART_JUMP_US + MAX_SKEW * elapsed_us
-            if abs(error_us) <= slack_us or self._goes_on(remote_us, arrival_us, slack_us):
+            if -slack_us <= error_us <= slack_us or self._goes_on(remote_us, arrival_us, slack_us):
                 return remote_us
             self._restart()
         return remote_u32
@@ -147,22 +149,25 @@ class ClockTracker:
             self._late_since_us = arrival_us
         return arrival_us - self._late_since_us > DRAIN_US
 
-    def _add(self, remote_us: int, delta_us: int) -> bool:
-        """Add a point if it is the soonest of its bucket, drift removed; return whether it is."""
+    def _is_soonest(self, remote_us: int, delta_us: int) -> bool:
+        """Return whether a point is the soonest of its bucket so far, drift removed."""
+        if not self._buckets:
+            return True
+        soonest = self._buckets[-1]
+        bucket, newest = remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
+        if bucket != newest:
+            return bucket > newest
+        # Of a clock that runs fast, each packet alone seems to come sooner than the last.
+        return delta_us < soonest.delta_us + self._skew * (remote_us - soonest.remote_us)
+
+    def _add(self, remote_us: int, delta_us: int) -> None:
+        """Add the soonest point of its bucket."""
         buckets = self._buckets
-        if buckets:
-            soonest = buckets[-1]
-            bucket, newest = remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
-            # Of a clock that runs fast, each packet alone seems to come sooner than the last.
-            expected_us = soonest.delta_us + self._skew * (remote_us - soonest.remote_us)
-            if bucket < newest or (bucket == newest and delta_us >= expected_us):
-                return False
-            if bucket == newest:
-                buckets.pop()
+        if buckets and buckets[-1].remote_us // BUCKET_US == remote_us // BUCKET_US:
+            buckets.pop()
         buckets.append(_Point(remote_us, delta_us))
         del buckets[:-MAX_BUCKETS]
         self._fit()
-        return True
 
     def _fit(self) -> None:
         first, last = self._buckets[0], self._buckets[-1]
@@ -181,8 +186,8 @@ class ClockTracker:
         self._line = a
 
     def _to_local(self, remote_us: int) -> int:
-        delta_us = self._line.delta_us + self._skew * (remote_us - self._line.remote_us)
-        return remote_us + round(delta_us)
+        line = self._line
+        return remote_us + round(line.delta_us + self._skew * (remote_us - line.remote_us))
 
 
 def _lower_hull(points: list[_Point]) -> list[_Point]:

@@ -149,7 +149,12 @@ class IntervalService:
 
     def on_state(self, time_us: int) -> list[Answer]:
         """Send the messages of an IMU sample to the clients that requested more."""
-        return self._due(CARRIED_MESSAGES, time_us, Stream.offer) if self._fast else []
+        return self._due(CARRIED_MESSAGES, time_us, Stream.offer)
+
+    @property
+    def has_fast(self) -> bool:
+        """Whether a client requested more than the settings' rate."""
+        return bool(self._fast)
 
     def poll(self, now_us: int) -> list[Answer]:
         """Send the timed messages to the clients that requested more."""

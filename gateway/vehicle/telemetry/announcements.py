@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags
+from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import CRITICAL, INFO, NOTICE, WARNING, StatusText
 from gateway.vehicle.telemetry.health import Finding, Health
@@ -49,6 +49,8 @@ class Announcer:
 
     def __init__(self, bucket: int = BUCKET, refill_us: int = REFILL_US) -> None:
         self._topics: dict[str, _Topic] = {}
+        self._pending: dict[str, _Topic] = {}
+        """Those whose state is not announced yet."""
         self._bucket = self._tokens = bucket
         self._refill_us = refill_us
         self._refilled_us = 0
@@ -76,8 +78,17 @@ class Announcer:
         -------
         list of MAVLink_message
         """
-        known = self._topics.setdefault(topic, _Topic(initially, initially, text))
+        known = self._topics.get(topic)
+        if known is None:
+            known = self._topics[topic] = _Topic(initially, initially, text)
         known.state, known.text = state, text
+        if state == known.announced:
+            self._pending.pop(topic, None)
+            return []
+        if now_us < known.held_until_us:
+            self._pending[topic] = known
+            return []
+        self._pending.pop(topic, None)
         return self._announce(known, now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Any]:
@@ -90,17 +101,16 @@ class Announcer:
 
     def poll(self, now_us: int) -> list[Any]:
         """Return the states that changed while their topics were held."""
-        changed = [topic for topic in self._topics.values() if topic.state != topic.announced]
-        return [message for topic in changed for message in self._announce(topic, now_us)]
+        if not self._pending:
+            return []
+        due = [name for name, topic in self._pending.items() if now_us >= topic.held_until_us]
+        return [m for name in due for m in self._announce(self._pending.pop(name), now_us)]
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to announce."""
-        pending = (t.held_until_us for t in self._topics.values() if t.state != t.announced)
-        return min(pending, default=None)
+        return min((topic.held_until_us for topic in self._pending.values()), default=None)
 
     def _announce(self, topic: _Topic, now_us: int) -> list[Any]:
-        if topic.state == topic.announced or now_us < topic.held_until_us:
-            return []
         topic.announced = topic.state
         topic.held_until_us = now_us + HOLD_US
         return chunks(topic.text, self._number())
@@ -187,6 +197,8 @@ FLAG_TEXTS: Final = (
     ),
 )
 """A flag of the estimator, the text when it rises, and the text when it falls."""
+GPS_FIX: Final = StatusText(INFO, "GPS fix")
+GPS_LOST: Final = StatusText(WARNING, "GPS fix lost")
 UNCALIBRATED_SENSORS: Final = (
     (ImuFlags.MAG_UNCALIBRATED, "Compass"),
     (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
@@ -213,10 +225,16 @@ class Announcements:
         self._latency_s: float | None = None
         self._latency_since_us = 0
 
-    def on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
-        """Announce the estimator's changes."""
-        if flags == self._flags:
-            return []
+    def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Any]:
+        """Announce changes of the sensors' and the estimator's flags."""
+        found: list[Any] = []
+        if sample.flags & UNCALIBRATED != self._uncalibrated:
+            found = self._on_sample(sample, now_us)
+        if state.flags != self._flags:
+            found += self._on_flags(state.flags, now_us)
+        return found
+
+    def _on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
         changed, self._flags = flags ^ self._flags, flags
         found = []
         for flag, raised, fallen in FLAG_TEXTS:
@@ -227,13 +245,11 @@ class Announcements:
                 )
         return found
 
-    def on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
+    def _on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
         """Announce sensors that were never calibrated; the compass once it has measured a field."""
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if sample.mag_b_ut is None:
-            changed &= ~ImuFlags.MAG_UNCALIBRATED
-        if not changed:
-            return []
+            changed &= ~int(ImuFlags.MAG_UNCALIBRATED)
         self._uncalibrated ^= changed
         found = []
         for flag, sensor in UNCALIBRATED_SENSORS:
@@ -248,7 +264,7 @@ class Announcements:
     def on_fix(self, now_us: int) -> list[Any]:
         """Announce whether GPS fixes arrive."""
         fixed = self._health.has_fix(now_us)
-        text = StatusText(INFO, "GPS fix") if fixed else StatusText(WARNING, "GPS fix lost")
+        text = GPS_FIX if fixed else GPS_LOST
         return self._announcer.track("GPS", fixed, text, now_us, initially=False)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:

@@ -298,8 +298,7 @@ class Health:
         self._seen_us: dict[int, int] = {}
         self._faulty: dict[int, int] = {}
         self._roles: dict[int, str] = {}
-        self._absent = 0
-        self._imu_faults = 0
+        self._imu_flags = ImuFlags(0)
         self._fix: GpsFix | None = None
         self._nav_flags = NavFlags(0)
         self._load_permille = 0
@@ -312,19 +311,14 @@ class Health:
 
     def on_state(self, state: NavState, sample: ImuSample) -> None:
         """Note an IMU sample and what the estimator made of it."""
+        seen, seen_us = self._seen_us, sample.time_us
         # Samples that waited in the kernel during a stall are older than what the stall excuses.
-        seen_us = max(sample.time_us, self._seen_us.get(GYRO, sample.time_us))
-        self._seen_us[GYRO] = self._seen_us[ACCEL] = seen_us
+        if seen.get(GYRO, 0) > seen_us:
+            seen_us = seen[GYRO]
+        seen[GYRO] = seen[ACCEL] = seen_us
         if sample.mag_b_ut is not None:
-            self._seen_us[MAG] = seen_us
-        self._nav_flags = state.flags
-        flags = sample.flags
-        self._imu_faults = GYRO | ACCEL if flags & ImuFlags.SELF_TEST_FAILED else 0
-        self._absent = 0
-        if flags & ImuFlags.MAG_ABSENT:
-            self._absent |= MAG
-        if flags & ImuFlags.BARO_ABSENT:
-            self._absent |= PRESSURE
+            seen[MAG] = seen_us
+        self._nav_flags, self._imu_flags = state.flags, sample.flags
 
     def on_baro(self, sample: BaroSample) -> None:
         """Note a barometer sample."""
@@ -397,11 +391,13 @@ class Health:
         """
         present = 0
         healthy = 0
-        faulty = self._imu_faults
+        absent = MAG if self._imu_flags & ImuFlags.MAG_ABSENT else 0
+        absent |= PRESSURE if self._imu_flags & ImuFlags.BARO_ABSENT else 0
+        faulty = GYRO | ACCEL if self._imu_flags & ImuFlags.SELF_TEST_FAILED else 0
         for failed in self._faulty.values():
             faulty |= failed
         for sensor in SENSORS:
-            if sensor not in self._seen_us or self._absent & sensor:
+            if sensor not in self._seen_us or absent & sensor:
                 continue
             present |= sensor
             if self.is_alive(sensor, now_us) and not faulty & sensor:

@@ -63,22 +63,19 @@ class Stream:
 
     def __init__(self, interval: int) -> None:
         self.interval_us = interval
-        self._due_us: int | None = None
-        self._pace = Pace()
-
-    @property
-    def due_us(self) -> int | None:
+        self.due_us: int | None = None
         """When the message is due next; None while it is off or has not started."""
-        return None if self.interval_us == OFF else self._due_us
+        self._pace = Pace()
 
     def begin(self, time_us: int) -> None:
         """Start the grid at a time."""
-        self._due_us = time_us
+        if self.interval_us != OFF:
+            self.due_us = time_us
 
     def change(self, interval: int) -> None:
         """Set a new interval, counted from the next sample."""
         self.interval_us = interval
-        self._due_us = None
+        self.due_us = None
 
     def offer(self, time_us: int) -> bool:
         """Return whether the sample of this time is to be sent.
@@ -98,7 +95,7 @@ class Stream:
         """Do the same where several streams are carried by the same samples, of a known pace."""
         if self.interval_us == OFF:
             return False
-        late = 0 if self._due_us is None else time_us - self._due_us
+        late = 0 if self.due_us is None else time_us - self.due_us
         if late < -(period_us // 2):
             return False
         self._advance(time_us, late, late // LEAN)
@@ -118,19 +115,19 @@ class Stream:
         """
         if self.interval_us == OFF:
             return False
-        late = 0 if self._due_us is None else now_us - self._due_us
+        late = 0 if self.due_us is None else now_us - self.due_us
         if late < 0:
             return False
         self._advance(now_us, late, 0)
         return True
 
     def _advance(self, time_us: int, late: int, lean: int) -> None:
-        if self._due_us is None:
-            self._due_us = time_us
+        if self.due_us is None:
+            self.due_us = time_us
         if late > self.interval_us:
-            self._due_us += late // self.interval_us * self.interval_us
+            self.due_us += late // self.interval_us * self.interval_us
             lean = 0
-        self._due_us += self.interval_us + lean
+        self.due_us += self.interval_us + lean
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,6 +57,8 @@ IN_AIR: Final[int] = mavlink.MAV_LANDED_STATE_IN_AIR
 
 HOLD_US: Final = 2 * US_PER_S
 LANDING_US: Final = 5 * US_PER_S
+VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
+ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
 SLOW: Final = 0.5
 """Share of the take-off limits below which the vehicle has come down."""
 
@@ -81,22 +83,22 @@ class Motion:
         ground_alt_m : float
             Height of the ground above mean sea level, NaN while it is not known.
         """
-        candidate = self._candidate_of(state, ground_alt_m)
+        candidate = UNDEFINED
+        if state.flags & VELOCITY_VALID:
+            candidate = self._candidate_of(state, ground_alt_m)
         if candidate != self._candidate:
             self._candidate, self._since_us = candidate, state.time_us
-        if candidate in (UNDEFINED, self.landed_state):
+        if candidate == UNDEFINED or candidate == self.landed_state:
             return
         hold_us = LANDING_US if self.landed_state == IN_AIR else HOLD_US
         if state.time_us - self._since_us >= hold_us:
             self.landed_state = candidate
 
     def _candidate_of(self, state: NavState, ground_alt_m: float) -> int:
-        if not state.flags & NavFlags.VELOCITY_VALID:
-            return UNDEFINED
         north, east, _ = state.vel_n_mps
         speed = math.hypot(north, east) / self.takeoff_speed_mps
         height = 0.0
-        if state.flags & NavFlags.ALTITUDE_VALID and not math.isnan(ground_alt_m):
+        if state.flags & ALTITUDE_VALID and not math.isnan(ground_alt_m):
             height = (state.alt_amsl_m - ground_alt_m) / self.takeoff_height_m
         most = max(speed, height)
         if most > 1.0:
@@ -268,9 +270,13 @@ class Telemetry:
         period_us = self._pace.take(time_us)
         if time_us + period_us < self._state_due_us:
             return []
-        due = [m for m, stream in self._state_streams if stream.offer_paced(time_us, period_us)]
-        streams = (stream for _, stream in self._state_streams if stream.interval_us != OFF)
-        self._state_due_us = min((stream.due_us or 0 for stream in streams), default=time_us)
+        next_us, due = time_us + US_PER_S, []
+        for message_id, stream in self._state_streams:
+            if stream.offer_paced(time_us, period_us):
+                due.append(message_id)
+            if stream.due_us is not None and stream.due_us < next_us:
+                next_us = stream.due_us
+        self._state_due_us = next_us
         return self._build_all(due, time_us) if due else []
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
@@ -323,9 +329,10 @@ class Telemetry:
             self._polled, self._timed_due_us = True, None
             for k, message_id in enumerate(self._timed):
                 self.streams[message_id].begin(now_us + k * APART_US)
+        if self._timed_due_us is not None and now_us < self._timed_due_us:
+            return []
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
-        if due:
-            self._timed_due_us = None
+        self._timed_due_us = None
         found = self._build_all(due, now_us)
         silent = not self.health.is_alive(GPS, now_us)
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
