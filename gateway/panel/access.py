@@ -36,8 +36,9 @@ MAX_BODY: Final = 1 << 20
 MAX_LOGIN_BODY: Final = 1 << 13
 LOGIN_S: Final = 10.0
 """Longest time for the body of a login request."""
-UPLOAD: Final = "/recordings/"
-"""Paths below it accept a whole recording."""
+RECORDINGS: Final = "/recordings/"
+MAPS: Final = "/maps/"
+"""Paths below these two accept whole files."""
 API_PATHS: Final = ("/v1/", "/mavlink", "/helper/", "/ws/mavlink", "/info")
 """Paths of the REST and WebSocket API, which pages of `panel.origins` may use."""
 CORS_HEADERS: Final = {
@@ -281,7 +282,7 @@ class AccessControl:
         if scope.get("method") == "HEAD":
             # Answered as GET; the server, which has the scope itself, leaves the body out.
             scope = {**scope, "method": "GET"}
-        limit = self._upload_limit if scope["path"].startswith(UPLOAD) else MAX_BODY
+        limit = self._upload_limit if scope["path"].startswith((RECORDINGS, MAPS)) else MAX_BODY
         answer = PlainTextResponse(
             f"too large: at most {limit} bytes", HTTPStatus.REQUEST_ENTITY_TOO_LARGE
         )

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import httpx
-from pmtiles.reader import Reader
-from pmtiles.tile import MagicNumberNotFound, TileType, zxy_to_tileid
+from pmtiles.tile import zxy_to_tileid
 from pmtiles.writer import Writer
 
 from gateway import __version__
+from gateway.panel.map_tiles import GetBytes, PmTiles
 
 EARTH_M: Final = 6_378_137.0
 MAX_TILES: Final = 20_000
@@ -25,10 +25,8 @@ MAX_BYTES: Final = 500_000_000
 MAX_PIECE: Final = 16 << 20
 """Bytes of one request: a directory or a tile is smaller."""
 TIMEOUT_S: Final = 30.0
-RASTER: Final = {TileType.PNG, TileType.JPEG, TileType.WEBP}
 SPANS: Final = {"m": 1.0, "km": 1000.0, "mi": 1609.344, "nm": 1852.0}
 
-GetBytes = Callable[[int, int], bytes]
 Box = tuple[float, float, float, float]
 """South, west, north, east, deg."""
 
@@ -130,13 +128,11 @@ def extract_area(
     MapAreaError
         If the source is no raster map, or the area is too large.
     """
-    reader = Reader(get_bytes)
     try:
-        header: dict[str, Any] = reader.header()
-    except MagicNumberNotFound as error:
-        raise MapAreaError("the source is no PMTiles file") from error
-    if header["tile_type"] not in RASTER:
-        raise MapAreaError("the source has vector tiles; the panel draws PNG, JPEG and WebP tiles")
+        reader = PmTiles(get_bytes)
+    except ValueError as error:
+        raise MapAreaError(f"the source cannot be used: {error}") from error
+    header = reader.header
     zooms = range(header["min_zoom"], min(max_zoom, header["max_zoom"]) + 1)
     wanted = [(z, x, y) for z in zooms for x, y in tiles_in(box, z)]
     if len(wanted) > MAX_TILES:

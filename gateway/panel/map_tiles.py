@@ -5,24 +5,44 @@ map's owner does not see the users.
 """
 
 import asyncio
+import gzip
 import hashlib
+import json
 import logging
+import os
 import re
 import sqlite3
 import time
+import zlib
 from collections.abc import Callable
 from contextlib import closing
+from functools import lru_cache, partial
+from html import escape, unescape
+from http import HTTPStatus
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import httpx
 from fastapi import FastAPI
-from pmtiles.reader import MmapSource, Reader
-from pmtiles.tile import MagicNumberNotFound
+from msgspec.structs import replace
+from pmtiles.tile import (
+    Compression,
+    Entry,
+    MagicNumberNotFound,
+    SpecVersionUnsupported,
+    TileType,
+    deserialize_directory,
+    deserialize_header,
+    find_tile,
+    zxy_to_tileid,
+)
+from starlette.requests import Request
 from starlette.responses import Response
 
 from gateway import __version__
+from gateway.panel.access import MAPS
 from gateway.panel.panel_settings import MapStyle, PanelSettings
+from gateway.panel.recording_files import answer_upload, open_regular
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +58,23 @@ TIDY_EVERY: Final = 200
 MAX_ZOOM: Final = 24
 BROWSER_S: Final = 3600
 MAX_FILES: Final = 16
-STYLE_NAME: Final = re.compile(r"[\w .-]{1,32}")
+STYLE_NAME: Final = re.compile(r"\w[\w .-]{0,31}")
+RASTER: Final = {TileType.PNG, TileType.JPEG, TileType.WEBP}
+MAX_HEADER: Final = 127
+MAX_DIRECTORY: Final = 1 << 19
+"""Bytes of a directory, packed and unpacked; of a large map they have up to 200,000."""
+MAX_DEPTH: Final = 4
+MAX_ATTRIBUTION: Final = 300
+MARKUP: Final = re.compile(r"<[^>]*>")
+LONG_NUMBER: Final = re.compile(rb"[\x80-\xff]{10}")
+"""A number of more than 64 bits; a long one would take minutes to read."""
+BROKEN: Final = (ValueError, EOFError, IndexError, OverflowError, zlib.error)
+"""Raised by the library for damaged contents."""
+
+GetBytes = Callable[[int, int], bytes]
+"""Reads a range of bytes, given its offset and length; fewer at the end of the file."""
+GetTile = Callable[[int, int, int], bytes | None]
+"""Returns the tile of a zoom, column and row."""
 SIGNATURES: Final = (
     (b"\x89PNG", "image/png"),
     (b"\xff\xd8\xff", "image/jpeg"),
@@ -49,6 +85,118 @@ SIGNATURES: Final = (
 def kind_of_image(data: bytes) -> str | None:
     """Return the media type of a picture by its first bytes; None for anything else."""
     return next((kind for head, kind in SIGNATURES if data.startswith(head)), None)
+
+
+class PmTiles:
+    """A PMTiles file of raster tiles, read with bounds: its contents may be hostile.
+
+    The library's own reader unpacks directories without a limit.
+
+    Parameters
+    ----------
+    get_bytes : callable
+        Reads a range of bytes of the file.
+
+    Raises
+    ------
+    ValueError
+        If it is no such file; the text says why.
+    """
+
+    def __init__(self, get_bytes: GetBytes) -> None:
+        self._get_bytes = get_bytes
+        try:
+            self.header: dict[str, Any] = dict(deserialize_header(get_bytes(0, MAX_HEADER)))
+        except (*BROKEN, MagicNumberNotFound) as error:
+            raise ValueError("it is no PMTiles file") from error
+        except SpecVersionUnsupported as error:
+            raise ValueError("its PMTiles version is not 3: convert it") from error
+        if self.header["tile_type"] not in RASTER:
+            kind = self.header["tile_type"].name
+            raise ValueError(f"its tiles are {kind}; the panel draws PNG, JPEG and WEBP")
+        self._directory = lru_cache(maxsize=8)(self._read_directory)
+        self._directory(self.header["root_offset"], self.header["root_length"])
+
+    @property
+    def max_zoom(self) -> int:
+        """Greatest zoom of its tiles."""
+        return min(int(self.header["max_zoom"]), MAX_ZOOM)
+
+    def get(self, z: int, x: int, y: int) -> bytes | None:
+        """Return a tile; None if there is none. Raises ValueError for a damaged directory."""
+        wanted = zxy_to_tileid(z, x, y)
+        return self._follow(lambda entries: find_tile(entries, wanted))
+
+    def first_tile(self) -> bytes | None:
+        """Return the first tile; raises ValueError for a damaged directory."""
+        return self._follow(lambda entries: entries[0] if entries else None)
+
+    @property
+    def attribution(self) -> str:
+        """The map's attribution, whose markup is removed."""
+        text = unescape(str(self.metadata().get("attribution") or ""))[:MAX_ATTRIBUTION]
+        return escape(MARKUP.sub("", text))
+
+    def metadata(self) -> dict[str, Any]:
+        """Return the description of the map, such as its attribution; empty if it is damaged."""
+        try:
+            data = self._unpacked(self.header["metadata_offset"], self.header["metadata_length"])
+            found = json.loads(data)
+        except (ValueError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def _follow(self, choose: Callable[[list[Entry]], Entry | None]) -> bytes | None:
+        offset, length = self.header["root_offset"], self.header["root_length"]
+        for _ in range(MAX_DEPTH):
+            entry = choose(self._directory(offset, length))
+            if entry is None:
+                return None
+            if entry.run_length:
+                if entry.length > MAX_TILE:
+                    return None
+                return self._get_bytes(self.header["tile_data_offset"] + entry.offset, entry.length)
+            offset, length = self.header["leaf_directory_offset"] + entry.offset, entry.length
+        raise ValueError("its directories are nested too deeply")
+
+    def _read_directory(self, offset: int, length: int) -> list[Entry]:
+        data = self._unpacked(offset, length)
+        if LONG_NUMBER.search(data):
+            raise ValueError("a directory of it is damaged")
+        try:
+            # The library takes packed ones only.
+            return deserialize_directory(gzip.compress(data, 0))
+        except BROKEN as error:
+            raise ValueError("a directory of it is damaged") from error
+
+    def _unpacked(self, offset: int, length: int) -> bytes:
+        if length > MAX_DIRECTORY:
+            raise ValueError("a directory of it is too large")
+        data = self._get_bytes(offset, length)
+        if self.header["internal_compression"] is Compression.NONE:
+            return data
+        unpacking = zlib.decompressobj(wbits=31)
+        try:
+            data = unpacking.decompress(data, MAX_DIRECTORY)
+        except zlib.error as error:
+            raise ValueError("a directory of it is damaged") from error
+        if unpacking.unconsumed_tail:
+            raise ValueError("a directory of it is too large")
+        return data
+
+
+def open_pmtiles(path: Path) -> PmTiles:
+    """Open a PMTiles file on the disk; raises ValueError or OSError if it is none."""
+
+    def get_bytes(offset: int, length: int) -> bytes:
+        # Not mapped into memory: a file that becomes shorter would end the process.
+        with open_regular(path.resolve()) as file:
+            try:
+                return os.pread(file.fileno(), length, offset)
+            except OverflowError as error:
+                raise ValueError("a directory of it is damaged") from error
+
+    return PmTiles(get_bytes)
 
 
 def styles_of(settings: PanelSettings) -> list[MapStyle]:
@@ -74,13 +222,16 @@ class MapTiles:
     def __init__(self, settings: PanelSettings) -> None:
         self._folder = Path(settings.tiles_folder).expanduser()
         self._limit = settings.tiles_limit_mb * 1_000_000
-        self._sources = [self._source(style) for style in styles_of(settings)]
+        self.styles: list[MapStyle] = []
+        self._sources: list[MapStyle | GetTile] = []
+        for style in styles_of(settings):
+            self._add(style)
         self._fetched = 0
         self._turns = asyncio.Semaphore(AT_ONCE)
         self._client: httpx.AsyncClient | None = None
 
     def serve(self, app: FastAPI) -> None:
-        """Serve `/tiles/STYLE/Z/X/Y`; without a tile the page shows the grid."""
+        """Serve `GET /tiles/STYLE/Z/X/Y` and `PUT /maps/NAME`, which adds a PMTiles file."""
 
         @app.get("/tiles/{style}/{z}/{x}/{y}")
         async def _tile(style: int, z: int, x: int, y: int) -> Response:
@@ -90,6 +241,16 @@ class MapTiles:
                 return Response(status_code=204, headers={"cache-control": "no-store"})
             headers = {"cache-control": f"max-age={BROWSER_S}"}
             return Response(data, media_type=kind, headers=headers)
+
+        @app.put(MAPS + "{name}")
+        async def _upload(name: str, request: Request) -> Response:
+            answer = await answer_upload(
+                request, self._folder, lambda: self._check_name(name), partial(_map_name, name)
+            )
+            if answer.status_code == HTTPStatus.CREATED:
+                path = self._folder / f"{name}.pmtiles"
+                self._add(MapStyle(name=name, url=str(path), max_zoom=MAX_ZOOM))
+            return answer
 
     async def tile(self, style: int, z: int, x: int, y: int) -> bytes | None:
         """Return one tile; None if there is none, or it cannot be fetched.
@@ -107,19 +268,42 @@ class MapTiles:
         source = self._sources[style]
         if isinstance(source, MapStyle):
             return await self._kept_or_fetched(source, z, x, y)
-        return await asyncio.to_thread(source, z, x, y)
-
-    def _source(self, style: MapStyle) -> MapStyle | Callable[[int, int, int], bytes | None]:
-        if style.url.startswith(("http://", "https://")):
-            return style
-        path = Path(style.url).expanduser()
         try:
-            return _open_pmtiles(path) if path.suffix == ".pmtiles" else _open_mbtiles(path)
-        except (OSError, ValueError, MagicNumberNotFound, sqlite3.Error) as error:
-            log.warning(
-                "map style %r: %s: %s", style.name, path, str(error) or "is no PMTiles file"
-            )
-            return lambda *_: None
+            return await asyncio.to_thread(source, z, x, y)
+        except (OSError, ValueError, sqlite3.Error) as error:
+            log.warning("map style %r: %s", self.styles[style].name, error)
+            self._sources[style] = _no_tile
+            return None
+
+    def _check_name(self, name: str) -> None:
+        if not STYLE_NAME.fullmatch(name):
+            raise ValueError("a map has a name of at most 32 letters, digits, spaces, and .-_")
+        if len([*self._folder.glob("*.pmtiles")]) >= MAX_FILES:
+            raise ValueError(f"{self._folder} has {MAX_FILES} maps already: delete one there")
+        if os.path.lexists(self._folder / f"{name}.pmtiles"):
+            raise ValueError(f"there is a map {name!r} already in {self._folder}")
+
+    def _add(self, style: MapStyle) -> None:
+        """Open a style; one that cannot be opened has no tiles."""
+        source: MapStyle | GetTile = style
+        if not style.url.startswith(("http://", "https://")):
+            path = Path(style.url).expanduser()
+            try:
+                if path.suffix == ".pmtiles":
+                    map_file = open_pmtiles(path)
+                    style = replace(
+                        style,
+                        max_zoom=min(style.max_zoom, map_file.max_zoom),
+                        attribution=style.attribution or map_file.attribution,
+                    )
+                    source = map_file.get
+                else:
+                    source = _open_mbtiles(path)
+            except (OSError, ValueError, sqlite3.Error) as error:
+                log.warning("map style %r: %s: %s", style.name, path, error)
+                source = _no_tile
+        self.styles.append(style)
+        self._sources.append(source)
 
     async def _kept_or_fetched(self, style: MapStyle, z: int, x: int, y: int) -> bytes | None:
         folder = hashlib.sha256(style.url.encode()).hexdigest()[:16]
@@ -205,9 +389,13 @@ def _open_mbtiles(path: Path) -> Callable[[int, int, int], bytes | None]:
     return get
 
 
-def _open_pmtiles(path: Path) -> Callable[[int, int, int], bytes | None]:
-    with path.open("rb") as file:
-        reader = Reader(MmapSource(file))
-    reader.header()
-    get: Callable[[int, int, int], bytes | None] = reader.get
-    return get
+def _map_name(name: str, path: Path) -> str:
+    """Return the file name of an uploaded map; raises ValueError if it is none."""
+    data = open_pmtiles(path).first_tile()
+    if data is None or kind_of_image(data) is None:
+        raise ValueError("it has no PNG, JPEG or WEBP tile")
+    return f"{name}.pmtiles"
+
+
+def _no_tile(*_: int) -> bytes | None:
+    return None

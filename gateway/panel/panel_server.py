@@ -177,6 +177,7 @@ def make_parts(
         dialogues,
         watch,
         RecordingJobs(),
+        MapTiles(settings),
     )
 
 
@@ -192,8 +193,8 @@ def make_app(parts: PanelParts) -> FastAPI:
         await telemetry.serve(websocket)
 
     add_tracks(app, parts.fleet)
-    MapTiles(parts.settings).serve(app)
-    add_recording_files(app, parts)
+    parts.tiles.serve(app)
+    add_recording_files(app, lambda: parts.recordings_folder)
     parts.jobs.serve(app)
     app.mount("/web", _CheckedFiles(directory=WEB))
     app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))

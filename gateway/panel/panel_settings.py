@@ -93,7 +93,7 @@ class PanelSettings(Settings, frozen=True):
         ),
     ] = 500
     upload_limit_mb: Annotated[
-        int, setting("Largest recording that a browser may upload.", "MB", ge=1, le=100_000)
+        int, setting("Largest recording or map that a browser may upload.", "MB", ge=1, le=100_000)
     ] = 512
     map_styles: Annotated[
         tuple[MapStyle, ...], setting("Styles of the map; the first one is the default.")

@@ -1,16 +1,17 @@
-"""Download of recordings as one archive, and checked uploads.
+"""Download of recordings as one archive, and checked uploads of recordings and maps.
 
 File names from the browser are always checked: a recording must be one of the existing ones, and
 an upload gets a name that follows the rules of recordings. An upload is written to a temporary
-file, checked, and only then becomes a recording. A download is packed while it is sent, so it needs
-no space on the disk.
+file, checked, and only then gets its name. A download is packed while it is sent, so it needs no
+space on the disk.
 """
 
 import os
 import secrets
 import stat
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from http import HTTPStatus
 from pathlib import Path
 from typing import BinaryIO, Final
@@ -21,8 +22,7 @@ from fastapi import FastAPI
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
-from gateway.panel.access import ROLE, UPLOAD, Role
-from gateway.panel.view_context import PanelParts
+from gateway.panel.access import RECORDINGS, ROLE, Role
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FileKind, kind_of
 from gateway.recordings.index import RecordingError, check_free, find_recording
@@ -35,23 +35,23 @@ KINDS: Final[dict[FileKind | None, str]] = {FileKind.TLOG: "_01.tlog", FileKind.
 """Kinds that can be uploaded, and the ending of their files."""
 
 
-def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
+def add_recording_files(app: FastAPI, folder_of: Callable[[], Path]) -> None:
     """Serve `GET /recordings/NAME` (a ZIP of its files) and `PUT /recordings/NAME`.
 
     Parameters
     ----------
     app : FastAPI
         The page's.
-    parts : PanelParts
-        With their folder.
+    folder_of : callable
+        Returns their folder.
     """
 
-    @app.get(UPLOAD + "{name}")
+    @app.get(RECORDINGS + "{name}")
     async def _download(name: str) -> Response:
         try:
             files = [
                 file
-                for file in find_recording(parts.recordings_folder, name).files
+                for file in find_recording(folder_of(), name).files
                 if file.is_file() and not file.is_symlink()
             ]
         except RecordingError as error:
@@ -66,22 +66,43 @@ def add_recording_files(app: FastAPI, parts: PanelParts) -> None:
             headers={"content-disposition": disposition},
         )
 
-    @app.put(UPLOAD + "{name}")
+    @app.put(RECORDINGS + "{name}")
     async def _upload(name: str, request: Request) -> Response:
-        if request.scope[ROLE] is not Role.OPERATOR:
-            return PlainTextResponse("viewers have read-only access", HTTPStatus.FORBIDDEN)
-        try:
-            folder = parts.recordings_folder
-            check_free(folder, name)
-            stored = await _store(folder, name, request.stream())
-        except ClientDisconnect:
-            return PlainTextResponse("interrupted", HTTPStatus.BAD_REQUEST)
-        except (RecordingError, ValueError) as error:
-            return PlainTextResponse(str(error), HTTPStatus.BAD_REQUEST)
-        except OSError as error:
-            text = f"cannot be stored: {error.strerror}"
-            return PlainTextResponse(text, HTTPStatus.INSUFFICIENT_STORAGE)
-        return PlainTextResponse(stored.name, HTTPStatus.CREATED)
+        folder = folder_of()
+        return await answer_upload(
+            request, folder, lambda: check_free(folder, name), partial(_recording_name, name)
+        )
+
+
+async def answer_upload(
+    request: Request, folder: Path, check: Callable[[], None], name_of: Callable[[Path], str]
+) -> Response:
+    """Store the body of an operator's request in a folder, and return its file name.
+
+    Parameters
+    ----------
+    request : Request
+        Its size is limited by `AccessControl`.
+    folder : Path
+        Created if it does not exist.
+    check : callable
+        Raises ValueError or RecordingError if the upload is not welcome.
+    name_of : callable
+        Returns the name for a stored file, or raises ValueError if its contents are wrong.
+    """
+    if request.scope[ROLE] is not Role.OPERATOR:
+        return PlainTextResponse("viewers have read-only access", HTTPStatus.FORBIDDEN)
+    try:
+        check()
+        stored = await _store(folder, request.stream(), name_of)
+    except ClientDisconnect:
+        return PlainTextResponse("interrupted", HTTPStatus.BAD_REQUEST)
+    except (RecordingError, ValueError) as error:
+        return PlainTextResponse(str(error), HTTPStatus.BAD_REQUEST)
+    except OSError as error:
+        text = f"cannot be stored: {error.strerror}"
+        return PlainTextResponse(text, HTTPStatus.INSUFFICIENT_STORAGE)
+    return PlainTextResponse(stored.name, HTTPStatus.CREATED)
 
 
 def zip_stream(files: Sequence[Path]) -> Iterator[bytes]:
@@ -127,14 +148,10 @@ class _Sink:
         return data
 
 
-async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
-    """Write an upload into the folder of the recordings, and rename it if it is a recording.
-
-    Raises
-    ------
-    ValueError
-        If it is no recording.
-    """
+async def _store(
+    folder: Path, chunks: AsyncIterator[bytes], name_of: Callable[[Path], str]
+) -> Path:
+    """Write an upload to a temporary file, and rename it once it is checked."""
     folder.mkdir(parents=True, exist_ok=True)
     fresh = folder / f".upload-{secrets.token_hex(8)}"
     try:
@@ -142,11 +159,7 @@ async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
         with fresh.open("xb") as file:
             async for chunk in chunks:
                 file.write(chunk)
-        suffix = KINDS.get(_kind(fresh))
-        if suffix is None:
-            allowed = " and ".join(str(kind) for kind in KINDS)
-            raise ValueError(f"this is no recording: {allowed} are taken")
-        target = folder / f"{name}{suffix}"
+        target = folder / name_of(fresh)
         # A file that was created meanwhile is never overwritten.
         target.touch(exist_ok=False)
         fresh.replace(target)
@@ -154,6 +167,15 @@ async def _store(folder: Path, name: str, chunks: AsyncIterator[bytes]) -> Path:
     finally:
         with suppress(FileNotFoundError):
             fresh.unlink()
+
+
+def _recording_name(name: str, path: Path) -> str:
+    """Return the file name of an uploaded recording; raises ValueError if it is none."""
+    suffix = KINDS.get(_kind(path))
+    if suffix is None:
+        allowed = " and ".join(str(kind) for kind in KINDS)
+        raise ValueError(f"this is no recording: {allowed} are taken")
+    return f"{name}{suffix}"
 
 
 def _kind(path: Path) -> FileKind | None:

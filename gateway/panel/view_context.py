@@ -38,6 +38,7 @@ from gateway.clock import GatewayClock
 from gateway.panel.access import Role
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.gateway_client import READING, ControlClient, GatewayWatch
+from gateway.panel.map_tiles import MapTiles
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_jobs import RecordingJobs
@@ -76,6 +77,7 @@ class PanelParts:
     """The gateway's status of the last second."""
     jobs: RecordingJobs
     """The catalogue and the exports of recordings."""
+    tiles: MapTiles
 
     @property
     def recordings_folder(self) -> Path:

@@ -101,7 +101,7 @@ def test_server_without_ranges_and_too_large_areas_are_refused(world: Path, tmp_
     with pytest.raises(MapAreaError, match="no ranges"):
         extract_area(open_source(ADDRESS, client), tmp_path / "x", (0, 0, 1, 1), 3)
     write_world(world, TileType.MVT)
-    with pytest.raises(MapAreaError, match="vector tiles"):
+    with pytest.raises(MapAreaError, match="its tiles are MVT"):
         extract_area(open_source(str(world)), tmp_path / "x", (0, 0, 1, 1), 3)
 
 

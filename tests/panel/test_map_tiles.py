@@ -1,5 +1,6 @@
 """Tiles from files, from a server on loopback, and from the disk when that is gone."""
 
+import gzip
 import os
 import sqlite3
 import struct
@@ -12,10 +13,13 @@ from typing import ClassVar
 
 import httpx
 import pytest
+from fastapi import FastAPI
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
+from starlette.types import Receive, Scope, Send
 
-from gateway.panel.map_tiles import MAX_TILE, MapTiles, tidy
+from gateway.panel.access import ROLE, Role
+from gateway.panel.map_tiles import MAX_FILES, MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
 
 pytestmark = pytest.mark.io
@@ -128,21 +132,113 @@ async def test_mbtiles_counts_rows_from_the_south(tmp_path: Path) -> None:
     assert await tiles.tile(0, 2, 1, 0) is None
 
 
-async def test_pmtiles(tmp_path: Path) -> None:
-    file = tmp_path / "field.pmtiles"
+def write_pmtiles(
+    file: Path,
+    kind: TileType = TileType.PNG,
+    attribution: str = "",
+    tile: tuple[int, int, int] = (4, 3, 2),
+) -> None:
+    """Write a map of one tile."""
     with file.open("wb") as stream:
         writer = Writer(stream)
-        writer.write_tile(zxy_to_tileid(4, 3, 2), picture(7))
+        writer.write_tile(zxy_to_tileid(*tile), picture(7))
         header = {
-            "tile_type": TileType.PNG,
-            "tile_compression": Compression.NONE,
+            "tile_type": kind, "tile_compression": Compression.NONE,
             "min_lon_e7": 0, "min_lat_e7": 0, "max_lon_e7": 0, "max_lat_e7": 0,
             "center_zoom": 0, "center_lon_e7": 0, "center_lat_e7": 0,
         }  # fmt: skip
-        writer.finalize(header, {})
-    tiles = tiles_of(tmp_path, str(file))
+        writer.finalize(header, {"attribution": attribution})
+
+
+async def test_pmtiles_file_is_a_style_with_its_own_zooms_and_attribution(tmp_path: Path) -> None:
+    write_pmtiles(tmp_path / "field.pmtiles", attribution="&lt;b&gt;&copy; <a href='x'>Me</a> & Co")
+    tiles = MapTiles(PanelSettings(tiles_folder=str(tmp_path), map_styles=()))
+    (style,) = tiles.styles
+    assert (style.name, style.max_zoom, style.attribution) == ("field", 4, "© Me &amp; Co")
     assert await tiles.tile(0, 4, 3, 2) == picture(7)
     assert await tiles.tile(0, 4, 3, 3) is None
+
+
+def changed(data: bytes, offset: int, value: int, size: int = 8) -> bytes:
+    return data[:offset] + value.to_bytes(size, "little") + data[offset + size :]
+
+
+def hostile_maps(folder: Path) -> dict[str, tuple[bytes, str]]:
+    """Make files that are no usable maps, and what is said of each."""
+    write_pmtiles(folder / "good", TileType.PNG)
+    good = (folder / "good").read_bytes()
+    write_pmtiles(folder / "vector", TileType.MVT)
+    bomb, text = gzip.compress(bytes(1 << 28)), "directory of it"
+    long_number = gzip.compress(b"\xff" * (1 << 18))
+    return {
+        "empty": (b"", "no PMTiles"),
+        "text": (b"<script>alert(1)</script>" * 20, "no PMTiles"),
+        "begin only": (b"PMTiles", "no PMTiles"),
+        "old version": (changed(good, 7, 2, 1), "version is not 3"),
+        "unknown kind": (changed(good, 99, 77, 1), "no PMTiles"),
+        "vector tiles": ((folder / "vector").read_bytes(), "tiles are MVT"),
+        "directory beyond the end": (changed(good, 8, 1 << 40), text),
+        "directory beyond all files": (changed(good, 8, (1 << 64) - 1), text),
+        "directory of 1 GB": (changed(good, 16, 1 << 30), text),
+        "directory that unpacks to 256 MB": (
+            changed(changed(good + bomb, 8, len(good)), 16, len(bomb)), text,
+        ),
+        "number of 2 million bits": (
+            changed(changed(good + long_number, 8, len(good)), 16, len(long_number)), text,
+        ),
+        "tile beyond the end": (changed(good, 56, 1 << 40), "no PNG"),
+        "tile that is a script": (good.replace(b"\x89PNG", b"<scr"), "no PNG"),
+    }  # fmt: skip
+
+
+def client_of(tiles: MapTiles, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
+    app = FastAPI()
+    tiles.serve(app)
+
+    async def with_role(scope: Scope, receive: Receive, send: Send) -> None:
+        scope[ROLE] = role
+        await app(scope, receive, send)
+
+    transport = httpx.ASGITransport(app=with_role)
+    return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1")
+
+
+async def test_uploaded_map_is_a_style_at_once_and_hostile_ones_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    maps, folder = hostile_maps(tmp_path / "made"), tmp_path / "tiles"
+    good = (tmp_path / "made" / "good").read_bytes()
+    tiles = MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=()))
+    async with client_of(tiles) as client:
+        for name, (data, text) in maps.items():
+            answer = await client.put(f"/maps/{name}", content=data)
+            assert (answer.status_code, text in answer.text) == (400, True), (name, answer.text)
+        for name in ("../field", "..%2Ffield", ".hidden", "a" * 33, "%00"):
+            assert (await client.put(f"/maps/{name}", content=good)).status_code >= 400
+        assert list(folder.iterdir()) == []
+        assert (await client.put("/maps/home field", content=good)).status_code == 201
+        assert (await client.get("/tiles/0/4/3/2")).content == picture(7)
+        assert "already" in (await client.put("/maps/home field", content=good)).text
+    assert [style.name for style in tiles.styles] == ["home field"]
+    assert [file.name for file in folder.iterdir()] == ["home field.pmtiles"]
+    async with client_of(tiles, Role.VIEWER) as viewer:
+        assert (await viewer.put("/maps/other", content=good)).status_code == 403
+    for number in range(MAX_FILES):
+        (folder / f"{number}.pmtiles").touch()
+    async with client_of(tiles) as client:
+        assert "delete one" in (await client.put("/maps/other", content=good)).text
+
+
+async def test_hostile_file_in_the_folder_does_not_stop_the_panel(tmp_path: Path) -> None:
+    (tmp_path / "made").mkdir()
+    folder = tmp_path / "tiles"
+    folder.mkdir()
+    os.mkfifo(folder / "pipe.pmtiles")
+    for name, (data, _) in hostile_maps(tmp_path / "made").items():
+        (folder / f"{name[:32]}.pmtiles").write_bytes(data)
+    tiles = MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=()))
+    for number, style in enumerate(tiles.styles):
+        data = await tiles.tile(number, 4, 3, 2)
+        assert not data or "script" in style.name
 
 
 @pytest.mark.parametrize("name", ["missing.mbtiles", "missing.pmtiles", "broken.pmtiles"])

@@ -26,6 +26,7 @@ from tests.panel.browsing import (
 )
 from tests.panel.scripted_vehicle import ScriptedVehicle
 from tests.panel.test_flight_page import frames
+from tests.panel.test_map_tiles import write_pmtiles
 
 pytestmark = [
     pytest.mark.io,
@@ -242,7 +243,7 @@ def test_3d_keeps_the_aircraft_while_the_theme_stays(page: Page) -> None:
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
 
 
-def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
+def test_row_live_map_with_styles_and_zoom(page: Page, tmp_path: Path) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")
     expect(view.locator(".leaflet-tile-loaded").first).to_be_visible()
@@ -265,6 +266,15 @@ def test_row_live_map_with_styles_and_zoom(page: Page) -> None:
     )
     expect(view.locator(".craft[data-selected='true']")).to_be_visible()
     expect(view.locator(".pin.home")).to_be_visible()
+    upload = view.get_by_label("Upload a PMTiles file")
+    (tmp_path / "hostile.pmtiles").write_bytes(b"no tiles at all")
+    upload.set_input_files(tmp_path / "hostile.pmtiles")
+    expect(page.get_by_text("it is no PMTiles file")).to_be_visible()
+    write_pmtiles(tmp_path / "home field.pmtiles", tile=(4, 12, 8))
+    upload.set_input_files(tmp_path / "home field.pmtiles")
+    expect(style.locator("option")).to_have_text(["Field", "Other", "home field", "Grid"])
+    style.select_option(label="home field")
+    expect(view.locator(".leaflet-tile-loaded[src*='/tiles/2/']").first).to_be_visible()
 
 
 LISTEN_TO_WORDS = """
@@ -349,11 +359,11 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
         tlog = next(name for name in names if name.endswith(".tlog"))
         (tmp_path / "evening_01.tlog").write_bytes(packed.read(tlog))
     assert {"morning flight_01_v1.csv", "morning flight_01_v2.csv"} <= set(names)
-    view.get_by_label("Bring a recording").set_input_files(tmp_path / "evening_01.tlog")
+    view.get_by_label("Upload a recording").set_input_files(tmp_path / "evening_01.tlog")
     brought = view.locator("tr[data-key='evening']")
     expect(brought).to_be_visible()
     (tmp_path / "holiday.tlog").write_text("this is no flight at all, but a text\n")
-    view.get_by_label("Bring a recording").set_input_files(tmp_path / "holiday.tlog")
+    view.get_by_label("Upload a recording").set_input_files(tmp_path / "holiday.tlog")
     expect(page.get_by_text("this is no recording")).to_be_visible()
     _move_in_time(page, row)
     for name in ("morning flight", "evening"):

@@ -6,7 +6,6 @@ from collections.abc import AsyncIterator
 from http import HTTPStatus
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
 from zipfile import ZipFile
 
 import httpx
@@ -33,7 +32,7 @@ def flight() -> bytes:
 
 def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
     app = FastAPI()
-    add_recording_files(app, SimpleNamespace(recordings_folder=folder))  # type: ignore[arg-type]
+    add_recording_files(app, lambda: folder)
 
     async def with_role(scope: Scope, receive: Receive, send: Send) -> None:
         scope[ROLE] = role

@@ -5,17 +5,17 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, Final
 
-from msgspec import to_builtins
 from nicegui import ui
 from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.map_tiles import styles_of
+from gateway.panel.access import MAPS
 from gateway.panel.state.vehicle import Spot
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets.prompts import closing, named_dialog, notify_failure
+from gateway.panel.widgets.prompts import UploadButton, closing, named_dialog, notify_failure
 
+STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
 """The map library is that of NiceGUI's own map, whose import registers it with the page."""
 
@@ -33,15 +33,27 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
 
     def __init__(self, context: ViewContext, *, full: bool) -> None:
         super().__init__()
-        styles = styles_of(context.parts.settings)
-        self._props["styles"] = [
-            {key: to_builtins(style)[key] for key in ("name", "attribution", "max_zoom")}
-            for style in styles
-        ]
+        self._tiles = context.parts.tiles
         self._props["full"] = full
+        self.refresh()
+        context.every(STYLES_S, self.refresh)
         self._props["may_mark"] = full and context.may_change
         if full and context.may_change:
             self.on("place", partial(_ask, context))
+            with self:
+                upload = UploadButton(
+                    context, MAPS, ".pmtiles", label="Add map…", title="Upload a PMTiles file"
+                )
+            upload.on("uploaded", self.refresh)
+
+    def refresh(self) -> None:
+        """Offer the present styles: any page may have added one."""
+        styles = [
+            {"name": style.name, "attribution": style.attribution, "max_zoom": style.max_zoom}
+            for style in self._tiles.styles
+        ]
+        if styles != self._props.get("styles"):
+            self.props["styles"] = styles
 
 
 def build(context: ViewContext) -> None:

@@ -12,11 +12,19 @@ from nicegui.element import Element
 from nicegui.events import GenericEventArguments
 
 from gateway.batch.catalogue import Row
+from gateway.panel.access import RECORDINGS
 from gateway.panel.playback import SPEEDS, Playback, Profile
 from gateway.panel.recording_facts import RecordingFacts
 from gateway.panel.recording_jobs import FORMATS
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets.prompts import closing, confirm, heading, named_dialog, notify_failure
+from gateway.panel.widgets.prompts import (
+    UploadButton,
+    closing,
+    confirm,
+    heading,
+    named_dialog,
+    notify_failure,
+)
 from gateway.panel.widgets.recorder import RecorderControls
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
@@ -32,10 +40,6 @@ FACTS: Final = ("Duration", "Distance", "Height", "Loss")
 
 class TimeSlider(Element, component=WEB / "time_slider.js"):
     """A slider through a recording; emits `seek` with seconds since its start."""
-
-
-class UploadButton(Element, component=WEB / "upload_button.js"):
-    """Upload a file; emits `uploaded` with the result."""
 
 
 class RecordingsView:
@@ -62,9 +66,11 @@ class RecordingsView:
                     self._search = ui.input(placeholder="Name, or duration > 300 and loss > 0.05")
                     self._search.props('dense outlined clearable aria-label="Search recordings"')
                     if context.may_change:
-                        upload = UploadButton()
-                        upload.props["limit"] = context.parts.settings.upload_limit_mb * 1_000_000
-                        upload.on("uploaded", self._on_upload)
+                        upload = UploadButton(
+                            context, RECORDINGS, ".tlog,.csv",
+                            label="Upload…", title="Upload a recording",
+                        )  # fmt: skip
+                        upload.on("uploaded", self.refresh)
                 self._trouble = ui.label().classes("soft")
                 self._table = DataTable(
                     ("Name", "Last written (UTC)", "Size", "Files", *FACTS),
@@ -189,11 +195,6 @@ class RecordingsView:
                 ui.download.from_url(url)
             finally:
                 note.dismiss()
-
-    async def _on_upload(self, event: GenericEventArguments) -> None:
-        text = printable(str(event.args["text"]))
-        ui.notify(text, type="positive" if event.args["ok"] else "negative")
-        await self.refresh()
 
     async def _open(self, name: str, *, fused_again: bool = False) -> None:
         context = self._context

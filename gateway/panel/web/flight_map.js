@@ -92,6 +92,7 @@ export default {
         <button :aria-pressed="follow" @click="follow = !follow" title="Keep the aircraft in the middle">{{ follow ? "Following" : "Follow" }}</button>
         <button v-if="full" @click="fit" title="Show all of the path">Fit</button>
         <button v-if="full" @click="clear" title="Clear the drawn path">Clear path</button>
+        <slot></slot>
       </div>
       <div class="map-offline" v-if="offline" role="status">no map tiles (offline)</div>
       <div class="map-place" v-if="place">
@@ -139,6 +140,10 @@ export default {
     map.on("click", (event) => this.full && this.$emit("place", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
     map.on("dragstart", () => (this.follow = false));
     this.$watch("style", () => this.set_style());
+    // A map that was added is shown where there was none.
+    this.$watch("styles", (now) => {
+      if (this.offline || !this.tiles) this.style = now.length - 1;
+    });
     this.set_style();
     this.paint();
     this.stop_theme = mavgate.watch_theme(() => this.paint());

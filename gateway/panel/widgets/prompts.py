@@ -1,17 +1,19 @@
-"""Headings, and prompts around a request: why it failed, a question before it cannot be undone."""
+"""Headings, uploads, and prompts: why a request failed, a question before it cannot be undone."""
 
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final
 
 from nicegui import ui
+from nicegui.element import Element
 from nicegui.elements.mixins.text_element import TextElement
+from nicegui.events import GenericEventArguments
 
 from gateway.live.control_socket import ControlError
 from gateway.panel.playback import PlaybackError
 from gateway.panel.recording_jobs import ExportError
 from gateway.panel.uplink import CommandFailedError
-from gateway.panel.view_context import NotAllowedError, ViewContext
+from gateway.panel.view_context import WEB, NotAllowedError, ViewContext
 from gateway.printable import printable
 from gateway.recordings.index import RecordingError
 
@@ -24,6 +26,35 @@ FAILURES: Final = (
 def heading(text: str) -> TextElement:
     """Add the heading of a card."""
     return TextElement(tag="h2", text=text).classes("title")
+
+
+class UploadButton(Element, component=WEB / "upload_button.js"):
+    """Upload a file; emits `uploaded` with the result, which is also shown on the page.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page of an operator.
+    path : str
+        Path of the server below which files of this kind are put.
+    accept : str
+        Endings of their names.
+    label, title : str
+        Text of the button, and its name for screen readers.
+    """
+
+    def __init__(
+        self, context: ViewContext, path: str, accept: str, *, label: str, title: str
+    ) -> None:
+        super().__init__()
+        self._props |= {"path": path, "accept": accept, "label": label, "title": title}
+        self._props["limit"] = context.parts.settings.upload_limit_mb * 1_000_000
+        self.on("uploaded", _show_upload)
+
+
+def _show_upload(event: GenericEventArguments) -> None:
+    text = printable(str(event.args["text"]))
+    ui.notify(text, type="positive" if event.args["ok"] else "negative")
 
 
 @contextmanager
