@@ -3,6 +3,7 @@
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 import msgspec
 
@@ -11,6 +12,7 @@ from gateway.hub.stats import ClientStats
 from gateway.live.control_socket import ControlError, ControlServer, NoParams
 from gateway.live.player_edge import PlayerEdge, PlayerStatus
 from gateway.live.recorder import Recorder
+from gateway.live.serial_port import SerialPort, SerialStatus, list_serial_ports
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,
@@ -169,6 +171,64 @@ class AircraftVerbs:
         except ValueError as error:
             raise ControlError(str(error)) from error
         return "mark cleared" if place is None else "marked"
+
+
+class PortParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A serial port, as in the setting `port` of `[serial]`."""
+
+    port: str
+
+
+class SerialVerbs:
+    """`serial.*`.
+
+    Parameters
+    ----------
+    port : SerialPort
+        The receiver's port. The one of its settings may be chosen even if this machine does not
+        list it.
+    is_simulated : bool
+        Whether the receiver is simulated; then its port stays open.
+    """
+
+    def __init__(self, port: SerialPort, *, is_simulated: bool) -> None:
+        self._port = port
+        self._own = port.status([]).wanted
+        self._is_simulated = is_simulated
+
+    def register(self, server: ControlServer) -> None:
+        """Register the verbs on a socket."""
+        server.register("serial.status", NoParams, self._status)
+        server.register("serial.connect", PortParams, self._connect)
+        server.register("serial.disconnect", NoParams, self._disconnect)
+
+    async def _status(self, _: NoParams) -> SerialStatus:
+        # In a thread: a USB hub that does not answer holds up the list.
+        ports = await asyncio.to_thread(list_serial_ports)
+        return replace(self._port.status(ports), is_fixed=self._is_simulated)
+
+    async def _connect(self, params: PortParams) -> SerialStatus:
+        self._check_changeable()
+        ports = await asyncio.to_thread(list_serial_ports)
+        # No other path: opening some devices has effects, as that of a watchdog, which restarts
+        # the machine.
+        known = {"auto", self._own, *(port.device for port in ports)}
+        if params.port not in known:
+            raise ControlError(
+                f"{params.port!r} is no serial port of this machine; there are "
+                f"{', '.join(sorted(known))}"
+            )
+        self._port.connect(params.port)
+        return self._port.status(ports)
+
+    async def _disconnect(self, params: NoParams) -> SerialStatus:
+        self._check_changeable()
+        self._port.disconnect()
+        return await self._status(params)
+
+    def _check_changeable(self) -> None:
+        if self._is_simulated:
+            raise ControlError("the receiver is simulated: `mavgate run` uses a serial port")
 
 
 class HubVerbs:

@@ -23,7 +23,7 @@ from gateway.config import (
 )
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
-from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs
+from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs, SerialVerbs
 from gateway.live.imu_tap import ImuTap
 from gateway.live.loop_lag import LoopLag
 from gateway.live.metrics_server import MetricsServer
@@ -130,14 +130,14 @@ class Daemon:
             *(lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state, self._introduction),
         )
         self._budget = RecordingBudget()
+        heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
+        self._serial = SerialPort(serial, *heard, self.now_us)
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
         self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
         self._notifier = ServiceNotifier()
-        heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
-        self._serial = SerialPort(serial, *heard, self.now_us)
         self._sent: Counter[int] = Counter()
         self._lag = LoopLag()
 
@@ -154,6 +154,7 @@ class Daemon:
         control = ControlServer(socket_path("run"))
         RecorderVerbs(self._recorder).register(control)
         AircraftVerbs(self._mark).register(control)
+        SerialVerbs(self._serial, is_simulated=self._receiver is not None).register(control)
         HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(control)
         self._imu = ImuTap(
             lambda vehicle_id: self._pipeline.find(vehicle_id).settings.calibration,

@@ -17,9 +17,10 @@ import logging
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 import serial
+from msgspec.structs import replace
 from serial.tools import list_ports
 
 from gateway.reasons import reason_of
@@ -90,6 +91,23 @@ class Port:
     serial_number: str
     description: str
     known: bool
+
+
+@dataclass(frozen=True, slots=True)
+class SerialStatus:
+    """The receiver's port at one moment."""
+
+    state: Literal["open", "waiting", "closed"]
+    wanted: str
+    """As the setting `port`."""
+    device: str
+    """The open port; empty if none is."""
+    reason: str
+    """Why it is not open yet."""
+    ports: tuple[Port, ...]
+    """All ports of this machine."""
+    is_fixed: bool = False
+    """Whether the receiver is simulated: its port cannot be changed."""
 
 
 def list_serial_ports() -> list[Port]:
@@ -365,14 +383,34 @@ class SerialPort:
             self._search = None
         self._release()
 
-    def apply(self, settings: SerialSettings) -> None:
-        """Move to another port or speed; nothing happens if neither changed."""
-        if settings != self._settings:
-            self.close()
-            self._settings = settings
-            self._delay_s = FIRST_RETRY_S
-            self._silent.clear()
-            self._open()
+    def connect(self, wanted: str) -> None:
+        """Close the port, and open the one that a setting `port` names, now or once it exists."""
+        self.disconnect()
+        self._settings = replace(self._settings, port=wanted)
+        self._delay_s = FIRST_RETRY_S
+        self._last_complaint = ""
+        self._silent.clear()
+        self._on_lost(wanted)
+        self._open()
+
+    def disconnect(self) -> None:
+        """Close the port until `connect` is called."""
+        device = None if self._port is None else str(self._port.port)
+        self.close()
+        if device is not None:
+            self._on_lost(device)
+
+    def status(self, ports: list[Port]) -> SerialStatus:
+        """Return the state of the port; `ports` are those of this machine."""
+        is_trying = self._retry is not None or self._search is not None
+        state: Literal["open", "waiting", "closed"] = "waiting" if is_trying else "closed"
+        return SerialStatus(
+            "open" if self.connected else state,
+            self._settings.port,
+            "" if self._port is None else str(self._port.port),
+            self._last_complaint if is_trying else "",
+            tuple(ports),
+        )
 
     def _open(self) -> None:
         self._retry = None

@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import serial
 
+from gateway.live.control_socket import ControlServer
+from gateway.live.control_verbs import SerialVerbs
 from gateway.live.serial_port import (
     LONGEST_RETRY_S,
     Port,
@@ -20,6 +22,7 @@ from gateway.live.serial_port import (
     why_not_open,
 )
 from gateway.wire.framing import encode_frame
+from tests.live.test_control_verbs import ask
 
 CH340 = Port("/dev/ttyUSB0", "1a86:7523", "", "WCH CH340", known=True)
 FTDI = Port("/dev/ttyUSB1", "0403:6001", "A50285BI", "FTDI FT232R", known=True)
@@ -357,3 +360,46 @@ async def test_no_receiver_among_several_adapters_is_reported_with_each_answer(
         f"{held}: another program has it open",
     ):
         assert text in str(raised.value)
+
+
+@pytest.mark.io
+async def test_serial_port_is_changed_closed_and_opened_again(
+    adapters: Adapters, listener: Listener, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.live.control_verbs.list_serial_ports", adapters.ports)
+    first, second = adapters.plug(), adapters.plug()
+    settings = SerialSettings(port=first)
+    port = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    server = ControlServer(tmp_path / "s")
+    SerialVerbs(port, is_simulated=False).register(server)
+    port.start()
+    status = (await ask(server, "serial.status"))["result"]
+    assert (status["state"], status["device"], len(status["ports"])) == ("open", first, 2)
+    moved = (await ask(server, "serial.connect", port=second))["result"]
+    assert (moved["state"], moved["wanted"], moved["device"]) == ("open", second, second)
+    assert listener.lost == [first, second]
+    # The first is free for other programs.
+    serial.Serial(first, timeout=0, exclusive=True).close()
+    for path in ("/dev/watchdog", "/etc/passwd", "", "usb:1a86:7523"):
+        refused = await ask(server, "serial.connect", port=path)
+        assert "is no serial port of this machine" in refused["error"]
+    closed = (await ask(server, "serial.disconnect"))["result"]
+    assert (closed["state"], closed["device"], port.connected) == ("closed", "", False)
+    adapters.pull(first)
+    waiting = (await ask(server, "serial.connect", port=first))["result"]
+    assert (waiting["state"], waiting["wanted"]) == ("waiting", first)
+    assert "No such file or directory" in waiting["reason"]
+    assert (await ask(server, "serial.connect", port="auto"))["result"]["device"] == second
+    assert (await ask(server, "serial.disconnect"))["result"]["state"] == "closed"
+
+
+@pytest.mark.io
+async def test_port_of_a_simulated_receiver_is_not_changed(
+    listener: Listener, tmp_path: Path
+) -> None:
+    port = SerialPort(SerialSettings(), listener.on_bytes, print, print, lambda: 42)
+    server = ControlServer(tmp_path / "s")
+    SerialVerbs(port, is_simulated=True).register(server)
+    assert (await ask(server, "serial.status"))["result"]["is_fixed"]
+    for verb, params in (("serial.connect", {"port": "auto"}), ("serial.disconnect", {})):
+        assert "simulated" in (await ask(server, verb, **params))["error"]

@@ -243,6 +243,23 @@ def test_client_is_added_and_removed(desk: Desk) -> None:
         expect(row).to_have_count(0)
 
 
+def test_serial_port_is_disconnected_and_connected_again(desk: Desk) -> None:
+    view = desk.view("link")
+    banner = desk.page.locator(".banner", has_text="Receiver lost")
+    state = view.locator("[data-role=serial]")
+    expect(state).to_contain_text(f"{desk.receiver.port} is open")
+    view.get_by_role("button", name="Disconnect").click()
+    expect(state).to_contain_text("disconnected")
+    expect(banner).to_be_visible()
+    assert not desk.status["report"]["connected"]
+    view.get_by_label("Serial port").click()
+    desk.page.get_by_role("option", name=desk.receiver.port).click()
+    view.get_by_role("button", name="Connect", exact=True).click()
+    expect(state).to_contain_text(f"{desk.receiver.port} is open")
+    expect(banner).to_have_count(0)
+    assert desk.status["report"]["connected"]
+
+
 def test_silent_node_is_a_banner_over_every_view_and_an_event(desk: Desk) -> None:
     banner = desk.page.locator(".banner", has_text="GPS node 1 silent")
     expect(banner).to_have_count(0)

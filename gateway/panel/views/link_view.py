@@ -5,13 +5,17 @@ from typing import Any, Final
 
 from nicegui import ui
 
+from gateway.live.control_socket import ControlError
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets.prompts import confirm, heading, notify_failure
 from gateway.panel.widgets.table import Cells, DataTable, RowButton
+from gateway.printable import printable
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
+SERIAL_S: Final = 2.0
+AUTO: Final = "find the receiver by its frames"
 SILENT_US: Final = 2 * US_PER_S
 UNKNOWN: Final = "—"
 LOSS_WARN: Final = 5.0
@@ -32,10 +36,13 @@ class LinkView:
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
+        self._was_shown = False
         with ui.element("div").classes("cards"):
             with ui.element("div").classes("card padded"):
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
+                if context.may_change:
+                    self._build_serial()
                 self._nodes = DataTable(
                     (
                         "Node",
@@ -78,6 +85,56 @@ class LinkView:
                     'dense outlined aria-label="Endpoint of a new client"'
                 )
                 ui.button("Add", on_click=self._add).props("no-caps")
+
+    def _build_serial(self) -> None:
+        """Build the choice of the receiver's port, which is hidden for a simulated one."""
+        with ui.element("div").classes("line") as self._serial:
+            self._port = ui.select({"auto": AUTO}, value="auto").classes("spring")
+            self._port.props('dense outlined options-dense aria-label="Serial port"')
+            ui.button("Connect", on_click=self._connect).props("no-caps")
+            self._leave = ui.button("Disconnect", on_click=self._disconnect)
+            self._leave.props("no-caps outline")
+        self._serial_reason = ui.label().classes("soft").props("data-role=serial")
+        self._serial.set_visibility(False)
+        self._context.every(SERIAL_S, self._refresh_serial)
+
+    async def _refresh_serial(self) -> None:
+        try:
+            status = await self._context.ask("serial.status")
+        except ControlError:
+            status = None
+        self._show_serial(status)
+
+    def _show_serial(self, status: Record | None) -> None:
+        shown = status is not None and not status["is_fixed"]
+        self._serial.set_visibility(shown)
+        self._serial_reason.set_visibility(shown)
+        if status is None:
+            return
+        options = {"auto": AUTO, status["wanted"]: status["wanted"]} | {
+            port["device"]: printable(f"{port['device']}  {port['description']}")
+            for port in status["ports"]
+        }
+        options["auto"] = AUTO
+        if options != self._port.options:
+            # A port that is about to be chosen stays chosen while it exists.
+            kept = self._port.value if self._was_shown else status["wanted"]
+            self._port.set_options(options, value=kept if kept in options else "auto")
+        self._was_shown = True
+        self._leave.set_enabled(status["state"] != "closed")
+        self._serial_reason.set_text(printable(_serial_line(status)))
+
+    async def _connect(self) -> None:
+        with notify_failure(self._context):
+            self._show_serial(await self._context.ask("serial.connect", port=self._port.value))
+            await self._context.parts.watch.refresh()
+            self.refresh()
+
+    async def _disconnect(self) -> None:
+        with notify_failure(self._context):
+            self._show_serial(await self._context.ask("serial.disconnect"))
+            await self._context.parts.watch.refresh()
+            self.refresh()
 
     async def _add(self) -> None:
         with notify_failure(self._context):
@@ -160,6 +217,15 @@ _SHOWN: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
 def build(context: ViewContext) -> None:
     """Build the view."""
     LinkView(context)
+
+
+def _serial_line(status: Record) -> str:
+    match status["state"]:
+        case "open":
+            return f"{status['device']} is open, until the gateway ends or another is connected"
+        case "waiting":
+            return status["reason"] or f"looking for the receiver on {status['wanted']}"
+    return "disconnected: no data until a port is connected"
 
 
 def _receiver_line(status: Record) -> str:
