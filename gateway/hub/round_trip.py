@@ -1,11 +1,12 @@
 """Round-trip times, measured by requests that clients answer automatically.
 
 Some ground stations answer PING, others only TIMESYNC; both are sent. The requests come from a
-separate component (the MAVLink id of a UDP bridge), so they leave no gap in the sequence numbers
-of the vehicle, and no answer to the vehicle is mistaken for an answer to them. Requests of
-another gateway are answered by that component too and not forwarded: they measure this one link.
+separate component, so they leave no gap in the sequence numbers of the vehicle, and no answer to
+the vehicle is mistaken for an answer to them. Requests of another gateway are answered by that
+component too and not forwarded: they measure this one link.
 """
 
+from collections import deque
 from typing import Final
 
 from pymavlink.dialects.v20 import all as dialect
@@ -15,7 +16,10 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import EVERYBODY, MavFrame, frame_of
 
-PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_UDP_BRIDGE
+PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_USER75
+"""Of the ids for private use the last one: mavros and Cockpit are 240, the UDP bridge."""
+MAX_ASKED: Final = 64
+"""Rounds whose answers are recognized: a minute of them, one a second."""
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to an older request is ignored."""
 NS_PER_US: Final = 1000
@@ -45,6 +49,7 @@ class RoundTrip:
         self._signer = signer
         self._sender = dialect.MAVLink(None, NOBODY, PROBE_COMPONENT)
         self._reader = dialect.MAVLink(None)
+        self._asked_us: deque[int] = deque(maxlen=MAX_ASKED)
 
     @property
     def origin(self) -> Origin:
@@ -66,6 +71,7 @@ class RoundTrip:
         list of MavFrame
         """
         self._sender.srcSystem = system
+        self._asked_us.append(now_us)
         return [
             self._encode(message, now_us)
             for message in (
@@ -88,6 +94,8 @@ class RoundTrip:
                 return None
             sent_us = answer.ts1 // NS_PER_US
         else:
+            return None
+        if sent_us not in self._asked_us:
             return None
         round_trip_us: int = now_us - sent_us
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None

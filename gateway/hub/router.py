@@ -9,6 +9,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
+from pymavlink.dialects.v20 import all as dialect
+
 from gateway.hub.fanout import Fanout, recipient_of
 from gateway.hub.limits import RequestQueue
 from gateway.hub.own_vehicles import HEARTBEAT_ID, OwnVehicles
@@ -29,6 +31,8 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
+UNADDRESSED_REQUESTS: Final = frozenset({HEARTBEAT_ID, dialect.MAVLINK_MSG_ID_TIMESYNC})
+"""Messages without a target that our vehicles handle, whoever sends them."""
 MAX_CLAIMS: Final = 8
 """Systems that are shown for an untrusted client."""
 
@@ -218,7 +222,7 @@ class Router:
         self, client: Client, path: Path | None, frame: MavFrame, from_station: bool, now_us: int
     ) -> None:
         message_id = frame.message_id
-        telemetry = message_id != HEARTBEAT_ID and message_id not in TARGET_OFFSETS
+        telemetry = message_id not in TARGET_OFFSETS and message_id not in UNADDRESSED_REQUESTS
         if from_station or not telemetry:
             self._ask(client, frame, forwarded=client.trusted)
         if not client.trusted:

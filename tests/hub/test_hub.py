@@ -298,6 +298,15 @@ async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
     station.say(station.sender.pack(dialect.MAVLink_timesync_message(77, sync.ts1)))
     await rig.until(lambda: hub.clients()[0].round_trip_us == 2_000)
     assert len(rig.incoming) == 1
+    # mavros has the id of a UDP bridge in the system of its vehicle, and asks as well.
+    mavros = dialect.MAVLink(None, 1, dialect.MAV_COMP_ID_UDP_BRIDGE)
+    asked = [
+        dialect.MAVLink_timesync_message(0, 1000),
+        dialect.MAVLink_command_long_message(1, 1, 512, 0, 1, 0, 0, 0, 0, 0, 0),
+    ]
+    for number, message in enumerate(asked, 2):
+        station.say(bytes(message.pack(mavros)))
+        await rig.until(lambda number=number: len(rig.incoming) == number)
 
 
 class TestChangesAtRunTime:

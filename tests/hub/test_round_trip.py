@@ -43,6 +43,7 @@ def test_frames_that_are_no_recent_answer_give_none() -> None:
     assert probe.read(pong(1_000_000), 1_000_001 + LONGEST_US) is None
     question = dialect.MAVLink_timesync_message(0, 1_000_000 * 1000)
     foreign = dialect.MAVLink_timesync_message(123, 1_000_000 * 1000 + 1)
+    of_another_asker = dialect.MAVLink_timesync_message(123, 1_000_001 * 1000)
     heartbeat = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
-    for message in (question, foreign, heartbeat):
+    for message in (question, foreign, of_another_asker, heartbeat):
         assert probe.read(pack(message), 1_001_500) is None

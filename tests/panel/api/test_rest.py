@@ -282,6 +282,35 @@ class TestFollowing:
             await stream.send(b"\1\2")
             assert await stream.recv() == b"\1\2"
 
+    async def test_messages_of_cockpit_are_sent_and_answered(self, world: World) -> None:
+        header = {"system_id": 255, "component_id": 240, "sequence": 0}
+        sync = {"type": "TIMESYNC", "ts1": 8_015_700_000, "tc1": 0}
+        zoom = {"type": "COMMAND_LONG", "target_component": 1, "confirmation": 0}
+        sent = [
+            sync | {"target_system": 1, "target_component": 1},
+            zoom
+            | {"command": {"type": "MAV_CMD_SET_CAMERA_ZOOM"}}
+            | {f"param{number}": 0 for number in range(1, 8)},
+        ]
+
+        def heard() -> list[Any]:
+            link = mavlink.MAVLink(None)
+            messages = (link.decode(bytearray(incoming.frame)) for incoming in world.heard)
+            return [m for m in messages if m.get_srcComponent() == 240]
+
+        url = f"ws://{world.url}/mavlink2rest/ws/mavlink?filter=TIMESYNC"
+        async with websockets.connect(url) as stream, asyncio.timeout(LIMIT_S):
+            for message in sent:
+                await stream.send(json.dumps({"header": header, "message": message}))
+                assert str(await stream.recv()).startswith("Ok(")
+            while len(heard()) < 2:
+                await asyncio.sleep(0.01)
+            assert heard()[0].ts1 == sync["ts1"]
+            assert (heard()[1].command, heard()[1].target_system) == (531, 0)
+            world.send(mavlink.MAVLink_timesync_message(7, sync["ts1"]))
+            answer = json.loads(await stream.recv())
+            assert answer["message"] == sync | {"tc1": 7}
+
     @staticmethod
     async def until_followed(world: World, stream: Any) -> None:
         async with asyncio.timeout(LIMIT_S):
