@@ -25,9 +25,8 @@ from msgspec.structs import replace
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.analysis.processes import begin_copy
-from gateway.cli.live.demo import calibrated_aircraft
+from gateway.cli.live.demo import calibrated_aircraft, made_ahead
 from gateway.cli.live.run import loop_comes_first
-from gateway.cli.support.simulated_line import made_ahead
 from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings

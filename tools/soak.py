@@ -29,7 +29,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from rich.progress import Progress
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from gateway.cli.support.simulated_line import made_ahead
+from gateway.cli.live.demo import made_ahead
 from gateway.live.pty_port import PtyPort
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings

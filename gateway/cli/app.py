@@ -1,19 +1,240 @@
-"""The command `mavgate`: one file per group of commands."""
+"""The command `mavgate`: its options, and its commands with their files.
 
+A file is imported when one of its commands is called, as some import much; listing all commands or
+running a small one must not cost that. Summaries and panels are here for the list, and again as the
+first line of the command's docstring in its file.
+"""
+
+import gc
 import io
 import logging
 import os
 import sys
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import IO, Annotated, cast
+from typing import IO, Annotated, Any, Final, cast
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
-from gateway.cli.command_table import LazyGroup
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable
 from gateway.reasons import reason_of
+
+RECORDINGS: Final = "Recordings"
+GATEWAY: Final = "A running gateway"
+
+
+@dataclass(frozen=True, slots=True)
+class CommandEntry:
+    """Module and summary of a command."""
+
+    module: str
+    """Below `gateway.cli`."""
+    summary: str
+    panel: str | None = None
+
+
+COMMANDS: Final[dict[str, CommandEntry]] = {
+    "run": CommandEntry(
+        "live.run", "Run the gateway on the receiver's serial port until interrupted."
+    ),
+    "demo": CommandEntry(
+        "live.demo", "Fly the simulated tracker, over and over, until interrupted."
+    ),
+    "panel": CommandEntry(
+        "live.panel",
+        "Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.",
+    ),
+    "fleet": CommandEntry(
+        "live.fleet", "Show the vehicles of many sites here, through a Zenoh router."
+    ),
+    "setup": CommandEntry(
+        "live.first_start",
+        "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
+    ),
+    "calibrate": CommandEntry(
+        "live.calibrate",
+        "Calibrate an aircraft's sensors and save the result with its residuals.",
+    ),
+    "ports": CommandEntry("live.flash", "List the serial ports, and the one that `auto` selects."),
+    "check-config": CommandEntry(
+        "live.doctor",
+        "Check the settings and those of the aircraft, or print all settings with their defaults.",
+    ),
+    "flash": CommandEntry(
+        "live.flash",
+        "Write a ready-made program with its settings to a board, or read them back.",
+    ),
+    "doctor": CommandEntry(
+        "live.doctor",
+        "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
+    ),
+    "map": CommandEntry(
+        "live.map", "Fetch an area of a map for the panel, for use without a network."
+    ),
+    "report": CommandEntry(
+        "recorded.report",
+        "Make a page of figures and tables of a flight, those of the paper included.",
+    ),
+    "page": CommandEntry(
+        "recorded.page",
+        "Make one HTML file of a flight, which opens offline in any browser.",
+        RECORDINGS,
+    ),
+    "sweep": CommandEntry(
+        "recorded.sweep",
+        "Try settings on one flight or many, and write the best as a settings file.",
+    ),
+    "record": CommandEntry(
+        "live.record", "Start, stop, name, list and delete recordings.", RECORDINGS
+    ),
+    "play": CommandEntry(
+        "recorded.play",
+        "Play recordings to the ground stations, several at once if you like.",
+        RECORDINGS,
+    ),
+    "seek": CommandEntry("recorded.play", "Seek in the running player.", RECORDINGS),
+    "player": CommandEntry("recorded.play", "Control the running player.", RECORDINGS),
+    "convert": CommandEntry("recorded.convert", "Convert, trim and join recordings.", RECORDINGS),
+    "fuse": CommandEntry(
+        "recorded.fuse",
+        "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
+        RECORDINGS,
+    ),
+    "info": CommandEntry(
+        "recorded.info",
+        "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        RECORDINGS,
+    ),
+    "batch": CommandEntry(
+        "recorded.batch",
+        "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+        RECORDINGS,
+    ),
+    "catalogue": CommandEntry(
+        "recorded.catalogue",
+        "Index all recordings under a folder, and list and search what is in them.",
+        RECORDINGS,
+    ),
+    "recover": CommandEntry(
+        "recorded.info",
+        "Write the intact part of a damaged recording to a new file, and list what was left out.",
+        RECORDINGS,
+    ),
+    "status": CommandEntry(
+        "live.clients",
+        "Show the status of the gateway: receiver, nodes, aircraft, clients.",
+        GATEWAY,
+    ),
+    "clients": CommandEntry("live.clients", "List, add and remove clients and sources.", GATEWAY),
+    "mark": CommandEntry(
+        "live.clients",
+        "Mark a location: ground stations show distance and bearing to it. Without one, clear it.",
+        GATEWAY,
+    ),
+    "reload": CommandEntry(
+        "live.clients",
+        "Apply changed settings of the hub and of signing; other clients stay connected.",
+        GATEWAY,
+    ),
+}
+
+
+def load_command(name: str) -> Any:
+    """Import the file of a command and create it.
+
+    Parameters
+    ----------
+    name : str
+        One of `COMMANDS`.
+    """
+    part = typer.Typer(rich_markup_mode="rich")
+    # With a callback it is a group, however few commands the file has.
+    part.callback()(lambda: None)
+    if COMMANDS[name].panel != GATEWAY:
+        _load_extensions()
+    import_module(f"gateway.cli.{COMMANDS[name].module}").register(part)
+    group = typer.main.get_group(part)
+    gc.enable()
+    return tidied(group.commands[name])
+
+
+def tidied(command: Any) -> Any:
+    """Return a command whose help flows at any width, and names a type only where one is typed.
+
+    Parameters
+    ----------
+    command : typer.core.TyperCommand or TyperGroup
+        Changed in place, with all commands below it.
+    """
+    if command.help:
+        paragraphs = command.help.split("\n\n")
+        command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    # A context that parses nothing, since parsing loads what takes half of the time of `--help`.
+    for parameter in command.get_params(command.context_class(command)):
+        if getattr(parameter, "is_flag", False):
+            parameter.metavar = ""
+    for below in getattr(command, "commands", {}).values():
+        tidied(below)
+    return command
+
+
+@cache
+def _load_extensions() -> None:
+    """Load the extensions, or end the command; one that only asks a gateway does not need them."""
+    # Imported late, because the search for installed packages takes 20 ms.
+    from gateway.extensions import ExtensionError, load_extensions
+
+    try:
+        load_extensions()
+    except ExtensionError as error:
+        sys.exit(f"mavgate: {error}")
+
+
+class LazyGroup(TyperGroup):
+    """The commands of `COMMANDS`, each imported when it is called."""
+
+    _listing = False
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
+        """Return all names, in the order of the table."""
+        return [*COMMANDS]
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command; the error for an unknown name suggests the nearest."""
+        self.commands = cast(Any, dict.fromkeys(COMMANDS))
+        try:
+            return super().resolve_command(ctx, args)
+        finally:
+            self.commands = {}
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
+        """Return a command; only its summary while a list is made."""
+        entry = COMMANDS.get(cmd_name)
+        if entry is None:
+            return None
+        if self._listing:
+            return TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
+        return load_command(cmd_name)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the list of commands without importing them."""
+        self._listing = True
+        tidied(self)
+        super().format_help(ctx, formatter)
+        self._listing = False
+
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Complete a name without importing its command."""
+        self._listing = True
+        found = super().shell_complete(ctx, incomplete)
+        self._listing = False
+        return found
+
 
 log = logging.getLogger(__name__)
 app = typer.Typer(

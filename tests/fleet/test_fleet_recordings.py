@@ -16,8 +16,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.cli.support import fetching
-from gateway.cli.support.fetching import FetchError, PiecePace, RecordingFetch
+from gateway.cli.live import fleet as fleet_command
+from gateway.cli.live.fleet import FetchError, PiecePace, RecordingFetch
 from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
 from gateway.hub.transports.zenoh import site_queries
 from gateway.hub.transports.zenoh.site_queries import (
@@ -99,7 +99,7 @@ class TestOverTheSession:
     async def test_fetch_continues_after_the_site_has_reconnected(
         self, world: World, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(fetching, "LARGEST", fetching.SMALLEST)
+        monkeypatch.setattr(fleet_command, "LARGEST", fleet_command.SMALLEST)
         await opened(world, folder)
         ask, asked = over(world), []
         gone, retried = threading.Event(), threading.Event()
@@ -111,7 +111,7 @@ class TestOverTheSession:
             return ask(verb, params, wait_s)
 
         def wait(seconds: float) -> None:
-            if seconds == fetching.RETRY_S:
+            if seconds == fleet_command.RETRY_S:
                 retried.set()
                 back.wait(0.05)
 
@@ -129,7 +129,9 @@ class TestOverTheSession:
         assert await spoken_for(world, task) is True
         assert (to / NAME).read_bytes() == CONTENT
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
-        assert sorted(set(offsets)) == [*range(0, SIZE, fetching.SMALLEST)], "none from the start"
+        assert sorted(set(offsets)) == [*range(0, SIZE, fleet_command.SMALLEST)], (
+            "none from the start"
+        )
 
     async def test_stopped_fetch_continues_at_its_offset(
         self, world: World, folder: Path, tmp_path: Path
@@ -310,7 +312,7 @@ class TestFetch:
     def test_site_that_never_answers_is_an_error(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(fetching, "PATIENCE_S", -1.0)
+        monkeypatch.setattr(fleet_command, "PATIENCE_S", -1.0)
         one = RecordingFetch("site", tmp_path, lambda *_: {"data": None}, wait=lambda _: None)
         with pytest.raises(FetchError, match="continues from here"):
             one.fetch(NAME, 10, lambda _: None)
@@ -329,12 +331,12 @@ class TestFetch:
             sizes.append(pace.size)
         assert sizes[4:9] == [MAX_PIECE] * 5
         assert sizes[-1] == MAX_PIECE // 8
-        assert fetching.LARGEST == MAX_PIECE
+        assert fleet_command.LARGEST == MAX_PIECE
         for _ in range(10):
             pace.note(5.0)
-        assert pace.size == fetching.SMALLEST
+        assert pace.size == fleet_command.SMALLEST
 
-    @pytest.mark.parametrize(("took_s", "waited_s"), [(0.1, 0.1), (3.0, fetching.SLOW_S)])
+    @pytest.mark.parametrize(("took_s", "waited_s"), [(0.1, 0.1), (3.0, fleet_command.SLOW_S)])
     def test_pauses_leave_half_of_the_link_to_telemetry(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float
     ) -> None:
@@ -349,7 +351,7 @@ class TestFetch:
             begin = params["offset"]
             return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
 
-        monkeypatch.setattr(fetching.time, "monotonic", lambda: now_s)
+        monkeypatch.setattr(fleet_command.time, "monotonic", lambda: now_s)
         one = RecordingFetch("site", tmp_path, ask, wait=waits.append)
-        assert one.fetch(NAME, 3 * fetching.SMALLEST, lambda _: None)
+        assert one.fetch(NAME, 3 * fleet_command.SMALLEST, lambda _: None)
         assert waits == pytest.approx([waited_s] * 3)

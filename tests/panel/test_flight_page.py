@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from typer.testing import CliRunner
 
 from gateway.cli.app import app
-from gateway.cli.support.settings_options import read_options
+from gateway.cli.support.options import read_options
 from gateway.config import GatewaySettings
 from gateway.panel.flight_page import PageFlight, read_flight, render_page
 from gateway.recordings.files import FlightError

@@ -15,15 +15,16 @@ from rich import box
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from gateway.cli.support.asking import ask, is_running
-from gateway.cli.support.recording_options import files_of, refusing
-from gateway.cli.support.settings_options import (
+from gateway.cli.support.options import (
     ConfigOption,
+    ask,
     folder_of,
+    is_running,
     read_aircraft,
     read_options,
     read_settings,
 )
+from gateway.cli.support.recording_options import files_of, refusing
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft

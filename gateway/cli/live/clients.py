@@ -9,9 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.command_table import GATEWAY
-from gateway.cli.support.asking import AskingTyper, ask, with_socket
-from gateway.cli.support.settings_options import USER_CONFIG, ConfigOption
+from gateway.cli.app import GATEWAY
+from gateway.cli.support.options import USER_CONFIG, AskingTyper, ConfigOption, ask, with_socket
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     UNKNOWN,

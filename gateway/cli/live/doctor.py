@@ -1,4 +1,4 @@
-"""`mavgate doctor`: check the installation, the settings, the ports and the disk."""
+"""`mavgate doctor` and `check-config`: check the installation, settings, ports and disk."""
 
 import grp
 import os
@@ -14,19 +14,30 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.support.settings_options import ConfigOption, folder_of, read_settings
-from gateway.cli.support.terminal import console_of, how_to_add
+from gateway.cli.support.options import ConfigOption, folder_of, read_settings
+from gateway.cli.support.terminal import console_of, how_to_add, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
-from gateway.config import ConfigError, GatewaySettings, aircraft_folder, load_aircraft
-from gateway.hub.endpoint import Endpoint, EndpointKind, parse_endpoint
+from gateway.config import (
+    ConfigError,
+    GatewaySettings,
+    aircraft_folder,
+    load,
+    load_aircraft,
+    render,
+)
+from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.tls import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part_files import free_bytes_near
-from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
+from gateway.live.serial_port import (
+    PortNotFoundError,
+    fitting_ports,
+    list_serial_ports,
+)
 from gateway.reasons import reason_of
 
 TTY: Final = Path("/sys/class/tty")
@@ -277,11 +288,6 @@ CHECKS: Final[tuple[Check, ...]] = (
 STYLES: Final = {Grade.GOOD: "green", Grade.NOTE: "yellow", Grade.WRONG: "red"}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(doctor)
-
-
 def doctor(*, config: ConfigOption = None) -> None:
     """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
@@ -295,3 +301,36 @@ def doctor(*, config: ConfigOption = None) -> None:
         console.print(f"{finding.what}: {finding.text}")
     if wrong:
         raise typer.Exit(1)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands of this file."""
+    app.command()(doctor)
+    app.command()(check_config)
+
+
+def check_config(
+    file: Annotated[
+        Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
+    ] = None,
+) -> None:
+    """Check the settings and those of the aircraft, or print all settings with their defaults.
+
+    All errors are listed at once, each with the allowed values.
+    """
+    if file is None:
+        print(render(GatewaySettings()), end="")
+        return
+    try:
+        settings = load(file)
+        aircraft = load_aircraft(settings)
+    except ConfigError as error:
+        refuse(str(error))
+    for endpoint in map(parse_endpoint, settings.hub.endpoints):
+        if endpoint.port == 0 and endpoint.kind in LISTENING:
+            refuse(
+                f"{file}: hub.endpoints: {endpoint.url!r} takes any free port, which no ground "
+                "station can know; name one of 1 to 65535"
+            )
+    others = f", and of {len(aircraft)} aircraft in {aircraft_folder(settings)}" if aircraft else ""
+    print(f"{file}: all settings are right{others}")

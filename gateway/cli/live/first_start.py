@@ -20,7 +20,7 @@ from gateway.cli.live.calibrate import (
     capture_from,
     live_step,
 )
-from gateway.cli.support.settings_options import ConfigOption, read_aircraft, read_settings
+from gateway.cli.support.options import ConfigOption, read_aircraft, read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import GatewaySettings, save_aircraft

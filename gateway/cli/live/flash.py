@@ -1,5 +1,6 @@
-"""`mavgate flash`: write a ready-made program with its settings to a board, or read them back."""
+"""`mavgate flash` and `ports`: programs and settings of boards, and the ports that they are at."""
 
+import asyncio
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Final, get_args
@@ -29,7 +30,14 @@ from gateway.flashing.upload import (
     with_settings,
     write_flash,
 )
-from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports
+from gateway.live.serial_port import (
+    PortNotFoundError,
+    SerialSettings,
+    find_port,
+    find_receiver,
+    fitting_ports,
+    list_serial_ports,
+)
 from gateway.output import write_new
 from gateway.reasons import reason_of
 from gateway.settings import Field, fields_of
@@ -76,8 +84,9 @@ def _option(name: str) -> Any:
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
+    """Add the commands of this file."""
     app.command()(flash)
+    app.command()(ports)
 
 
 def flash(
@@ -237,3 +246,26 @@ def _print(device: str, block: SettingsBlock) -> None:
         text = f"{value:08x}" if field == "radio_address" else str(value)
         table.add_row(field, text, FIELDS[field].unit, OPTIONS.get(field, ""))
     console.print(table)
+
+
+def ports() -> None:
+    """List the serial ports, and the one that `auto` selects.
+
+    If several USB adapters fit, each is opened and asked for the receiver's frames.
+    """
+    found = list_serial_ports()
+    table = table_of("device", "setting by USB id", "serial number", "description", left=4)
+    for port in found:
+        usb = f"usb:{port.usb_id}" if port.usb_id else ""
+        table.add_row(port.device, usb, port.serial_number, port.description)
+    console = console_of()
+    if found:
+        console.print(table)
+    try:
+        fitting = fitting_ports("auto", found)
+        if len(fitting) > 1:
+            console.print(f"asking {', '.join(fitting)} for the receiver's frames")
+            fitting = [asyncio.run(find_receiver(SerialSettings()))]
+        console.print(f'port = "auto" takes {fitting[0]}')
+    except PortNotFoundError as error:
+        console.print(f'port = "auto": {error}')

@@ -1,19 +1,36 @@
-"""`mavgate fleet`: the vehicles of many sites, their state, and their recordings."""
+"""`mavgate fleet`: the vehicles of many sites, their state, and their recordings.
+
+A recording is fetched in pieces through the running fleet. A partial file is kept next to the
+target as `.NAME.part` until it is complete and its SHA-256 is that of the site's file: an
+incomplete file never looks complete. An existing partial file is continued, if it is the beginning
+of the site's file.
+"""
 
 import asyncio
+import base64
+import fcntl
+import hashlib
 import logging
-from collections.abc import Mapping
+import os
+import shutil
+import time
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, BinaryIO, Final
 
 import msgspec
 import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.asking import AskingTyper, ask, socket_of, with_socket
-from gateway.cli.support.fetching import FetchError, RecordingFetch
-from gateway.cli.support.settings_options import ConfigOption, read_settings
+from gateway.cli.support.options import (
+    AskingTyper,
+    ConfigOption,
+    ask,
+    read_settings,
+    socket_of,
+    with_socket,
+)
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,
@@ -27,7 +44,8 @@ from gateway.hub.endpoint import SITE_NAME
 from gateway.live.control_socket import ControlError, request
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import detached_output, on_end_signals
-from gateway.recordings.index import NEWEST
+from gateway.output import sync_folder
+from gateway.recordings.index import NEWEST, is_file_name
 from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted
 
@@ -35,6 +53,194 @@ log = logging.getLogger(__name__)
 
 DISK_S: Final = 60.0
 """Longest wait for a file to be written: a worn card takes seconds for each step."""
+
+SMALLEST: Final = 4 << 10
+LARGEST: Final = 128 << 10
+"""Largest piece of one answer."""
+FAST_S: Final = 0.05
+SLOW_S: Final = 0.2
+RETRY_S: Final = 1.0
+PATIENCE_S: Final = 60.0
+"""Longest wait for a disconnected site."""
+DIGEST_WAIT_S: Final = 330.0
+PIECE_WAIT_S: Final = 20.0
+READ_SIZE: Final = 1 << 20
+
+Ask = Callable[[str, dict[str, Any], float], Any]
+"""Asks a fleet: the verb, its parameters, the longest wait in seconds."""
+
+
+class FetchError(Exception):
+    """A file that cannot be fetched; the text says why, and what to do."""
+
+
+class PiecePace:
+    """Size of a piece, so that it takes about a tenth of a second.
+
+    On a narrow link telemetry waits behind a piece, so pieces are small there; on a fast link they
+    grow.
+    """
+
+    def __init__(self) -> None:
+        self.size = SMALLEST
+
+    def note(self, took_s: float) -> None:
+        """Adapt the size to the duration of the last piece."""
+        if took_s < FAST_S:
+            self.size = min(self.size * 2, LARGEST)
+        elif took_s > SLOW_S:
+            self.size = max(self.size // 2, SMALLEST)
+
+
+class RecordingFetch:
+    """Fetch files of one site into a folder.
+
+    Parameters
+    ----------
+    site : str
+        Its name.
+    folder : Path
+        Where to; made if it is not there.
+    ask : callable
+        See `Ask`; raises `ControlError` for what is refused.
+    force : bool
+        Replace files that differ.
+    wait : callable
+        Waits some seconds.
+    """
+
+    def __init__(
+        self,
+        site: str,
+        folder: Path,
+        ask: Ask,
+        *,
+        force: bool = False,
+        wait: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._site = site
+        self._folder = folder
+        self._ask = ask
+        self._force = force
+        self._wait = wait
+        self._pace = PiecePace()
+
+    def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
+        """Fetch one file, or the rest of it.
+
+        Parameters
+        ----------
+        name : str
+            As the site lists it.
+        size : int
+            As the site lists it; what has been written since is left for the next time.
+        advance : callable
+            Called with the bytes that are there more.
+
+        Returns
+        -------
+        bool
+            Whether anything had to be fetched.
+
+        Raises
+        ------
+        FetchError
+            If it cannot be fetched.
+        OSError
+            If the disk fails.
+        """
+        if not is_file_name(name):
+            raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
+        target, part = self._folder / name, self._folder / f".{name}.part"
+        if target.exists():
+            if self._is_same(target, size, name):
+                advance(size)
+                return False
+            if not self._force and not self._has_grown(target, size, name):
+                raise FetchError(f"{target} exists and differs; use --force to replace it")
+        self._folder.mkdir(parents=True, exist_ok=True)
+        with part.open("a+b") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise FetchError(f"{target} is being fetched by another program") from error
+            if target.exists() and not file.seek(0, os.SEEK_END):
+                # The existing file may be the beginning; otherwise the fetch starts from zero.
+                with target.open("rb") as known:
+                    shutil.copyfileobj(known, file)
+            self._fill(file, name, size, advance)
+            file.flush()
+            os.fsync(file.fileno())
+            part.replace(target)
+        sync_folder(self._folder)
+        return True
+
+    def _is_same(self, target: Path, size: int, name: str) -> bool:
+        return target.stat().st_size == size and self._is_beginning(target, name)
+
+    def _has_grown(self, target: Path, size: int, name: str) -> bool:
+        return target.stat().st_size < size and self._is_beginning(target, name)
+
+    def _is_beginning(self, target: Path, name: str) -> bool:
+        with target.open("rb") as file:
+            digest = _digest_of(file).hexdigest()
+            return self._digest(name, file.tell()) == digest
+
+    def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
+        """Fetch until the file is whole and is the site's."""
+        digest = _digest_of(file)
+        have = file.seek(0, os.SEEK_END)
+        if have and (have > size or digest.hexdigest() != self._digest(name, have)):
+            file.truncate(0)
+            digest, have = hashlib.sha256(), 0
+        advance(have)
+        while have < size:
+            piece = self._piece(name, have, min(self._pace.size, size - have))
+            if not piece:
+                raise FetchError(f"{name} has become shorter at the site; fetch it again")
+            file.write(piece)
+            digest.update(piece)
+            have += len(piece)
+            advance(len(piece))
+        if digest.hexdigest() != self._digest(name, size):
+            file.truncate(0)
+            raise FetchError(f"{name} has changed at the site meanwhile; fetch it again")
+
+    def _piece(self, name: str, offset: int, size: int) -> bytes:
+        params = {"file": name, "offset": offset, "size": size}
+        begin_s = time.monotonic()
+        data = base64.b64decode(self._persist("fleet.piece", params, "data", PIECE_WAIT_S))
+        took_s = time.monotonic() - begin_s
+        self._pace.note(took_s)
+        # Leave the other half of the time to telemetry.
+        self._wait(min(took_s, SLOW_S))
+        return data
+
+    def _digest(self, name: str, size: int) -> str:
+        params = {"file": name, "size": size}
+        return self._persist("fleet.digest", params, "sha256", DIGEST_WAIT_S)
+
+    def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
+        """Retry until there is an answer: links break and come back."""
+        end_s = time.monotonic() + PATIENCE_S
+        while True:
+            answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]
+            if answer is not None:
+                return answer
+            if time.monotonic() > end_s:
+                raise FetchError(
+                    f"site {self._site} does not answer; the same command continues from here"
+                )
+            self._wait(RETRY_S)
+
+
+def _digest_of(file: BinaryIO) -> "hashlib._Hash":
+    digest = hashlib.sha256()
+    file.seek(0)
+    while piece := file.read(READ_SIZE):
+        digest.update(piece)
+    return digest
+
 
 group = AskingTyper(
     help="Show the vehicles of many sites here, through a Zenoh router.",

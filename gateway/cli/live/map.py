@@ -7,14 +7,14 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from gateway.cli.support.recording_options import files_of, refusing
-from gateway.cli.support.settings_options import (
+from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
     load_settings,
     or_refuse,
     read_options,
 )
+from gateway.cli.support.recording_options import files_of, refusing
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 
 group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")

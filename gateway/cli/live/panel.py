@@ -1,8 +1,13 @@
-"""`mavgate panel`: the page in a browser."""
+"""`mavgate panel`: the page in a browser, also as a child process of the gateway."""
 
+import asyncio
 import logging
 import os
+import subprocess
 import sys
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import Annotated, Final
@@ -10,15 +15,16 @@ from typing import Annotated, Final
 import typer
 from msgspec.structs import replace
 
-from gateway.cli.support.asking import SocketOption
-from gateway.cli.support.panel_process import LINK, OneLineFormatter
-from gateway.cli.support.settings_options import (
+from gateway.cli.support.options import (
     ConfigOption,
+    SocketOption,
     folder_of,
     read_settings,
 )
 from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.hub.endpoint import parse_endpoint
+from gateway.live.terminal import own_command
+from gateway.printable import LONGEST, PrintableFormatter
 
 log = logging.getLogger(__name__)
 
@@ -96,3 +102,142 @@ def _log_uncaught(
 
 def _show_link(link: str) -> None:
     print(f"{LINK}{link}", flush=True)
+
+
+LINK: Final = "panel: "
+"""Begin of the line with the page's address."""
+RESTART_S: Final = 5.0
+LONGEST_RESTART_S: Final = 300.0
+"""Longest pause between restarts, so that repeated failures do not fill the log."""
+
+LINE_BREAK: Final = "\x1e"
+"""Between the lines of one record of the panel's log, whose own control characters are escaped."""
+LONGEST_RECORD: Final = 15_000
+"""Characters of a record, which fit into a line of 64 kB; of a longer one the end is kept."""
+END_S: Final = 3.0
+"""Within which it ends by itself when asked to; the loop must not close before it has."""
+
+
+def is_installed() -> bool:
+    """Return whether the extra is installed."""
+    return find_spec("nicegui") is not None
+
+
+def launched_panel(config: Path | None, *, wanted: bool) -> "PanelProcess | None":
+    """Return the panel, which begins to load, or None if it is not wanted."""
+    if not wanted:
+        return None
+    panel = PanelProcess(config)
+    panel.launch()
+    return panel
+
+
+class OneLineFormatter(PrintableFormatter):
+    """Formats each record as one line, so that the gateway logs a traceback as one record."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line of a record."""
+        text = super().format(record)
+        if len(text) > LONGEST_RECORD:
+            head = text.partition("\n")[0][:LONGEST]
+            text = f"{head}\n…\n{text[-LONGEST_RECORD:]}"
+        return text.replace("\n", LINE_BREAK)
+
+
+class PanelProcess:
+    """The panel as a child process of the gateway; restarted when it dies.
+
+    Parameters
+    ----------
+    config : Path or None
+        The gateway's settings file.
+    """
+
+    def __init__(self, config: Path | None) -> None:
+        self.link = ""
+        """The page's address; empty while there is none."""
+        self._command = own_command("panel", "--attached")
+        if config is not None:
+            self._command += ["--config", str(config)]
+        self._task: asyncio.Task[None] | None = None
+        self._child: subprocess.Popen[bytes] | None = None
+
+    def launch(self) -> None:
+        """Start the process; it loads its libraries, then waits for the control socket's path."""
+        log.info("the panel is loading; its address follows")
+        self._child = subprocess.Popen(
+            self._command,
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+
+    def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
+        """Connect it to the gateway, and keep it running; needs a running event loop.
+
+        Parameters
+        ----------
+        control_socket : callable
+            Waits for the gateway's control socket and returns its path.
+        """
+        self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
+
+    async def close(self) -> None:
+        """End it, and wait until it has ended."""
+        if self._task is not None:
+            self._task.cancel()
+            await asyncio.wait([self._task])
+        child = self._child
+        if child is None:
+            return
+        with child:
+            child.terminate()
+            try:
+                await asyncio.to_thread(child.wait, END_S)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                await asyncio.to_thread(child.wait)
+
+    async def _keep(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
+        path = os.fsencode(await control_socket())
+        wait_s = RESTART_S
+        while True:
+            if self._child is None:
+                self.launch()
+            assert self._child is not None
+            code = await self._attend(self._child, path)
+            wait_s = RESTART_S if self.link else min(2 * wait_s, LONGEST_RESTART_S)
+            self.link, self._child = "", None
+            log.warning("the panel has ended (%d); starting it again in %.0f s", code, wait_s)
+            await asyncio.sleep(wait_s)
+
+    async def _attend(self, child: subprocess.Popen[bytes], path: bytes) -> int:
+        """Pass the path of the control socket, read all output, and return the exit code."""
+        assert child.stdin is not None
+        with suppress(BrokenPipeError):
+            child.stdin.write(path + b"\n")
+        output = asyncio.StreamReader()
+        transport, _ = await asyncio.get_running_loop().connect_read_pipe(
+            lambda: asyncio.StreamReaderProtocol(output), child.stdout
+        )
+        try:
+            await self._read(output)
+        finally:
+            transport.close()
+        code = await asyncio.to_thread(child.wait)
+        child.stdin.close()
+        return code
+
+    async def _read(self, output: asyncio.StreamReader) -> None:
+        while not output.at_eof():
+            try:
+                line = await output.readline()
+            except ValueError:
+                continue  # too long a line, which is gone
+            text = line.decode(errors="replace").rstrip()
+            if text.startswith(LINK):
+                self.link = text.removeprefix(LINK)
+                log.info("panel: %s", self.link)
+            elif text:
+                log.warning("panel: %s", text.replace(LINE_BREAK, "\n"))

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from gateway.cli.command_table import RECORDINGS
-from gateway.cli.support.asking import AskingTyper, ask, is_running
-from gateway.cli.support.settings_options import (
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import (
+    AskingTyper,
     ConfigOption,
+    ask,
     folder_of,
+    is_running,
     read_options,
     read_settings,
 )

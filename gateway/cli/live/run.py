@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import msgspec
 import typer
 
-from gateway.cli.support.panel_process import PanelProcess, launched_panel
-from gateway.cli.support.settings_options import (
+from gateway.cli.live.panel import PanelProcess, launched_panel
+from gateway.cli.support.options import (
     ConfigOption,
     load_settings,
     or_refuse,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
 from gateway.cli.support.batch_work import (
     JobsOption,
     SchedulerOption,
@@ -17,13 +17,13 @@ from gateway.cli.support.batch_work import (
     failures,
     season_options,
 )
+from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
     SettingsOption,
     refusing,
 )
-from gateway.cli.support.settings_options import ConfigOption, read_settings
 from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
 from gateway.output import write_new
 from gateway.units import counted

@@ -12,17 +12,17 @@ from typer.core import TyperGroup
 from gateway.batch.catalogue import CatalogueError, Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
-from gateway.cli.command_table import RECORDINGS
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    read_column_map,
-    refusing,
-)
-from gateway.cli.support.settings_options import (
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
     read_options,
     read_settings,
+)
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    read_column_map,
+    refusing,
 )
 from gateway.cli.support.terminal import (
     UNKNOWN,

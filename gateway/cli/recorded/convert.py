@@ -5,7 +5,12 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import (
+    ConfigOption,
+    read_options,
+    read_settings,
+)
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,
@@ -25,11 +30,6 @@ from gateway.cli.support.recording_options import (
     read_sensors,
     recordings_folder,
     refusing,
-)
-from gateway.cli.support.settings_options import (
-    ConfigOption,
-    read_options,
-    read_settings,
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.output import write_new

@@ -9,7 +9,12 @@ import numpy as np
 import typer
 
 from gateway.aircraft import Aircraft, AircraftSettings
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import (
+    ConfigOption,
+    read_options,
+    read_settings,
+)
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -22,11 +27,6 @@ from gateway.cli.support.recording_options import (
     read_sensors,
     recordings_folder,
     refusing,
-)
-from gateway.cli.support.settings_options import (
-    ConfigOption,
-    read_options,
-    read_settings,
 )
 from gateway.cli.support.terminal import console_of
 from gateway.estimation.record import FloatArray, IntArray

@@ -11,7 +11,8 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -21,7 +22,6 @@ from gateway.cli.support.recording_options import (
     recordings_folder,
     refusing,
 )
-from gateway.cli.support.settings_options import ConfigOption, read_options, read_settings
 from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new
 from gateway.recordings.files import (

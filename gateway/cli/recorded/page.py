@@ -6,7 +6,14 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
+from gateway.cli.support.options import (
+    ConfigOption,
+    folder_of,
+    load_settings,
+    or_refuse,
+    read_options,
+)
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -16,13 +23,6 @@ from gateway.cli.support.recording_options import (
     progress_of,
     read_column_map,
     refusing,
-)
-from gateway.cli.support.settings_options import (
-    ConfigOption,
-    folder_of,
-    load_settings,
-    or_refuse,
-    read_options,
 )
 from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.output import write_new

@@ -12,12 +12,19 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.command_table import RECORDINGS
+from gateway.cli.app import RECORDINGS
 from gateway.cli.live.run import (
     EndpointOption,
     with_endpoints,
 )
-from gateway.cli.support.asking import AskingTyper, ask, with_socket
+from gateway.cli.support.options import (
+    AskingTyper,
+    ConfigOption,
+    ask,
+    read_options,
+    read_settings,
+    with_socket,
+)
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,
@@ -31,11 +38,6 @@ from gateway.cli.support.recording_options import (
     read_range,
     recordings_folder,
     refusing,
-)
-from gateway.cli.support.settings_options import (
-    ConfigOption,
-    read_options,
-    read_settings,
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
 from gateway.config import GatewaySettings

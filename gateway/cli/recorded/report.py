@@ -18,6 +18,11 @@ from gateway.cli.support.loading import (
     fusion_of,
     load_flight,
 )
+from gateway.cli.support.options import (
+    ConfigOption,
+    load_settings,
+    or_refuse,
+)
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -25,11 +30,6 @@ from gateway.cli.support.recording_options import (
     SmoothOption,
     print_remarks,
     refusing,
-)
-from gateway.cli.support.settings_options import (
-    ConfigOption,
-    load_settings,
-    or_refuse,
 )
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 from gateway.output import check_folder

@@ -7,12 +7,12 @@ import typer
 
 from gateway.batch.storage import is_url
 from gateway.cli.support.loading import Loading, ReferenceOption, SystemOption
-from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
-from gateway.cli.support.settings_options import (
+from gateway.cli.support.options import (
     ConfigOption,
     load_settings,
     or_refuse,
 )
+from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
 from gateway.cli.support.terminal import refuse
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]

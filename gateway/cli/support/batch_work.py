@@ -19,6 +19,7 @@ from gateway.batch.tasks import (
     run_season,
     without_secrets,
 )
+from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
     Wanted,
     files_of,
@@ -26,7 +27,6 @@ from gateway.cli.support.recording_options import (
     recordings_folder,
     refusing,
 )
-from gateway.cli.support.settings_options import read_options, read_settings
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice

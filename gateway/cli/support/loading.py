@@ -9,6 +9,7 @@ import typer
 
 from gateway.analysis.flight_arrays import Flight, FusionSettings
 from gateway.analysis.sources import flight_of_blocks, judged_by, simulated_flight
+from gateway.cli.support.options import folder_of, read_options
 from gateway.cli.support.recording_options import (
     files_of,
     print_remarks,
@@ -16,7 +17,6 @@ from gateway.cli.support.recording_options import (
     read_column_map,
     refusing,
 )
-from gateway.cli.support.settings_options import folder_of, read_options
 from gateway.config import GatewaySettings
 from gateway.recordings.files import FileKind, FlightError, SettingsChoice, kind_of
 from gateway.recordings.fuse import aircraft_for, check_latency

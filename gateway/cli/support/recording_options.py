@@ -18,8 +18,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from gateway.cli.support.asking import ask, is_running
-from gateway.cli.support.settings_options import folder_of, read_settings
+from gateway.cli.support.options import ask, folder_of, is_running, read_settings
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.reasons import reason_of
 from gateway.recordings.files import FlightError, Position, SettingsChoice

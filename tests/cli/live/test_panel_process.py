@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.support import panel_process
-from gateway.cli.support.panel_process import LONGEST_RECORD, OneLineFormatter, PanelProcess
+from gateway.cli.live import panel as panel_command
+from gateway.cli.live.panel import LONGEST_RECORD, OneLineFormatter, PanelProcess
 from gateway.live.log_limit import LogLimit
 
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
@@ -24,7 +24,7 @@ async def control_socket() -> Path:
 async def test_it_has_ended_when_it_is_closed(
     begin: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(panel_process, "END_S", 0.2 if begin else 60.0)
+    monkeypatch.setattr(panel_command, "END_S", 0.2 if begin else 60.0)
     panel = PanelProcess(None)
     panel._command = [sys.executable, "-c", begin + SAYING]
     panel.start(control_socket)

@@ -7,7 +7,7 @@ from itertools import count, islice
 
 import pytest
 
-from gateway.cli.support.simulated_line import made_ahead
+from gateway.cli.live.demo import made_ahead
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame

@@ -9,8 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli.app import app
-from gateway.cli.command_table import COMMANDS, load_command
+from gateway.cli.app import COMMANDS, app, load_command
 
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
 LARGE = (
