@@ -34,6 +34,7 @@ rm -rf "$lib/bin" "$lib/share"
 # A third of all that would be installed are the tests of other packages, types, sources of C, and
 # MAVLink dialects that are parts of `all`.
 find "$lib" -type d -name tests -prune -exec rm -r {} +
+find "$lib" -name "*_tests.*.so" -delete
 find "$lib" -type f \( -name "*.pyi" -o -name "*.pyx" -o -name "*.pxd" -o -name "*.[ch]" \) -delete
 dialects=$lib/pymavlink/dialects
 if [ -d "$dialects" ]; then
@@ -52,7 +53,13 @@ mkdir -p "$root/usr/bin" "$root/usr/lib/systemd/system" "$root/usr/lib/sysusers.
 sed "s/@MINOR@/$minor/" tools/debian/mavgate > "$root/usr/bin/mavgate"
 chmod 755 "$root/usr/bin/mavgate"
 mv "$work/share/doc/mavgate" "$root/usr/share/doc/"
-gzip -9 --no-name --stdout CHANGELOG.md > "$root/usr/share/doc/mavgate/changelog.gz"
+{
+    printf 'mavgate (%s) unstable; urgency=medium\n\n' "$version"
+    printf '  * CHANGELOG.md in this folder lists the changes.\n\n'
+    printf ' -- the mavgate project <mavgate@localhost>  %s\n' "$(date -R)"
+} | gzip -9 --no-name > "$root/usr/share/doc/mavgate/changelog.gz"
+mkdir -p "$root/usr/share/man/man1"
+gzip -9 --no-name --stdout tools/debian/mavgate.1 > "$root/usr/share/man/man1/mavgate.1.gz"
 "$python" -m tools.third_party --copyright "$root/usr/share/doc/mavgate/copyright" "$lib"
 mv "$work/share/mavgate/mavgate.service" "$root/usr/lib/systemd/system/"
 cp tools/debian/60-mavgate.rules "$root/usr/lib/udev/rules.d/"
@@ -70,7 +77,9 @@ for shell in bash zsh fish; do
 done
 # Python wrote it while this script ran the program; the installation writes it for its Python.
 find "$root" -name __pycache__ -prune -exec rm -r {} +
-find "$lib" -type f -name "*.so*" -exec chmod 644 {} +
+find "$lib" -type f -exec chmod 644 {} +
+# Modules of some packages begin as programs do, for a Python that Debian does not have.
+find "$lib" -name "*.py" -exec sed -i '1s|^#!.*python.*$|#!/usr/bin/python3|' {} +
 mkdir -p "$root/usr/share/lintian/overrides"
 cp tools/debian/lintian-overrides "$root/usr/share/lintian/overrides/mavgate"
 echo /etc/mavgate/gateway.toml > "$root/DEBIAN/conffiles"
@@ -83,5 +92,5 @@ sed -e "s/@VERSION@/$version/" -e "s/@ARCHITECTURE@/$(dpkg --print-architecture)
     tools/debian/control > "$root/DEBIAN/control"
 chmod -R go=u-w "$root"
 mkdir -p "$output"
-step "compression" dpkg-deb --root-owner-group -Zxz --build "$root" "$output"
+step "compression, for up to two minutes" dpkg-deb --root-owner-group -Zxz --build "$root" "$output"
 ls -l "$output"/mavgate_*.deb
