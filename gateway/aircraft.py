@@ -208,18 +208,15 @@ class Aircraft:
         wanted: Sequence[VehicleAction],
         now_us: int,
     ) -> list[Action]:
-        """Order the actions: frames first, then the record, then changes of settings."""
-        if not wanted:
-            return [record]
-        actions = self.perform(wanted, now_us)
-        changed = [action for action in actions if isinstance(action, SettingsChanged)]
-        if not changed:
-            actions.append(record)
-            return actions
-        others = [action for action in actions if not isinstance(action, SettingsChanged)]
-        return [*others, record, *changed]
+        """Add the record to the actions, before changes of the settings of the next one."""
+        return self.perform(wanted, now_us, record) if wanted else [record]
 
-    def perform(self, wanted: Iterable[VehicleAction], now_us: int) -> list[Action]:
+    def perform(
+        self,
+        wanted: Iterable[VehicleAction],
+        now_us: int,
+        record: FusedSample | BaroRaw | GpsFix | NodeStatus | None = None,
+    ) -> list[Action]:
         """Carry out the vehicle's actions on the other stages; return the rest.
 
         Parameters
@@ -227,20 +224,25 @@ class Aircraft:
         wanted : iterable of VehicleAction
         now_us : int
             Gateway clock.
+        record : FusedSample, BaroRaw, GpsFix or NodeStatus, optional
+            Its cause, which is recorded before the settings change.
 
         Returns
         -------
         list of Action
         """
         actions: list[Action] = []
+        changed: list[Action] = []
         for action in wanted:
             if isinstance(action, SettingsChange):
-                actions += self._change(action.section, action.settings)
+                changed += self._change(action.section, action.settings)
             elif isinstance(action, CalibrationMeasured):
-                actions += self._recalibrate(action, now_us)
+                changed += self._recalibrate(action, now_us)
             else:
                 actions.append(action)
-        return actions
+        if record is not None:
+            actions.append(record)
+        return actions + changed if changed else actions
 
     def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
         """Join the calibration with a measured one, unless no sensor has such errors."""

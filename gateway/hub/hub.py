@@ -6,7 +6,7 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 
@@ -60,13 +60,9 @@ SHED_AFTER_US: Final = 150_000
 is waiting already."""
 
 
-class _Queued(NamedTuple):
-    """One of our own frames that waits for a turn of the loop."""
-
-    frame: MavFrame
-    step: int | None
-    client_id: int | None
-    since_us: int
+_Queued = tuple[MavFrame, int | None, int | None, int]
+"""One of our own frames that waits for a turn of the loop: the frame, its step (see `Numbering`),
+the client that it answers, and since when it waits."""
 
 
 class Hub:
@@ -145,7 +141,7 @@ class Hub:
         self._published = self._shed = 0
         self._gathering: dict[float, list[Callable[[], None]]] = {}
         """Callbacks to flush, by their wait."""
-        self._numbering = Numbering(lambda _: True)
+        self._numbering = Numbering()
         """Answers overtake telemetry, so frames are numbered when they leave the queues."""
         self._answers: deque[_Queued] = deque()
         self._telemetry: deque[_Queued] = deque()
@@ -166,13 +162,14 @@ class Hub:
         if self._burst_turn is not None:
             self._burst_turn.cancel()
         for queued in (*self._answers, *self._telemetry):
-            self._send(queued)
+            self._send(queued, self.now_us())
         for location in list(self._endpoints):
             self.remove(location)
 
     def send(self, outgoing: Outgoing) -> None:
         """Send one of our own frames now: to all clients that take it, or to the one it answers."""
-        self._send(self._queued(outgoing))
+        now_us = self.now_us()
+        self._send(self._queued(outgoing, now_us), now_us)
 
     def send_all(self, frames: Iterable[Outgoing]) -> None:
         """Send frames of ours over several turns of the loop, answers first.
@@ -180,44 +177,44 @@ class Hub:
         Each kind leaves in its order. When the processor is short of time, telemetry that has
         waited for `SHED_AFTER_US` is dropped.
         """
+        now_us = self.now_us()
         for outgoing in frames:
-            queued = self._queued(outgoing)
+            queued = self._queued(outgoing, now_us)
             is_answer = (
                 self._keeps_order
                 or outgoing.client_id is not None
-                or queued.frame.message_id in NOT_TELEMETRY_IDS
+                or outgoing.message_id in NOT_TELEMETRY_IDS
             )
             (self._answers if is_answer else self._telemetry).append(queued)
         if self._burst_turn is None:
             self._send_some()
 
-    def _queued(self, outgoing: Outgoing) -> _Queued:
+    def _queued(self, outgoing: Outgoing, now_us: int) -> _Queued:
         frame, client_id = frame_of(outgoing.frame), outgoing.client_id
         # Now, while it is known which client has made the request.
         self._router.charge(client_id, len(frame.data))
-        return _Queued(frame, self._numbering.enter(frame), client_id, self.now_us())
+        return frame, self._numbering.enter(frame), client_id, now_us
 
     def _send_some(self) -> None:
         self._burst_turn = None
-        room, shed_us = SENDS_AT_ONCE, self.now_us() - SHED_AFTER_US
+        now_us, room = self.now_us(), SENDS_AT_ONCE
         answers, telemetry = self._answers, self._telemetry
         try:
-            while telemetry and telemetry[0].since_us < shed_us:
+            while telemetry and telemetry[0][3] < now_us - SHED_AFTER_US:
                 telemetry.popleft()
                 self._shed += 1
             while (answers or telemetry) and (
                 room > 0 or len(answers) + len(telemetry) > MAX_WAITING
             ):
                 queued = (answers or telemetry).popleft()
-                room -= len(self._clients) if queued.client_id is None else 1
-                self._send(queued)
+                room -= len(self._clients) if queued[2] is None else 1
+                self._send(queued, now_us)
         finally:
             if answers or telemetry:
                 self._burst_turn = asyncio.get_running_loop().call_soon(self._send_some)
 
-    def _send(self, queued: _Queued) -> None:
+    def _send(self, queued: _Queued, now_us: int) -> None:
         frame, step, client_id, _ = queued
-        now_us = self.now_us()
         self._published += 1
         sequence = frame.sequence if step is None else self._numbering.leave(frame, step)
         if self._vehicles.has_waiting:

@@ -35,11 +35,12 @@ class OwnVehicles:
         """Register a frame of ours, maybe for greetings; return whether its vehicle is new."""
         origin, message_id = frame.origin, frame.message_id
         is_new = not self.is_own(origin, now_us)
+        if not is_new and message_id not in GREETING:
+            return False
         if is_new:
             # Frames that an earlier playback sent of this system are outdated.
             self._frames[origin] = {}
-        if is_new or message_id in GREETING:
-            self._seen_us[origin] = now_us
+        self._seen_us[origin] = now_us
         if message_id in GREETING:
             self._frames[origin][message_id] = frame
         return is_new

@@ -58,11 +58,11 @@ class Numbering:
 
     Parameters
     ----------
-    is_own : callable
+    is_own : callable, optional
         Whether an origin is one of our vehicles; frames of others are never changed.
     """
 
-    def __init__(self, is_own: Callable[[Origin], bool]) -> None:
+    def __init__(self, is_own: Callable[[Origin], bool] | None = None) -> None:
         self._is_own = is_own
         self._entered: dict[Origin, int] = {}
         self._left: dict[Origin, int] = {}
@@ -70,11 +70,12 @@ class Numbering:
     def enter(self, frame: MavFrame) -> int | None:
         """Return a frame's step, to be passed to `leave`; None for a frame of others."""
         origin, sequence = frame.origin, frame.sequence
-        if not self._is_own(origin):
+        if self._is_own is not None and not self._is_own(origin):
             return None
-        before = self._entered.get(origin, sequence - 1)
-        if len(self._entered) < MAX_ORIGINS or origin in self._entered:
-            self._entered[origin] = sequence
+        entered = self._entered
+        before = entered.get(origin, sequence - 1)
+        if len(entered) < MAX_ORIGINS or origin in entered:
+            entered[origin] = sequence
         return sequence - before & SEQUENCE_MASK
 
     def leave(self, frame: MavFrame, step: int) -> int:

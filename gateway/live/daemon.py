@@ -342,9 +342,9 @@ class Daemon:
         self._hub.send_all([each for each in frames if each.client_id != RECORDED_ONLY])
         for sent in frames:
             self._sent[sent.message_id] += 1
-            frame, to = sent.frame, sent.client_id
             if sent.message_id in UNRECORDED:
                 continue
+            frame, to = sent.frame, sent.client_id
             if to in (None, RECORDED_ONLY) or self._budget.takes(to, len(frame), self.now_us()):
                 self._recorder.frame(frame)
 
@@ -384,11 +384,17 @@ class Daemon:
 
     def _perform(self, actions: Sequence[Action]) -> None:
         """Carry out the actions of the pure stages, frames first."""
-        if frames := [action for action in actions if isinstance(action, Outgoing)]:
-            self._send(frames)
+        frames: list[Outgoing] = []
+        others: list[Action] = []
         for action in actions:
-            if not isinstance(action, Outgoing):
-                self._carry_out(action)
+            if isinstance(action, Outgoing):
+                frames.append(action)
+            else:
+                others.append(action)
+        if frames:
+            self._send(frames)
+        for action in others:
+            self._carry_out(action)
 
     def _carry_out(self, action: Action) -> None:
         match action:

@@ -237,10 +237,10 @@ class Encoder:
         -------
         Outgoing
         """
-        if type(message) is PackedMessage:
+        if isinstance(message, PackedMessage):
             packer = message.packer
             frame = self._frame(packer.message_id, packer.crc_extra, message.payload())
-            self._sequence = (self._sequence + 1) % 256
+            self._sequence = self._sequence + 1 & 0xFF
             return Outgoing(frame, packer.message_id, client_id)
         # Not message.id: HIGHRES_IMU and others have a field of that name.
         message_id = message.get_msgId()

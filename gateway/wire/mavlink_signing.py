@@ -21,7 +21,7 @@ from gateway.wire.mavlink_splitter import (
     START_V2,
     MavFrame,
     frame_of,
-    with_sequence,
+    renumbered,
 )
 
 LINK_ID: Final = bytes(1)
@@ -70,11 +70,9 @@ class FrameSigner:
         MavFrame
             The frame to send instead.
         """
-        key = self.keys.get(frame.origin[0])
+        key = self.keys.get(frame.origin[0]) if self.keys else None
         if key is None or self._clock is None:
-            if frame.sequence == sequence:
-                return frame
-            return frame_of(with_sequence(frame.data, sequence))
+            return renumbered(frame, sequence)
         self._newest = max(self._newest + 1, self._clock.timestamp(now_us))
         return frame_of(sign(frame.data, sequence, key, self._newest))
 

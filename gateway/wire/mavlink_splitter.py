@@ -241,14 +241,21 @@ def with_sequence(data: bytes, sequence: int) -> bytes:
     bytes
         The frame to send instead.
     """
+    return renumbered(frame_of(data), sequence).data
+
+
+def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
+    """Return a frame with another sequence number; a signed or an unknown one as it is."""
+    data = frame.data
+    extra = CRC_EXTRA.get(frame.message_id)
+    if extra is None or frame.signed or frame.sequence == sequence:
+        return frame
     at = 4 if data[0] == START_V2 else 2
-    if data[at] == sequence:
-        return data
-    extra = CRC_EXTRA.get(message_id_of(data))
-    if extra is None or is_signed(data):
-        return data
-    body = data[1:at] + bytes((sequence,)) + data[at + 1 : -2]
-    return data[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
+    body = b"%b%c%b" % (data[1:at], sequence, data[at + 1 : -2])
+    data = data[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
+    return MavFrame(
+        data, frame.key, frame.message_id, frame.origin, frame.target, sequence, signed=False
+    )
 
 
 def _split(data: bytes, *, final: bool) -> tuple[list[Event], int]:

@@ -22,6 +22,7 @@ from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
 from gateway.vehicle.actions import Request, SaveSettings
 from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_splitter import MavFrame
 
 PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
@@ -171,8 +172,8 @@ async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def note(sent: Outgoing) -> None:
-        message = mavlink.MAVLink(None).decode(bytearray(sent.frame.data))
+    def note(queued: tuple[MavFrame, int, int, int], _: int) -> None:
+        message = mavlink.MAVLink(None).decode(bytearray(queued[0].data))
         if message.get_type() == "COMMAND_ACK":
             seen.append((message.result, file.read_text() if file.exists() else ""))
         elif message.get_type() == "STATUSTEXT" and message.text.startswith("Settings"):

@@ -204,6 +204,7 @@ UNCALIBRATED_SENSORS: Final = (
     (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
 )
 UNCALIBRATED: Final = sum(int(flag) for flag, _ in UNCALIBRATED_SENSORS)
+INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
 
 LATENCY_SETTLED_US: Final = 5_000_000
 """A latency that has not changed for so long has converged."""
@@ -228,7 +229,9 @@ class Announcements:
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Any]:
         """Announce changes of the sensors' and the estimator's flags."""
         found: list[Any] = []
-        if sample.flags & UNCALIBRATED != self._uncalibrated:
+        changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
+        # The compass only once it has measured a field.
+        if changed and (sample.mag_b_ut is not None or changed & INERTIAL):
             found = self._on_sample(sample, now_us)
         if state.flags != self._flags:
             found += self._on_flags(state.flags, now_us)
@@ -249,7 +252,7 @@ class Announcements:
         """Announce sensors that were never calibrated; the compass once it has measured a field."""
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if sample.mag_b_ut is None:
-            changed &= ~int(ImuFlags.MAG_UNCALIBRATED)
+            changed &= INERTIAL
         self._uncalibrated ^= changed
         found = []
         for flag, sensor in UNCALIBRATED_SENSORS:

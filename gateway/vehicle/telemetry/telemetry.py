@@ -272,10 +272,13 @@ class Telemetry:
             return []
         next_us, due = time_us + US_PER_S, []
         for message_id, stream in self._state_streams:
-            if stream.offer_paced(time_us, period_us):
-                due.append(message_id)
-            if stream.due_us is not None and stream.due_us < next_us:
-                next_us = stream.due_us
+            due_us = stream.due_us
+            if due_us is None or due_us <= time_us + period_us:
+                if stream.offer_paced(time_us, period_us):
+                    due.append(message_id)
+                due_us = stream.due_us
+            if due_us is not None and due_us < next_us:
+                next_us = due_us
         self._state_due_us = next_us
         return self._build_all(due, time_us) if due else []
 
