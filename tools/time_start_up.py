@@ -2,6 +2,7 @@
 
     python tools/time_start_up.py
     python tools/time_start_up.py --gateway
+    python tools/time_start_up.py --radio
 
 Prints the CPU of `mavgate --help` and `status`, the best of five; then of `mavgate run` on a
 simulated receiver the seconds, the CPU and the memory from its call to its first datagram and to
@@ -10,21 +11,31 @@ its first attitude. The baselines are a Python that does nothing, and `mavlogdum
 Then it starts the demo and prints seconds of wall clock: the scripted QGroundControl over UDP and
 TCP, as MAVLink 1 and 2, the best of five each; and MAVProxy from its heartbeat to the last
 parameter. The baseline is the round trip of one PING.
+
+With `--radio` the station is on a serial radio instead: a pseudo-terminal that carries 57,600 Bd
+each way, with the telemetry of the demo on it. It reads the description of the parameters by
+MAVLink FTP as QGroundControl does, both files by bursts, and asks all its questions. The baseline
+is the same with the description as plain JSON, computed from its size at the measured rate.
 """
 
 import argparse
+import contextlib
+import lzma
 import os
 import re
 import resource
 import select
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -33,6 +44,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.station import Station
 from tests.end_to_end.test_ground_stations import CONFIG
@@ -40,6 +52,17 @@ from tests.vehicle.test_start_up import qgroundcontrol
 
 REPEATS = 5
 START_UNIX_US = 1_781_187_930_000_000
+BAUD = 57_600
+BITS_PER_BYTE = 10
+FTP_DATA_BYTES = 239
+LOST_S = 1.0
+RADIO_CONFIG = """
+[hub]
+endpoints = ["serial:{device}:{baud}", "udp:127.0.0.1:{{port}}"]
+
+[simulator]
+gps_first_fix_s = 0.5
+"""
 
 
 def cpu_of(*arguments: str) -> float:
@@ -122,7 +145,7 @@ def connect(kind: int, port: int, version: int) -> Station:
     deadline_s = time.monotonic() + START_LIMIT_S
     while time.monotonic() < deadline_s:
         try:
-            station = Station(kind, port, version)
+            station = Station.connect(kind, port, version)
         except OSError:
             time.sleep(0.2)
             continue
@@ -177,15 +200,121 @@ def time_mavproxy(port: int, folder: Path) -> None:
     print(f"MAVProxy, {count} parameters: {seconds:.2f} s from its first heartbeat")
 
 
+class Radio:
+    """A pseudo-terminal and a socket, with a line between them that carries some bytes a second."""
+
+    def __init__(self, baud: int) -> None:
+        self.master, self.slave = os.openpty()
+        tty.setraw(self.slave)
+        os.set_blocking(self.master, False)
+        self.device = os.ttyname(self.slave)
+        self.station_side, self._inner = socket.socketpair()
+        self._inner.setblocking(False)
+        self._bytes_per_s = baud / BITS_PER_BYTE
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._carry)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        began_s, carried, up = time.monotonic(), 0, b""
+        while not self._ended.wait(0.005):
+            room = int((time.monotonic() - began_s) * self._bytes_per_s) - carried
+            carried += room
+            with contextlib.suppress(BlockingIOError):
+                self._inner.send(os.read(self.master, room))
+            with contextlib.suppress(BlockingIOError):
+                up += self._inner.recv(4096)
+            up = up[os.write(self.master, up[:room]) :]
+
+    def close(self) -> None:
+        """End the line."""
+        self._ended.set()
+        self._thread.join()
+        self._inner.close()
+        os.close(self.master)
+        os.close(self.slave)
+
+
+def ftp_packets(messages: list[Any]) -> list[Packet]:
+    """Return the FTP packets among some messages."""
+    found = (m for m in messages if m.get_type() == "FILE_TRANSFER_PROTOCOL")
+    return [decode_packet(bytes(message.payload)) for message in found]
+
+
+def read_file(station: Station, path: bytes) -> bytes:
+    """Read a file by MAVLink FTP in bursts, and ask again where one ends or loses something."""
+    sequence = 0
+
+    def ask(opcode: int, session: int, data: bytes = b"", **fields: int) -> list[Packet]:
+        nonlocal sequence
+        sequence += 1
+        size, offset = fields.get("size", len(data)), fields.get("offset", 0)
+        packet = Packet(sequence, session, opcode, size, 0, 0, offset, data)
+        message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, packet.encode())
+        return ftp_packets(station.ask(message, "FILE_TRANSFER_PROTOCOL"))
+
+    [opened] = ask(Opcode.OPEN_FILE_RO, 0, path)
+    if opened.opcode != ACK:
+        raise SystemExit(f"{path.decode()} cannot be read")
+    (size,) = struct.unpack("<I", opened.data)
+    content = b""
+    while len(content) < size:
+        pieces = ask(
+            Opcode.BURST_READ_FILE, opened.session, size=FTP_DATA_BYTES, offset=len(content)
+        )
+        heard_s = time.monotonic()
+        while len(content) < size and time.monotonic() - heard_s < LOST_S:
+            for piece in pieces:
+                if piece.offset == len(content):
+                    content += piece.data[: piece.size]
+                    heard_s = time.monotonic()
+            if len(content) < size:
+                pieces = ftp_packets(station.wait(0.005))
+    ask(Opcode.TERMINATE_SESSION, opened.session)
+    return content
+
+
+def time_radio(folder: Path) -> None:
+    """Print how soon a station on a serial radio has the parameters and their description."""
+    radio = Radio(BAUD)
+    config = RADIO_CONFIG.format(device=radio.device, baud=BAUD)
+    gateway = Gateway(folder, "demo", config=config)
+    station = Station(radio.station_side)
+    try:
+        station.until_heard()
+        station.wait(5.0)  # telemetry settles at the rate of the line
+        files: dict[str, bytes] = {}
+        general_s = timed(lambda: files.update(general=read_file(station, b"/general.json")))
+        described_s = timed(
+            lambda: files.update(parameters=read_file(station, b"/parameter.json.xz"))
+        )
+        asked_s = timed(lambda: qgroundcontrol(station))
+    finally:
+        gateway.stop()
+        radio.close()
+        station.close()
+    packed, plain = len(files["parameters"]), len(lzma.decompress(files["parameters"]))
+    print(f"general.json, {len(files['general'])} bytes: {general_s:.1f} s")
+    print(f"parameter.json.xz, {packed} bytes: {described_s:.1f} s")
+    print(f"other questions, parameters and missions: {asked_s:.1f} s")
+    print(f"ready after {general_s + described_s + asked_s:.1f} s at {BAUD} Bd")
+    plain_s = general_s + described_s * plain / packed + asked_s
+    print(f"with {plain} bytes of plain JSON: {plain_s:.1f} s")
+
+
 def main() -> None:
     """Start the demo, measure, stop it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--gateway", action="store_true", help="its own start alone")
-    alone = parser.parse_args().gateway
+    parser.add_argument("--radio", action="store_true", help="a station on a serial radio alone")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.environ["XDG_RUNTIME_DIR"] = folder
+        if options.radio:
+            time_radio(Path(folder))
+            return
         time_gateway(Path(folder))
-        if alone:
+        if options.gateway:
             return
         gateway = Gateway(Path(folder), "demo", config=CONFIG)
         try:

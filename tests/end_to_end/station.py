@@ -20,22 +20,29 @@ class Station:
     """Slices of time before it asks again: a busy machine may keep the gateway waiting."""
     ask_again_s = 1.0
 
-    def __init__(self, kind: int, port: int, version: int) -> None:
+    def __init__(self, sock: socket.socket, version: int = 2) -> None:
         self.version = version
         self.inbox: list[Any] = []
         self.mav = mavlink.MAVLink(None, 255, 190)
         self._parser = mavlink.MAVLink(None)
         self._parser.robust_parsing = True
-        self._sock = socket.socket(socket.AF_INET, kind)
-        try:
-            self._sock.connect(("127.0.0.1", port))
-        except OSError:
-            self._sock.close()
-            raise
+        self._sock = sock
         self._beat_s = 0.0
+
+    @classmethod
+    def connect(cls, kind: int, port: int, version: int) -> "Station":
+        """Connect to a gateway on this machine; raises OSError if none listens."""
+        sock = socket.socket(socket.AF_INET, kind)
+        try:
+            sock.connect(("127.0.0.1", port))
+        except OSError:
+            sock.close()
+            raise
+        station = cls(sock, version)
         # Stations of one id that count from the same number send the same bytes, and the
         # gateway takes the second ones for copies that came by another way.
-        self.mav.seq = self._sock.getsockname()[1] % 256
+        station.mav.seq = sock.getsockname()[1] % 256
+        return station
 
     def close(self) -> None:
         self._sock.close()

@@ -86,7 +86,7 @@ def stations(gateway: Gateway) -> Iterator[Callable[..., Station]]:
         deadline_s = time.monotonic() + START_LIMIT_S
         while True:
             try:
-                station = Station(kind, gateway.listen_port, version)
+                station = Station.connect(kind, gateway.listen_port, version)
                 opened.append(station)
                 station.until_heard(1.0)
             except (ConnectionError, AssertionError):

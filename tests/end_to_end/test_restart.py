@@ -33,7 +33,7 @@ RALLY_ITEMS = [item(seq, RALLY) for seq in range(3)]
 
 
 def store(port: int) -> None:
-    station = Station(socket.SOCK_STREAM, port, 2)
+    station = Station.connect(socket.SOCK_STREAM, port, 2)
     station.until_heard()
     for items, kind in ((ITEMS, MISSION), (RALLY_ITEMS, RALLY)):
         # The aircraft gives up a station that stays silent for some seconds.
@@ -46,7 +46,7 @@ def store(port: int) -> None:
 
 
 def find(port: int) -> tuple[int, int, int]:
-    station = Station(socket.SOCK_STREAM, port, 2)
+    station = Station.connect(socket.SOCK_STREAM, port, 2)
     station.until_heard()
     assert list(map(content, download(station))) == list(map(content, ITEMS))
     assert list(map(content, download(station, RALLY))) == list(map(content, RALLY_ITEMS))
