@@ -63,6 +63,36 @@ THE USE OF THIS SOFTWARE, EVEN IF ADVISED OF THE POSSIBILITY OF SUCH DAMAGE.
 """
 
 
+BUNDLED: Final = (
+    (
+        "Natural Earth, coasts and borders at 1:50 million and populated places",
+        "Public domain",
+        "the panel's coarse map, `gateway/panel/web/base_map.json`",
+        "",
+    ),
+    (
+        "world-atlas, which makes TopoJSON of the coasts and borders",
+        "ISC",
+        "the same file",
+        """\
+Copyright 2013-2019 Michael Bostock
+
+Permission to use, copy, modify, and/or distribute this software for any purpose with or without fee
+is hereby granted, provided that the above copyright notice and this permission notice appear in all
+copies.
+
+THE SOFTWARE IS PROVIDED "AS IS" AND THE AUTHOR DISCLAIMS ALL WARRANTIES WITH REGARD TO THIS
+SOFTWARE INCLUDING ALL IMPLIED WARRANTIES OF MERCHANTABILITY AND FITNESS. IN NO EVENT SHALL THE
+AUTHOR BE LIABLE FOR ANY SPECIAL, DIRECT, INDIRECT, OR CONSEQUENTIAL DAMAGES OR ANY DAMAGES
+WHATSOEVER RESULTING FROM LOSS OF USE, DATA OR PROFITS, WHETHER IN AN ACTION OF CONTRACT, NEGLIGENCE
+OR OTHER TORTIOUS ACTION, ARISING OUT OF OR IN CONNECTION WITH THE USE OR PERFORMANCE OF THIS
+SOFTWARE.
+""",
+    ),
+)
+"""Data in this repository: origin, licence, use, and text of the licence."""
+
+
 def main() -> None:
     """Write one of the two files."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
@@ -97,6 +127,15 @@ def page() -> str:
             f"| {'-' * width} | --- |",
             *table[1:],
         ]
+    lines += [
+        "",
+        "## Data in this repository",
+        "",
+        "| data | licence | use |",
+        "| --- | --- | --- |",
+    ]
+    lines += [f"| {data} | {licence} | {use} |" for data, licence, use, _ in BUNDLED]
+    lines += ["", *(text.rstrip() for *_, text in BUNDLED if text)]
     return "\n".join(lines) + "\n"
 
 
@@ -127,6 +166,8 @@ def copyright_of(packages: Iterable[Distribution]) -> str:
         "",
         (ROOT / "LICENSE").read_text(),
     ]
+    for data, licence, _, text in BUNDLED:
+        parts += ["=" * 78, f"{data}: {licence}", "", text]
     for package in sorted(packages, key=lambda one: one.name.lower()):
         parts += ["=" * 78, f"{package.name} {package.version}: {_licence(package)}", ""]
         parts += texts_of(package)

@@ -39,6 +39,15 @@ VIEWS = (
     "flight", "map", "link", "recordings", "calibration", "tuning", "plots", "events",
 )  # fmt: skip
 RATE_OF_THE_SENSOR = "/v1/mavlink/vehicles/1/components/1/messages/HIGHRES_IMU/message/zgyro"
+OFFLINE = (
+    (
+        '{{name = "Street", url = "http://127.0.0.1:9/{{{{z}}}}/{{{{x}}}}/{{{{y}}}}", '
+        'attribution = "Someone"}}'
+    )
+    .replace("{{{{", "{{")
+    .replace("}}}}", "}}")
+)
+"""A style whose tiles cannot be fetched."""
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -83,7 +92,7 @@ class Desk:
 def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     folder, receiver = tmp_path_factory.mktemp("desk"), BenchReceiver()
     receiver.start()
-    config = CONFIG.partition("map_styles")[0] + "enabled = true\nmap_styles = []\n"
+    config = CONFIG.partition("map_styles")[0] + f"enabled = true\nmap_styles = [{OFFLINE}]\n"
     config += f"[vehicle.rates]\nhighres_imu_hz = {RATE_HZ:.1f}\n"
     gateway = Process(folder, "run", "--plain", "--port", receiver.port, config=config)
     page = open_page(browser, gateway.link())
@@ -220,6 +229,24 @@ def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
     lat_deg, lon_deg = (float(part) for part in place.split(","))
     desk.page.wait_for_function(f"Math.abs(mavgate.state.home.lat_deg - {lat_deg}) < 1e-6")
     assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)
+
+
+def test_map_without_tiles_says_so_and_shows_coasts_and_towns(desk: Desk) -> None:
+    view = desk.view("map")
+    names = view.locator("canvas.map-towns")
+    owners = view.locator(".leaflet-control-attribution")
+    expect(view.get_by_text("no map tiles (offline)")).to_be_visible()
+    view.locator(".map").evaluate("(map) => map.mavgate_map.setZoom(5, { animate: false })")
+    # At 47 degrees north and 8 east.
+    expect(names).to_have_attribute("data-names", re.compile(r"^\d{2}$"))
+    expect(owners).to_contain_text("Made with Natural Earth")
+    expect(owners).not_to_contain_text("Someone")
+    view.get_by_label("Map style").select_option(label="Grid")
+    expect(names).to_have_count(0)
+    expect(owners).not_to_contain_text("Natural Earth")
+    expect(view.get_by_text("no map tiles (offline)")).to_have_count(0)
+    view.get_by_label("Map style").select_option(label="Street")
+    expect(names).to_have_count(1)
 
 
 def test_client_is_added_and_removed(desk: Desk) -> None:

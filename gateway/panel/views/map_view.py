@@ -35,6 +35,7 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
         super().__init__()
         self._tiles = context.parts.tiles
         self._props["full"] = full
+        self._props["base"] = "/web/base_map.json"
         self.refresh()
         context.every(STYLES_S, self.refresh)
         self._props["may_mark"] = full and context.may_change

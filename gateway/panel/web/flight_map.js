@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
-// The map: fused track and GPS fixes apart, home, mark, accuracy; a metric grid below everything.
+// The map: fused track and GPS fixes apart, home, mark, accuracy; below them tiles, or a coarse map
+// of the world, or a metric grid.
 import { leaflet as L } from "nicegui-leaflet";
 
 const EARTH_M = 6378137;
 const rad = Math.PI / 180;
 const CIRCLE_95 = 2.4477 / Math.SQRT2; // of the root of both axes' variances, as a radius
 const MAX_DOTS = 2000;
+const MAX_TOWNS = 60;
+const LINE_GAP = 90; // least pixels between two lines of the grid
+const GRID_ZOOM = 9; // the coarse map shows less than the grid when it is looked at more closely
 const AIRCRAFT = {
   plane: "M16 2c1.4 0 2 2 2 5v5l12 6v3l-12-3v7l4 3v2l-6-1.6L10 30v-2l4-3v-7L2 21v-3l12-6V7c0-3 .6-5 2-5z",
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
@@ -15,11 +19,10 @@ const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
 const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
 const at = (spot) => [spot.lat_deg, spot.lon_deg];
 
-// Lines every 1, 2 or 5 times ten to the n metres from home, with their distance at the edge.
-const MetricGrid = L.Layer.extend({
-  origin: null,
+// A canvas over the whole map, which is drawn again whenever the map moves.
+const CanvasLayer = L.Layer.extend({
   onAdd(map) {
-    this.canvas = L.DomUtil.create("canvas", "map-grid", map.getPane("grid"));
+    this.canvas = L.DomUtil.create("canvas", this.options.className, map.getPane(this.options.pane));
     map.on("move zoom resize viewreset", this.draw, this);
     this.draw();
   },
@@ -39,19 +42,31 @@ const MetricGrid = L.Layer.extend({
     this.canvas.style.height = `${size.y}px`;
     const pen = this.canvas.getContext("2d");
     pen.scale(ratio, ratio);
+    this.fill(pen, map, size);
+  },
+});
+
+// Lines every 1, 2 or 5 times ten to the n metres from home, with their distance at the edge.
+const MetricGrid = CanvasLayer.extend({
+  options: { pane: "grid", className: "map-grid" },
+  origin: null,
+  least_zoom: 0,
+  fill(pen, map, size) {
     pen.fillStyle = mavgate.colour("map");
     pen.fillRect(0, 0, size.x, size.y);
-    if (!this.origin) return;
+    if (!this.origin || map.getZoom() < this.least_zoom) return;
     const [lat, lon] = this.origin;
     const here = map.latLngToContainerPoint(this.origin);
-    const east = map.latLngToContainerPoint([lat, lon + 0.001]);
-    const factor = mavgate.factor("length");
-    const per_unit = ((east.x - here.x) / (0.001 * rad * Math.cos(lat * rad) * EARTH_M)) * factor;
-    const wanted = 90 / per_unit;
+    // Not by points of the container, which are rounded.
+    const degree = map.project([lat, lon + 1]).x - map.project([lat, lon]).x;
+    const per_m = degree / (rad * Math.cos(lat * rad) * EARTH_M);
+    const quantity = LINE_GAP / per_m < 1000 ? "length" : "distance";
+    const per_unit = per_m * mavgate.factor(quantity);
+    const wanted = LINE_GAP / per_unit;
     const power = 10 ** Math.floor(Math.log10(wanted));
     const step = [1, 2, 5, 10].find((times) => times * power >= wanted) * power;
     this.canvas.dataset.step = step;
-    const unit = mavgate.show("length", 0)[1];
+    const unit = mavgate.show(quantity, 1e9)[1];
     const pixels = step * per_unit;
     pen.strokeStyle = mavgate.colour("grid");
     pen.fillStyle = mavgate.colour("soft");
@@ -79,6 +94,47 @@ const MetricGrid = L.Layer.extend({
     });
   },
 });
+
+// The names of towns, the most important first, as far as they do not overlap.
+const TownNames = CanvasLayer.extend({
+  options: { pane: "base", className: "map-towns" },
+  towns: [],
+  fill(pen, map, size) {
+    pen.font = "12px system-ui";
+    pen.fillStyle = mavgate.colour("soft");
+    const view = map.getBounds().pad(0.05);
+    const taken = [];
+    for (const [name, place] of this.towns) {
+      if (taken.length >= MAX_TOWNS) break;
+      if (!view.contains(place)) continue;
+      const { x, y } = map.latLngToContainerPoint(place);
+      const box = [x - 4, y - 9, x + 12 + pen.measureText(name).width, y + 9];
+      if (taken.some(([left, top, right, low]) => left < box[2] && box[0] < right && top < box[3] && box[1] < low)) continue;
+      taken.push(box);
+      pen.beginPath();
+      pen.arc(x, y, 2.5, 0, 2 * Math.PI);
+      pen.fill();
+      pen.fillText(name, x + 6, y + 4);
+    }
+    this.canvas.dataset.names = taken.length;
+  },
+});
+
+// Read the coarse map, once for all maps of a page.
+let base_map = null;
+function load_base_map(url) {
+  base_map ??= fetch(url).then((answer) => answer.json()).then(({ unit_deg, coasts, borders, towns }) => {
+    const place = (x, y) => [y * unit_deg, x * unit_deg];
+    const line = (steps) => {
+      let [x, y] = steps;
+      const points = [place(x, y)];
+      for (let n = 2; n < steps.length; n += 2) points.push(place((x += steps[n]), (y += steps[n + 1])));
+      return points;
+    };
+    return { coasts: coasts.map(line), borders: borders.map(line), towns: towns.map(([name, x, y]) => [name, place(x, y)]) };
+  });
+  return base_map;
+}
 
 export default {
   template: `
@@ -111,7 +167,7 @@ export default {
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
       </div>
     </div>`,
-  props: { styles: Array, full: Boolean, may_mark: Boolean },
+  props: { styles: Array, full: Boolean, may_mark: Boolean, base: String },
   computed: {
     // The coordinates in the entry field, or null.
     entered() {
@@ -128,6 +184,7 @@ export default {
     }));
     map.attributionControl.setPrefix("");
     map.createPane("grid").style.zIndex = 150;
+    map.createPane("base").style.zIndex = 160;
     map.createPane("fixes").style.zIndex = 390;
     L.control.scale({ imperial: false }).addTo(map);
     this.grid = new MetricGrid().addTo(map);
@@ -144,6 +201,7 @@ export default {
     this.$watch("styles", (now) => {
       if (this.offline || !this.tiles) this.style = now.length - 1;
     });
+    this.$watch("offline", () => this.set_base());
     this.set_style();
     this.paint();
     this.stop_theme = mavgate.watch_theme(() => this.paint());
@@ -174,6 +232,7 @@ export default {
       this.tiles?.remove();
       this.offline = false;
       const style = this.styles[this.style];
+      this.set_base();
       if (!style) return;
       // A tile that cannot be had is an error; its owner is named only where one is shown.
       const options = { maxZoom: 22, maxNativeZoom: style.max_zoom, errorTileUrl: "" };
@@ -191,8 +250,29 @@ export default {
       this.tiles.on("tileerror", () => (this.offline = loaded === 0));
       this.tiles.addTo(this.map);
     },
+    // Show the coarse map where there are no tiles, unless the grid was chosen.
+    async set_base() {
+      const wanted = () => this.base && this.style >= 0 && (this.offline || !this.styles.length);
+      if (wanted() && !this.world) {
+        const { coasts, borders, towns } = await load_base_map(this.base);
+        if (this.world || !this.map) return;
+        const options = { renderer: L.canvas({ pane: "base" }), weight: 1, interactive: false, attribution: "Made with Natural Earth" };
+        this.coasts = L.polyline(coasts, options);
+        this.borders = L.polyline(borders, { ...options, dashArray: "4 3" });
+        this.towns = new TownNames();
+        this.towns.towns = towns;
+        this.world = L.layerGroup([this.coasts, this.borders, this.towns]);
+        this.paint();
+      }
+      this.toggle(this.world, wanted(), () => {});
+      this.grid.least_zoom = wanted() ? GRID_ZOOM : 0;
+      this.grid.draw();
+    },
     paint() {
       this.mark_colour = mavgate.colour("mark");
+      this.coasts?.setStyle({ color: mavgate.colour("terrain-line") });
+      this.borders?.setStyle({ color: mavgate.colour("soft") });
+      this.towns?.draw();
       this.bearing.setStyle({ color: this.mark_colour });
       this.accuracy.setStyle({ color: mavgate.colour("track"), fillColor: mavgate.colour("track") });
       for (const one of Object.values(this.craft)) {
@@ -287,7 +367,7 @@ export default {
       if (shown) {
         place();
         if (!this.map.hasLayer(layer)) layer.addTo(this.map);
-      } else if (this.map.hasLayer(layer)) {
+      } else if (layer && this.map.hasLayer(layer)) {
         layer.remove();
       }
     },
