@@ -60,22 +60,23 @@ def run_pipeline(rate_hz: int, seconds: int, sleep_s: float = 0.0) -> tuple[floa
     pipeline.connect("bench")
     line = list(islice(frames(rate_hz), (seconds + 1) * rate_hz))
     now_us = due_us = sent = 0
-    used_s = 0.0
+    slept_s = began_s = 0.0
     for number, frame in enumerate(line):
         if number == rate_hz:
-            # The first second loads machine code and says how everything begins.
-            sent, used_s = 0, 0.0
+            # The first second loads machine code and sends what is sent at the start.
+            sent, slept_s, began_s = 0, 0.0, time.process_time()
         if sleep_s:
+            before_s = time.process_time()
             time.sleep(sleep_s)
+            slept_s += time.process_time() - before_s
         now_us += US_PER_S // rate_hz
-        began_s = time.process_time()
         actions = pipeline.feed(frame, now_us)
         if due_us <= now_us:
             actions += pipeline.poll(now_us)
             due_us = min(pipeline.next_due_us(), now_us + LONGEST_WAIT_US)
-        used_s += time.process_time() - began_s
-        sent += sum(isinstance(action, Outgoing) for action in actions)
-    return used_s, sent
+        for action in actions:
+            sent += isinstance(action, Outgoing)
+    return time.process_time() - began_s - slept_s, sent
 
 
 def show(rate_hz: int, seconds: int, used_s: float, sent: int) -> None:

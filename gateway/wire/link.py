@@ -33,6 +33,7 @@ UINT16_MAX: Final = 65_535
 SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
 """Payloads further back than any retry queue belong to another run of the node."""
+ALL_SEEN: Final = (1 << LATE_WINDOW) - 1
 SLOWED: Final = 64
 """Divisor of the elapsed time: by so little may samples follow each other sooner."""
 MOST_AHEAD_US: Final = 50_000
@@ -75,7 +76,7 @@ class SequenceCounter:
         ahead = (seq - self._last) % SEQUENCE_MODULUS
         if 0 < ahead < SEQUENCE_MODULUS // 2:
             self._last = seq
-            self._seen = (self._seen << ahead | 1) & ((1 << LATE_WINDOW) - 1)
+            self._seen = (self._seen << ahead | 1) & ALL_SEEN
             self.lost += ahead - 1
             self.received += 1
             return Arrival.NEW
@@ -94,7 +95,7 @@ class SequenceCounter:
     def _begin(self, seq: int) -> Arrival:
         self._last = seq
         # Numbers before the first one received are no late arrivals of this run.
-        self._seen = (1 << LATE_WINDOW) - 1
+        self._seen = ALL_SEEN
         self.received += 1
         return Arrival.NEW
 
