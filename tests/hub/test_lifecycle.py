@@ -243,6 +243,8 @@ class Link:
         def is_so() -> bool:
             self.far.poll()
             self.rig.clock.us += 2000
+            # By hand: its own timer runs on the machine's clock, far behind the manual one.
+            self.rig.tick(self.hub)
             return condition()
 
         await self.rig.until(is_so)
@@ -304,15 +306,17 @@ async def test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link: L
 
     await link.until(is_noticed)
     link.far.splitter.reset()
+    link.far.frames.clear()
     link.far.open()
     link.far.arrive(link.hub)
     link.rig.clock.us += 2_000_000
 
     def is_served() -> bool:
-        frame = link.rig.vehicle.attitude()
-        link.hub.send(link.rig.out(frame))
+        link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
         link.rig.clock.us += 100_000
-        return frame in link.far.poll()
+        # Any of them: while the kernel passes no bytes on, a queue drops old frames and renumbers
+        # those that follow.
+        return 30 in {frame[7] for frame in link.far.poll()}
 
     await link.until(is_served)
 
