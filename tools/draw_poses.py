@@ -1,8 +1,10 @@
-"""Draw the six positions of the accelerometer's calibration, for the panel and docs/calibration.md.
+"""Draw positions and orientations for the panel's calibration and docs/calibration.md.
 
     .venv/bin/python tools/draw_poses.py
 
-The aircraft is a solid model, drawn as `gateway/panel/web/pose-SIDE.svg`, where SIDE lies below.
+`gateway/panel/web/poses.svg` shows the six positions of the accelerometer's calibration, each also
+as a view of the file that is named by the side that lies below: `poses.svg#left`. `mounting.svg`
+shows the orientations of a board in the aircraft, with their angles.
 """
 
 import math
@@ -15,6 +17,7 @@ import numpy.typing as npt
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.geometry.quaternion import from_euler, rotate
+from gateway.panel.state.calibration import ORIENTATIONS, SIDE_NAMES
 from gateway.records import Vec3
 
 FloatArray = npt.NDArray[np.float64]
@@ -22,6 +25,7 @@ WEB = Path(__file__).resolve().parent.parent / "gateway" / "panel" / "web"
 COLOURS: Final = {"accent": (40, 140, 210), "soft": (125, 140, 155)}
 EDGE: Final = "#33414e"
 SHADOW: Final = "#8c98a4"
+INK: Final = "#6f7d8a"
 """Legible on light and on dark."""
 
 WIDTH: Final = 140
@@ -39,7 +43,14 @@ ATTITUDES: Final[dict[str, tuple[float, float]]] = {
     "front": (0.0, -90.0),
     "back": (0.0, 90.0),
 }
-"""Roll and pitch in deg, by the side that lies below; see `calibration_run.SIDES`."""
+"""Roll and pitch in deg, by the side that lies below."""
+CAPTION: Final = 22
+"""Height of the line below a picture."""
+FROM_ABOVE: Final = (
+    "M0-48c5 0 7 7 7 16v10l46 20v12L7 0v22l16 10v8L0 34l-23 6v-8l16-10V0l-46 10V-2L-7-22v-10"
+    "c0-9 2-16 7-16z"
+)
+"""Outline of an aircraft whose nose points up."""
 
 _BODY: Final = ((1.5, 0, 0), (0.5, 0.24, -0.1), (0.5, -0.24, -0.1), (0.5, 0, 0.28), (-1.2, 0, 0))
 _FACES: Final = (
@@ -60,19 +71,54 @@ _FACES: Final = (
 """Corners in body FRD, metres of a toy, and the colour's name in the style sheet."""
 
 
-def pose_svg(side: str) -> str:
-    """Draw the aircraft resting on one of its sides.
+def poses_svg() -> str:
+    """Draw the aircraft resting on each of its sides, and a view of each."""
+    parts = []
+    for number, side in enumerate(ATTITUDES):
+        left = number * WIDTH
+        parts.append(f'<view id="{side}" viewBox="{left} 0 {WIDTH} {HEIGHT}"/>')
+        parts.append(f'<g transform="translate({left})">{_pose(side)}</g>')
+        parts.append(_text(left + WIDTH / 2, HEIGHT + 12, SIDE_NAMES[side]))
+    return _document(len(ATTITUDES) * WIDTH, HEIGHT + CAPTION, "".join(parts))
 
-    Parameters
-    ----------
-    side : str
-        Which side lies below, one of `ATTITUDES`.
 
-    Returns
-    -------
-    str
-        An SVG document.
-    """
+def mounting_svg() -> str:
+    """Draw the board in the aircraft, seen from above, in each of its orientations."""
+    parts = []
+    for number, (name, (roll_deg, pitch_deg, yaw_deg)) in enumerate(ORIENTATIONS.items()):
+        x, y = (number % 4 + 0.5) * 1.4 * WIDTH, 62 + number // 4 * 158
+        is_up = roll_deg != 0.0
+        look = 'fill="#2f7d5b"' if is_up else 'fill="#f4f1e6" stroke-dasharray="3 2"'
+        # The side with the chips is drawn with them.
+        chips = '<path d="M-7-2h6v6h-6zM3 3h5v5h-5z" fill="#1c2329"/>' if is_up else ""
+        ink = "#ffffff" if is_up else EDGE
+        parts.append(
+            f'<g transform="translate({x} {y})"><path d="{FROM_ABOVE}" fill="#dfe5ea"'
+            f' stroke="{EDGE}" stroke-width=".8"/><g transform="rotate({yaw_deg:.0f})">'
+            f'<rect x="-13" y="-17" width="26" height="34" rx="3" {look} stroke="{EDGE}"/>{chips}'
+            f'<path d="M0 12V-11M-5-6 0-13 5-6" fill="none" stroke="{ink}" stroke-width="2"/>'
+            "</g></g>"
+        )
+        parts.append(_text(x, y + 62, name))
+        parts.append(_text(x, y + 77, f"{roll_deg:.0f}, {pitch_deg:.0f}, {yaw_deg:.0f}"))
+    return _document(round(5.6 * WIDTH), 312, "".join(parts))
+
+
+def _document(width: int, height: int, content: str) -> str:
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}">'
+        "<!-- SPDX-License-Identifier: Apache-2.0; made by tools/draw_poses.py -->"
+        f"{content}</svg>\n"
+    )
+
+
+def _text(x: float, y: float, text: str) -> str:
+    look = f'font-family="sans-serif" font-size="11" fill="{INK}" text-anchor="middle"'
+    return f'<text x="{x:.0f}" y="{y:.0f}" {look}>{text}</text>'
+
+
+def _pose(side: str) -> str:
+    """Draw the aircraft resting on one of its sides."""
     roll_deg, pitch_deg = ATTITUDES[side]
     q_nb = from_euler(math.radians(roll_deg), math.radians(pitch_deg), 0.0)
     faces = [
@@ -82,10 +128,8 @@ def pose_svg(side: str) -> str:
     faces.sort(key=lambda item: float(item[0][:, 2].mean()))
     drawn = "".join(_polygon(face, ink, lowest) for face, ink in faces)
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}">'
-        "<!-- SPDX-License-Identifier: Apache-2.0; made by tools/draw_poses.py -->"
         f'<ellipse cx="{WIDTH / 2}" cy="{GROUND + 6}" rx="52" ry="9" fill="{SHADOW}"'
-        f' fill-opacity=".4"/>{drawn}</svg>\n'
+        f' fill-opacity=".4"/>{drawn}'
     )
 
 
@@ -110,9 +154,9 @@ def _polygon(face: FloatArray, ink: str, lowest: float) -> str:
 
 
 def main() -> None:
-    """Write all pictures."""
-    for side in ATTITUDES:
-        (WEB / f"pose-{side}.svg").write_text(pose_svg(side))
+    """Write both pictures."""
+    (WEB / "poses.svg").write_text(poses_svg())
+    (WEB / "mounting.svg").write_text(mounting_svg())
 
 
 if __name__ == "__main__":

@@ -39,6 +39,7 @@ VIEWS = (
     "flight", "map", "link", "recordings", "calibration", "tuning", "plots", "events",
 )  # fmt: skip
 RATE_OF_THE_SENSOR = "/v1/mavlink/vehicles/1/components/1/messages/HIGHRES_IMU/message/zgyro"
+FIELD_OF_THE_SENSOR = RATE_OF_THE_SENSOR.replace("zgyro", "xmag")
 OFFLINE = (
     (
         '{{name = "Street", url = "http://127.0.0.1:9/{{{{z}}}}/{{{{x}}}}/{{{{y}}}}", '
@@ -124,6 +125,32 @@ def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None
     view.get_by_role("button", name="Store it").click()
     expect(view.locator(".step", has_text="Gyroscope")).to_contain_text("stored")
     assert "gyro_bias" in desk.kept
+
+
+def test_orientation_of_the_board_is_chosen_and_stored(desk: Desk) -> None:
+    view = desk.view("calibration")
+    view.locator(".step", has_text="Mounting").click()
+    picture = view.locator(".mounting-picture")
+    desk.page.wait_for_function("document.querySelector('.mounting-picture')?.naturalWidth > 0")
+    expect(picture).to_be_visible()
+    choice = view.get_by_label("Orientation of the board")
+    expect(choice).to_have_value("face up, arrow to the nose")
+    for way in ("tail", "nose"):
+        choice.click()
+        desk.page.get_by_role("option", name=f"face up, arrow to the {way}").click()
+        view.get_by_role("button", name="Use it").click()
+        # The heading is the way of the nose: the magnetometer's own x axis is turned with it.
+        desk.page.wait_for_function(
+            "async ([url, sign]) => Math.sign(Number(await (await fetch(url)).text())) === sign",
+            arg=[FIELD_OF_THE_SENSOR, -1 if way == "tail" else 1],
+            polling=200,
+        )
+        expect(choice).to_have_value(f"face up, arrow to the {way}")
+    kept = desk.kept
+    view.get_by_role("button", name="Store it").click()
+    expect(view.locator(".step", has_text="Mounting")).to_contain_text("stored")
+    assert desk.kept != kept or "mounting" not in kept
+    view.locator(".step", has_text="Gyroscope").click()
 
 
 def test_magnetometer_is_seen_as_a_cloud_and_undone_without_a_trace(desk: Desk) -> None:

@@ -86,6 +86,23 @@ MIN_FIT: Final = 30
 
 SIDES: Final = ("down", "up", "left", "right", "front", "back")
 """Which side of the aircraft lies below, as in the `[cal]` texts; down is level."""
+SIDE_NAMES: Final = {
+    "down": "level",
+    "up": "upside down",
+    "left": "on its left side",
+    "right": "on its right side",
+    "front": "nose down",
+    "back": "tail down",
+}
+ORIENTATIONS: Final = {
+    f"{face}, arrow to {way}": (roll_deg, 0.0, yaw_deg)
+    for face, roll_deg in (("face up", 180.0), ("face down", 0.0))
+    for way, yaw_deg in (
+        ("the nose", 0.0), ("the right wing", 90.0), ("the tail", 180.0), ("the left wing", -90.0),
+    )
+}  # fmt: skip
+"""Roll, pitch and yaw from the sensor's axes to the body's, deg, by how the board lies in the
+aircraft; its x arrow is printed next to the chips."""
 _POSES: Final = (("back", "front"), ("left", "right"), ("up", "down"))
 """By axis of body FRD: the side that lies below while gravity is felt along it, and against it."""
 SIDE_SHARE: Final = 0.85
@@ -101,6 +118,8 @@ _CANCELLED: Final = re.compile(r"^\[cal\] calibration cancelled")
 class CalibrationStep(StrEnum):
     """The calibrations, in the recommended order."""
 
+    MOUNTING = "mounting"
+    """Set by parameters; the others are measured by the aircraft."""
     GYRO = "gyro"
     ACCEL = "accel"
     LEVEL = "level"
@@ -248,6 +267,8 @@ class CalibrationRun:
                 return [Residual("Error of gravity over the six sides", "m/s²", *self._sides_rms())]
             case CalibrationStep.MAG:
                 return [Residual("Spread of the field's strength", "µT", *self._field_rms())]
+            case CalibrationStep.MOUNTING:
+                return []
 
     def _take_ack(self, message: Any, now_us: int) -> None:
         self._heard_us = now_us

@@ -11,6 +11,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.state.calibration import (
     CELLS,
+    ORIENTATIONS,
+    SIDE_NAMES,
     SIDES,
     CalibrationRun,
     CalibrationStep,
@@ -28,7 +30,15 @@ REFRESH_S: Final = 0.2
 STORE: Final = 1.0
 """PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 MIN_CELLS: Final = 60
+MNT_NAMES: Final = tuple(f"CAL_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
+MAG_MNT_NAMES: Final = tuple(f"CAL_MAG_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
+ANGLE_DEG: Final = 3.0
+"""Angles of less difference are those of a level that was calibrated."""
+MEASURED: Final = "another one, as measured"
 GUIDE: Final = {
+    CalibrationStep.MOUNTING: "When: first of all, and when the board was turned. Any other angle "
+    "is measured by `mavgate calibrate mounting`, and some degrees by Level. Good: raising the "
+    "nose raises the pitch, and lowering the right wing raises the roll.",
     CalibrationStep.GYRO: "When: before the first flight, and when the temperature has changed by "
     "more than 10 °C. Good: a rate at rest below 0.1 °/s.",
     CalibrationStep.ACCEL: "When: once for each board. Good: an error of gravity over the six "
@@ -38,17 +48,8 @@ GUIDE: Final = {
     CalibrationStep.MAG: "When: anything of steel or a power wire was moved, or in another region. "
     "Good: a spread of the field's strength below 1.5 µT.",
 }
-SIDE_NAMES: Final = {
-    "down": "level",
-    "up": "upside down",
-    "left": "on its left side",
-    "right": "on its right side",
-    "front": "nose down",
-    "back": "tail down",
-}
-"""By the side that lies below; see `calibration_run.SIDES`."""
-
 TITLES: Final = {
+    CalibrationStep.MOUNTING: ("Mounting", "developer_board", "how the board lies"),
     CalibrationStep.GYRO: ("Gyroscope", "360", "leave it at rest, 3 s"),
     CalibrationStep.ACCEL: ("Accelerometer", "view_in_ar", "six positions"),
     CalibrationStep.LEVEL: ("Level", "horizontal_rule", "as it flies, at rest, 3 s"),
@@ -97,6 +98,9 @@ class _CalibrationView:
         self._context = context
         self._step = CalibrationStep.GYRO
         self._drawn: object = None
+        self._drawn_steps: object = None
+        self._mounted = ""
+        self._choice: ui.select
         self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
 
     def build(self) -> None:
@@ -132,11 +136,17 @@ class _CalibrationView:
             done = run.state is RunState.DONE
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
         ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
-        state = (self._step, run, run and run.state, ready, dict(self._outcomes))
-        if state != self._drawn:
-            self._drawn = state
+        steps = (self._step, dict(self._outcomes))
+        if steps != self._drawn_steps:
+            self._drawn_steps = steps
             self._build_steps()
+        guide = (self._step, run, run and run.state, ready)
+        if guide != self._drawn:
+            self._drawn = guide
             self._build_guide(run, ready=ready)
+        if self._step is CalibrationStep.MOUNTING and self._mounted != self._orientation():
+            self._mounted = self._orientation()
+            self._choice.set_value(self._mounted)
         if run is not None:
             self._move(run)
 
@@ -169,6 +179,9 @@ class _CalibrationView:
         self._guide.clear()
         with self._guide:
             heading(TITLES[self._step][0])
+            if self._step is CalibrationStep.MOUNTING:
+                self._build_mounting(ready=ready)
+                return
             self._now = ui.label(self._what_now(run, ready=ready)).classes("now")
             if run is not None and run.state.is_over:
                 self._now.classes("good" if run.state is RunState.DONE else "bad")
@@ -183,6 +196,62 @@ class _CalibrationView:
             if run is not None and run.state is RunState.DONE:
                 self._build_residuals(run)
             ui.label(GUIDE[self._step]).classes("soft guide-note")
+
+    def _build_mounting(self, *, ready: bool) -> None:
+        ui.label(
+            "Choose how the board lies in the aircraft, seen from above. Its x arrow is printed "
+            "next to the chips; both the IMU and the compass are set."
+        ).classes("now")
+        picture = ui.element("img").classes("mounting-picture")
+        picture.props["src"] = "/web/mounting.svg"
+        picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
+        self._mounted = self._orientation()
+        self._choice = ui.select([*ORIENTATIONS, MEASURED], value=self._mounted)
+        self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
+        with ui.element("div").classes("buttons"):
+            may = self._may_calibrate and ready
+            use = ui.button("Use it", icon="check", on_click=self._mount).props(
+                "no-caps unelevated"
+            )
+            use.set_enabled(may)
+            store = ui.button("Store it", icon="save", on_click=self._store)
+            store.props("no-caps unelevated").classes("quiet").set_enabled(may)
+        ui.label(GUIDE[self._step]).classes("soft guide-note")
+
+    def _orientation(self) -> str:
+        """Return which of the orientations the parameters have."""
+        entries = {} if self._dialogue is None else self._dialogue.parameters.entries
+        now = [entries[name].value for name in MNT_NAMES if name in entries]
+        near = (
+            name
+            for name, angles in ORIENTATIONS.items()
+            if len(now) == len(angles)
+            and all(
+                abs((have - want + 180.0) % 360.0 - 180.0) < ANGLE_DEG
+                for have, want in zip(now, angles, strict=True)
+            )
+        )
+        return next(near, MEASURED)
+
+    def _mount(self) -> None:
+        """Set the angles of both sensors, in use until the gateway ends."""
+        self._context.check_may_change()
+        angles = ORIENTATIONS.get(self._choice.value)
+        if angles is None or self._context.system_id is None:
+            ui.notify("Choose an orientation first", type="warning")
+            return
+        for names in (MNT_NAMES, MAG_MNT_NAMES):
+            for name, angle_deg in zip(names, angles, strict=True):
+                self._context.parts.dialogues.change(self._context.system_id, name, angle_deg)
+        self._outcomes[self._step] = ("in use", "good")
+        ui.notify(
+            "In use until the gateway ends. Raise the nose: the pitch must rise.", type="info"
+        )
+
+    @property
+    def _may_calibrate(self) -> bool:
+        vehicle = self._context.vehicle
+        return self._context.may_change and vehicle is not None and vehicle.origin == LIVE
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
@@ -208,7 +277,7 @@ class _CalibrationView:
                 with ui.element("div").classes("pose") as pose:
                     pose.props["data-side"] = side
                     picture = ui.element("img").classes("pose-picture")
-                    picture.props["src"] = f"/web/pose-{side}.svg"
+                    picture.props["src"] = f"/web/poses.svg#{side}"
                     picture.props["alt"] = f"Aircraft {SIDE_NAMES[side]}"
                     ui.label(SIDE_NAMES[side])
                     state = ui.label("still to do").classes("state")
@@ -227,8 +296,7 @@ class _CalibrationView:
                         self._figures[name] = ui.label()
 
     def _build_buttons(self, run: CalibrationRun | None, *, ready: bool) -> None:
-        vehicle = self._context.vehicle
-        may = self._context.may_change and vehicle is not None and vehicle.origin == LIVE
+        may = self._may_calibrate
         with ui.element("div").classes("buttons"):
             if run is not None and not run.state.is_over:
                 ui.button("Cancel", on_click=self._cancel).props("no-caps unelevated").classes(
@@ -307,13 +375,19 @@ class _CalibrationView:
         context.check_may_change()
         if system_id is None:
             return
-        other = context.parts.dialogues.of(system_id).unanswered
-        if other not in (None, self._step):
-            # Storing this one would store the other too.
-            ui.notify(f"{TITLES[other][0]}: store it or undo it first", type="warning")
+        if self._has_other_unanswered():
             return
         context.parts.dialogues.calibrate(system_id, self._step)
         self._refresh()
+
+    def _has_other_unanswered(self) -> bool:
+        """Return whether another calibration is neither stored nor undone, and say so."""
+        other = self._dialogue.unanswered if self._dialogue else None
+        if other is None or other is self._step:
+            return False
+        # Storing this one would store the other too.
+        ui.notify(f"{TITLES[other][0]}: store it or undo it first", type="warning")
+        return True
 
     async def _cancel(self) -> None:
         self._context.check_may_change()
@@ -321,6 +395,8 @@ class _CalibrationView:
 
     async def _store(self) -> None:
         """Store it in the vehicle: this button is the confirmation."""
+        if self._has_other_unanswered():
+            return
         try:
             await self._context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE)
         except CommandFailedError as error:

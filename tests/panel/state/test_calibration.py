@@ -5,8 +5,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.geometry.rotation import matrix_from_euler_deg
 from gateway.panel.state.calibration import (
     CELLS,
+    ORIENTATIONS,
     SIDES,
     CalibrationRun,
     CalibrationStep,
@@ -146,6 +148,15 @@ def test_a_refusal_is_reported() -> None:
     command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
     run.take(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
     assert (run.state, run.trouble) == (RunState.FAILED, "denied")
+
+
+@pytest.mark.parametrize("name", ORIENTATIONS)
+def test_orientation_turns_the_arrow_and_the_face_of_the_board(name: str) -> None:
+    ways = {"nose": (1, 0, 0), "right wing": (0, 1, 0), "tail": (-1, 0, 0), "left wing": (0, -1, 0)}
+    face, _, way = name.partition(", arrow to the ")
+    matrix = np.array(matrix_from_euler_deg(ORIENTATIONS[name]))
+    assert matrix @ (1, 0, 0) == pytest.approx(ways[way])
+    assert matrix @ (0, 0, 1) == pytest.approx((0, 0, -1 if face == "face up" else 1))
 
 
 def test_every_direction_has_its_own_cell() -> None:
