@@ -1,6 +1,7 @@
 # make demo   the gateway on its built-in simulated receiver, until interrupted
 # make test   every test, the firmware's included
 # make kernels  the compiled kernels, if their sources have changed
+# make coverage  the lines of each package that the quick tests run, without a threshold
 # make wheel  wheels for x86-64 and aarch64, in dist/
 # make image  an OCI image, with podman, buildah or docker
 # make lint   formatting, lint and types
@@ -9,7 +10,7 @@
 # make fuzz   random and damaged input to every reader, for five minutes
 # make lock   resolve the dependencies of pyproject.toml and write the lock files
 
-.PHONY: demo kernels test lint deb wheel image fuzz lock firmware clean
+.PHONY: demo kernels test coverage lint deb wheel image fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
 FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck avrdude arduino-core-avr
@@ -28,6 +29,14 @@ test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
 	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations 20
+
+# Before Python 3.12 tracing makes the tests take 2.7 times the processor time, from then on little more:
+# so it is apart from `make test`, and without the slow tests, most of which start other processes.
+coverage: export PYTHONDONTWRITEBYTECODE =
+coverage: .venv/.dev kernels
+	COVERAGE_CORE=$$(.venv/bin/python -c 'import sys; print("sysmon" if sys.version_info >= (3, 12) else "ctrace")') \
+		.venv/bin/pytest -q -n 2 --dist loadfile -m "not slow" --cov=gateway --cov-report=
+	@.venv/bin/python -m tools.coverage_by_package
 
 lint: .venv/.dev
 	.venv/bin/pre-commit run --all-files
