@@ -5,7 +5,7 @@ Pure: time is an argument, and effects are returned as a list of actions.
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass
 
 import msgspec
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway import __version__
-from gateway.estimation.columns import NAV_COLUMNS, imu_rows, nav_row, nav_state
+from gateway.estimation.columns import nav_state
 from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
@@ -35,7 +35,6 @@ from gateway.records import (
 from gateway.sensing.calibrating import corrected_by
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
-from gateway.sensing.imu_log import ImuLog
 from gateway.settings import Settings
 from gateway.vehicle.actions import (
     WARNING,
@@ -89,8 +88,8 @@ class Aircraft:
         The signing timestamps accepted before.
     stored : StoredPlan, optional
         Missions, mark and home kept from an earlier run.
-    correct : callable, optional
-        Changes the states before they are sent: for a playback, which knows the future.
+    fused : FusedStates, optional
+        The states of a recording, in place of an estimator.
     """
 
     def __init__(
@@ -101,7 +100,7 @@ class Aircraft:
         clock: SigningClock | None = None,
         stamps: SigningTimestamps | None = None,
         stored: StoredPlan | None = None,
-        correct: Callable[[NavState], NavState] | None = None,
+        fused: "FusedStates | None" = None,
     ) -> None:
         self.vehicle_id = vehicle_id
         self.settings = settings
@@ -115,8 +114,10 @@ class Aircraft:
             stamps=stamps,
             stored=stored,
         )
-        self._chain, self._estimator = make_fusion(settings)
-        self._correct = correct
+        self.chain, self.estimator = make_fusion(settings)
+        self._fused = fused
+        if fused is not None:
+            self.estimator = fused
 
     @property
     def fusion_state(self) -> FusionState:
@@ -125,7 +126,7 @@ class Aircraft:
         return FusionState(
             vehicle_id=self.vehicle_id,
             fits=_fits(self.settings),
-            estimation=self._estimator.snapshot(),
+            estimation=self.estimator.snapshot(),
             home=None if home is None else (*astuple(home.location), home.set_time_us),
         )
 
@@ -137,70 +138,34 @@ class Aircraft:
         if state.home is not None:
             *location, since_us = state.home
             self.vehicle.telemetry.set_home(Home(Location(*location), since_us))
-        self._chain, self._estimator = make_fusion(self.settings, state)
+        if self._fused is None:
+            self.chain, self.estimator = make_fusion(self.settings, state)
 
     def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
         """Run one raw record through the stages."""
         match record:
             case ImuRaw():
-                return self._take_imu(record, self._chain.imu(record), now_us)
+                return self._take_imu(record, self.chain.imu(record), now_us)
             case ImuCalibrated():
-                return self._take_imu(None, self._chain.imu_calibrated(record), now_us)
+                return self._take_imu(None, self.chain.imu_calibrated(record), now_us)
             case BaroRaw():
-                baro = self._chain.baro(record)
-                self._estimator.update_baro(baro)
+                baro = self.chain.baro(record)
+                self.estimator.update_baro(baro)
                 return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
             case GpsFix():
-                self._estimator.update_gps(record)
+                self.estimator.update_gps(record)
                 wanted = self.vehicle.on_gps(record, now_us)
-                if isinstance(self._estimator, KernelEstimator):
-                    wanted += self.vehicle.on_latency(*self._estimator.gps_latency_s, now_us)
+                latency_s = latency_in_use(self.estimator)
+                if latency_s is not None:
+                    wanted += self.vehicle.on_latency(*latency_s, now_us)
                 return self._recorded(record, wanted, now_us)
             case NodeStatus():
                 return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
 
-    @property
-    def chain(self) -> SensorChain:
-        """The sensing stage."""
-        return self._chain
-
-    def fuse(
-        self, log: ImuLog, aiding: Sequence[tuple[int, BaroRaw | GpsFix]]
-    ) -> NDArray[np.float64]:
-        """Run a recording's samples through estimation alone, without the vehicle.
-
-        Parameters
-        ----------
-        log : ImuLog
-            From the sensing stage.
-        aiding : sequence of tuple
-            Heights and fixes in their order, each with the number of the sample before which it
-            arrived.
-
-        Returns
-        -------
-        ndarray, shape (n, NAV_COLUMNS)
-            The states that `take` records; see `gateway.estimation.columns`.
-        """
-        samples = [
-            (k, self._chain.baro(record) if isinstance(record, BaroRaw) else record)
-            for k, record in aiding
-        ]
-        if isinstance(self._estimator, KernelEstimator):
-            imu = imu_rows(log.accel_b_mps2, log.gyro_b_radps, log.mag_b_ut, log.flags)
-            states = self._estimator.run_in_arrival_order(log.time_us, imu, samples)
-        else:
-            states = fuse_singly(self._estimator, log.samples(), samples)
-        if self._correct is not None:
-            known = map(nav_state, log.time_us.tolist(), states)
-            states = np.array([nav_row(self._correct(state)) for state in known])
-        return states.reshape(-1, NAV_COLUMNS)
-
     def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
-        state = self._estimator.update_imu(sample)
-        self.state = state if self._correct is None else self._correct(state)
-        fused = FusedSample(self.vehicle_id, raw, sample, self.state)
-        return self._recorded(fused, self.vehicle.on_state(self.state, sample, now_us), now_us)
+        self.state = state = self.estimator.update_imu(sample)
+        fused = FusedSample(self.vehicle_id, raw, sample, state)
+        return self._recorded(fused, self.vehicle.on_state(state, sample, now_us), now_us)
 
     def _recorded(
         self,
@@ -276,12 +241,12 @@ class Aircraft:
         """Rebuild the stage whose settings changed; the others keep their state."""
         wanted = msgspec.structs.replace(self.settings, **{section: settings})
         if section == "calibration":
-            self._chain = SensorChain(wanted.calibration)
-        elif section == "estimation":
+            self.chain = SensorChain(wanted.calibration)
+        elif section == "estimation" and self._fused is None:
             fresh = make_estimator(wanted.estimation)
             if wanted.estimation.estimator == self.settings.estimation.estimator:
-                fresh.restore(self._estimator.snapshot())
-            self._estimator = fresh
+                fresh.restore(self.estimator.snapshot())
+            self.estimator = fresh
         # Only now, so that a stage that cannot be built changes no settings.
         self.settings = wanted
         return [] if section == "vehicle" else [SettingsChanged(self.vehicle_id)]
@@ -318,36 +283,45 @@ def make_fusion(
     return chain, estimator
 
 
-def fuse_singly(
-    estimator: Estimator,
-    samples: Sequence[ImuSample],
-    aiding: Iterable[tuple[int, BaroSample | GpsFix]],
-) -> NDArray[np.float64]:
-    """Run any estimator over samples and the heights and fixes between them, one by one.
+class FusedStates:
+    """The states of a recording that was fused already, in place of an estimator."""
 
-    Parameters
-    ----------
-    estimator : Estimator
-    samples : sequence of ImuSample
-    aiding : iterable of tuple
-        See `Aircraft.fuse`.
+    def __init__(self) -> None:
+        self.states: deque[NDArray[np.float64]] = deque()
+        """Of the next IMU samples; shape (NAV_COLUMNS,)."""
+        self.latencies: deque[tuple[float, float] | None] = deque()
+        """`latency_in_use` after each of the next fixes."""
+        self.gps_latency_s: tuple[float, float] | None = None
 
-    Returns
-    -------
-    ndarray, shape (n, NAV_COLUMNS)
-    """
-    waiting = deque(aiding)
-    rows = []
-    for number, sample in enumerate([*samples, None]):
-        while waiting and waiting[0][0] <= number:
-            record = waiting.popleft()[1]
-            if isinstance(record, BaroSample):
-                estimator.update_baro(record)
-            else:
-                estimator.update_gps(record)
-        if sample is not None:
-            rows.append(nav_row(estimator.update_imu(sample)))
-    return np.array(rows, np.float64).reshape(-1, NAV_COLUMNS)
+    def update_imu(self, sample: ImuSample) -> NavState:
+        """Return the state of the next sample."""
+        return nav_state(sample.time_us, self.states.popleft())
+
+    def update_baro(self, sample: BaroSample) -> None:
+        """Ignore a height: it is fused already."""
+
+    def update_gps(self, fix: GpsFix) -> None:  # noqa: ARG002
+        """Take over the latency that was in use after this fix."""
+        self.gps_latency_s = self.latencies.popleft()
+
+    def snapshot(self) -> bytes:
+        """Return nothing: there is no state to restore."""
+        return b""
+
+    def restore(self, snapshot: bytes) -> None:
+        """Ignore a state: the fusion restored it."""
+
+    def reset(self) -> None:
+        """Discard the states."""
+        self.states.clear()
+        self.latencies.clear()
+
+
+def latency_in_use(estimator: Estimator) -> tuple[float, float] | None:
+    """Return the GPS latency in use and the one that is set, s; None if it is not estimated."""
+    if isinstance(estimator, KernelEstimator | FusedStates):
+        return estimator.gps_latency_s
+    return None
 
 
 def _fits(settings: AircraftSettings) -> str:

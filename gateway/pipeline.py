@@ -11,11 +11,11 @@ state when it is heard again. Live, demo and playback differ only in who calls `
 `take` (raw records of a recording).
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.aircraft import Action, Aircraft, AircraftSettings, with_passphrase
+from gateway.aircraft import Action, Aircraft, AircraftSettings, FusedStates, with_passphrase
 from gateway.records import (
     FusionState,
     GpsFix,
@@ -23,7 +23,6 @@ from gateway.records import (
     Incoming,
     LinkReport,
     LoggedRequest,
-    NavState,
     RawRecord,
 )
 from gateway.units import US_PER_S
@@ -50,8 +49,8 @@ class PipelineSettings:
     """By vehicle id, in place of the default."""
     unix_us_at_zero: int = 0
     """Civil time at the gateway clock's zero, as far as known."""
-    correct: Callable[[NavState], NavState] | None = None
-    """Changes the states before they are sent: for a playback, which knows the future."""
+    fused: FusedStates | None = None
+    """The states of a recording, in place of an estimator."""
     places: Mapping[int, StoredPlan] = field(default_factory=dict)
     """Missions, marks and homes kept from an earlier run, by vehicle id."""
     stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
@@ -123,7 +122,7 @@ class Pipeline:
             clock=self._signing_clock,
             stamps=self._stamps.setdefault(vehicle_id, SigningTimestamps()),
             stored=known.places.get(vehicle_id),
-            correct=known.correct,
+            fused=known.fused,
         )
         self._set_key(aircraft)
         return aircraft

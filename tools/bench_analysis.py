@@ -9,16 +9,14 @@ import tempfile
 import time
 from pathlib import Path
 
-from gateway.analysis.case import make_case, with_estimator
-from gateway.analysis.fusion import imu_log
+from gateway.analysis.case import make_case
 from gateway.analysis.processes import cores
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.reporting.page import write_report
-from gateway.analysis.sources import simulated_flight
-from gateway.analysis.tuning.axis import grid, parse_axis
-from gateway.analysis.tuning.contest import make_contest
-from gateway.analysis.tuning.workers import pool
+from gateway.analysis.simulated import simulated_flight
+from gateway.analysis.sweep import grid, make_contest, parse_axis, pool
 from gateway.estimation.select import make_estimator
+from gateway.recordings.fuse import with_estimator
 from gateway.records import GpsFix
 
 RANGE = "0.1:0.9:9"
@@ -42,7 +40,7 @@ def main() -> None:
 
     estimator = make_estimator(with_estimator(case.fusion, "paper").estimation)
     fixes: list[GpsFix] = list(flight.fixes)
-    for sample in imu_log(case.flight).samples():
+    for sample in case.flight.samples.imu.samples():
         while fixes and fixes[0].time_us <= sample.time_us:
             estimator.update_gps(fixes.pop(0))
         estimator.update_imu(sample)

@@ -34,8 +34,8 @@ import msgspec
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
-from gateway.analysis.sources import ideal_calibration
-from gateway.analysis.tuning.axis import parse_axis
+from gateway.analysis.simulated import ideal_calibration
+from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import items_of

@@ -15,7 +15,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from gateway.analysis.reporting.sections.estimators import COLOURS
+from gateway.analysis.reporting.estimators import COLOURS
 from gateway.analysis.reporting.style import GREEN, MUTED
 
 TARGET = Path(__file__).resolve().parent.parent / "docs" / "pictures" / "accuracy.png"

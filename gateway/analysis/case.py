@@ -1,20 +1,28 @@
-"""One flight fused with every estimator, the input of all sections of a report."""
+"""One flight fused with every estimator, and its key figures."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-import msgspec
 import numpy as np
 
-from gateway.analysis.flight_arrays import (
+from gateway.analysis.blending import make_judge, score, withhold
+from gateway.analysis.flight import (
     Flight,
     FlightTrack,
-    FusionSettings,
+    FloatArray,
     LocalFrame,
+    fixes_of,
+    fuse_track,
     local_frame,
+    smooth_track,
 )
-from gateway.analysis.fusion import fuse, fuse_smoothed
+from gateway.analysis.metrics import errors_over_time, rms
+from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
+from gateway.recordings.fuse import FusionSettings, with_estimator
+from gateway.settings import Settings, fields_of
+from gateway.units import US_PER_S
 
 ESTIMATORS: Final[tuple[str, ...]] = tuple(
     name for name in OWN_ESTIMATORS if name in EstimationSettings.__struct_fields__
@@ -55,19 +63,94 @@ class Case:
         return "truth" if reference is not None and reference.is_exact else "reference"
 
 
-def with_estimator(fusion: FusionSettings, name: str) -> FusionSettings:
-    """Choose another estimator."""
-    estimation = msgspec.structs.replace(fusion.estimation, estimator=name)
-    return msgspec.structs.replace(fusion, estimation=estimation)
-
-
 def make_case(
     flight: Flight, fusion: FusionSettings | None = None, *, smooth: bool = False
 ) -> Case:
     """Fuse a flight with every estimator."""
     fusion = fusion or flight.fusion
-    tracks = {name: fuse(flight, with_estimator(fusion, name)) for name in ESTIMATORS}
+    tracks = {name: fuse_track(flight, with_estimator(fusion, name)) for name in ESTIMATORS}
     latency_s = None
-    if smooth and not np.any(np.diff(flight.time_us) < 0):
-        tracks[SMOOTHED], latency_s = fuse_smoothed(flight, fusion)
+    if smooth:
+        # Where the clock was set back there is no order to smooth in.
+        with suppress(ValueError):
+            tracks[SMOOTHED], latency_s = smooth_track(flight, fusion)
     return Case(flight, fusion, tracks, local_frame(flight), latency_s)
+
+
+HOLD_OUT: Final = 5
+"""Every n-th fix is withheld for comparison."""
+
+
+def summarise(case: Case) -> dict[str, float]:
+    """Summarise a flight."""
+    flight, track = case.flight, case.track
+    fixes = fixes_of(flight)
+    gap_s = np.diff(fixes.arrival_us) / US_PER_S
+    filtering = case.fusion.estimation.paper
+    smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.accel_b_mps2)
+    shaking = flight.accel_b_mps2 - smooth
+    speed = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
+    found = {
+        "duration, s": flight.duration_s,
+        "IMU samples a second": flight.rate_hz,
+        "usable GPS fixes": float(len(fixes)),
+        "longest time without a fix, s": float(gap_s.max()) if len(gap_s) else float("nan"),
+        "distance flown, m": _distance_m(case),
+        "greatest height above the start, m": _climbed_m(track.alt_amsl_m[flight.scored]),
+        "greatest ground speed, m/s": _greatest(speed[flight.scored]),
+        "shaking above the low-pass, m/s² RMS": rms(shaking),
+        "error at withheld fixes, m RMS": withheld_error_m(case, case.chosen),
+    }
+    if flight.reference is not None:
+        errors = errors_over_time(track, flight.reference.track)
+        for key, name in (
+            ("tilt_deg", "tilt error, deg RMS"),
+            ("heading_deg", "heading error, deg RMS"),
+            ("horizontal_m", "horizontal error, m RMS"),
+            ("height_m", "height error, m RMS"),
+        ):
+            found[name] = rms(errors[key][flight.scored])
+    return found
+
+
+def withheld_error_m(case: Case, estimator: str) -> float:
+    """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
+    judge = make_judge(case.flight, withhold(case.flight, HOLD_OUT))
+    if estimator == SMOOTHED:
+        track, _ = smooth_track(judge.fused, case.fusion)
+    else:
+        track = fuse_track(judge.fused, with_estimator(case.fusion, estimator))
+    return score(track, judge)["held_m"]
+
+
+def changed_settings(a: FusionSettings, b: FusionSettings) -> list[tuple[str, object, object]]:
+    """List the settings that differ: key, value in `a`, value in `b`."""
+    return _changes(a, b, "")
+
+
+def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, object]]:
+    found: list[tuple[str, object, object]] = []
+    for field in fields_of(type(a)):
+        of_a, of_b = getattr(a, field.name), getattr(b, field.name)
+        if field.section:
+            found += _changes(of_a, of_b, f"{prefix}{field.name}.")
+        elif of_a != of_b:
+            found.append((f"{prefix}{field.name}", of_a, of_b))
+    return found
+
+
+def _distance_m(case: Case) -> float:
+    """Distance over ground, from the fused speed."""
+    speed = np.hypot(case.track.vel_n_mps[:, 0], case.track.vel_n_mps[:, 1])
+    dt_s = np.diff(case.flight.time_s, append=case.flight.time_s[-1])
+    return float(np.nansum(speed * dt_s))
+
+
+def _climbed_m(alt_m: FloatArray) -> float:
+    known = alt_m[np.isfinite(alt_m)]
+    return float(known.max() - known[0]) if len(known) else float("nan")
+
+
+def _greatest(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.max()) if len(known) else float("nan")

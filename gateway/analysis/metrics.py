@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gateway.analysis.flight_arrays import FlightTrack, FloatArray
+from gateway.analysis.flight import FlightTrack, FloatArray
 from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import radii_m
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.flight_arrays import Flight, FlightTrack, FloatArray, LocalFrame, fixes_of
+from gateway.analysis.flight import Flight, FlightTrack, FloatArray, LocalFrame, fixes_of
 from gateway.units import US_PER_S
 
 AIRBORNE_MPS: Final = 3.0

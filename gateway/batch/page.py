@@ -159,8 +159,8 @@ def _picture(errors: Sequence[FlightErrors]) -> Any:
     from matplotlib.ticker import FuncFormatter
 
     from gateway.analysis.reporting import style
+    from gateway.analysis.reporting.estimators import COLOURS, OTHER
     from gateway.analysis.reporting.page import Picture
-    from gateway.analysis.reporting.sections.estimators import COLOURS, OTHER
 
     names = sorted({name for flight in errors for name in flight.held_m})
 

@@ -18,13 +18,9 @@ from typing import Any, ClassVar, Final, Protocol
 import msgspec
 
 from gateway import __version__
-from gateway.analysis.case import Case, make_case
-from gateway.analysis.flight_arrays import Flight, FusionSettings
-from gateway.analysis.fusion import fuse_states
-from gateway.analysis.key_figures import summarise, withheld_error_m
-from gateway.analysis.sources import flight_of_blocks
-from gateway.analysis.tuning.axis import Axis, SweepError, grid
-from gateway.analysis.tuning.contest import make_contest, run_trial, score_of
+from gateway.analysis.case import Case, make_case, summarise, withheld_error_m
+from gateway.analysis.flight import Flight, flight_of_files
+from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import began_text
 from gateway.batch.storage import (
@@ -34,12 +30,13 @@ from gateway.batch.storage import (
     stamp_of_item,
     without_user,
 )
+from gateway.estimation.select import make_estimator
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
-from gateway.recordings.fuse import aircraft_for, fused_lines
+from gateway.recordings.fuse import fuse
 from gateway.recordings.index import as_text, recording_name
-from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import ReadOptions, header_for, open_rows
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_fusion import fused_lines, header_of_states
 from gateway.recordings.summary import describe
 
 HELD: Final = "held_m"
@@ -133,7 +130,7 @@ class FuseTask(_JudgingTask):
     name: ClassVar[str] = "fuse"
 
     def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:
-        states = fuse_states(read.flight, case.fusion)
+        states = fuse(read.flight.samples, make_estimator(case.fusion.estimation)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
         return {f"fused/{name}.csv": b"".join(lines)}
 
@@ -219,18 +216,9 @@ class ReadFlight:
 
 def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
-    table = joined_tables([open_rows(file, options) for file in files])
-    aircraft = aircraft_for(files, table, options)
-    fusion = FusionSettings(estimation=aircraft.estimation)
-    flight = flight_of_blocks(
-        table.blocks, aircraft.calibration, fusion, name=name, story="One of a season."
-    )
+    flight, table, aircraft = flight_of_files(files, options, name=name, story="One of a season.")
     known = table.header
-    header = msgspec.structs.replace(
-        header_for(aircraft, known.vehicle_id),
-        session=known.session,
-        unix_us_at_zero=known.unix_us_at_zero,
-    )
+    header = header_of_states(known, aircraft)
     zero_us = known.unix_us_at_zero
     began = None if zero_us is None else zero_us + int(flight.time_us[0])
     return ReadFlight(flight, header, known.vehicle_id, began_text(began))

@@ -1,7 +1,8 @@
 """The compiled estimator behind the interface of all: one sample live, or a whole log."""
 
 import struct
-from collections.abc import Sequence
+from bisect import bisect_left, bisect_right
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise
@@ -246,7 +247,11 @@ class KernelEstimator:
         return out
 
     def run_in_arrival_order(
-        self, time_us: IntArray, imu: FloatArray, aiding: Sequence[Aiding]
+        self,
+        time_us: IntArray,
+        imu: FloatArray,
+        aiding: Sequence[Aiding],
+        on_fix: Callable[[], None] | None = None,
     ) -> FloatArray:
         """Advance over samples and what arrived between them, in the order of arrival.
 
@@ -258,6 +263,8 @@ class KernelEstimator:
         aiding : sequence of tuple
             Heights and fixes in their order, each with the number of the sample before which it
             arrived: up to n.
+        on_fix : callable, optional
+            Called after each fix.
 
         Returns
         -------
@@ -266,15 +273,19 @@ class KernelEstimator:
         """
         # The compiled loop takes heights first: it is interrupted where one came after a fix.
         cuts = {k for (k, a), (m, b) in pairwise(aiding) if k == m and _is_fix(a) > _is_fix(b)}
+        if on_fix is not None:
+            cuts = {k for k, record in aiding if _is_fix(record)}
         pieces = []
-        begin = 0
+        begin = taken = 0
         for end in [*sorted(cuts - {len(time_us)}), len(time_us)]:
-            within = [(k - begin, r) for k, r in aiding if begin <= k < end and k not in cuts]
+            until = bisect_left(aiding, end, taken, key=_sample_of)
+            within = [(k - begin, record) for k, record in aiding[taken:until]]
             pieces.append(self._run_piece(time_us[begin:end], imu[begin:end], within))
-            for k, record in aiding:
-                if k == end:
-                    self._take(record)
-            begin = end
+            begin, taken = end, bisect_right(aiding, end, until, key=_sample_of)
+            for _, record in aiding[until:taken]:
+                self._take(record)
+                if on_fix is not None and _is_fix(record):
+                    on_fix()
         return np.concatenate(pieces)
 
     def _run_piece(
@@ -304,6 +315,10 @@ def _flag_columns(sample: ImuSample) -> tuple[float, ...]:
     """Return the columns of a sample's row that show its flags, and keep them."""
     columns = _FLAG_COLUMNS[sample.flags & _ROW_FLAGS] = imu_row(sample)[-len(ROW_FLAGS) :]
     return columns
+
+
+def _sample_of(aiding: Aiding) -> int:
+    return aiding[0]
 
 
 def _is_fix(record: BaroSample | GpsFix) -> bool:

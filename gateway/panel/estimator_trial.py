@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from gateway.analysis.flight_arrays import (
+from gateway.analysis.flight import (
     Flight,
     FlightTrack,
-    FusionSettings,
     IntArray,
     fixes_of,
+    flight_of_blocks,
+    fuse_track,
 )
-from gateway.analysis.fusion import fuse
 from gateway.analysis.metrics import euler_rad, rms
 from gateway.estimation.select import ESTIMATORS, EstimationSettings
 from gateway.geometry.angle import wrap_180
@@ -28,6 +28,7 @@ from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.fields import FloatArray
 from gateway.panel.state.fleet import TimedFrames
 from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
@@ -83,7 +84,7 @@ def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estima
     found = []
     for name in ESTIMATORS:
         chosen = replace(settings, estimation=replace(settings.estimation, estimator=name))
-        found.append(_estimate(name, flight, fuse(flight, chosen), zero_us))
+        found.append(_estimate(name, flight, fuse_track(flight, chosen), zero_us))
     return found
 
 
@@ -126,10 +127,6 @@ async def compare_apart(frames: TimedFrames, parameters: Mapping[str, float]) ->
 
 
 def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, int]:
-    # Imported in the separate process: with the simulator it loads all of SciPy, for which the
-    # panel's start would take twice as long.
-    from gateway.analysis.sources import flight_of_blocks
-
     reader = AutopilotReader()
     data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
     rows = reader.feed(TlogScanner(strict=True).feed(data, final=True))

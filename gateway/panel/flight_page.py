@@ -23,18 +23,15 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
 from gateway.analysis.case import make_case
-from gateway.analysis.flight_arrays import FlightTrack, FloatArray, FusionSettings
+from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
 from gateway.analysis.metrics import euler_rad
-from gateway.analysis.sources import flight_of_blocks
 from gateway.panel.state.vehicle import FlightHistory, VehicleState
 from gateway.printable import printable
 from gateway.reasons import reason_of
 from gateway.recordings.files import FlightError
-from gateway.recordings.fuse import aircraft_for
-from gateway.recordings.join import joined_tables
 from gateway.recordings.opening import open_flights
 from gateway.recordings.play import Track
-from gateway.recordings.reading import ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
@@ -178,12 +175,7 @@ def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadO
         How to read them.
     """
     try:
-        table = joined_tables([open_rows(file, options) for file in files])
-        aircraft = aircraft_for(files, table, options)
-        fusion = FusionSettings(estimation=aircraft.estimation)
-        sensors = flight_of_blocks(
-            table.blocks, aircraft.calibration, fusion, name=flight.name, story=""
-        )
+        sensors, table, _ = flight_of_files(files, options, name=flight.name)
         case = make_case(sensors)
     except (FlightError, OSError, ValueError) as error:
         flight.remarks.append(f"The estimators are not compared: {reason_of(error)}")

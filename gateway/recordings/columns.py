@@ -65,21 +65,17 @@ Read = TypeVar("Read")
 class Codec(Generic[Read]):
     """The columns of one kind of record, and the functions that write and read them.
 
-    Parameters
-    ----------
-    record : type
-        Of the record; what no field gives it is passed to `read`.
-    prefix : str
-        Of its columns.
-    fields : tuple
-        Each a kind of `_KINDS`, the attribute, and the column or columns (a pattern and its parts)
-        if they are not named like the attribute.
+    Each field is a kind of `_KINDS`, the attribute, and the column or columns (a pattern and its
+    parts) if they are not named like the attribute.
     """
 
     def __init__(self, record: type[Read], prefix: str, *fields: tuple[Any, ...]) -> None:
         self.columns: tuple[str, ...] = ()
         self.whole: tuple[str, ...] = ()
+        self.truths: tuple[str, ...] = ()
         self.needed: tuple[str, ...] = ()
+        self.patterns: list[str] = []
+        """The columns of each field at once, such as `accel_{x,y,z}_raw`."""
         written, read = [], []
         for kind, attribute, *named in fields:
             is_whole, may_be_empty, write, get = _KINDS[kind]
@@ -92,7 +88,9 @@ class Codec(Generic[Read]):
             read.append(f"{attribute}={got}")
             self.columns += names
             self.whole += names if is_whole else ()
+            self.truths += names if kind == "flag" else ()
             self.needed += names if is_whole and not may_be_empty else ()
+            self.patterns.append(prefix + pattern.replace("{}", f"{{{','.join(parts)}}}"))
         self.empty = (None,) * len(self.columns)
         scope = globals() | {"isnan": math.isnan, "record": record}
         # As dataclasses makes its methods: a loop over the fields would take three times as long.
@@ -182,12 +180,19 @@ COLUMNS: Final[tuple[str, ...]] = (
 NAV_COLUMNS: Final = NAV_CODEC.columns
 WHOLE_COLUMNS: Final = frozenset((*HEAD_COLUMNS, *(n for group in _GROUPS for n in group.whole)))
 """Those that hold whole numbers."""
+TRUTHS: Final = frozenset(name for group in _GROUPS for name in group.truths)
+"""Those of them that are 1 or 0: true or false."""
 UNITS: Final = {
     "_mps2": "m/s^2", "_mps": "m/s", "_radps": "rad/s", "_rad": "rad", "_ut": "uT",
     "_degc": "degC", "_deg": "deg", "_dege7": "1e-7 deg", "_us": "us", "_ms": "ms", "_pa": "Pa",
     "_m": "m", "_raw": "counts", "_range_g": "g", "_dps": "deg/s", "_per_gauss": "counts/gauss",
 }  # fmt: skip
 """Unit of a column, by the ending of its name."""
+
+
+def unit_of(name: str) -> str:
+    """Return the unit of a column; empty for a number without one."""
+    return next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
 
 
 def span_of(*names: str) -> slice:
@@ -279,7 +284,7 @@ class RowBuilder:
         self._state: NavState | None = None
 
     def add(
-        self, record: BaroRaw | GpsFix | FusedSample | ImuCalibrated | NavState
+        self, record: BaroRaw | GpsFix | FusedSample | ImuRaw | ImuCalibrated | NavState
     ) -> list[TableRow]:
         """Take the next record and return the rows that it completes.
 
@@ -294,6 +299,8 @@ class RowBuilder:
                 self._gps = record
             case FusedSample():
                 rows = [self._row(record.imu, _calibrated(record), record.state)]
+            case ImuRaw():
+                rows = [self._row(record, None, None)]
             case ImuCalibrated():
                 rows = [self._row(None, record, self._state)]
                 self._state = None
@@ -301,8 +308,12 @@ class RowBuilder:
                 rows, self._state = [], record
         return rows
 
-    def _row(self, raw: ImuRaw | None, imu: ImuCalibrated, state: NavState | None) -> TableRow:
-        row = TableRow(imu.time_us, self._baro, self._gps, raw, imu, state)
+    def _row(
+        self, raw: ImuRaw | None, imu: ImuCalibrated | None, state: NavState | None
+    ) -> TableRow:
+        newest = raw or imu
+        assert newest is not None
+        row = TableRow(newest.time_us, self._baro, self._gps, raw, imu, state)
         self._baro = self._gps = None
         return row
 

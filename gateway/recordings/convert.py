@@ -17,7 +17,6 @@ from gateway.recordings.formats.maps import (
     tracks_of_frames,
     tracks_of_table,
 )
-from gateway.recordings.fuse import RecordedFusion
 from gateway.recordings.join import NOTHING_WITHIN, Limits, joined_tables, trimmed
 from gateway.recordings.moment import place_in
 from gateway.recordings.reading import (
@@ -29,6 +28,7 @@ from gateway.recordings.reading import (
     open_rows,
     recorded_frames,
 )
+from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Stamper, TlogRecord, encode_record
 

@@ -12,9 +12,9 @@ from gateway.aircraft import AircraftSettings
 from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
-from gateway.recordings.fuse import aircraft_for
 from gateway.recordings.join import joined_tables
 from gateway.recordings.reading import ReadOptions, open_rows
+from gateway.recordings.recorded_fusion import aircraft_for
 from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.recorded import RecordedFlight

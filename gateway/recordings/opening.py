@@ -25,10 +25,10 @@ from gateway.recordings.files import (
     open_tlog,
     temporary_copy,
 )
-from gateway.recordings.fuse import RecordedFusion, end_of
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
 from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_fusion import RecordedFusion, end_of
 from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
 
 READ_SIZE: Final = 1 << 20

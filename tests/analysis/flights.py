@@ -1,10 +1,13 @@
 """A short simulated flight, made once for all tests of the analysis."""
 
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
+
 from gateway.analysis.case import Case, make_case
-from gateway.analysis.flight_arrays import Flight
-from gateway.analysis.sources import simulated_flight
+from gateway.analysis.flight import Flight
+from gateway.analysis.simulated import simulated_flight
 from gateway.simulator.simulator_settings import SimulatorSettings
 
 DURATION_S = 60.0
@@ -19,3 +22,9 @@ def short_flight() -> Flight:
 @cache
 def short_case() -> Case:
     return make_case(short_flight())
+
+
+def with_imu(flight: Flight, **columns: np.ndarray) -> Flight:
+    """Replace columns of the IMU samples."""
+    samples = flight.samples
+    return replace(flight, samples=replace(samples, imu=replace(samples.imu, **columns)))

@@ -11,10 +11,10 @@ from gateway.analysis.blending import (
     make_judge,
     score,
     with_weights,
+    withhold,
 )
-from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.interpolation import withhold
-from gateway.analysis.reporting.sections.weights import weights
+from gateway.analysis.reporting.estimators import weights
+from gateway.recordings.fuse import FusionSettings
 from tests.analysis.flights import short_case, short_flight
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from gateway.analysis.filtering import apply, compare, response
+from gateway.analysis.signals import apply, compare, response
 from gateway.estimation.paper.paper import PaperSettings
 
 SETTINGS = PaperSettings()

@@ -3,15 +3,13 @@ import math
 import numpy as np
 import pytest
 
-from gateway.analysis.flight_arrays import (
-    FusionSettings,
-    LocalFrame,
-    fixes_of,
-    flight_of_samples,
-    local_frame,
-)
-from gateway.analysis.fusion import imu_log
+from gateway.analysis.flight import LocalFrame, fixes_of, flight_of_blocks, local_frame
 from gateway.geometry.geodesy import displacement_m
+from gateway.recordings.columns import TableRow
+from gateway.recordings.fuse import FusionSettings
+from gateway.recordings.table import block_of
+from gateway.records import ImuCalibrated, ImuFlags, NodeId
+from gateway.sensing.calibration import NodeCalibration
 from tests.analysis.flights import DURATION_S, short_flight
 
 
@@ -56,10 +54,11 @@ def test_the_local_frame_measures_metres() -> None:
 
 
 def test_a_flight_without_fixes_has_no_frame() -> None:
-    assert local_frame(short_flight().with_fixes([])) is None
+    assert local_frame(short_flight().with_fixes([False] * len(short_flight().fixes))) is None
 
 
 def test_too_few_samples_are_no_flight() -> None:
-    samples = imu_log(short_flight()).samples()[:1]
+    zero = (0.0, 0.0, 0.0)
+    row = TableRow(0, imu=ImuCalibrated(0, NodeId(1, 0), zero, zero, None, 20.0, ImuFlags(0)))
     with pytest.raises(ValueError, match="1 IMU samples are no flight"):
-        flight_of_samples(samples, [], [], name="x", story="", fusion=FusionSettings())
+        flight_of_blocks([block_of([row])], NodeCalibration(), FusionSettings(), name="x", story="")

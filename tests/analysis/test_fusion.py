@@ -1,10 +1,11 @@
+from collections import deque
+
 import msgspec
 import numpy as np
 import pytest
 
 from gateway.analysis.case import ESTIMATORS, with_estimator
-from gateway.analysis.flight_arrays import FlightTrack
-from gateway.analysis.fusion import fuse, imu_log
+from gateway.analysis.flight import FlightTrack, fuse_track
 from gateway.analysis.metrics import position_error_m, rms
 from gateway.estimation.select import make_estimator
 from gateway.records import BaroSample, NavFlags
@@ -15,19 +16,14 @@ from tests.analysis.flights import short_case, short_flight
 def test_a_whole_flight_at_once_equals_sample_by_sample(name: str) -> None:
     flight, case = short_flight(), short_case()
     estimator = make_estimator(with_estimator(case.fusion, name).estimation)
-    baros = [
-        BaroSample(time_us, np.nan, np.nan, alt_m)
-        for time_us, alt_m in zip(
-            flight.baro_time_us.tolist(), flight.baro_alt_m.tolist(), strict=True
-        )
-    ]
-    fixes = list(flight.fixes)
-    for k, sample in enumerate(imu_log(flight).samples()[:1500]):
-        # Between two IMU samples the barometer comes first, as in a log that is run at once.
-        while baros and baros[0].time_us <= sample.time_us:
-            estimator.update_baro(baros.pop(0))
-        while fixes and fixes[0].time_us <= sample.time_us:
-            estimator.update_gps(fixes.pop(0))
+    waiting = deque(flight.samples.aiding)
+    for k, sample in enumerate(flight.samples.imu.samples()[:1500]):
+        while waiting and waiting[0][0] <= k:
+            _, record = waiting.popleft()
+            if isinstance(record, BaroSample):
+                estimator.update_baro(record)
+            else:
+                estimator.update_gps(record)
         state = estimator.update_imu(sample)
         if k % 300 == 299:
             track, valid = case.tracks[name], NavFlags.POSITION_VALID in state.flags
@@ -60,5 +56,5 @@ def test_another_cutoff_gives_another_track() -> None:
     flight, fusion = short_flight(), with_estimator(short_case().fusion, "paper")
     paper = msgspec.structs.replace(fusion.estimation.paper, accel_cutoff_hz=2.0)
     estimation = msgspec.structs.replace(fusion.estimation, paper=paper)
-    changed = fuse(flight, msgspec.structs.replace(fusion, estimation=estimation))
+    changed = fuse_track(flight, msgspec.structs.replace(fusion, estimation=estimation))
     assert not np.array_equal(changed.q_nb, short_case().tracks["paper"].q_nb)

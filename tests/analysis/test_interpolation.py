@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from gateway.analysis.flight_arrays import Fixes, fixes_of
-from gateway.analysis.interpolation import error_at_fixes_m, interpolate, split, thin, withhold
+from gateway.analysis.blending import error_at_fixes_m, interpolate, split, thin, withhold
+from gateway.analysis.flight import Fixes, fixes_of
 from tests.analysis.flights import short_flight
 
 

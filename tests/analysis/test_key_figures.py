@@ -1,10 +1,17 @@
 import msgspec
 import pytest
 
-from gateway.analysis.case import ESTIMATORS, SMOOTHED, make_case, with_estimator
-from gateway.analysis.key_figures import changed_settings, summarise, withheld_error_m
-from gateway.analysis.reporting.sections.comparison import comparison
-from gateway.analysis.sources import simulated_flight
+from gateway.analysis.case import (
+    ESTIMATORS,
+    SMOOTHED,
+    changed_settings,
+    make_case,
+    summarise,
+    with_estimator,
+    withheld_error_m,
+)
+from gateway.analysis.reporting.estimators import comparison
+from gateway.analysis.simulated import simulated_flight
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import DURATION_S, short_case, short_flight
 

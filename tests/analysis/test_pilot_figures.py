@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gateway.analysis.flight_arrays import FlightTrack, LocalFrame, local_frame
+from gateway.analysis.flight import FlightTrack, LocalFrame, local_frame
 from gateway.analysis.pilot_figures import pilot_figures
 from tests.analysis.flights import short_case, short_flight
 

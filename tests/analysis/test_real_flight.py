@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from gateway.analysis.blending import blend_table, grows
-from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.sources import flight_of_blocks
-from gateway.analysis.tuning.axis import with_value
+from gateway.analysis.flight import flight_of_blocks
+from gateway.analysis.sweep import with_value
 from gateway.recordings.files import read_chunks
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
+from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import TRACKER_LOG
 from gateway.recordings.table import block_of
 from gateway.sensing.calibration import NodeCalibration

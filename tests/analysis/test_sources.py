@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 
 from gateway.analysis.case import make_case
-from gateway.analysis.flight_arrays import FlightTrack, fixes_of
-from gateway.analysis.fusion import fuse
+from gateway.analysis.flight import (
+    FlightTrack,
+    at_times,
+    fixes_of,
+    flight_of_blocks,
+    fuse_track,
+    judged_by,
+)
 from gateway.analysis.reporting.compose import make_report
-from gateway.analysis.sources import at_times, flight_of_blocks, ideal_calibration, judged_by
+from gateway.analysis.simulated import ideal_calibration
 from gateway.estimation.select import make_estimator
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import block_of
@@ -17,7 +23,7 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.analysis.flights import short_case, short_flight
+from tests.analysis.flights import short_case, short_flight, with_imu
 
 SIMULATED: SimulatedFlight = fly(
     SimulatorSettings(imu_rate_hz=50, gps_outages_s=((40.0, 3.0),)), duration_s=30.0
@@ -65,7 +71,7 @@ def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
     assert len(fixes_of(flight)) > 100
     assert (flight.node_time_us is not None) == raw
     assert flight.recorded is not None
-    again = fuse(flight, flight.fusion)
+    again = fuse_track(flight, flight.fusion)
     assert flight.recorded.lat_deg[-1] == pytest.approx(again.lat_deg[-1], abs=1e-9)
 
 
@@ -123,8 +129,7 @@ def test_the_nearest_row_is_taken_if_it_is_near() -> None:
 
 def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> None:
     flight = short_flight()
-    bare = replace(
-        flight.with_fixes([]), mag_b_ut=np.full_like(flight.mag_b_ut, np.nan), reference=None
-    )
+    bare = replace(flight.with_fixes([False] * len(flight.fixes)), reference=None)
+    bare = with_imu(bare, mag_b_ut=np.full_like(flight.mag_b_ut, np.nan))
     titles = [section.title for section in make_report(make_case(bare)).sections]
     assert titles == ["Acceleration filters", "Noise", "Timing and loss"]

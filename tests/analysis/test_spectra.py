@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gateway.analysis.spectra import allan_deviation, longest_rest, power_density
+from gateway.analysis.signals import allan_deviation, longest_rest, power_density
 from tests.analysis.flights import short_flight
 
 RATE_HZ = 100.0

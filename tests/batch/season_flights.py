@@ -8,7 +8,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
-from gateway.analysis.sources import ideal_calibration
+from gateway.analysis.simulated import ideal_calibration
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import encode_head

@@ -14,7 +14,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
-from gateway.analysis.reporting.sections.ground_track import ground_track
+from gateway.analysis.reporting.ground_track import ground_track
 from gateway.batch.executors import LocalProcesses, WorkError, WorkFailed, failure_of
 from gateway.batch.storage import BatchItem, StorageError, StoredFile, items_of
 from gateway.batch.tasks import (

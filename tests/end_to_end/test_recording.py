@@ -16,10 +16,10 @@ from gateway.live.recorder import Recorder
 from gateway.live.session import RecordingSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import TableRow
-from gateway.recordings.fuse import RecordedFusion
 from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
 from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing

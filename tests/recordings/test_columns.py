@@ -1,6 +1,7 @@
 """Rows keep every record, its digits and its place."""
 
 import math
+import re
 import struct
 
 import numpy as np
@@ -9,8 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from gateway.estimation.columns import nav_row
 from gateway.recordings.columns import (
     COLUMNS,
+    NAV_CODEC,
     RowBuilder,
     TableRow,
     read_lines,
@@ -30,6 +33,7 @@ from gateway.recordings.table import (
 )
 from gateway.records import FusedSample
 from tests.recordings.samples import make_baro, make_fix, make_flight, make_fused
+from tools.document_columns import PAGE, with_table
 
 
 def rows_of(records: list[object]) -> list[TableRow]:
@@ -195,3 +199,25 @@ def test_whole_numbers_that_another_program_wrote_as_floats_are_read() -> None:
     text = row_to_line(row).replace(f"{row.time_us},", f"{row.time_us}.0,", 1)
     (again,) = TableReader().feed((encode_head(TableHeader(vehicle_id=3)) + text).encode())
     assert repr(again) == repr(row)
+
+
+def test_documented_columns_are_those_of_the_codec() -> None:
+    page = PAGE.read_text()
+    assert with_table(page) == page
+    named = [name for pattern in re.findall(r"^\| [^|]+ \| `(.+?)`", page, re.MULTILINE)
+             for name in expanded(pattern)]  # fmt: skip
+    assert tuple(named) == COLUMNS
+
+
+def expanded(pattern: str) -> list[str]:
+    """Return the columns of a pattern such as `accel_{x,y,z}_raw`."""
+    found = re.fullmatch(r"(.*)\{(.*)\}(.*)", pattern)
+    if found is None:
+        return [pattern]
+    before, parts, after = found.groups()
+    return [before + part + after for part in parts.split(",")]
+
+
+def test_states_have_the_order_of_the_estimators() -> None:
+    state = make_fused(np.random.default_rng(1), 5).state
+    assert repr([*map(float, NAV_CODEC.write(state)[1:])]) == repr(nav_row(state))

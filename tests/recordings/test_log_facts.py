@@ -8,15 +8,15 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.analysis.case import make_case
-from gateway.analysis.reporting.sections.estimators import estimators
+from gateway.analysis.reporting.estimators import estimators
 from gateway.batch.tasks import read_season_flight
 from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
-from gateway.recordings.fuse import RecordedFusion, aircraft_for
 from gateway.recordings.reading import ReadOptions, open_rows, settings_of
+from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

@@ -1,23 +1,28 @@
 """A recorded flight, fused again, is the flight."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 
 import msgspec
 import numpy as np
 import pytest
 
-from gateway.aircraft import AircraftSettings, SettingsChanged
+from gateway.aircraft import AircraftSettings, FusedStates, SettingsChanged
+from gateway.estimation.columns import NAV_ALT, NAV_LAT, NAV_LON, NAV_QUAT, nav_row
 from gateway.estimation.paper.paper import PaperSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.fuse import InterpolatedPosition, Replay
+from gateway.recordings.fuse import Fusion, InterpolatedPosition
 from gateway.recordings.reading import header_for, settings_of
+from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.table import (
+    TableEvent,
     TableHeader,
     TableMark,
     TableReader,
+    block_of,
     encode_head,
     encode_header,
     encode_state,
@@ -119,14 +124,13 @@ def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:
     return reader.header, rows
 
 
-def fuse_again(settings: AircraftSettings, rows: list[TableRow]) -> list[NavState]:
-    replay = Replay(Pipeline(PipelineSettings(settings)))
-    return [
-        action.state
-        for row in rows
-        for _, action in replay.take(row)
-        if isinstance(action, FusedSample)
-    ]
+def fuse_again(settings: AircraftSettings, lines: Iterable[TableEvent]) -> list[NavState]:
+    return states_of(Fusion(1, settings, follow=True), lines)
+
+
+def states_of(fusion: Fusion, lines: Iterable[TableEvent]) -> list[NavState]:
+    rows = fusion.block(block_of(lines)).events(1)
+    return [row.state for row in rows if isinstance(row, TableRow) and row.state]
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
@@ -167,14 +171,7 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
     reader = TableReader()
     events = reader.feed(text.encode(), final=True)
     assert sum(isinstance(event, TableHeader) for event in events) == 2
-    replay = Replay(Pipeline(PipelineSettings(settings)))
-    again = [
-        action.state
-        for event in events
-        if isinstance(event, TableRow | TableHeader)
-        for _, action in replay.take(event)
-        if isinstance(action, FusedSample)
-    ]
+    again = fuse_again(settings, events)
     assert repr(again) == repr(states)
 
 
@@ -210,22 +207,18 @@ def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
 ) -> None:
     settings, state, rows = fly_from_the_middle(estimator, rng)
     recorded = [row.state for row in rows if row.state]
-    replay = Replay(Pipeline(PipelineSettings(settings)))
-    again = [
-        action.state
-        for line in [state, *rows]
-        for _, action in replay.take(line)
-        if isinstance(action, FusedSample)
-    ]
+    again = fuse_again(settings, [state, *rows])
     assert repr(again) == repr(recorded)
     assert repr(fuse_again(settings, rows)) != repr(recorded)
     assert state.home is not None
     assert state.home[3] < rows[0].time_us
     # With other settings, home is still where it was.
-    pipeline = Pipeline(PipelineSettings(make_settings("paper" if estimator == "eskf" else "eskf")))
-    assert not Replay(pipeline).restore(state)
-    for _ in Replay(pipeline).take(rows[0]):
-        pass
+    other, played = make_settings("paper" if estimator == "eskf" else "eskf"), FusedStates()
+    pipeline = Pipeline(PipelineSettings(other, fused=played))
+    Fusion(1, other, follow=True, played=played).block(block_of([state, rows[0]]))
+    for line in (state, rows[0]):
+        for _ in Replay(pipeline).take(line):
+            pass
     assert pipeline.aircraft[1].fusion_state.home == state.home
 
 
@@ -245,16 +238,10 @@ def test_a_state_that_does_not_fit_is_reported_and_left_alone(
         ),
         (settings, msgspec.structs.replace(state, estimation=state.estimation[:-40]), "truncated"),
     ):
-        replay = Replay(Pipeline(PipelineSettings(settings_now)))
-        assert not list(replay.take(found))
-        (refused,) = replay.refused
+        fusion = Fusion(1, settings_now, follow=True)
+        states = states_of(fusion, [found, *rows[:50]])
+        (refused,) = fusion.refused
         assert reason in refused
-        states = [
-            action.state
-            for row in rows[:50]
-            for _, action in replay.take(row)
-            if isinstance(action, FusedSample)
-        ]
         assert repr(states) == repr(fuse_again(settings_now, rows[:50]))
 
 
@@ -345,10 +332,10 @@ def test_interpolated_positions_lie_on_the_line_between_the_fixes(
     second = msgspec.structs.replace(second, lon_dege7=-1_799_999_000, alt_amsl_m=20.0)
     position = InterpolatedPosition([first, second], 0.25)
     _, states = fly(make_settings("paper"), make_flight(rng, 1))
-    middle = position(msgspec.structs.replace(states[0], time_us=1_250_000))
-    assert middle.alt_amsl_m == pytest.approx(15.0)
-    assert middle.lon_deg == pytest.approx(-180.0)
-    assert middle.lat_deg == pytest.approx((first.lat_dege7 + second.lat_dege7) * 0.5e-7)
-    assert middle.q_nb == states[0].q_nb
-    outside = msgspec.structs.replace(states[0], time_us=2_000_000)
-    assert position(outside) is outside
+    row = np.array([nav_row(states[0])] * 2)
+    middle, outside = position(np.array([1_250_000, 2_000_000]), row)
+    assert middle[NAV_ALT] == pytest.approx(15.0)
+    assert middle[NAV_LON] == pytest.approx(-180.0)
+    assert middle[NAV_LAT] == pytest.approx((first.lat_dege7 + second.lat_dege7) * 0.5e-7)
+    assert middle[NAV_QUAT : NAV_QUAT + 4].tolist() == row[0, NAV_QUAT : NAV_QUAT + 4].tolist()
+    np.testing.assert_array_equal(outside, row[0])

@@ -10,8 +10,9 @@ from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.fuse import Replay, RowFusion
+from gateway.recordings.fuse import Fusion
 from gateway.recordings.reading import Line, header_for
+from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
 from gateway.simulator.flight import fly
@@ -56,9 +57,9 @@ def one_by_one(lines: list[Line], settings: AircraftSettings) -> Iterator[TableR
 
 
 def at_once(lines: list[Line], settings: AircraftSettings) -> list[TableEvent]:
-    fusion = RowFusion(Aircraft(1, settings), follow=True)
+    fusion = Fusion(1, settings, follow=True)
     blocks = [block_of(lines[k : k + BLOCK]) for k in range(0, len(lines), BLOCK)]
-    return [event for block in fusion.blocks(blocks) for event in block.events(1)]
+    return [event for block in blocks for event in fusion.block(block).events(1)]
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
@@ -109,6 +110,6 @@ def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None
 
 def test_a_state_of_other_settings_is_refused_and_left_out() -> None:
     state = Aircraft(1, settings_for("eskf")).fusion_state
-    fusion = RowFusion(Aircraft(1, settings_for("paper")), follow=True)
-    assert [block.comments for block in fusion.blocks([block_of([state])])] == [()]
+    fusion = Fusion(1, settings_for("paper"), follow=True)
+    assert fusion.block(block_of([state])).comments == ()
     assert fusion.refused == ["it is of another version or other settings"]

@@ -12,8 +12,8 @@ from gateway.cli.app import app
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.files import FlightError
-from gateway.recordings.fuse import RecordedFusion, smooth_blocks
-from gateway.recordings.reading import ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_fusion import RecordedFusion
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
@@ -26,8 +26,7 @@ def rows_of_golden() -> tuple[list[str], list[str]]:
 
 
 def smoothed(path: Path) -> tuple[IntArray, FloatArray]:
-    time_us, states, _ = smooth_blocks(open_rows(path, OPTIONS).blocks, AircraftSettings())
-    return time_us, states
+    return RecordedFusion([path], OPTIONS, smooth=True, latency_s=0.0).states()
 
 
 def test_samples_that_came_late_are_put_into_their_place(tmp_path: Path) -> None:

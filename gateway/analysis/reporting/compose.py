@@ -4,16 +4,18 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.analysis.case import Case
-from gateway.analysis.flight_arrays import fixes_of
+from gateway.analysis.flight import fixes_of
+from gateway.analysis.reporting.estimators import comparison, estimators, weights
+from gateway.analysis.reporting.ground_track import gps_interpolation, ground_track, orientation
 from gateway.analysis.reporting.page import Fact, Report, Section
-from gateway.analysis.reporting.sections.acceleration import acceleration
-from gateway.analysis.reporting.sections.comparison import comparison
-from gateway.analysis.reporting.sections.estimators import estimators
-from gateway.analysis.reporting.sections.ground_track import gps_interpolation, ground_track
-from gateway.analysis.reporting.sections.orientation import orientation
-from gateway.analysis.reporting.sections.pilot import figures_of, pilot_facts, the_flight
-from gateway.analysis.reporting.sections.raw_sensors import heights, magnetometer, noise, timing
-from gateway.analysis.reporting.sections.weights import weights
+from gateway.analysis.reporting.pilot import figures_of, pilot_facts, the_flight
+from gateway.analysis.reporting.raw_sensors import (
+    acceleration,
+    heights,
+    magnetometer,
+    noise,
+    timing,
+)
 
 SECTIONS: Final[tuple[Callable[[Case], Section | None], ...]] = (
     the_flight,

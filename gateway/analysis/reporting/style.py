@@ -17,7 +17,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from gateway.analysis.flight_arrays import FloatArray
+from gateway.analysis.flight import FloatArray
 
 BLUE: Final = "#0072b2"
 ORANGE: Final = "#e69f00"

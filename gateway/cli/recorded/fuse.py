@@ -1,14 +1,11 @@
 """`mavgate fuse`: run an estimator causally over a log, from CSV to CSV."""
 
-from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Final
 
-import msgspec
 import numpy as np
 import typer
 
-from gateway.aircraft import Aircraft, AircraftSettings
 from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import (
     ConfigOption,
@@ -29,24 +26,11 @@ from gateway.cli.support.recording_options import (
     refusing,
 )
 from gateway.cli.support.terminal import console_of
-from gateway.estimation.record import FloatArray, IntArray
+from gateway.estimation.record import IntArray
 from gateway.estimation.select import DEPRECATED, ESTIMATORS
 from gateway.output import check_output, write_new
-from gateway.recordings.columns import NAV, has_group
-from gateway.recordings.files import FlightError, SettingsChoice
-from gateway.recordings.fuse import (
-    SETTLES,
-    RowFusion,
-    aircraft_for,
-    fused_lines,
-    note_smoothed_latency,
-    smooth_blocks,
-    with_smoothed_estimator,
-)
-from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import RecordedTable, header_for, open_rows
-from gateway.recordings.table import TableBlock
-from gateway.records import FusionState
+from gateway.recordings.files import SettingsChoice
+from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
 from gateway.units import US_PER_S, counted
 
 LEAST_RATE_HZ: Final = 10.0
@@ -112,28 +96,15 @@ def fuse_log(
             progress=advance,
             sensors=read_sensors(sensor),
         )
-        table = joined_tables([open_rows(part, options) for part in files])
-        aircraft = aircraft_for(files, table, options, gps_latency_s)
-        if estimator is not None:
-            estimation = msgspec.structs.replace(aircraft.estimation, estimator=estimator)
-            aircraft = msgspec.structs.replace(aircraft, estimation=estimation)
-        try:
-            if smooth:
-                aircraft = with_smoothed_estimator(aircraft)
-                time_us, states, latency_s = smooth_blocks(table.blocks, aircraft)
-                aircraft = note_smoothed_latency(file, table, aircraft, latency_s)
-            else:
-                time_us, states = _fused(table, aircraft)
-        except ValueError as error:
-            raise FlightError(f"{file}: {error}") from error
-        header = header_for(aircraft, table.header.vehicle_id)
-        known = table.header
-        header = msgspec.structs.replace(
-            header, session=known.session, unix_us_at_zero=known.unix_us_at_zero
-        )
-        write_new(out, fused_lines(header, time_us, states), overwrite=force, inputs=inputs)
-    print_remarks(table.remarks)
-    name = aircraft.estimation.estimator + (" and smoothed" if smooth else "")
+        fusion = RecordedFusion(
+            files, options, smooth=smooth, estimator=estimator, latency_s=gps_latency_s,
+            states_only=True,
+        )  # fmt: skip
+        time_us, states = fusion.states()
+        lines = fused_lines(fusion.header, time_us, states)
+        write_new(out, lines, overwrite=force, inputs=inputs)
+    print_remarks(fusion.remarks)
+    name = fusion.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
     _report(file, time_us, f"{out}: ", f" fused by {name}")
 
 
@@ -155,21 +126,3 @@ def _rate_hz(time_us: IntArray) -> float:
     intervals_us = np.diff(time_us)
     intervals_us = intervals_us[intervals_us > 0]
     return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0
-
-
-def _fused(table: RecordedTable, aircraft: AircraftSettings) -> tuple[IntArray, FloatArray]:
-    """Fuse causally; from the state at the table's begin on where there is one that fits."""
-    fusion = RowFusion(Aircraft(table.header.vehicle_id, aircraft), follow=False)
-    rows = [block.cells for block in fusion.blocks(_with_begin(table.blocks))]
-    table.remarks.extend(SETTLES.format(reason) for reason in fusion.refused)
-    cells = np.concatenate(rows)
-    cells = cells[has_group(cells, NAV)]
-    return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]
-
-
-def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
-    """Leave of what stands between rows only a state at the very begin."""
-    for number, block in enumerate(blocks):
-        begin = block.comments[:1] if number == 0 else ()
-        kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
-        yield TableBlock(block.cells, kept)

@@ -8,8 +8,7 @@ from typing import Annotated, Final
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from gateway.analysis.flight_arrays import Flight
-from gateway.analysis.sources import with_latency
+from gateway.analysis.flight import Flight
 from gateway.cli.support.loading import (
     FlightArgument,
     Loading,
@@ -33,7 +32,8 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 from gateway.output import check_folder
-from gateway.recordings.fuse import smoothed_latency_in_words
+from gateway.recordings.fuse import with_reference
+from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
@@ -88,7 +88,7 @@ def report(
     if against_config is not None:
         others = fusion_of(or_refuse(lambda: load_settings(against_config)))
         if flight is None:
-            others = with_latency(others, loaded.latency_s)
+            others = with_reference(others, gps_latency_s=loaded.latency_s)
     console = console_of(stderr=True)
     hidden = not console.is_terminal
     with Progress(

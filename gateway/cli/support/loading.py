@@ -7,8 +7,8 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.analysis.flight_arrays import Flight, FusionSettings
-from gateway.analysis.sources import flight_of_blocks, judged_by, simulated_flight
+from gateway.analysis.flight import Flight, flight_of_files, judged_by
+from gateway.analysis.simulated import simulated_flight
 from gateway.cli.support.options import folder_of, read_options
 from gateway.cli.support.recording_options import (
     files_of,
@@ -19,8 +19,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.config import GatewaySettings
 from gateway.recordings.files import FileKind, FlightError, SettingsChoice, kind_of
-from gateway.recordings.fuse import aircraft_for, check_latency
-from gateway.recordings.join import joined_tables
+from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import ReadOptions, is_table, open_rows
 
 FlightArgument = Annotated[
@@ -76,15 +75,10 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
     files = [*parts, loading.reference] if loading.reference is not None else parts
     with progress_of(files) as advance, refusing():
         options = _read_options(loading, advance)
-        table = joined_tables([open_rows(part, options) for part in parts])
-        aircraft = aircraft_for(parts, table, options)
-        if is_table(parts[0]):
-            check_latency(parts[0], table, aircraft)
-        fusion = FusionSettings(estimation=aircraft.estimation)
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:
-            flight = flight_of_blocks(
-                table.blocks, aircraft.calibration, fusion, name=path.name, story=story
+            flight, table, _ = flight_of_files(
+                parts, options, name=path.name, story=story, checked=True
             )
         except ValueError as error:
             raise FlightError(str(error)) from error

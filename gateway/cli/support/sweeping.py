@@ -18,20 +18,23 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.tuning import contest as sweeping
-from gateway.analysis.tuning.axis import (
+from gateway.analysis import sweep as sweeping
+from gateway.analysis.sweep import (
+    COLUMN_OF,
     ESTIMATOR_KEY,
     Axis,
+    Contest,
+    Metric,
+    Run,
     SweepError,
+    Trial,
     Values,
     grid,
     parse_axis,
+    pool,
     with_estimator_of,
     with_values,
 )
-from gateway.analysis.tuning.contest import COLUMN_OF, Contest, Metric, Trial
-from gateway.analysis.tuning.workers import Run, pool
 from gateway.batch.statistics import Choice, FloatArray, choose, group_of
 from gateway.batch.tasks import FlightResult, SweepTask
 from gateway.cli.support.batch_work import SeasonWork
@@ -40,6 +43,7 @@ from gateway.cli.support.recording_options import refusing
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
+from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import ReadOptions
 from gateway.units import counted
 

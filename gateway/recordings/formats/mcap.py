@@ -27,6 +27,7 @@ from gateway import __version__
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import from_euler, multiply, normalise, to_euler
 from gateway.recordings.answers import is_station
+from gateway.recordings.columns import unit_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.formats.parquet import Pieces, decoded
 from gateway.records import Quat
@@ -112,13 +113,18 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         ),
         _object(
             "mavgate.State",
-            roll_deg=_number("degrees, right wing down positive"),
-            pitch_deg=_number("degrees, nose up positive"),
-            heading_deg=_number("degrees from true north, clockwise"),
-            alt_amsl_m=_number("m above mean sea level"),
-            height_m=_number("m above home"),
-            speed_mps=_number("m/s over the ground"),
-            climb_mps=_number("m/s, upwards positive"),
+            **{
+                name: _number(unit_of(name).replace("deg", "degrees") + meaning)
+                for name, meaning in (
+                    ("roll_deg", ", right wing down positive"),
+                    ("pitch_deg", ", nose up positive"),
+                    ("heading_deg", " from true north, clockwise"),
+                    ("alt_amsl_m", " above mean sea level"),
+                    ("height_m", " above home"),
+                    ("speed_mps", " over the ground"),
+                    ("climb_mps", ", upwards positive"),
+                )
+            },
         ),
     )
 }

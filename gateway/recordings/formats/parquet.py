@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.columns import COLUMNS, UNITS, WHOLE_COLUMNS, TableRow, cells_of
+from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
@@ -84,8 +84,6 @@ TIME: Final = "time"
 HEADER: Final = b"mavgate.header"
 END: Final = "mavgate.end"
 """Comments after the last row."""
-
-TRUTHS: Final = {"gps_fix_ok"}
 
 _TYPES: Final = {
     **{f"{sign}int{bits}_t": getattr(pa, f"{sign}int{bits}")() for sign in ("", "u")
@@ -160,7 +158,7 @@ def _column(name: str) -> pa.Field:
         kind = pa.int64()
     else:
         kind = pa.float64()
-    unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), None)
+    unit = unit_of(name)
     return pa.field(name, kind, metadata={"unit": unit} if unit else None)
 
 

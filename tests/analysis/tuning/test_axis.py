@@ -1,7 +1,6 @@
 import pytest
 
-from gateway.analysis.flight_arrays import FusionSettings
-from gateway.analysis.tuning.axis import (
+from gateway.analysis.sweep import (
     Axis,
     SweepError,
     full_key,
@@ -9,6 +8,7 @@ from gateway.analysis.tuning.axis import (
     parse_axis,
     with_value,
 )
+from gateway.recordings.fuse import FusionSettings
 
 ALPHA, BETA = "estimation.paper.alpha_accel", "estimation.paper.beta_velocity"
 LATENCY = "estimation.reference.gps_latency_s"

@@ -3,21 +3,19 @@ import math
 import numpy as np
 import pytest
 
-from gateway.analysis.flight_arrays import fixes_of
-from gateway.analysis.tuning.axis import (
+from gateway.analysis.flight import fixes_of
+from gateway.analysis.sweep import (
     Axis,
     SweepError,
     Values,
     grid,
-)
-from gateway.analysis.tuning.contest import (
     make_contest,
     optimise,
+    pool,
     run_trial,
     settings_at,
     tabulate,
 )
-from gateway.analysis.tuning.workers import pool
 from tests.analysis.flights import short_case, short_flight
 
 ALPHA, BETA = "estimation.paper.alpha_accel", "estimation.paper.beta_velocity"

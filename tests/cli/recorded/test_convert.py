@@ -4,7 +4,6 @@ import gzip
 import json
 import math
 from pathlib import Path
-from xml.etree import ElementTree as ET
 
 import msgspec
 import numpy as np
@@ -103,21 +102,6 @@ def test_nothing_is_overwritten_unless_forced(tlog: Path, tmp_path: Path) -> Non
     assert read_tlog(out) == RECORDS
 
 
-def test_a_table_becomes_the_tlog_of_its_flight(table: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out.tlog"
-    run("convert", table, "-o", out)
-    records = read_tlog(out)
-    stamps = [record.time_us for record in records]
-    assert stamps == sorted(set(stamps))
-    log = mavutil.mavlogfile(str(out))
-    last = None
-    while (message := log.recv_match(type="GLOBAL_POSITION_INT")) is not None:
-        last = message
-    log.close()
-    assert last is not None
-    assert last.lat / 1e7 == pytest.approx(47.1234567, abs=1e-3)
-
-
 def test_a_table_fused_again_is_the_same_table(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.csv"
     run("convert", table, "-o", out, "--fuse")
@@ -144,21 +128,6 @@ def test_positions_on_straight_lines(table: Path, tmp_path: Path) -> None:
     middle = rows[len(rows) // 2].state
     assert middle is not None
     assert middle.alt_amsl_m == pytest.approx(np.interp(middle.time_us, times - latency_us, alts))
-
-
-@pytest.mark.parametrize("ending", ["kml", "gpx"])
-@pytest.mark.parametrize("source", ["table", "tlog"])
-def test_a_track_for_a_map(
-    request: pytest.FixtureRequest, table: Path, tmp_path: Path, ending: str, source: str
-) -> None:
-    path = table
-    if source == "tlog":
-        path = tmp_path / "x.tlog"
-        run("convert", table, "-o", path)
-    out = tmp_path / f"track.{ending}"
-    run("convert", path, "-o", out)
-    tags = [element.tag.partition("}")[2] for element in ET.parse(out).iter()]
-    assert tags.count("coord" if ending == "kml" else "trkpt") > 50
 
 
 @pytest.mark.parametrize("ending", ["kml", "gpx", "geojson"])

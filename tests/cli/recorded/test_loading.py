@@ -11,7 +11,7 @@ from gateway.cli.support.loading import STORIES, Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
-from gateway.recordings import fuse as log_facts
+from gateway.recordings import recorded_fusion as log_facts
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.files import FileKind
 from gateway.recordings.reading import header_for

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gateway.analysis.flight_arrays import Flight
+from gateway.analysis.flight import Flight
 from gateway.cli.app import app
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gateway.analysis.reporting.page import Report
-from gateway.analysis.reporting.sections.raw_sensors import timing
+from gateway.analysis.reporting.raw_sensors import timing
 from gateway.cli.app import app
 from gateway.cli.recorded import report
 from gateway.recordings.columns import row_to_line

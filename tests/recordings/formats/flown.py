@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gateway.analysis.sources import ideal_calibration
+from gateway.analysis.simulated import ideal_calibration
 from gateway.geometry.quaternion import to_euler
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from gateway.sensing.chain import SensorChain
@@ -74,8 +74,11 @@ def believed() -> tuple[Believed, ...]:
     )
 
 
-def timed(*streams: Iterable[Record | Believed]) -> list[Record | Believed]:
-    return sorted((r for stream in streams for r in stream), key=lambda r: r.time_us)
+def timed(
+    *streams: Iterable[Record | Believed], seconds: float = DURATION_S
+) -> list[Record | Believed]:
+    found = (r for stream in streams for r in stream if r.time_us <= seconds * 1e6)
+    return sorted(found, key=lambda r: r.time_us)
 
 
 # ULog: https://docs.px4.io/main/en/dev_log/ulog_file_format
@@ -144,13 +147,13 @@ class Ulog:
         self.parts.append(ulog_message(b"D", struct.pack("<H", self.ids[topic]) + data))
 
 
-def make_ulog(*, old: bool = False) -> bytes:
+def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
     """Write the flight as PX4 of today, or of 2018: places as integers, pressures in hPa."""
     formats = dict(FORMATS)
     formats["vehicle_gps_position"] = OLD_GPS if old else NEW_GPS
     formats.pop("vehicle_air_data" if old else "sensor_baro")
     log = Ulog(formats, {"MAV_SYS_ID": 7})
-    for r in timed(records(), believed()):
+    for r in timed(records(), believed(), seconds=seconds):
         t = r.time_us
         if isinstance(r, Believed) and t % 500_000 == 0:
             log.parts.append(ulog_message(b"S", SYNC))
@@ -205,13 +208,13 @@ SCALES = {"c": 100, "C": 100, "e": 100, "L": 1e7}
 Row = tuple[str, Sequence[float | bytes]]
 
 
-def dataflash_rows() -> list[Row]:
+def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
     rows: list[Row] = [
         ("FMT", (number, dataflash_size(form), name.encode(), form.encode(), columns.encode()))
         for name, (number, form, columns) in DATAFLASH.items()
     ]
     rows.append(("PARM", (BOOT_US, b"SYSID_THISMAV", 9.0, 1.0)))
-    for r in timed(records(), believed()):
+    for r in timed(records(), believed(), seconds=seconds):
         t = BOOT_US + r.time_us
         match r:
             case ImuCalibrated():
@@ -252,8 +255,8 @@ def dataflash_size(form: str) -> int:
     return 3 + struct.calcsize("<" + "".join(CODES[letter] for letter in form))
 
 
-def make_dataflash() -> bytes:
-    return b"".join(packed(name, values) for name, values in dataflash_rows())
+def make_dataflash(seconds: float = DURATION_S) -> bytes:
+    return b"".join(packed(name, values) for name, values in dataflash_rows(seconds))
 
 
 def packed(name: str, values: Sequence[float | bytes]) -> bytes:
@@ -268,10 +271,10 @@ def packed(name: str, values: Sequence[float | bytes]) -> bytes:
     return b"\xa3\x95" + struct.pack("<B" + codes, number, *scaled)
 
 
-def make_dataflash_text() -> bytes:
+def make_dataflash_text(seconds: float = DURATION_S) -> bytes:
     """As `.log` files have it: a line a message, its values in the units of the columns."""
     lines = []
-    for name, values in dataflash_rows():
+    for name, values in dataflash_rows(seconds):
         texts = (v.decode() if isinstance(v, bytes) else repr(float(v)) if isinstance(v, float)
                  or v != int(v) else str(int(v)) for v in values)  # fmt: skip
         lines.append(", ".join([name, *texts]))

@@ -46,21 +46,6 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     return path
 
 
-def test_a_table_comes_back_as_it_was(
-    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(parquet_file, "ROWS", 100)
-    columns, again = tmp_path / "flight.parquet", tmp_path / "again.csv"
-    run("convert", table, "-o", columns)
-    run("convert", columns, "-o", again)
-    assert again.read_bytes() == table.read_bytes()
-    assert pq.ParquetFile(columns).num_row_groups > 5
-    # What it holds is fused again like the table itself.
-    for source, out in ((table, "a.csv"), (columns, "b.csv")):
-        run("convert", source, "-o", tmp_path / out, "--fuse")
-    assert (tmp_path / "a.csv").read_bytes() == (tmp_path / "b.csv").read_bytes()
-
-
 def test_columns_have_types_and_units(table: Path, tmp_path: Path) -> None:
     run("convert", table, "-o", tmp_path / "a.parquet")
     found = pq.read_table(tmp_path / "a.parquet")

@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from gateway.analysis.case import Case
-from gateway.analysis.flight_arrays import FloatArray, fixes_of
+from gateway.analysis.flight import FloatArray, fixes_of
 from gateway.analysis.metrics import euler_rad
 from gateway.analysis.pilot_figures import FlightEvent, PilotFigures, pilot_figures
 from gateway.analysis.reporting import style

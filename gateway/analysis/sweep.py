@@ -1,32 +1,150 @@
-"""Settings tried out on a flight: every point of a grid, or by an optimiser.
+"""Settings tried out on a flight: every point of a grid, or by an optimiser, on all cores.
 
 Each trial fuses the flight causally, from the samples only. Some GPS fixes are withheld from the
 fusion to score it: a filter that only copies its GPS, noise included, gains nothing.
 """
 
+import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
+import msgspec
 import numpy as np
 import pandas as pd
 from scipy.optimize import OptimizeResult, differential_evolution
 
-from gateway.analysis.blending import Judge, judge_of, make_judge, score
-from gateway.analysis.flight_arrays import Flight, FlightTrack, FusionSettings
-from gateway.analysis.fusion import fuse
-from gateway.analysis.interpolation import thin, withhold
+from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, withhold
+from gateway.analysis.case import ESTIMATORS
+from gateway.analysis.flight import Flight, FlightTrack, fuse_track
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
-from gateway.analysis.tuning.axis import (
-    ESTIMATOR_KEY,
-    Axis,
-    SweepError,
-    Value,
-    Values,
-    with_estimator_of,
-    with_values,
-)
+from gateway.analysis.processes import copies, cores
+from gateway.recordings.fuse import FusionSettings
+from gateway.settings import Settings, fields_of
+
+SHORT: Final = {
+    "alpha": "estimation.paper.alpha_accel",
+    "beta": "estimation.paper.beta_velocity",
+}
+"""The paper's own names."""
+ESTIMATOR_KEY: Final = "estimation.estimator"
+LARGEST_GRID: Final = 100_000
+
+Value = float | int | str | bool
+Values = tuple[Value, ...]
+
+
+class SweepError(ValueError):
+    """A sweep that cannot be done; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Axis:
+    """One setting that is varied."""
+
+    key: str
+    """Path from the root of the settings, such as `estimation.paper.alpha_accel`."""
+    values: Values
+
+
+def full_key(name: str) -> str:
+    """Find a setting by its path, the end of its path, or the paper's name."""
+    name = SHORT.get(name, name)
+    found = [key for key in _leaves(FusionSettings, "") if key == name or key.endswith(f".{name}")]
+    if not found:
+        raise SweepError(f"no setting ends in {name!r}")
+    if len(found) > 1 and name not in found:
+        raise SweepError(f"{name!r} may be {' or '.join(found)}")
+    return name if name in found else found[0]
+
+
+def parse_axis(name: str, text: str) -> Axis:
+    """Read an axis: `0.1:0.9:9` for nine values from 0.1 to 0.9, or `0.1,0.5` for a list.
+
+    Raises SweepError if the text is neither, or a value is not allowed.
+    """
+    key = full_key(name)
+    parts = text.split(":")
+    try:
+        values: Values
+        if len(parts) == 3:
+            steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
+            # Rounded to the digits that a person would write.
+            values = tuple(float(f"{step:.12g}") for step in steps)
+        elif len(parts) == 2:
+            values = (float(parts[0]), float(parts[1]))
+        else:
+            values = tuple(_value(part.strip()) for part in text.split(","))
+    except ValueError as error:
+        raise SweepError(f"{name}: {text!r} is no low:high:count and no list: {error}") from error
+    if not values:
+        raise SweepError(f"{name}: {text!r} holds no value")
+    for value in values:
+        with_value(FusionSettings(), key, value)
+    return Axis(key, values)
+
+
+def grid(axes: Sequence[Axis]) -> list[Values]:
+    """List every point of a grid; the first axis varies slowest.
+
+    Raises SweepError if there are too many.
+    """
+    size = math.prod(len(axis.values) for axis in axes)
+    if size > LARGEST_GRID:
+        raise SweepError(f"the grid has {size} points; at most {LARGEST_GRID} are tried")
+    return list(itertools.product(*(axis.values for axis in axes)))
+
+
+def with_value(settings: Any, key: str, value: Value) -> Any:
+    """Return settings with one value changed."""
+    name, _, rest = key.partition(".")
+    if rest:
+        return msgspec.structs.replace(
+            settings, **{name: with_value(getattr(settings, name), rest, value)}
+        )
+    field = next(f for f in fields_of(type(settings)) if f.name == name)
+    if isinstance(value, float) and value.is_integer() and isinstance(field.default, int):
+        value = int(value)
+    try:
+        checked = msgspec.convert(value, field.type)
+    except msgspec.ValidationError as error:
+        raise SweepError(f"{name} = {value}: {error}") from error
+    return msgspec.structs.replace(settings, **{name: checked})
+
+
+def with_values(
+    fusion: FusionSettings, keys: Sequence[str], values: Sequence[Value]
+) -> FusionSettings:
+    """Return settings with values changed by key; raises SweepError as `with_value`."""
+    for key, value in zip(keys, values, strict=True):
+        fusion = with_value(fusion, key, value)
+    return fusion
+
+
+def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSettings:
+    """Choose the estimator that the keys belong to, if to one; raises SweepError if to several."""
+    named = {key.split(".")[1] for key in keys if key.startswith("estimation.")} & set(ESTIMATORS)
+    if len(named) > 1:
+        raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
+    return with_value(fusion, ESTIMATOR_KEY, named.pop()) if named else fusion
+
+
+def _leaves(kind: type[Settings], prefix: str) -> Iterator[str]:
+    for field in fields_of(kind):
+        if field.section:
+            yield from _leaves(field.section, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}"
+
+
+def _value(text: str) -> Value:
+    try:
+        return float(text)
+    except ValueError:
+        return {"true": True, "false": False}.get(text, text)
+
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 COLUMN_OF: Final[dict[Metric, str]] = {
@@ -80,7 +198,7 @@ def make_contest(
 def score_of(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
     """Fuse the flight with any settings, and score it by the fixes of the contest."""
     judge = rejudged(contest.judge, fusion)
-    return _scores(fuse(judge.fused, fusion), judge)
+    return _scores(fuse_track(judge.fused, fusion), judge)
 
 
 def run_trial(contest: Contest, values: Sequence[Value]) -> dict[str, float]:
@@ -196,3 +314,41 @@ def _attitude_deg(track: FlightTrack, judge: Judge) -> float:
         return math.nan
     error = total_error_rad(rotation_error(track.q_nb, reference.track.q_nb))
     return rms(np.degrees(error[judge.fused.scored]))
+
+
+Scores = dict[str, float]
+Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
+
+_contest: Contest | None = None
+"""Of this process of the pool; it has no other place for it."""
+
+
+@contextmanager
+def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
+    """Open a pool of processes."""
+    count = jobs or cores()
+    if count == 1:
+        yield lambda points: ((k, run_trial(contest, values)) for k, values in enumerate(points))
+        return
+    with copies(count, _begin, contest) as processes:
+
+        def run(points: Sequence[Values]) -> Iterator[tuple[int, Scores]]:
+            return processes.imap_unordered(_run, enumerate(points), _chunk(points, count))
+
+        yield run
+
+
+def _chunk(points: Sequence[Values], jobs: int) -> int:
+    """Return how many points a process is given at once: few messages, and an even load."""
+    return max(1, min(8, len(points) // (4 * jobs)))
+
+
+def _begin(contest: Contest) -> None:
+    global _contest
+    _contest = contest
+
+
+def _run(numbered: tuple[int, Values]) -> tuple[int, Scores]:
+    assert _contest is not None
+    index, values = numbered
+    return index, run_trial(_contest, values)

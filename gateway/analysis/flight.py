@@ -1,0 +1,423 @@
+"""One flight for the analysis: its calibrated samples, the truth if known, and its fused tracks.
+
+Flights of all sources have the same form: the samples of a recording in the order in which they
+were processed, on the gateway clock.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.aircraft import AircraftSettings
+from gateway.estimation.columns import (
+    NAV_ALT,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_QUAT,
+    NAV_VEL,
+)
+from gateway.estimation.reference import is_usable
+from gateway.estimation.select import make_estimator
+from gateway.geometry.angle import wrap_180
+from gateway.geometry.geodesy import radii_m
+from gateway.recordings.columns import NAV, NODE_TIME, RAW, has_group
+from gateway.recordings.fuse import (
+    SMOOTHED_ESTIMATOR,
+    FusionSettings,
+    Samples,
+    fuse,
+    has_sample,
+    samples_of,
+    with_estimator,
+)
+from gateway.recordings.join import joined_tables
+from gateway.recordings.reading import ReadOptions, RecordedTable, is_table, open_rows
+from gateway.recordings.recorded_fusion import aircraft_for, check_latency
+from gateway.recordings.table import TableBlock
+from gateway.records import (
+    BaroSample,
+    GpsFix,
+    NavFlags,
+)
+from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
+from gateway.units import DEG_PER_DEGE7, US_PER_S
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+SETTLING_US: Final = 5_000_000
+"""After the first fix; earlier samples are not scored."""
+NEAR_US: Final = 50_000
+"""Maximum difference between the times of a state and of the sample it is compared with."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightTrack:
+    """Attitude, position and velocity at N times."""
+
+    time_us: IntArray
+    q_nb: FloatArray
+    """Shape (N, 4), scalar first; NaN where not known."""
+    lat_deg: FloatArray
+    lon_deg: FloatArray
+    alt_amsl_m: FloatArray
+    vel_n_mps: FloatArray
+    """Shape (N, 3), NED."""
+
+    def where_valid(self, flags: IntArray) -> "FlightTrack":
+        """Set values to NaN that the estimator does not flag as valid.
+
+        An attitude counts as known without a heading only if there never is one.
+        """
+
+        def masked(values: FloatArray, flag: NavFlags) -> FloatArray:
+            valid = (flags & int(flag)) != 0
+            return np.where(valid if values.ndim == 1 else valid[:, np.newaxis], values, np.nan)
+
+        q_nb = masked(self.q_nb, NavFlags.ATTITUDE_VALID)
+        headed = (flags & int(NavFlags.HEADING_VALID)) != 0
+        if headed.any():
+            q_nb[: int(np.argmax(headed))] = np.nan
+        return FlightTrack(
+            time_us=self.time_us,
+            q_nb=q_nb,
+            lat_deg=masked(self.lat_deg, NavFlags.POSITION_VALID),
+            lon_deg=masked(self.lon_deg, NavFlags.POSITION_VALID),
+            alt_amsl_m=masked(self.alt_amsl_m, NavFlags.ALTITUDE_VALID),
+            vel_n_mps=masked(self.vel_n_mps, NavFlags.VELOCITY_VALID),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """The reference of an estimate, at the times of the IMU samples."""
+
+    track: FlightTrack
+    is_exact: bool
+    """Whether it is the exact truth and not another estimate."""
+    story: str
+    """One sentence: where it comes from."""
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """One flight's samples."""
+
+    name: str
+    story: str
+    """One sentence: where it comes from."""
+    fusion: FusionSettings
+    """The settings that belong to it, such as its GPS latency."""
+    samples: Samples
+    scored: BoolArray
+    """Shape (N,), which samples count for errors."""
+    mag_uncalibrated_b_ut: FloatArray | None = None
+    node_time_us: IntArray | None = None
+    """When the node sampled, on its own clock."""
+    reference: Reference | None = None
+    recorded: FlightTrack | None = None
+    """The states fused in flight."""
+
+    @property
+    def time_us(self) -> IntArray:
+        """Shape (N,), of the IMU samples."""
+        return self.samples.imu.time_us
+
+    @property
+    def accel_b_mps2(self) -> FloatArray:
+        """Shape (N, 3), specific force, calibrated."""
+        return self.samples.imu.accel_b_mps2
+
+    @property
+    def gyro_b_radps(self) -> FloatArray:
+        """Shape (N, 3), calibrated."""
+        return self.samples.imu.gyro_b_radps
+
+    @property
+    def mag_b_ut(self) -> FloatArray:
+        """Shape (N, 3), calibrated, NaN unless newly sampled."""
+        return self.samples.imu.mag_b_ut
+
+    @property
+    def fixes(self) -> list[GpsFix]:
+        """In the order of their arrival."""
+        return [record for _, record in self.samples.aiding if isinstance(record, GpsFix)]
+
+    @property
+    def baro_time_us(self) -> IntArray:
+        """Shape (M,), of the barometer samples."""
+        return np.array([r.time_us for _, r in self._heights], np.int64)
+
+    @property
+    def baro_alt_m(self) -> FloatArray:
+        """Shape (M,), height in the standard atmosphere."""
+        return np.array([r.alt_pressure_m for _, r in self._heights], np.float64)
+
+    @property
+    def _heights(self) -> list[tuple[int, BaroSample]]:
+        return [(k, r) for k, r in self.samples.aiding if isinstance(r, BaroSample)]
+
+    @property
+    def time_s(self) -> FloatArray:
+        """Seconds since the first sample."""
+        return self.seconds(self.time_us)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last sample."""
+        return float(self.time_s[-1])
+
+    @property
+    def rate_hz(self) -> float:
+        """IMU samples a second, by the median interval; by the mean one where most are zero."""
+        intervals_us = np.diff(self.time_us)
+        typical_us = float(np.median(intervals_us)) or max(float(np.mean(intervals_us)), 1.0)
+        return US_PER_S / typical_us
+
+    @property
+    def latency_s(self) -> float:
+        """How old a fix is at its arrival."""
+        return self.fusion.estimation.reference.gps_latency_s
+
+    def seconds(self, time_us: IntArray) -> FloatArray:
+        """Convert gateway times to seconds since the first sample."""
+        return np.asarray((time_us - self.time_us[0]) / US_PER_S, np.float64)
+
+    def with_fixes(self, keep: Sequence[bool] | BoolArray) -> "Flight":
+        """Return the same flight with some of its fixes."""
+        kept = iter(keep)
+        aiding = [(k, r) for k, r in self.samples.aiding if not isinstance(r, GpsFix) or next(kept)]
+        return replace(self, samples=Samples(self.samples.imu, aiding))
+
+
+@dataclass(frozen=True, slots=True)
+class Fixes:
+    """The usable fixes of a flight as arrays."""
+
+    arrival_us: IntArray
+    valid_us: IntArray
+    """When each fix was true."""
+    lat_deg: FloatArray
+    lon_deg: FloatArray
+    alt_amsl_m: FloatArray
+    vel_n_mps: FloatArray
+    """Shape (M, 3)."""
+
+    def __len__(self) -> int:
+        return len(self.arrival_us)
+
+
+def fixes_of(flight: Flight) -> Fixes:
+    """Return the fixes that an estimator would use."""
+    reference = flight.fusion.estimation.reference
+    used = [fix for fix in flight.fixes if is_usable(fix, reference)]
+    arrival = np.array([fix.time_us for fix in used], np.int64)
+    return Fixes(
+        arrival_us=arrival,
+        valid_us=arrival - round(reference.gps_latency_s * US_PER_S),
+        lat_deg=np.array([fix.lat_dege7 for fix in used]) * DEG_PER_DEGE7,
+        lon_deg=np.array([fix.lon_dege7 for fix in used]) * DEG_PER_DEGE7,
+        alt_amsl_m=np.array([fix.alt_amsl_m for fix in used], np.float64),
+        vel_n_mps=np.array([fix.vel_n_mps for fix in used], np.float64).reshape(-1, 3),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LocalFrame:
+    """Metres north and east of one position."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+    def north_m(self, lat_deg: FloatArray) -> FloatArray:
+        """Convert latitudes to metres north."""
+        meridian, _ = radii_m(self.lat_deg, self.alt_m)
+        return np.asarray(np.radians(lat_deg - self.lat_deg) * meridian)
+
+    def east_m(self, lon_deg: FloatArray) -> FloatArray:
+        """Convert longitudes to metres east, the shortest way round."""
+        _, parallel = radii_m(self.lat_deg, self.alt_m)
+        return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
+
+    def place(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
+        """Convert positions to metres, shape (N, 2): north and east."""
+        return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
+
+
+def local_frame(flight: Flight) -> LocalFrame | None:
+    """Return a frame with its origin at the first usable fix; None without one."""
+    fixes = fixes_of(flight)
+    if not len(fixes):
+        return None
+    return LocalFrame(float(fixes.lat_deg[0]), float(fixes.lon_deg[0]), float(fixes.alt_amsl_m[0]))
+
+
+def flight_of_files(
+    files: Sequence[Path],
+    options: ReadOptions,
+    *,
+    name: str,
+    story: str = "",
+    checked: bool = False,
+) -> tuple[Flight, RecordedTable, AircraftSettings]:
+    """Read the parts of a recording as one flight; also return its table and its settings.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        Its parts.
+    options : ReadOptions
+        How they are read.
+    name, story : str
+        See `Flight`.
+    checked : bool
+        Whether a remark is added where the motion contradicts the latency of a recording.
+
+    Raises
+    ------
+    FlightError, OSError
+        If a file cannot be read.
+    ValueError
+        If there are fewer than two IMU samples.
+    """
+    table = joined_tables([open_rows(file, options) for file in files])
+    aircraft = aircraft_for(files, table, options)
+    if checked and is_table(files[0]):
+        check_latency(files[0], table, aircraft)
+    fusion = FusionSettings(estimation=aircraft.estimation)
+    flight = flight_of_blocks(table.blocks, aircraft.calibration, fusion, name=name, story=story)
+    return flight, table, aircraft
+
+
+def flight_of_blocks(
+    blocks: Iterable[TableBlock],
+    calibration: NodeCalibration,
+    fusion: FusionSettings,
+    *,
+    name: str,
+    story: str,
+) -> Flight:
+    """Build a flight from rows; ValueError if there are fewer than two IMU samples."""
+    counts: list[FloatArray] = []
+    states: list[FloatArray] = []
+
+    def noted() -> Iterator[TableBlock]:
+        for block in blocks:
+            holds = block.cells[has_sample(block.cells)]
+            counts.append(np.column_stack([holds[:, NODE_TIME], holds[:, RAW]]))
+            states.append(block.cells[has_group(block.cells, NAV)][:, NAV])
+            yield block
+
+    samples = samples_of(noted(), calibration)
+    if len(samples.imu) < 2:
+        raise ValueError(f"{name}: {len(samples.imu)} IMU samples are no flight")
+    flight = Flight(name, story, fusion, samples, np.ones(len(samples.imu), np.bool_))
+    flight = replace(flight, scored=_settled(flight))
+    raw = np.concatenate(counts)
+    if not np.isnan(raw).any():
+        turned = Correction(calibration.mag_mounting, IDENTITY3, (0.0, 0.0, 0.0))
+        flight = replace(
+            flight,
+            node_time_us=raw[:, 0].astype(np.int64),
+            mag_uncalibrated_b_ut=turned.apply_all(new_field_ut(raw[:, 1:], samples.imu.flags)),
+        )
+    recorded = np.concatenate(states)
+    if not len(recorded):
+        return flight
+    return replace(flight, recorded=at_times(_track_of_cells(recorded), flight.time_us))
+
+
+def _settled(flight: Flight) -> BoolArray:
+    """Score from the time on at which any estimator can have settled."""
+    reference = flight.fusion.estimation.reference
+    first_us = next((fix.time_us for fix in flight.fixes if is_usable(fix, reference)), None)
+    start_us = int(flight.time_us[0]) if first_us is None else first_us
+    return np.asarray(flight.time_us >= start_us + SETTLING_US)
+
+
+def _track_of_cells(cells: FloatArray) -> FlightTrack:
+    """Make a track of the columns `NAV` of a table."""
+    return track_of(cells[:, 0].astype(np.int64), cells[:, 1:])
+
+
+def fuse_track(flight: Flight, settings: FusionSettings) -> FlightTrack:
+    """Fuse a flight causally, from the samples only, with the estimator that the settings name."""
+    return track_of(
+        flight.time_us, fuse(flight.samples, make_estimator(settings.estimation)).states
+    )
+
+
+def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
+    """Smooth a flight; also return the GPS latency that was used, s. See `fuse`."""
+    estimator = make_estimator(with_estimator(settings, SMOOTHED_ESTIMATOR).estimation)
+    fused = fuse(flight.samples, estimator, smoothed=True)
+    return track_of(np.sort(flight.time_us, kind="stable"), fused.states), fused.latency_s
+
+
+def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
+    """Return the values that the flags of fused states mark as valid."""
+    track = FlightTrack(
+        time_us=time_us,
+        q_nb=states[:, NAV_QUAT : NAV_QUAT + 4],
+        lat_deg=states[:, NAV_LAT],
+        lon_deg=states[:, NAV_LON],
+        alt_amsl_m=states[:, NAV_ALT],
+        vel_n_mps=states[:, NAV_VEL : NAV_VEL + 3],
+    )
+    return track.where_valid(states[:, NAV_FLAGS].astype(np.int64))
+
+
+def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
+    """Take the states of a recording as a flight's reference.
+
+    Raises ValueError if the recording holds no state.
+    """
+    states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
+    if not sum(map(len, states)):
+        raise ValueError(f"{name}: holds no states to judge by")
+    track = at_times(_track_of_cells(np.concatenate(states)), flight.time_us)
+    return replace(
+        flight, reference=Reference(track, is_exact=False, story=f"the states in {name}")
+    )
+
+
+def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
+    """Return the rows of a track that are nearest to given times.
+
+    Parameters
+    ----------
+    track : FlightTrack
+        In the order of time.
+    time_us : ndarray, shape (N,)
+        Without a row within `NEAR_US`, the result is NaN.
+
+    Returns
+    -------
+    FlightTrack
+        One row for each of the times.
+    """
+    after = np.searchsorted(track.time_us, time_us).clip(1, max(len(track.time_us) - 1, 1))
+    before = after - 1
+    after = after.clip(0, len(track.time_us) - 1)
+    late = track.time_us[after] - time_us < time_us - track.time_us[before]
+    nearest = np.where(late, after, before)
+    near = np.abs(track.time_us[nearest] - time_us) <= NEAR_US
+
+    def chosen(values: FloatArray) -> FloatArray:
+        return np.where(near if values.ndim == 1 else near[:, np.newaxis], values[nearest], np.nan)
+
+    return FlightTrack(
+        time_us=time_us,
+        q_nb=chosen(track.q_nb),
+        lat_deg=chosen(track.lat_deg),
+        lon_deg=chosen(track.lon_deg),
+        alt_amsl_m=chosen(track.alt_amsl_m),
+        vel_n_mps=chosen(track.vel_n_mps),
+    )

@@ -1,0 +1,391 @@
+"""The estimators side by side, two cases side by side, and Table I of the paper."""
+
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from gateway.analysis.blending import PAPER_TABLE, WEIGHTS, blend_table, grows, interpolate
+from gateway.analysis.case import HOLD_OUT, Case, changed_settings, summarise, withheld_error_m
+from gateway.analysis.flight import BoolArray, FlightTrack, Reference, fixes_of
+from gateway.analysis.metrics import (
+    errors_over_time,
+    position_error_m,
+    rms,
+    rotation_error,
+    total_error_rad,
+    worst,
+)
+from gateway.analysis.reporting import style
+from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.geometry.angle import wrap_180
+
+COLOURS: Final = {"paper": style.ORANGE, "eskf": style.PINK}
+STORY: Final = (
+    "Every estimator fused the same samples, and is compared with {}. `paper` is the paper's "
+    "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
+    "flight and slowly tilts the horizon. `eskf` uses the GPS velocity to distinguish the "
+    "manoeuvre from gravity."
+)
+SMOOTHED_STORY: Final = (
+    " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
+    "recording can be."
+)
+LATENCY_STORY: Final = (
+    " The manoeuvres contradict the GPS latency set, {:.2f} s: `smoothed` uses the {:.2f} s "
+    "they show, from the beginning."
+)
+OWN_GPS: Final = (
+    "its own interpolated GPS, which is not independent: what follows the fixes' own errors agrees "
+    "best"
+)
+OTHER: Final = style.GREEN
+TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
+
+
+def estimators(case: Case) -> Section | None:
+    """Build the section; None without a reference."""
+    reference = _reference(case)
+    if reference is None:
+        return None
+    turns = bool(np.isfinite(reference.track.q_nb).any())
+    tracks = dict(case.tracks)
+    if case.flight.recorded is not None:
+        tracks["recorded in flight"] = case.flight.recorded
+    table = error_table(tracks, reference, case.flight.scored)
+    if len(fixes_of(case.flight)) > HOLD_OUT:
+        withheld = {name: withheld_error_m(case, name) for name in case.tracks}
+        table["withheld fixes, m"] = table["estimator"].map(withheld)
+    return Section(
+        "Estimators compared",
+        STORY.format(reference.story) + _smoothed_story(case),
+        [
+            Picture(
+                "estimator_errors",
+                lambda width: _draw_errors(case, reference, width),
+                "Error of each estimator over the flight. "
+                + (TILT if turns else "")
+                + "Without GPS the position drifts until it is back; its scale is logarithmic. "
+                "The first seconds, in which every estimator converges, do not count.",
+            )
+        ],
+        [
+            ReportTable(
+                "estimators",
+                table,
+                "RMS errors where they count; worst is the greatest. Withheld fixes: horizontal "
+                f"error at every {HOLD_OUT}th fix when the estimator is not given it.",
+            )
+        ],
+    )
+
+
+def error_table(
+    tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
+) -> pd.DataFrame:
+    """Score tracks against a reference.
+
+    Parameters
+    ----------
+    tracks : dict of str to FlightTrack
+        By the name to show.
+    reference : Reference
+    scored : ndarray of bool, shape (N,)
+        Which samples count.
+
+    Returns
+    -------
+    DataFrame
+        One row per track; a column without values is left out.
+    """
+    rows = []
+    for name, track in tracks.items():
+        errors = errors_over_time(track, reference.track)
+        errors = {key: np.where(scored, value, np.nan) for key, value in errors.items()}
+        rows.append(
+            {
+                "estimator": name,
+                "roll, deg": rms(errors["roll_deg"]),
+                "pitch, deg": rms(errors["pitch_deg"]),
+                "yaw, deg": rms(errors["yaw_deg"]),
+                "tilt, deg": rms(errors["tilt_deg"]),
+                "worst tilt, deg": worst(errors["tilt_deg"]),
+                "horizontal, m": rms(errors["horizontal_m"]),
+                "worst horizontal, m": worst(errors["horizontal_m"]),
+                "height, m": rms(errors["height_m"]),
+                "speed, m/s": rms(errors["speed_mps"]),
+            }
+        )
+    return pd.DataFrame(rows).dropna(axis="columns", how="all")
+
+
+def _reference(case: Case) -> Reference | None:
+    """Choose the flight's own reference, or its interpolated GPS."""
+    if case.flight.reference is not None:
+        return case.flight.reference
+    if case.frame is None:
+        return None
+    track = interpolate(fixes_of(case.flight), case.flight.time_us)
+    return Reference(track, is_exact=False, story=OWN_GPS)
+
+
+def _smoothed_story(case: Case) -> str:
+    """Describe the origin of the smoothed track, if there is one."""
+    set_s, used_s = case.fusion.estimation.reference.gps_latency_s, case.smoothed_latency_s
+    if used_s is None:
+        return ""
+    return SMOOTHED_STORY + (LATENCY_STORY.format(set_s, used_s) if used_s != set_s else "")
+
+
+def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
+    errors = {name: errors_over_time(t, reference.track) for name, t in case.tracks.items()}
+    kinds = [
+        (key, label)
+        for key, label in (
+            ("tilt_deg", "tilt (deg)"),
+            ("heading_deg", "heading (deg)"),
+            ("horizontal_m", "horizontal (m)"),
+        )
+        if any(np.isfinite(found[key]).any() for found in errors.values())
+    ]
+    figure, axes = style.panels(width_in, len(kinds), 1.75)
+    for panel, (key, label) in zip(axes, kinds, strict=True):
+        for name, found in errors.items():
+            colour = COLOURS.get(name, OTHER)
+            shown = np.where(case.flight.scored, found[key], np.nan)
+            style.draw(panel, case.flight.time_s, shown, colour, name, lw=1.0)
+        panel.set_ylabel(label)
+        if key == "horizontal_m":
+            panel.set_yscale("log")
+    axes[-1].set_xlabel("time (s)")
+    style.legend_above(axes[0], 3)
+    return figure
+
+
+SAME_PLACE_DEG: Final = 0.5
+"""Flights further apart do not fit on one map."""
+NAMES: Final = ("A", "B")
+AB_COLOURS: Final = (style.BLUE, style.RED)
+
+
+def comparison(a: Case, b: Case) -> Section:
+    """Build the section."""
+    same = np.array_equal(a.flight.time_us, b.flight.time_us)
+    what = "the same flight with other settings" if same else b.flight.name
+    lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."
+    pictures = [_difference(a, b) if same else _profiles(a, b)]
+    if _on_one_map(a, b):
+        pictures.append(
+            Picture(
+                "comparison_map",
+                lambda width: _draw_map(a, b, width),
+                "Both fused tracks from above.",
+            )
+        )
+    return Section("Comparison", lead, pictures, _tables(a, b))
+
+
+def _tables(a: Case, b: Case) -> list[ReportTable]:
+    first, second = summarise(a), summarise(b)
+    rows = [
+        {"": key, "A": first.get(key, np.nan), "B": second.get(key, np.nan)}
+        for key in dict.fromkeys([*first, *second])
+    ]
+    numbers = pd.DataFrame(rows)
+    numbers["B − A"] = numbers["B"] - numbers["A"]
+    tables = [ReportTable("comparison", numbers, "Both in numbers, and B less A.")]
+    if changes := changed_settings(a.fusion, b.fusion):
+        settings = pd.DataFrame(changes, columns=["setting", "A", "B"]).astype(str)
+        tables.append(ReportTable("comparison_settings", settings, "Settings that differ."))
+    return tables
+
+
+def _difference(a: Case, b: Case) -> Picture:
+    return Picture(
+        "comparison_difference",
+        lambda width: _draw_difference(a, b, width),
+        "Distance between the two fused tracks over time.",
+    )
+
+
+def _profiles(a: Case, b: Case) -> Picture:
+    return Picture(
+        "comparison_profiles",
+        lambda width: _draw_profiles(a, b, width),
+        "Height above the start and ground speed of both flights, each from its own start.",
+    )
+
+
+def _on_one_map(a: Case, b: Case) -> bool:
+    if a.frame is None or b.frame is None:
+        return False
+    north_deg = abs(a.frame.lat_deg - b.frame.lat_deg)
+    east_deg = abs(wrap_180(a.frame.lon_deg - b.frame.lon_deg))
+    return max(north_deg, east_deg) < SAME_PLACE_DEG
+
+
+def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:
+    figure, (above, below) = style.panels(width_in, 2, 1.9)
+    time = a.flight.time_s
+    apart = position_error_m(b.track, a.track)
+    turned = total_error_rad(rotation_error(b.track.q_nb, a.track.q_nb))
+    style.draw(above, time, np.hypot(apart[:, 0], apart[:, 1]), style.BLUE, "horizontal")
+    style.draw(above, time, np.abs(apart[:, 2]), style.ORANGE, "vertical")
+    style.draw(below, time, np.degrees(turned), style.GREEN, "attitude")
+    above.set_ylabel("apart (m)")
+    below.set(ylabel="turned apart (deg)", xlabel="time (s)")
+    style.legend_above(above)
+    return figure
+
+
+def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
+    figure, (above, below) = style.panels(width_in, 2, 2.0)
+    for case, name, colour in zip((a, b), NAMES, AB_COLOURS, strict=True):
+        track, scored = case.track, case.flight.scored
+        alt = np.where(scored, track.alt_amsl_m, np.nan)
+        known = alt[np.isfinite(alt)]
+        if len(known):
+            style.draw(above, case.flight.time_s, alt - known[0], colour, name)
+        speed = np.where(scored, np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1]), np.nan)
+        style.draw(below, case.flight.time_s, speed, colour, name)
+    above.set_ylabel("above the start (m)")
+    below.set(ylabel="ground speed (m/s)", xlabel="time (s)")
+    style.legend_above(above)
+    return figure
+
+
+def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, min(0.7 * width_in, 4.6)))
+    axes = figure.subplots()
+    frame = a.frame
+    for case, name, colour, width in zip((a, b), NAMES, AB_COLOURS, (2.6, 1.0), strict=True):
+        if frame is not None:
+            place = frame.place(case.track.lat_deg, case.track.lon_deg)
+            step = max(1, len(place) // 4000)
+            axes.plot(place[::step, 1], place[::step, 0], color=colour, lw=width, label=name)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel="east of A's first fix (m)", ylabel="north of A's first fix (m)")
+    style.legend_above(axes)
+    return figure
+
+
+INTERVAL_S: Final = 1.0
+"""Fixes a second of the paper's receiver, by the gaps that its figure 13 shows."""
+COLOUR_MAP: Final = "cividis_r"
+
+
+def weights(case: Case) -> Section | None:
+    """Build the section; None without GPS."""
+    if case.frame is None:
+        return None
+    thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
+    full = blend_table(case.flight, case.fusion, 0.0)
+    if not (_is_judged(thinned) and _is_judged(full)):
+        return None
+    return Section(
+        "Alpha and beta: Table I",
+        _lead(thinned),
+        [
+            Picture(
+                "table1_heat_map",
+                lambda width: _draw_heat_map(thinned, width),
+                "Mean error against interpolated GPS, metres, on this flight and in the paper. "
+                "Light is good. All four maps have one scale, which is logarithmic.",
+            )
+        ],
+        [
+            ReportTable(
+                "table1",
+                _beside_paper(thinned),
+                "GPS thinned to one fix a second. Latitude and longitude: mean error against "
+                "interpolated GPS, as in the paper. Held out: horizontal RMS error at the fixes "
+                "withheld from the filter. Against reference: horizontal RMS error over the "
+                "whole flight, stretches without GPS included. All in metres.",
+                strong=(_best(thinned),),
+            ),
+            ReportTable(
+                "table1_all_fixes",
+                _renamed(full),
+                "The same with every fix of the receiver.",
+                strong=(_best(full),),
+            ),
+        ],
+    )
+
+
+def _lead(table: pd.DataFrame) -> str:
+    best = table.iloc[_best(table)]
+    both = grows(table, "north_m") and grows(table, "east_m")
+    shape = (
+        "As in the paper, both errors grow" if both else "Unlike in the paper, not both errors grow"
+    )
+    return (
+        "Alpha is the weight of the integrated acceleration in the velocity, beta that of the "
+        f"integrated velocity in the position. {shape} with alpha and with beta in every row and "
+        f"column; the smallest error is at {best.alpha:g}/{best.beta:g}. The figures differ from "
+        "the paper's in size for three reasons: it is another flight; here the filter blends once "
+        "at each fix and with the corrected equations, since the printed ones cannot be computed; "
+        "and each fix is carried forward by its latency. GPS is thinned to one fix a second here "
+        "because with many fixes there is little between them to get wrong."
+    )
+
+
+def _is_judged(table: pd.DataFrame) -> bool:
+    return bool(table[["north_m", "east_m"]].notna().all(axis=1).any())
+
+
+def _best(table: pd.DataFrame) -> int:
+    return int(np.argmin(np.hypot(table["north_m"], table["east_m"])))
+
+
+def _renamed(table: pd.DataFrame) -> pd.DataFrame:
+    names = {
+        "alpha": "alpha", "beta": "beta", "north_m": "latitude", "east_m": "longitude",
+        "held_m": "held out", "reference_m": "against reference",
+    }  # fmt: skip
+    known = [name for name in names if table[name].notna().any()]
+    return table[known].rename(columns=names)
+
+
+def _beside_paper(table: pd.DataFrame) -> pd.DataFrame:
+    shown = _renamed(table)
+    paper = PAPER_TABLE.rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
+    merged: pd.DataFrame = shown.merge(paper, on=["alpha", "beta"], how="left")
+    return merged
+
+
+def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, 2.5 if width_in >= style.WIDE_IN else 4.2))
+    wide = width_in >= style.WIDE_IN
+    axes = figure.subplots(1, 4) if wide else figure.subplots(2, 2)
+    grids = [
+        ("this flight, latitude", table, "north_m"),
+        ("this flight, longitude", table, "east_m"),
+        ("paper, latitude", PAPER_TABLE, "north_m"),
+        ("paper, longitude", PAPER_TABLE, "east_m"),
+    ]
+    values = {
+        title: source.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
+        for title, source, column in grids
+    }
+    every = np.concatenate([grid.ravel() for grid in values.values()])
+    scale = LogNorm(float(np.nanmin(every)), float(np.nanmax(every)))
+    for panel, (title, grid) in zip(axes.ravel(), values.items(), strict=True):
+        panel.imshow(grid, cmap=COLOUR_MAP, norm=scale, origin="lower", aspect="auto")
+        for (row, col), value in np.ndenumerate(grid):
+            dark = scale(value) > 0.5
+            panel.text(
+                col, row, f"{value:.1f}", ha="center", va="center",
+                color="#ffffff" if dark else "#000000",
+            )  # fmt: skip
+        panel.set_title(title)
+        panel.set(xticks=range(len(WEIGHTS)), yticks=range(len(WEIGHTS)))
+        panel.set_xticklabels([f"{weight:g}" for weight in WEIGHTS])
+        panel.set_yticklabels([f"{weight:g}" for weight in WEIGHTS])
+        panel.grid(visible=False)
+        panel.set_xlabel("beta")
+    for panel in axes.ravel()[:: 4 if wide else 2]:
+        panel.set_ylabel("alpha")
+    return figure

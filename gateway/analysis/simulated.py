@@ -1,0 +1,79 @@
+"""The built-in simulated flight, for the analysis, with its exact truth.
+
+Apart from `flight`: the simulator loads all of SciPy, which the panel does not need.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from gateway.analysis.flight import Flight, FlightTrack, Reference, flight_of_blocks
+from gateway.recordings.columns import RowBuilder
+from gateway.recordings.fuse import FusionSettings, with_reference
+from gateway.recordings.table import block_of
+from gateway.records import BaroRaw, GpsFix, ImuRaw
+from gateway.sensing.calibration import NodeCalibration
+from gateway.simulator.flight import SimulatedAircraft
+from gateway.simulator.receiver import simulate
+from gateway.simulator.sensors import SensorErrors
+from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.trajectory import FLIGHT_S, Trajectory
+from gateway.units import US_PER_S
+from gateway.wire.link import Link
+
+SIMULATED_STORY: Final = (
+    "The built-in simulated flight of a small fixed-wing aircraft, 218 s like the paper's own: "
+    "rest, take-off, a circuit with a figure of eight, landing. GPS is lost for 10 s and for 3 s, "
+    "and some payloads are lost on the radio."
+)
+TRUTH_STORY: Final = "the simulation's exact truth"
+
+
+def simulated_flight(
+    settings: SimulatorSettings | None = None,
+    fusion: FusionSettings | None = None,
+    duration_s: float = FLIGHT_S,
+) -> Flight:
+    """Fly the built-in flight, with losses and jitter of radio and serial line as live."""
+    settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
+    aircraft = SimulatedAircraft(settings)
+    link, builder = Link(), RowBuilder()
+    records = (
+        record
+        for frame in simulate(settings).frames(duration_s)
+        for record in link.feed(frame.data, round(frame.time_s * US_PER_S))
+    )
+    rows = [
+        row
+        for record in records
+        if isinstance(record, ImuRaw | BaroRaw | GpsFix)
+        for row in builder.add(record)
+    ]
+    flight = flight_of_blocks(
+        [block_of([*rows, *builder.flush()])],
+        ideal_calibration(aircraft.errors),
+        with_reference(fusion or FusionSettings(), gps_latency_s=settings.gps_latency_s),
+        name="simulated flight",
+        story=SIMULATED_STORY,
+    )
+    return replace(flight, reference=_truth_of(aircraft.trajectory, flight))
+
+
+def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
+    """Return the calibration that undoes the simulated sensors' constant errors."""
+    return msgspec.convert(errors, NodeCalibration, from_attributes=True)
+
+
+def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
+    truth = trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
+    track = FlightTrack(
+        time_us=flight.time_us,
+        q_nb=truth.q_nb,
+        lat_deg=truth.lat_deg,
+        lon_deg=truth.lon_deg,
+        alt_amsl_m=truth.alt_amsl_m,
+        vel_n_mps=truth.vel_n_mps,
+    )
+    return Reference(track, is_exact=True, story=TRUTH_STORY)

@@ -1,1 +1,0 @@
-"""Settings tried out on flights."""

@@ -1,0 +1,473 @@
+"""Recordings fused again: the settings to fuse them with, their rows and states, their MAVLink.
+
+GPS latency and declination follow one rule for every command: a latency that the user has set is
+used; else that of the log's comments; else it is estimated from the motion; else the default is
+assumed, with a remark. mavgate's own recordings keep theirs.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from gateway import __version__
+from gateway.aircraft import Action, Aircraft, AircraftSettings, FusedStates
+from gateway.estimation.kernel import (
+    FoundLatency,
+    KernelEstimator,
+    SampleLog,
+    estimate_latency,
+)
+from gateway.estimation.reference import ReferenceSettings
+from gateway.estimation.select import make_estimator
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import (
+    GPS,
+    GPS_CODEC,
+    NAV,
+    NAV_COLUMNS,
+    WHOLE_COLUMNS,
+    FloatArray,
+    TableRow,
+    has_group,
+    write_lines,
+)
+from gateway.recordings.files import (
+    FileKind,
+    FlightError,
+    encoding_of,
+    kind_of,
+    read_chunks,
+    read_ends,
+)
+from gateway.recordings.fuse import (
+    SMOOTHED_ESTIMATOR,
+    Correct,
+    Fusion,
+    InterpolatedPosition,
+    fuse,
+    sample_log,
+    samples_of,
+    smoothed_states,
+    with_estimator,
+    with_reference,
+)
+from gateway.recordings.join import joined_tables
+from gateway.recordings.reading import (
+    Line,
+    ReadOptions,
+    RecordedTable,
+    aircraft_of,
+    csv_reader,
+    header_for,
+    is_table,
+    open_rows,
+    settings_of,
+)
+from gateway.recordings.table import (
+    FORMAT_LINE,
+    REMARK,
+    TableBlock,
+    TableHeader,
+    TableMark,
+    TableReader,
+    encode_header,
+)
+from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
+from gateway.records import (
+    RECORDED_ONLY,
+    FusionState,
+    GpsFix,
+    NodeStatus,
+    Outgoing,
+)
+from gateway.sensing.imu_log import IntArray
+from gateway.vehicle.actions import INFO, StatusText
+
+LONGEST_GAP_US: Final = 1_000_000
+"""In a longer gap the pipeline's timers are not run one by one."""
+
+
+class Replay:
+    """Feed rows to a pipeline as if they arrived now: from them, and their states, to MAVLink."""
+
+    def __init__(self, pipeline: Pipeline, *, follow: bool = True) -> None:
+        self._pipeline = pipeline
+        self._follow = follow
+        self._now_us: int | None = None
+
+    def take(self, row: Line) -> Iterator[tuple[int, Action]]:
+        """Process one row, a change of settings, a mark, or a state to restore."""
+        if isinstance(row, TableHeader):
+            if self._follow:
+                now_us = self._now_us or 0
+                for action in self._pipeline.change(row.vehicle_id, settings_of(row), now_us):
+                    yield now_us, action
+            return
+        if isinstance(row, TableMark):
+            yield from self._wait(row.time_us)
+            now_us = self._now_us or 0
+            for action in self._pipeline.say(StatusText(INFO, REMARK + row.text), now_us):
+                yield now_us, action
+            return
+        if isinstance(row, FusionState):
+            self._pipeline.restore(row)
+            return
+        # In the order in which they were processed; counts before SI values.
+        records = [row] if isinstance(row, NodeStatus) else [row.baro, row.gps, row.raw or row.imu]
+        for record in records:
+            if record is None:
+                continue
+            yield from self._wait(record.time_us)
+            now_us = self._now_us if self._now_us is not None else record.time_us
+            for action in self._pipeline.take(record, now_us):
+                yield now_us, action
+
+    def _wait(self, until_us: int) -> Iterator[tuple[int, Action]]:
+        """Run the timed actions before the next record; the clock never goes back."""
+        now_us = until_us if self._now_us is None else max(self._now_us, until_us)
+        if self._now_us is None or now_us - self._now_us > LONGEST_GAP_US:
+            self._now_us = now_us
+        while (due_us := max(self._pipeline.next_due_us(), self._now_us)) < now_us:
+            self._now_us = due_us
+            for action in self._pipeline.poll(due_us):
+                yield due_us, action
+            if self._pipeline.next_due_us() <= due_us:
+                break
+        self._now_us = now_us
+
+
+HEAD_LINES: Final = 20
+LATENCY_TOLERANCE_S: Final = 0.03
+"""The position may lag the velocity of the same fix by this much; only the velocity is compared."""
+_KEY_VALUE: Final = re.compile(r"(\w+)=(-?[\d.]+)")
+USUAL: Final = ReferenceSettings()
+
+
+def aircraft_for(
+    files: Sequence[Path],
+    table: RecordedTable,
+    options: ReadOptions,
+    given_s: float | None = None,
+) -> AircraftSettings:
+    """Choose the settings for a flight, and complete them from its log.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The parts of one flight.
+    table : RecordedTable
+        Their rows. Where the latency has to be estimated they are read here, and kept for the
+        next reader; a remark states the result.
+    options : ReadOptions
+        Current settings that differ from the defaults take precedence over the log.
+    given_s : float, optional
+        The GPS latency as the user gives it, s.
+
+    Returns
+    -------
+    AircraftSettings
+        Those of `aircraft_of`. For a log of another program, `gps_latency_s` and
+        `declination_deg` of its # lines are used, else the latency estimated from its manoeuvres.
+
+    Raises
+    ------
+    FlightError
+        If a value in a # line is out of range.
+    """
+    aircraft = aircraft_of(table, options)
+    facts = {} if is_table(files[0]) else facts_of(files[0])
+    aircraft = with_facts(aircraft, facts)
+    if given_s is not None:
+        return with_reference(aircraft, gps_latency_s=given_s)
+    latency_s = aircraft.estimation.reference.gps_latency_s
+    known = is_table(files[0]) or "gps_latency_s" in facts
+    if known or latency_s != USUAL.gps_latency_s:
+        return aircraft
+    log = _log_of(table, aircraft)
+    if len(log.gps) == 0:
+        return aircraft
+    found = estimate_latency(log)
+    if found is None:
+        how = f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
+    else:
+        how = f"{_in_words(found)} is estimated from its manoeuvres"
+        aircraft = with_reference(aircraft, gps_latency_s=found.latency_s)
+    table.remarks.append(f"{files[0]}: gives no GPS latency; {how}; gps_latency_s sets it")
+    return aircraft
+
+
+def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) -> None:
+    """Add a remark where the motion of a recording speaks against the latency that is set."""
+    set_s = aircraft.estimation.reference.gps_latency_s
+    found = estimate_latency(_log_of(table, aircraft))
+    if found is None:
+        return
+    if abs(found.latency_s - set_s) > max(LATENCY_TOLERANCE_S, 3.0 * found.std_s):
+        table.remarks.append(
+            f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
+            f"but gps_latency_s is {set_s:.2f} s"
+        )
+
+
+def smoothed_latency_in_words(used_s: float, set_s: float) -> str:
+    """Describe a GPS latency that a flight was smoothed with, and that was not set."""
+    return (
+        f"smoothed with a GPS latency of {used_s:.2f} s, which its manoeuvres show; "
+        f"gps_latency_s is {set_s:.2f} s"
+    )
+
+
+def _log_of(table: RecordedTable, aircraft: AircraftSettings) -> SampleLog:
+    """Read a table for `estimate_latency`, and keep its rows for the next reader."""
+    blocks = list(table.blocks)
+    table.blocks = iter(blocks)
+    samples = samples_of(blocks, aircraft.calibration)
+    return sample_log(samples, _kalman_filter(aircraft))
+
+
+def _kalman_filter(aircraft: AircraftSettings) -> KernelEstimator:
+    estimator = make_estimator(with_estimator(aircraft, SMOOTHED_ESTIMATOR).estimation)
+    assert isinstance(estimator, KernelEstimator)
+    return estimator
+
+
+def _in_words(latency: FoundLatency) -> str:
+    return f"{latency.latency_s:.3f} s +- {latency.std_s:.3f} s"
+
+
+def facts_of(file: Path) -> dict[str, float]:
+    """Read `key=value` in the comments of another program's CSV; FlightError if no number."""
+    facts: dict[str, float] = {}
+    if kind_of(file) is not FileKind.CSV:
+        return facts
+    begin = next(read_chunks(file), b"")
+    head = begin.decode(encoding_of(begin), errors="replace")
+    for number, line in enumerate(head.split("\n", HEAD_LINES)[:HEAD_LINES], 1):
+        for key, value in _KEY_VALUE.findall(line) if line.startswith("#") else ():
+            try:
+                facts[key] = float(value)
+            except ValueError as error:
+                raise FlightError(f"{file}: line {number}: {key}={value} is no number") from error
+    return facts
+
+
+def with_facts(aircraft: AircraftSettings, facts: dict[str, float]) -> AircraftSettings:
+    """Replace default settings by values of a log; raises FlightError if one is out of range."""
+    reference = aircraft.estimation.reference
+    changes: dict[str, object] = {}
+    if "gps_latency_s" in facts and reference.gps_latency_s == USUAL.gps_latency_s:
+        changes["gps_latency_s"] = facts["gps_latency_s"]
+    if "declination_deg" in facts and reference.declination == USUAL.declination:
+        changes |= {"declination": "fixed", "declination_deg": facts["declination_deg"]}
+    try:
+        msgspec.convert(msgspec.to_builtins(reference) | changes, ReferenceSettings)
+    except msgspec.ValidationError as error:
+        raise FlightError(f"its # line has an invalid value: {error}") from error
+    return with_reference(aircraft, **changes)
+
+
+LINES: Final = 2000
+"""Lines that are written at once."""
+WRITTEN: Final = ("time_us", *NAV_COLUMNS)
+IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
+
+
+def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
+    """Write a table of states only; unknown values are left blank.
+
+    Parameters
+    ----------
+    header : TableHeader
+        Head of the table: how they were fused.
+    time_us : ndarray, shape (N,)
+        Of the IMU samples.
+    states : ndarray, shape (N, NAV_COLUMNS)
+        See `gateway.estimation.columns`.
+    """
+    yield f"{FORMAT_LINE}\n{encode_header(header)}{','.join(WRITTEN)}\n".encode()
+    table = np.column_stack([time_us, time_us, states])
+    for begin in range(0, len(table), LINES):
+        yield write_lines(table[begin : begin + LINES], IS_WHOLE)
+
+
+SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
+
+
+class RecordedFusion:
+    """Recordings in sequence as one flight, fused again; FlightError if they cannot be.
+
+    Parameters
+    ----------
+    files : sequence of Path
+        The parts of one recording, or flights in sequence.
+    options : ReadOptions
+        How they are read, and with which settings they are fused.
+    smooth : bool
+        Whether states use the samples after them too.
+    estimator : str, optional
+        Instead of the one in the settings.
+    latency_s : float, optional
+        The GPS latency as the user gives it, s.
+    states_only : bool
+        Whether only `states` is wanted: then the files are read once.
+    """
+
+    def __init__(
+        self,
+        files: Sequence[Path],
+        options: ReadOptions,
+        *,
+        smooth: bool = False,
+        estimator: str | None = None,
+        latency_s: float | None = None,
+        states_only: bool = False,
+    ) -> None:
+        self._table = table = joined_tables([open_rows(file, options) for file in files])
+        self.aircraft = aircraft_for(files, table, options, latency_s)
+        """The settings of the fusion."""
+        if smooth or estimator is not None:
+            name = SMOOTHED_ESTIMATOR if smooth or estimator is None else estimator
+            self.aircraft = with_estimator(self.aircraft, name)
+        self._follow = options.choice == "recorded" and is_table(files[0])
+        self._smoothed: tuple[IntArray, FloatArray] | None = None
+        self._correct: Correct | None = None
+        if smooth:
+            blocks = table.blocks if states_only else _blocks_of(files, options)
+            self._smoothed = self._smooth(blocks, files[0])
+            self._correct = smoothed_states(*self._smoothed)
+        elif options.position == "interpolated":
+            latency_s = self.aircraft.estimation.reference.gps_latency_s
+            self._correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
+        self._refused: list[str] = []
+
+    def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
+        """Smooth the rows; a remark states a latency that is not the one that is set."""
+        samples = samples_of(blocks, self.aircraft.calibration)
+        try:
+            fused = fuse(samples, _kalman_filter(self.aircraft), smoothed=True)
+        except ValueError as error:
+            raise FlightError(f"{file}: {error}") from error
+        set_s = self.aircraft.estimation.reference.gps_latency_s
+        if fused.latency_s != set_s:
+            text = smoothed_latency_in_words(fused.latency_s, set_s)
+            self._table.remarks.append(f"{file}: {text}")
+            self.aircraft = with_reference(self.aircraft, gps_latency_s=fused.latency_s)
+        return np.sort(samples.imu.time_us, kind="stable"), fused.states
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks about the states for the user, as far as the rows were read."""
+        return [*map(SETTLES.format, self._refused), *self._table.remarks]
+
+    @property
+    def header(self) -> TableHeader:
+        """The head of a table of the states alone."""
+        return header_of_states(self._table.header, self.aircraft)
+
+    def introduction(self) -> Iterator[bytes]:
+        """Yield the frames with the vehicle's version and the parameters that it is fused with."""
+        vehicle = Aircraft(self._table.header.vehicle_id, self.aircraft).vehicle
+        return (sent.frame for sent in vehicle.introduction())
+
+    def _fusion(self, *, follow: bool, played: FusedStates | None = None) -> Fusion:
+        vehicle_id = self._table.header.vehicle_id
+        fusion = Fusion(vehicle_id, self.aircraft, follow=follow, played=played)
+        fusion.correct, fusion.refused = self._correct, self._refused
+        return fusion
+
+    def frames(self) -> Iterator[TlogRecord]:
+        """Yield the MAVLink that the gateway would have sent, at civil times."""
+        header, states = self._table.header, FusedStates()
+        fusion = self._fusion(follow=self._follow, played=states)
+        zero_us = header.unix_us_at_zero or 0
+        settings = PipelineSettings(self.aircraft, {}, zero_us, states)
+        replay, stamper = Replay(Pipeline(settings), follow=self._follow), Stamper(zero_us)
+        for block in self._table.blocks:
+            fusion.block(block)
+            lines = (e for e in block.events(header.vehicle_id) if isinstance(e, Line))
+            for now_us, action in (sent for line in lines for sent in replay.take(line)):
+                if not isinstance(action, Outgoing) or action.message_id in UNRECORDED:
+                    continue
+                if action.client_id in (None, RECORDED_ONLY):
+                    yield TlogRecord(stamper.stamp(now_us), action.frame)
+
+    def table(self) -> RecordedTable:
+        """Return the rows with the new states, under a head that says how they were fused."""
+        blocks = map(self._fusion(follow=self._follow).block, self._table.blocks)
+        # The first may hold nothing but the head of the file.
+        first = next((block for block in blocks if len(block) or block.comments), None)
+        at_begin = [] if first is None else [c for row, c in first.comments if row == 0]
+        begins_cold = not any(isinstance(comment, FusionState) for comment in at_begin[:1])
+        old, new = self._table.header, header_for(self.aircraft, self._table.header.vehicle_id)
+        if not self._follow or not old.settings:
+            old = msgspec.structs.replace(old, settings=new.settings, calibration=new.calibration)
+        header = msgspec.structs.replace(old, mavgate_version=__version__, cold_start=begins_cold)
+        return RecordedTable(header, chain([] if first is None else [first], blocks))
+
+    def states(self) -> tuple[IntArray, FloatArray]:
+        """Return times and states of the IMU samples, all with the settings of the head.
+
+        They begin with the state at the begin of the table, where there is one that fits.
+        """
+        if self._smoothed is not None:
+            return self._smoothed
+        fusion = self._fusion(follow=False)
+        rows = [fusion.block(block).cells for block in _with_begin(self._table.blocks)]
+        cells = np.concatenate(rows)
+        cells = cells[has_group(cells, NAV)]
+        return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]
+
+
+def header_of_states(known: TableHeader, aircraft: AircraftSettings) -> TableHeader:
+    """Return the head of a table of new states, for a recording with a known head."""
+    return msgspec.structs.replace(
+        header_for(aircraft, known.vehicle_id),
+        session=known.session,
+        unix_us_at_zero=known.unix_us_at_zero,
+    )
+
+
+def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
+    """Leave of the lines between rows only a state at the very begin."""
+    for number, block in enumerate(blocks):
+        begin = block.comments[:1] if number == 0 else ()
+        kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
+        yield TableBlock(block.cells, kept)
+
+
+def end_of(file: Path, options: ReadOptions) -> int | None:
+    """Return the civil time of a table's last row without reading all of it; None if unknown."""
+    kind = kind_of(file)
+    if kind is FileKind.OTHER:
+        return None
+    head, tail = read_ends(file)
+    rows: list[TableRow] = []
+    if kind is FileKind.CSV:
+        lines = (head + tail).decode(errors="replace").splitlines()
+        with suppress(ValueError):
+            rows = list(csv_reader(options).rows(lines))
+        zero_us = 0
+    else:
+        reader = TableReader()
+        events = reader.feed(head + tail, final=True)
+        rows = [event for event in events if isinstance(event, TableRow)]
+        zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
+    return zero_us + rows[-1].time_us if rows else None
+
+
+def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:
+    """Read all once more, before the rows or along with them."""
+    quiet = replace(options, progress=None)
+    return joined_tables([open_rows(file, quiet) for file in files]).blocks
+
+
+def _fixes_of(files: Iterable[Path], options: ReadOptions) -> Iterator[GpsFix]:
+    for block in _blocks_of(files, options):
+        yield from map(GPS_CODEC.read, block.cells[has_group(block.cells, GPS), GPS].tolist())
