@@ -42,10 +42,11 @@ class Timer:
     def __init__(self, chip: RunsOnCycles, clock_ppm: float = 0.0) -> None:
         self.chip = chip
         self._period_fs = round(_FS_PER_S / (chip.frequency_hz * (1 + clock_ppm * 1e-6)))
+        self._halted_ps = 0
 
     def time_of(self, cycle: int) -> int:
         """Return when a cycle begins, in ps."""
-        return cycle * self._period_fs // 1000
+        return self._halted_ps + cycle * self._period_fs // 1000
 
     @property
     def now_ps(self) -> int:
@@ -54,7 +55,11 @@ class Timer:
 
     def run(self, until_ps: int) -> None:
         """Run to at least this time."""
-        self.chip.run(-(-until_ps * 1000 // self._period_fs))
+        self.chip.run(-((self._halted_ps - until_ps) * 1000 // self._period_fs))
+
+    def halt(self, until_ps: int) -> None:
+        """Let time pass until then without a cycle."""
+        self._halted_ps += max(0, until_ps - self.now_ps)
 
 
 class Bench:

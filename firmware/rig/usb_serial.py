@@ -73,7 +73,9 @@ class UsbSerial:
             os.close(file)
 
     def run_while(self, process: subprocess.Popen[str], limit_s: float) -> int:
-        """Run the bench until a program that uses the port has ended; returns its exit code.
+        """Run this board until a program that uses the port has ended; returns its exit code.
+
+        The other boards are halted meanwhile, so that this one keeps up with true time.
 
         Raises
         ------
@@ -83,11 +85,17 @@ class UsbSerial:
         # The bench may have run alone meanwhile.
         self._ahead_of_s = time.monotonic() - self._bench.now_ps / PS_PER_S
         end_ps = self._bench.now_ps + round(limit_s * PS_PER_S)
-        while process.poll() is None:
-            if self._bench.now_ps > end_ps:
-                process.kill()
-                raise TimeoutError(f"{process.args} runs for more than {limit_s} s")
-            self.run(PIECE_S)
+        timers, self._bench.timers = self._bench.timers, [self._board.timer]
+        try:
+            while process.poll() is None:
+                if self._bench.now_ps > end_ps:
+                    process.kill()
+                    raise TimeoutError(f"{process.args} runs for more than {limit_s} s")
+                self.run(PIECE_S)
+        finally:
+            self._bench.timers = timers
+            for timer in timers:
+                timer.halt(self._bench.now_ps)
         return process.returncode
 
     def run(self, seconds: float) -> None:

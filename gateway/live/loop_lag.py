@@ -16,8 +16,8 @@ STALL_US: Final = 500_000
 SPAN_US: Final = 10 * US_PER_S
 MAX_SHARE: Final = 0.3
 """Delays that add up to more of the span mean that the loop cannot keep up."""
-WARM_UP_US: Final = 10 * US_PER_S
-"""After the start, machine code is loaded and the first samples take longer."""
+WARM_UP_US: Final = 5 * US_PER_S
+"""At the start, loading machine code takes 0.25 s of a PC, several times that of a small board."""
 RECOVERED_US: Final = 60 * US_PER_S
 MAX_DELAYS: Final = 1000
 """In a span; the timer fires at most every millisecond, but only delays are kept."""

@@ -62,9 +62,17 @@ def flash(usb: UsbSerial, *words: str) -> str:
 
 
 def test_boards_flashed_through_optiboot_fly_with_their_settings(
-    tools: None, bench: MakeBench, plugged: Callable[[Board], UsbSerial]
+    tools: None,
+    programs: Path,
+    bench: MakeBench,
+    plugged: Callable[[Board], UsbSerial],
+    tmp_path: Path,
 ) -> None:
-    rig = bench(receiver=str(NEW_BOOTLOADER))
+    settings = BoardSettings(radio_channel=81, radio_kbps=250, radio_power_dbm=-6)
+    image = with_settings(IntelHex(str(programs / "receiver.hex")), settings)
+    flashed = tmp_path / "receiver.hex"
+    flashed.write_bytes(NEW_BOOTLOADER.with_suffix(".hex").read_bytes() + b"\n" + image)
+    rig = bench(receiver=str(flashed.with_suffix("")))
     node = rig.imu_node(program=str(NEW_BOOTLOADER))
     usb = plugged(node)
     flash(usb, "imu", "--vehicle", "2", "--channel", "80", "--rate", "250", "--send-rate", "60")
@@ -76,17 +84,17 @@ def test_boards_flashed_through_optiboot_fly_with_their_settings(
         "imu_send_hz      60",
     ):
         assert text in shown
-    # The receiver on another channel hears nothing.
-    receiver_usb = plugged(rig.receiver)
-    flash(receiver_usb, "receiver", "--channel", "81", "--rate", "250")
-    rig.run(3.0)
+    # The receiver on another channel receives nothing.
+    rig.run(2.5)
     assert rig.statuses[-1].channel == 81
     assert rig.frames == []
-    flash(receiver_usb, "receiver", "--keep", "--channel", "80")
-    since_s = rig.now_s + 2.5
-    rig.run(4.5)
+    kept = flash(plugged(rig.receiver), "receiver", "--keep", "--channel", "80")
+    for text in ("radio_channel    80", "radio_power_dbm  -6"):
+        assert text in kept
+    since_s = rig.now_s + 2.0
+    rig.run(3.0)
     payloads = rig.payloads(ImuPayload, since_s=since_s)
-    assert len(payloads) == pytest.approx(120, abs=4)
+    assert len(payloads) == pytest.approx(60, abs=3)
     assert {f.header.node.vehicle_id for _, f in rig.frames} == {2}
     assert {f.pipe for _, f in rig.frames} == {2}
 

@@ -20,7 +20,7 @@ def test_short_delays_are_normal() -> None:
 def test_stall_at_the_start_is_normal() -> None:
     lag = LoopLag()
     call(lag, 0, 0)
-    report = call(lag, 5 * S, 3 * S)
+    report = call(lag, 4 * S, 2 * S)
     assert (report.stalled_us, report.changed) == (2 * S, False)
 
 
