@@ -33,8 +33,9 @@ from gateway.hub.routing_table import Origin, Path
 from gateway.hub.stats import ClientCounters
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from gateway.wire.mavlink_splitter import SEQUENCE_V2, MavFrame, frame_of, is_whole_frame
 from gateway.wire.mavlink_version1 import base_size, to_mavlink1
 
 SEQUENCE_MASK: Final = 0xFF
@@ -234,8 +235,8 @@ class Route:
     """
 
     __slots__ = (
-        "_direct", "_limited", "_on_foreign", "_others", "_path", "_rejects", "_source_id",
-        "frames", "message_id", "size",
+        "_direct", "_extra", "_limited", "_needs_frame", "_on_foreign", "_others", "_path",
+        "_rejects", "_source_id", "frames", "message_id", "size",
     )  # fmt: skip
 
     def __init__(
@@ -258,6 +259,8 @@ class Route:
         self._direct = [client for client in free if client.is_direct]
         self._others = [client for client in free if not client.is_direct]
         self._limited = [(client, limit) for client, limit in targets if limit is not None]
+        self._needs_frame = bool(self._others or self._limited or rejects is not None)
+        self._extra = CRC_EXTRA.get(message_id)
 
     def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
         """Send a frame to every client; a rejected one to none."""
@@ -267,7 +270,30 @@ class Route:
                 self._path.stream.accept(frame.sequence, self._source_id, now_us)
             elif self._rejects(frame, now_us):
                 return
-        data = frame.data
+        for client in self._others:
+            client.transmit(frame)
+        for client, limit in self._limited:
+            if limit.is_due(now_us):
+                client.transmit(frame)
+        self._write(frame.data)
+
+    def forward_datagram(self, data: bytes, now_us: int) -> bool:
+        """Do the same with a datagram of this kind; return False if it is not one valid frame.
+
+        Most routes need nothing of the frame but its bytes and its sequence number.
+        """
+        if self._extra is None or not is_whole_frame(data, self._extra):
+            return False
+        if self._needs_frame:
+            self.forward(frame_of(data), now_us)
+            return True
+        self._path.heard_us = now_us
+        self._path.stream.accept(data[SEQUENCE_V2], self._source_id, now_us)
+        self._write(data)
+        return True
+
+    def _write(self, data: bytes) -> None:
+        """Send a frame to the clients that take any number of bytes at once."""
         self.frames += 1
         self.size += len(data)
         for client in self._direct:
@@ -275,11 +301,6 @@ class Route:
                 client.write(data)
             except OSError as error:
                 client.recover_uncounted(data, error)
-        for client in self._others:
-            client.transmit(frame)
-        for client, limit in self._limited:
-            if limit.is_due(now_us):
-                client.transmit(frame)
         if self._on_foreign is not None:
             self._on_foreign(data)
 

@@ -32,6 +32,9 @@ SIGNED: Final = 0x01
 """The only incompatibility flag that is defined."""
 OVERHEAD_V1: Final = 8
 OVERHEAD_V2: Final = 12
+SEQUENCE_V2: Final = 4
+KEY_V2: Final = slice(5, 10)
+"""Place of `MavFrame.key` in a frame of version 2."""
 SIGNATURE_SIZE: Final = 13
 HEARTBEAT_TYPE_OFFSET: Final = 4
 _TYPE_GCS: Final = bytes((6,))
@@ -159,15 +162,26 @@ def read_datagram(data: bytes) -> MavFrame | None:
     """
     if len(data) < OVERHEAD_V2:
         return None
-    start, length, flags, _, sequence, system, component, low, high = _HEAD_V2(data)
-    if start != START_V2 or flags or len(data) != length + OVERHEAD_V2:
-        return None
-    message_id = low | high << 16
-    extra = CRC_EXTRA.get(message_id)
-    if extra is None or mcrf4xx(data[1:-2] + extra) != data[-2] | data[-1] << 8:
-        return None
-    target = _target(message_id, data, PAYLOAD_V2)
-    return MavFrame(data, data[5:10], message_id, (system, component), target, sequence, False)
+    extra = CRC_EXTRA.get(data[7] | data[8] << 8 | data[9] << 16)
+    return frame_of(data) if extra is not None and is_whole_frame(data, extra) else None
+
+
+def is_whole_frame(data: bytes, extra: bytes) -> bool:
+    """Return whether a datagram is exactly one unsigned version 2 frame of a known kind.
+
+    Parameters
+    ----------
+    data : bytes
+        The datagram.
+    extra : bytes
+        CRC_EXTRA of its message.
+    """
+    return (
+        data[0] == START_V2
+        and data[1] + OVERHEAD_V2 == len(data)
+        and not data[2]
+        and mcrf4xx(data[1:-2] + extra) == data[-2] | data[-1] << 8
+    )
 
 
 def frame_of(data: bytes) -> MavFrame:

@@ -10,7 +10,7 @@ from gateway.hub.admission import SILENT_AFTER_US
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import RETRY_US, Client, Write, not_open
-from gateway.wire.mavlink_splitter import MavFrame, read_datagram, split_datagram
+from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram
 
 NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 4096
@@ -97,6 +97,13 @@ class DatagramClient(Client):
         """Process one datagram of this peer."""
         if self.state != "open":
             self.revive()
+        route = self.routes.get(data[KEY_V2])
+        if route is not None and route.forward_datagram(data, now_us):
+            counters = self.counters
+            counters.received += 1
+            counters.bytes_received += len(data)
+            self.heard_us = now_us
+            return
         frame = read_datagram(data)
         if frame is None:
             self.receive(split_datagram(data), len(data), now_us)
@@ -219,7 +226,8 @@ class DatagramClient(Client):
                 return
             if size >= most:
                 break
-        self.limit_reads(sock, self._on_readable, size)
+        if not self.trusted:
+            self.limit_reads(sock, self._on_readable, size)
 
 
 class DatagramPeer(DatagramClient):
