@@ -35,21 +35,7 @@ MAX_GAP_S: Final = 2.0
 
 
 def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
-    """Interpolate linearly between the fixes, at the times at which they were valid.
-
-    Parameters
-    ----------
-    fixes : Fixes
-        In the order of time.
-    time_us : ndarray, shape (N,)
-        Gateway times to interpolate at.
-
-    Returns
-    -------
-    FlightTrack
-        Positions and velocities; NaN before the first fix, after the last and in long gaps. The
-        attitude is NaN.
-    """
+    """Interpolate linearly between the fixes, at the times at which they were valid."""
     size = len(time_us)
     if len(fixes) < 2:
         unknown = np.full(size, np.nan)
@@ -103,13 +89,7 @@ def split(flight: Flight, keep: BoolArray) -> tuple[Flight, Flight]:
 
 
 def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
-    """Compare a track with fixes, each at the time at which it was valid.
-
-    Returns
-    -------
-    ndarray, shape (M, 2)
-        Metres north and east; NaN where the track has no position.
-    """
+    """Compare a track with fixes, each at the time at which it was valid."""
     if not len(fixes):
         return np.empty((0, 2))
     meridian, parallel = radii_m(float(fixes.lat_deg[0]), float(fixes.alt_amsl_m[0]))

@@ -389,20 +389,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
 
 
 def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
-    """Return the rows of a track that are nearest to given times.
-
-    Parameters
-    ----------
-    track : FlightTrack
-        In the order of time.
-    time_us : ndarray, shape (N,)
-        Without a row within `NEAR_US`, the result is NaN.
-
-    Returns
-    -------
-    FlightTrack
-        One row for each of the times.
-    """
+    """Return the rows of a track nearest to given times; NaN without one within `NEAR_US`."""
     after = np.searchsorted(track.time_us, time_us).clip(1, max(len(track.time_us) - 1, 1))
     before = after - 1
     after = after.clip(0, len(track.time_us) - 1)

@@ -26,18 +26,7 @@ def worst(values: FloatArray) -> float:
 
 
 def rotation_error(q_nb: FloatArray, reference_q_nb: FloatArray) -> FloatArray:
-    """Find the rotation in NED from the reference to the estimate: `q * conj(reference)`.
-
-    Parameters
-    ----------
-    q_nb, reference_q_nb : ndarray, shape (N, 4)
-        Attitudes, scalar first.
-
-    Returns
-    -------
-    ndarray, shape (N, 4)
-        Quaternions with a scalar part of at least 0.
-    """
+    """Find the rotation in NED from the reference to the estimate: `q * conj(reference)`."""
     pw, px, py, pz = q_nb.T
     w, x, y, z = reference_q_nb.T
     error = np.column_stack(

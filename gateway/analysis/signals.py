@@ -60,14 +60,7 @@ def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) ->
 
 
 def compare(settings: PaperSettings, rate_hz: float) -> pd.DataFrame:
-    """Compare the filters' properties in a table.
-
-    Returns
-    -------
-    DataFrame
-        One row per filter: ripple of the pass band, gain at the cutoff and at three times the
-        cutoff, group delay at 0 Hz and its maximum, overshoot of a step, time per sample.
-    """
+    """Compare the filters' properties in a table."""
     return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
 
 
@@ -118,48 +111,14 @@ REST_ACCEL_MPS2: Final = 0.15
 
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Estimate the one-sided power spectral density by Welch's method.
-
-    Parameters
-    ----------
-    x : ndarray, shape (N, 3)
-        A signal sampled evenly.
-    rate_hz : float
-        Sample rate.
-
-    Returns
-    -------
-    frequency_hz : ndarray, shape (M,)
-        Without 0 Hz.
-    density : ndarray, shape (M, 3)
-        Unit of x squared per Hz.
-    """
+    """Estimate frequencies without 0 Hz and one-sided power spectral density, by Welch."""
     size = min(len(x), round(SEGMENT_S * rate_hz))
     frequency, density = signal.welch(np.nan_to_num(x), rate_hz, nperseg=size, axis=0)
     return frequency[1:], density[1:]
 
 
 def allan_deviation(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
-    """Compute the overlapping Allan deviation of a rate.
-
-    Parameters
-    ----------
-    x : ndarray, shape (N, 3)
-        A rate sampled evenly, such as an angular rate at rest.
-    rate_hz : float
-        Sample rate.
-
-    Returns
-    -------
-    tau_s : ndarray, shape (M,)
-        Averaging times.
-    deviation : ndarray, shape (M, 3)
-        Unit of x.
-
-    References
-    ----------
-    .. [1] IEEE Std 952-1997, annex C.
-    """
+    """Compute averaging times and overlapping Allan deviations (IEEE Std 952-1997, annex C)."""
     longest = len(x) // MIN_CLUSTERS
     if longest < 1:
         return np.empty(0), np.empty((0, 3))
@@ -173,20 +132,7 @@ def allan_deviation(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArr
 
 
 def longest_rest(accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, rate_hz: float) -> slice:
-    """Find the longest stretch in which the sensors measure only noise.
-
-    Parameters
-    ----------
-    accel_b_mps2, gyro_b_radps : ndarray, shape (N, 3)
-        Specific force and angular rate.
-    rate_hz : float
-        Sample rate.
-
-    Returns
-    -------
-    slice
-        Empty if there is no rest.
-    """
+    """Find the longest stretch in which the sensors measure only noise."""
     window = max(round(rate_hz), 2)
     if len(gyro_b_radps) < window:
         return slice(0, 0)

@@ -36,20 +36,7 @@ Place = tuple[float, float, float]
 
 
 def simplified(places: Sequence[Place]) -> list[Place]:
-    """Leave out places that the straight lines between the others pass within a few metres.
-
-    The method of Ramer, Douglas and Peucker [1]_, with a greater tolerance where too many are left.
-
-    Parameters
-    ----------
-    places : sequence of Place
-        In the order of their times.
-
-    References
-    ----------
-    .. [1] D. Douglas, T. Peucker, "Algorithms for the reduction of the number of points required to
-       represent a digitized line or its caricature", Cartographica 10(2), 1973.
-    """
+    """Leave out places that the straight lines between the others pass within a few metres."""
     if len(places) < 3:
         return list(places)
     plane, tolerance_m = _in_metres(places), TOLERANCE_M
@@ -253,13 +240,7 @@ def began_text(unix_us: int | None) -> str | None:
 
 
 def lost_share(times_us: NDArray[np.int64]) -> float | None:
-    """Estimate which share of samples is missing between those that came at a steady rate.
-
-    Parameters
-    ----------
-    times_us : ndarray, shape (N,)
-        Of the samples, on the clock of who sampled them; a restart sets it back.
-    """
+    """Estimate which share of samples is missing between those that came at a steady rate."""
     steps = np.diff(times_us)
     steps = steps[steps > 0]
     if not len(steps):

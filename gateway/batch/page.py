@@ -51,21 +51,7 @@ def group_table(groups: Sequence[GroupErrors]) -> pd.DataFrame:
 def write_season_page(
     results: Sequence[FlightResult], folder: Path, compared: Versus | None
 ) -> Path:
-    """Write the season's page, its figure and its tables into a folder.
-
-    Parameters
-    ----------
-    results : sequence of FlightResult
-        Of `fuse` or `report`.
-    folder : Path
-    compared : Versus or None
-        The same flights by another version.
-
-    Returns
-    -------
-    Path
-        The page.
-    """
+    """Write the season's page, its figure and its tables into a folder."""
     # They need the extra plot, for which the command has looked.
     from gateway.analysis.reporting.page import Fact, Report, ReportTable, Section, write_report
 

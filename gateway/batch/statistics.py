@@ -55,26 +55,12 @@ def _percent(ratio: float) -> str:
 def lead_of(
     errors: NDArray[np.float64], others: NDArray[np.float64], groups: Sequence[str]
 ) -> Lead | None:
-    """Compare two errors of the same flights.
-
-    The logarithms of the ratios are averaged over each group; a permutation test over the signs of
-    the groups' averages gives p, a bootstrap over the groups the interval.
-
-    Parameters
-    ----------
-    errors, others : ndarray, shape (F,)
-        Positive; flights where one of them is not known are left out.
-    groups : sequence of str
-        Aircraft and day of each flight.
-
-    Returns
-    -------
-    Lead or None
-        None if both are known of no flight.
-    """
+    """Compare two errors of the same flights."""
     known = np.isfinite(errors) & np.isfinite(others) & (errors > 0.0) & (others > 0.0)
     if not known.any():
         return None
+    # A permutation test over the signs of the groups' averages gives p, a bootstrap over the
+    # groups the interval.
     logs = np.log(errors[known] / others[known])
     labels = np.array(groups)[known]
     units = np.array([logs[labels == label].mean() for label in np.unique(labels)])
@@ -123,26 +109,7 @@ class Choice:
 
 
 def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choice:
-    """Choose a point for all flights, and judge the choosing.
-
-    Parameters
-    ----------
-    errors : ndarray, shape (F, P)
-        Of each flight with each point.
-    base : ndarray, shape (F,)
-        Of each flight with the settings that it came with.
-    groups : sequence of str
-        Aircraft and day of each flight: flights of one group stay in one fold.
-
-    Returns
-    -------
-    Choice
-
-    Raises
-    ------
-    ValueError
-        If the errors of all points are known of no flight.
-    """
+    """Choose a point for all flights, and judge the choosing."""
     known = np.asarray((np.isfinite(errors) & (errors > 0.0)).all(axis=1))
     if not known.any():
         raise ValueError("no flight can judge all of these settings: they hold too few fixes")
@@ -175,13 +142,7 @@ def choose(errors: FloatArray, base: FloatArray, groups: Sequence[str]) -> Choic
 
 
 def folds_of(groups: Sequence[str]) -> NDArray[np.int64]:
-    """Deal groups out to folds of about equal numbers of flights; with one group, flights.
-
-    Returns
-    -------
-    ndarray, shape (F,)
-        Number of the fold of each flight.
-    """
+    """Deal groups out to folds of about equal numbers of flights; with one group, flights."""
     labels = list(groups) if len(set(groups)) > 1 else [str(k) for k in range(len(groups))]
     sizes = Counter(labels)
     load = [0] * min(FOLDS, len(sizes))

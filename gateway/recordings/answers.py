@@ -265,19 +265,7 @@ class LogAnswers:
 
 
 class VehicleAnswers:
-    """The answers of one vehicle of a recording at the played moment, under its played id.
-
-    Parameters
-    ----------
-    log : LogAnswers
-        Of its recording.
-    system_id : int
-        Its system id in the recording.
-    played_as : int
-        Its system id in playback.
-    position_us : callable
-        Returns the recording's time that is being played.
-    """
+    """The answers of one vehicle of a recording at the played moment, under its played id."""
 
     def __init__(
         self, log: LogAnswers, system_id: int, played_as: int, position_us: Callable[[], int]
@@ -301,13 +289,7 @@ class VehicleAnswers:
         return self._log.mission_at(self._system_id, kind, self._position_us())
 
     def parameters(self) -> dict[str, bytes]:
-        """Return the parameters by name, in their order, numbered so that the list is complete.
-
-        Returns
-        -------
-        dict of str to bytes
-            PARAM_VALUE frames; each value has its recorded bits, whatever its type.
-        """
+        """Return the parameters by name, in their order, numbered so that the list is complete."""
         values = [
             _VALUE.unpack(payload_of(frame, _VALUE.size)) for frame in self.frames(PARAM_VALUE_ID)
         ]

@@ -382,20 +382,7 @@ def has_position(cells: FloatArray) -> BoolArray:
 
 
 def read_lines(text: bytes, width: int) -> FloatArray | None:
-    """Read lines of numbers at once.
-
-    Parameters
-    ----------
-    text : bytes
-        Lines, each with its end.
-    width : int
-        Cells of each line.
-
-    Returns
-    -------
-    ndarray, shape (n, width), or None
-        None if one of the lines is not so many numbers; `read_cells` finds which.
-    """
+    """Read lines of `width` numbers each; None if one is not: `read_cells` finds which."""
     # JSON's whole zero has no sign, a float's has one.
     if text.translate(None, _OF_NUMBERS) or b"-0," in text or b"-0\n" in text:
         return None
@@ -430,19 +417,7 @@ def read_cells(line: bytes, width: int, places: Sequence[int] | None) -> list[fl
 
 
 def settle(cells: FloatArray) -> dict[int, str]:
-    """Leave of each row what its groups hold, and return which rows are invalid.
-
-    Parameters
-    ----------
-    cells : ndarray, shape (n, len(COLUMNS))
-        As read; changed in place: a group without its first cell is empty, what a group may leave
-        out has its default.
-
-    Returns
-    -------
-    dict
-        The reason why a row is invalid, by its number.
-    """
+    """Clear in place what no group holds; return why rows are invalid, by their numbers."""
     for group in (RAW, SI, MAG, BARO, GPS, NAV):
         cells[np.isnan(cells[:, group.start]), group] = np.nan
     has_raw, has_si = has_group(cells, RAW), has_group(cells, SI)
@@ -481,20 +456,7 @@ def _fault(row: FloatArray) -> str:
 
 
 def write_lines(cells: FloatArray, is_whole: BoolArray = IS_WHOLE) -> bytes:
-    """Write rows as lines: floats with all their digits, NaN as an empty cell.
-
-    Parameters
-    ----------
-    cells : ndarray, shape (n, m)
-        The numbers.
-    is_whole : ndarray of bool, shape (m,)
-        Which columns hold whole numbers.
-
-    Returns
-    -------
-    bytes
-        What `row_to_line` gives for each.
-    """
+    """Write rows as lines: floats with all their digits, NaN as an empty cell."""
     if not len(cells):
         return b""
     columns = map(_texts, cells.T, is_whole.tolist())

@@ -193,23 +193,7 @@ def _readable(path: Path) -> Iterator[None]:
 def read_chunks(
     path: Path, progress: Progress | None = None, limit: int | None = None
 ) -> Iterator[bytes]:
-    """Read a file, gzipped or not, in chunks.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    progress : callable, optional
-        Called with the number of further bytes read from the disk.
-    limit : int, optional
-        Maximum unpacked size of a packed file, in bytes. Callers that keep the content need one;
-        a caller that handles chunk by chunk does not.
-
-    Raises
-    ------
-    OSError
-        As `open_unpacked`, or if the limit is exceeded.
-    """
+    """Read a file, gzipped or not, in chunks."""
     done = size = 0
     with open_unpacked(path) as (file, raw):
         while data := file.read(CHUNK):

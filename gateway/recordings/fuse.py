@@ -233,19 +233,7 @@ def samples_of(blocks: Iterable[TableBlock], calibration: NodeCalibration) -> Sa
 
 
 def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
-    """Calibrate rows of a table: counts where there are some, else SI values as they are.
-
-    Parameters
-    ----------
-    cells : ndarray, shape (n, len(COLUMNS))
-        See `gateway.recordings.columns`.
-    chain : SensorChain
-        Of their aircraft.
-
-    Returns
-    -------
-    Samples
-    """
+    """Calibrate rows of a table: counts where there are some, else SI values as they are."""
     holds = has_sample(cells)
     rows = cells[holds]
     flags = rows[:, FLAGS].astype(np.int64)
@@ -275,19 +263,7 @@ Correct = Callable[[IntArray, FloatArray], FloatArray]
 
 
 class Fusion:
-    """Fuse the blocks of a table one after another, as its rows were fused live.
-
-    Parameters
-    ----------
-    vehicle_id : int
-        Their aircraft.
-    settings : AircraftSettings
-        With which it begins.
-    follow : bool
-        Whether settings change where they changed in flight.
-    played : FusedStates, optional
-        Gets the states too, for a playback.
-    """
+    """Fuse the blocks of a table one after another, as its rows were fused live."""
 
     def __init__(
         self,

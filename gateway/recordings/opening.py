@@ -39,22 +39,6 @@ class TlogFile:
 
     It is read, not memory-mapped: a file that shrinks, or a USB stick that is pulled out, would
     kill a process that had mapped it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    progress : callable, optional
-        Called with how many more bytes were indexed.
-    answers : LogAnswers, optional
-        Collects answers from the file.
-    unpacked_limit : int
-        Maximum unpacked size of a packed file, in bytes.
-
-    Raises
-    ------
-    OSError
-        If it cannot be read, or is too large when unpacked.
     """
 
     def __init__(

@@ -72,19 +72,7 @@ class Source(Protocol):
 
 
 class Track:
-    """A tlog being played.
-
-    Parameters
-    ----------
-    source : Source
-        The tlog.
-    shift_us : int
-        Added to every time, to play several recordings together.
-    system_ids : mapping of int to int
-        New system ids by recorded ones; other senders keep theirs.
-    with_commands : bool
-        Play messages of stations and other requests to a vehicle too.
-    """
+    """A tlog being played."""
 
     def __init__(
         self,
@@ -131,19 +119,7 @@ class Track:
         return self._addressed(record.frame)
 
     def seek(self, time_us: int) -> list[bytes]:
-        """Move to the first record that is not before a time.
-
-        Parameters
-        ----------
-        time_us : int
-            In this player's time, the shift included.
-
-        Returns
-        -------
-        list of bytes
-            Frames from before that time that a ground station must know to understand the rest:
-            heartbeats, home and the like, the newest of each.
-        """
+        """Move to the first record that is not before a time."""
         wanted_us = time_us - self._shift_us
         newest: dict[tuple[int, int, int], bytes] = {}
         batches = self._read_from(self._source.index.offset_before(wanted_us, CONTEXT_RECORDS))
@@ -240,23 +216,7 @@ def check_speed(speed: float) -> float:
 
 
 class Player:
-    """Play several recordings together.
-
-    Parameters
-    ----------
-    tracks : sequence of Track
-        At least one.
-    now_us : int
-        Gateway clock at the start.
-    speed : float
-        See `check_speed`.
-    begin_us, end_us : int, optional
-        Range of the recordings' time to play; the whole by default, the end included.
-    max_gap_us : int, optional
-        Longest gap to keep; None keeps all.
-    loop : bool
-        Restart at the end.
-    """
+    """Play several recordings together."""
 
     def __init__(
         self,
@@ -320,20 +280,7 @@ class Player:
         self.state = PlayState.PLAYING
 
     def step(self, now_us: int, count: int = 1) -> list[bytes]:
-        """Pause, and play the next frames at once.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-        count : int
-            How many frames.
-
-        Returns
-        -------
-        list of bytes
-            At most `count` frames, after the frames that a seek has left to send.
-        """
+        """Pause, and play the next frames at once."""
         self.pause(now_us)
         frames, self._context = self._context, []
         for _ in range(count):
@@ -367,20 +314,7 @@ class Player:
         return self._anchor[0] if track is None else self._due_us(track)
 
     def poll(self, now_us: int, limit: int) -> list[bytes]:
-        """Return the frames that are due.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-        limit : int
-            Most frames of the recordings, so that others get their turn.
-
-        Returns
-        -------
-        list of bytes
-            In order; after a seek, first the frames that a ground station needs.
-        """
+        """Return the frames that are due."""
         frames, self._context = self._context, []
         if self.state is not PlayState.PLAYING:
             return frames

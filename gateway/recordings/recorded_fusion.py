@@ -158,28 +158,8 @@ def aircraft_for(
 ) -> AircraftSettings:
     """Choose the settings for a flight, and complete them from its log.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        The parts of one flight.
-    table : RecordedTable
-        Their rows. Where the latency has to be estimated they are read here, and kept for the
-        next reader; a remark states the result.
-    options : ReadOptions
-        Current settings that differ from the defaults take precedence over the log.
-    given_s : float, optional
-        The GPS latency as the user gives it, s.
-
-    Returns
-    -------
-    AircraftSettings
-        Those of `aircraft_of`. For a log of another program, `gps_latency_s` and
-        `declination_deg` of its # lines are used, else the latency estimated from its manoeuvres.
-
-    Raises
-    ------
-    FlightError
-        If a value in a # line is out of range.
+    `given_s` is the GPS latency that the user gives. Where it has to be estimated, the table is
+    read here and kept for the next reader. FlightError if a value in a # line is out of range.
     """
     aircraft = aircraft_of(table, options)
     facts = {} if is_table(files[0]) else facts_of(files[0])
@@ -280,17 +260,7 @@ IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
 
 
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
-    """Write a table of states only; unknown values are left blank.
-
-    Parameters
-    ----------
-    header : TableHeader
-        Head of the table: how they were fused.
-    time_us : ndarray, shape (N,)
-        Of the IMU samples.
-    states : ndarray, shape (N, NAV_COLUMNS)
-        See `gateway.estimation.columns`.
-    """
+    """Write a table of states only; unknown values are left blank."""
     yield f"{FORMAT_LINE}\n{encode_header(header)}{','.join(WRITTEN)}\n".encode()
     table = np.column_stack([time_us, time_us, states])
     for begin in range(0, len(table), LINES):
@@ -301,23 +271,7 @@ SETTLES: Final = "the state stored at the start is not used: {}; the estimator h
 
 
 class RecordedFusion:
-    """Recordings in sequence as one flight, fused again; FlightError if they cannot be.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        The parts of one recording, or flights in sequence.
-    options : ReadOptions
-        How they are read, and with which settings they are fused.
-    smooth : bool
-        Whether states use the samples after them too.
-    estimator : str, optional
-        Instead of the one in the settings.
-    latency_s : float, optional
-        The GPS latency as the user gives it, s.
-    states_only : bool
-        Whether only `states` is wanted: then the files are read once.
-    """
+    """Recordings in sequence as one flight, fused again; FlightError if they cannot be."""
 
     def __init__(
         self,

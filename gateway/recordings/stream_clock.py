@@ -28,27 +28,11 @@ def times_on_clock(
     newest_us: IntArray,
     sampled_us: IntArray,
 ) -> IntArray:
-    """Return the time of each message since the table's time zero.
+    """Return the time of each message since the table's time zero; it grows within a stream.
 
-    Parameters
-    ----------
-    streams : ndarray, shape (n,)
-        The stream of each message.
-    own_us : ndarray, shape (n,)
-        Time in the message; 0 if it contains none, less for a message without a time.
-    recorded_us : ndarray, shape (n,)
-        Time of the recording.
-    zero_us : ndarray, shape (2,)
-        The vehicle's time at zero, and that of the recording.
-    newest_us : ndarray, shape (STREAMS,)
-        The newest time of each stream; changed.
-    sampled_us : ndarray, shape (1,)
-        When the newest IMU sample was recorded; changed.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        Within a stream, it never decreases.
+    An `own_us` of 0 means that the message contains no time, less that its kind has none. `zero_us`
+    is the vehicle's time at zero, and that of the recording; the newest time of each stream, and
+    when the newest IMU sample was recorded, are changed.
     """
     found = np.empty_like(own_us)
     inputs = [np.ascontiguousarray(part, np.int64) for part in (streams, own_us, recorded_us)]

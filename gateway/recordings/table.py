@@ -229,21 +229,7 @@ class TableReader:
         return [*self.feed_block(data, final=final).events(self.vehicle_id)]
 
     def feed_block(self, data: bytes, *, final: bool = False) -> TableBlock:
-        """Take the next bytes of the file.
-
-        Parameters
-        ----------
-        data : bytes
-            Any chunk.
-        final : bool
-            Whether the file ends with it. A last line without its end may have been cut within a
-            number and is dropped.
-
-        Returns
-        -------
-        TableBlock
-            All that came in whole lines.
-        """
+        """Take the next bytes of the file."""
         text, newline, rest = (self._rest + data).rpartition(b"\n")
         block = self._take(text + newline) if newline else TableBlock(NO_ROWS)
         if len(rest) > MAX_LINE or (self._skipped and not newline):

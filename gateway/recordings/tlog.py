@@ -46,17 +46,7 @@ Times = TypeVar("Times", int, NDArray[np.int64])
 
 
 def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDArray[np.bool_]:
-    """Return whether a time is not between its neighbours, which are in order.
-
-    Parameters
-    ----------
-    before_us, time_us, after_us : int, or ndarray of shape (n,)
-        Of the record before, of the record itself, and of the next one.
-
-    Returns
-    -------
-    bool, or ndarray of shape (n,)
-    """
+    """Return whether a time is not between its neighbours, which are in order."""
     gap_us = after_us - before_us
     is_in_order = (gap_us >= -ORDER_US) & (gap_us <= DAY_US)
     is_outside = (time_us < before_us - ORDER_US) | (time_us > after_us + ORDER_US)
@@ -116,20 +106,7 @@ class TlogRecord:
 
 
 def encode_record(time_us: int, frame: bytes) -> bytes:
-    """Build the bytes of one record.
-
-    Parameters
-    ----------
-    time_us : int
-        µs since 1970.
-    frame : bytes
-        A complete MAVLink frame.
-
-    Returns
-    -------
-    bytes
-        Big-endian time, then the frame.
-    """
+    """Build the bytes of one record."""
     return time_us.to_bytes(TIME_SIZE, "big") + frame
 
 
@@ -198,21 +175,7 @@ class TlogScanner:
         """Time of the newest record."""
 
     def feed(self, data: bytes, *, final: bool = False) -> Batch:
-        """Take the next bytes of the file.
-
-        Parameters
-        ----------
-        data : bytes
-            Any chunk.
-        final : bool
-            Whether the file ends with it. Before that the last record is held back, since only
-            its successor confirms it.
-
-        Returns
-        -------
-        Batch
-            Every record that is certain now.
-        """
+        """Take the next bytes of the file."""
         data = self._rest + data if self._rest else data
         room = len(data) // SMALLEST_RECORD + 1
         columns = np.empty((COLUMNS, room), np.int64)
@@ -387,20 +350,7 @@ class TlogIndex:
                 self.stations.add(origin)
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
-        """Return where to begin reading to find the first record that is not before a time.
-
-        Parameters
-        ----------
-        time_us : int
-            µs since 1970.
-        records : int
-            Begin at least this many records earlier, or at the start of the file.
-
-        Returns
-        -------
-        int
-            Offset of a record at most `records` and two strides before it; 0 for an empty file.
-        """
+        """Return where to begin reading to find the first record that is not before a time."""
         if not self._offsets:
             return 0
         entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
@@ -457,31 +407,14 @@ class CivilClock:
 
 
 class Stamper:
-    """The time stamps of one file: they grow, and follow one fixed offset.
-
-    Parameters
-    ----------
-    offset_us : int
-        Civil time of gateway time zero.
-    """
+    """The time stamps of one file: they grow, and follow one fixed offset."""
 
     def __init__(self, offset_us: int) -> None:
         self.offset_us = offset_us
         self._last_us = 0
 
     def stamp(self, now_us: int) -> int:
-        """Return the civil time of a moment, later than every stamp before.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        int
-            µs since 1970, a multiple of `STEP_US`.
-        """
+        """Return the civil time of a moment, later than every stamp before."""
         wanted_us = max(now_us + self.offset_us, 0) & ~_LINK_BITS
         self._last_us = max(wanted_us, self._last_us + STEP_US)
         return self._last_us

@@ -143,33 +143,11 @@ def scan(
     records: IntArray,
     damage: IntArray,
 ) -> tuple[int, int, int, bool]:
-    """Walk over bytes that begin at a record, or anywhere when out of step.
+    """Walk over bytes that begin at a record (`in_step`), or anywhere.
 
-    Parameters
-    ----------
-    data : ndarray of uint8
-        The bytes.
-    final : bool
-        Whether the file ends here; otherwise the last, undecided bytes are left over.
-    strict : bool
-        Check every checksum.
-    in_step : bool
-        Whether a record is known to begin at the first byte.
-    extra : ndarray, shape (n,)
-        Checksum seeds by message id, -1 where unknown.
-    records : ndarray, shape (COLUMNS, m)
-        Filled; `m` at least `data.size // SMALLEST_RECORD + 1`.
-    damage : ndarray, shape (2, m + 1)
-        Filled with begin and end of each run of bytes that belong to no record.
-
-    Returns
-    -------
-    position : int
-        First byte that was not consumed.
-    count, damaged : int
-        Columns filled of `records` and of `damage`.
-    in_step : bool
-        To be handed to the next call.
+    Fills `records`, shape (COLUMNS, m) with m at least `data.size // SMALLEST_RECORD + 1`, and
+    `damage`, shape (2, m + 1), with begin and end of each run of bytes that belong to no record.
+    Returns the first byte that was not consumed, the columns filled of both, and `in_step`.
     """
     found = np.zeros(4, np.int64)
     arrays = (extra, records, damage, found)

@@ -165,20 +165,7 @@ def node_samples(records: Sequence[ImuRaw], moving: Sequence[bool] | None = None
 
 
 def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
-    """Average the specific force of each pose that the node was laid in.
-
-    Parameters
-    ----------
-    accel : ndarray, shape (n, 3)
-        m/s2, sensor axes.
-    windows : list of slice
-        See `still_windows`.
-
-    Returns
-    -------
-    ndarray, shape (m, 3)
-        One row per pose; windows of the same direction are averaged.
-    """
+    """Average the specific force of each pose that the node was laid in."""
     poses: list[list[FloatArray]] = []
     for window in windows:
         mean = np.asarray(accel[window].mean(axis=0))
@@ -197,24 +184,7 @@ def solve_rest(samples: FloatArray) -> RestFit:
 
 
 def solve_accelerometer(poses: FloatArray) -> SphereFit:
-    """Fit bias and scale so that every pose reads one gravity [1]_.
-
-    Parameters
-    ----------
-    poses : ndarray, shape (m, 3)
-        Mean specific force of each pose, m/s2, sensor axes; six or more, one on each side. Nine or
-        more also determine the skew of the axes.
-
-    Returns
-    -------
-    SphereFit
-        In m/s2.
-
-    Raises
-    ------
-    CalibrationError
-        If poses are missing, or if the result is too large for a sensor error.
-    """
+    """Fit bias and scale so that every pose reads one gravity [1]_."""
     if len(poses) < MIN_POSES:
         found = counted(len(poses), "pose")
         raise MoreNeeded(f"{found} where {MIN_POSES} are needed, one on each side")
@@ -392,22 +362,7 @@ def rest_spans(samples: NodeSamples) -> list[slice]:
 
 
 def gyro_at_rest(samples: NodeSamples) -> FloatArray:
-    """Return the gyroscope's samples at rest, which show only its bias.
-
-    Parameters
-    ----------
-    samples : NodeSamples
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        rad/s, sensor axes.
-
-    Raises
-    ------
-    CalibrationError
-        If there was no rest, or if what seems to be rests contradict each other.
-    """
+    """Return the gyroscope's samples at rest, which show only its bias."""
     spans = rest_spans(samples)
     if not spans:
         raise CalibrationError(f"no {REST_WINDOWS * STILL_S:.0f} s of rest: {NOT_STILL}")

@@ -180,22 +180,7 @@ def temperature_from_counts(raw: Number) -> Number:
 def vectors_from_counts(
     scaled: Callable[[Int3, int], Vec3 | None], counts: FloatArray, ranges: FloatArray
 ) -> FloatArray:
-    """Scale an array of counts, shape (n, 3), each vector by its own range.
-
-    Parameters
-    ----------
-    scaled : callable
-        One of the three above.
-    counts : ndarray, shape (n, 3)
-        Whole numbers.
-    ranges : ndarray, shape (n,)
-        Second argument of `scaled` for each.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Bit for bit what `scaled` gives for each; NaN where it gives None.
-    """
+    """Scale an array of counts, shape (n, 3), each vector by its own range."""
     found = np.full(counts.shape, np.nan)
     for one in np.unique(ranges).tolist():
         unit = scaled((1, 1, 1), int(one))
@@ -207,20 +192,7 @@ def vectors_from_counts(
 
 
 def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
-    """Scale the magnetometer's counts of many payloads to uT in sensor axes.
-
-    Parameters
-    ----------
-    counts : ndarray, shape (n, 13)
-        In the order of `ImuRaw`.
-    flags : ndarray of int, shape (n,)
-        `ImuFlags`.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        NaN unless it is new, none of its axes overflowed, and not all are zero.
-    """
+    """Scale the magnetometer's counts of many payloads to uT in sensor axes."""
     state = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
     field = vectors_from_counts(mag_from_counts, counts[:, 6:9], counts[:, 12])
     return np.where((state == int(ImuFlags.MAG_NEW))[:, np.newaxis], field, np.nan)

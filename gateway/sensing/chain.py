@@ -36,13 +36,7 @@ ALL_FLAGS: Final = sum(map(int, ImuFlags))
 
 
 class SensorChain:
-    """Calibrate the samples of one aircraft: pure functions of a sample, which never raise on data.
-
-    Parameters
-    ----------
-    calibration : NodeCalibration
-        The IMU node's errors and mounting.
-    """
+    """Calibrate the samples of one aircraft; never raises on data."""
 
     def __init__(self, calibration: NodeCalibration) -> None:
         cal = calibration
@@ -53,18 +47,7 @@ class SensorChain:
         self._flags: dict[int, ImuFlags] = {}
 
     def imu(self, raw: ImuRaw) -> ImuSample:
-        """Turn one IMU payload into a sample in body FRD.
-
-        Parameters
-        ----------
-        raw : ImuRaw
-            Counts in sensor axes.
-
-        Returns
-        -------
-        ImuSample
-            Calibrated SI values; NaN where the sensor could not be read.
-        """
+        """Turn one IMU payload into a sample in body FRD."""
         accel = gyro = UNKNOWN_VEC3
         if raw.accel_raw != BLANK:
             accel = self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g))

@@ -85,21 +85,7 @@ def estimators(case: Case) -> Section | None:
 def error_table(
     tracks: dict[str, FlightTrack], reference: Reference, scored: BoolArray
 ) -> pd.DataFrame:
-    """Score tracks against a reference.
-
-    Parameters
-    ----------
-    tracks : dict of str to FlightTrack
-        By the name to show.
-    reference : Reference
-    scored : ndarray of bool, shape (N,)
-        Which samples count.
-
-    Returns
-    -------
-    DataFrame
-        One row per track; a column without values is left out.
-    """
+    """Score tracks against a reference."""
     rows = []
     for name, track in tracks.items():
         errors = errors_over_time(track, reference.track)

@@ -99,18 +99,7 @@ def panels(
 
 
 def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Thin a long line to the least and the greatest value of each stretch.
-
-    Parameters
-    ----------
-    x, y : ndarray, shape (N,)
-        The line.
-
-    Returns
-    -------
-    x, y : ndarray
-        At most `MAX_POINTS` points; the line itself if it is short enough.
-    """
+    """Thin a long line to the least and the greatest value of each stretch."""
     stretch = -(-len(x) // (MAX_POINTS // 2))
     if stretch <= 2:
         return x, y

@@ -57,22 +57,7 @@ def layout_of(kind: Any) -> np.dtype[np.void]:
 
 
 def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
-    """Read the fields of some frames of one message.
-
-    Parameters
-    ----------
-    batch : Batch
-        Records of a tlog.
-    wanted : ndarray of int, shape (n,)
-        Numbers of those that are this message.
-    kind : type
-        pymavlink's class of the message.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        See `layout_of`; fields that a sender cut off or did not know are zero.
-    """
+    """Read the fields of some frames of one message; those cut off or unknown are zero."""
     layout = layout_of(kind)
     data = np.frombuffer(batch.data, np.uint8)
     starts = batch.starts[wanted] + TIME_SIZE
@@ -132,17 +117,7 @@ def baro_cells(values: Fields, time_us: IntArray) -> FloatArray:
 
 
 def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntArray) -> FloatArray:
-    """Return the cells of `GPS_COLUMNS` of GPS_RAW_INT.
-
-    Parameters
-    ----------
-    values, time_us :
-        As for the others.
-    places : ndarray
-        Fields of GLOBAL_POSITION_INT.
-    place_at : ndarray of int, shape (n,)
-        Which of them was known at each fix; -1 for none.
-    """
+    """Return the cells of GPS_RAW_INT; `place_at` is the newest of `places`, -1 for none."""
     reported = np.minimum(values["fix_type"], FIX_3D)
     fix_type = np.select(
         [reported == FIX_2D, reported == FIX_3D],
@@ -279,18 +254,7 @@ class AutopilotReader:
         """The row that waits for its sample, if any."""
 
     def feed(self, batch: Batch) -> FloatArray:
-        """Take the next records of the recording, of which every checksum was checked.
-
-        Parameters
-        ----------
-        batch : Batch
-            The one after the last.
-
-        Returns
-        -------
-        ndarray, shape (n, len(COLUMNS))
-            The rows that are complete now; see `gateway.recordings.columns`.
-        """
+        """Take the next records of the recording, of which every checksum was checked."""
         taken = self._taken(batch)
         message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
         fields = {
