@@ -20,10 +20,10 @@ from gateway.live.control_verbs import PlayerVerbs
 from gateway.live.player_edge import PlayerEdge
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
-from gateway.recordings.join import NOTHING_WITHIN
 from gateway.recordings.moment import Moment, place_in
 from gateway.recordings.opening import PlayedFlight
 from gateway.recordings.play import Player
+from gateway.recordings.reading import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle

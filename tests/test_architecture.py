@@ -74,10 +74,10 @@ IMPURE_PARTS = {
 }
 """Impure parts of pure packages."""
 PURE_FOLDERS = {"panel/state"}
-PURE_FILES = {"batch/facts.py", "batch/statistics.py"} | {
+PURE_FILES = {"batch/facts.py"} | {
     f"recordings/{name}.py"
     for name in (
-        *("columns", "table", "tlog", "tlog_scan", "answers", "join", "moment", "play"),
+        *("columns", "table", "tlog", "tlog_scan", "answers", "moment", "play"),
         *("formats/csv", "formats/maps", "formats/mavlink"),
     )
 }

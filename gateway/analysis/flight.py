@@ -35,8 +35,13 @@ from gateway.recordings.fuse import (
     samples_of,
     with_estimator,
 )
-from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import ReadOptions, RecordedTable, is_table, open_rows
+from gateway.recordings.reading import (
+    ReadOptions,
+    RecordedTable,
+    is_table,
+    joined_tables,
+    open_rows,
+)
 from gateway.recordings.recorded_fusion import aircraft_for, check_latency
 from gateway.recordings.table import TableBlock
 from gateway.records import (

@@ -20,11 +20,10 @@ from gateway.batch.facts import (
     FlightFacts,
     Flown,
     Place,
-    TableSkimmer,
+    TableTally,
     TlogTally,
     feature,
     feature_collection,
-    tally_rows,
 )
 from gateway.recordings.files import (
     CHUNK,
@@ -38,10 +37,11 @@ from gateway.recordings.files import (
     open_recording,
     other_format,
     read_batches,
-    read_chunks,
+    read_blocks,
 )
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.reading import ReadOptions, open_rows
+from gateway.recordings.table import TableBlock, TableReader
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
 SCHEMA: Final = 1
@@ -509,10 +509,15 @@ def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
         for batch in read_batches(path):
             tlog.add(batch)
         return tlog.flown()
+    tally = TableTally()
     if kind is FileKind.TABLE:
-        table = TableSkimmer()
-        for data in read_chunks(path):
-            table.feed(data)
-        return table.flown()
+        reader = TableReader()
+        for block in read_blocks(path, reader, None):
+            tally.add(block)
+        return tally.flown(reader.header)
     rows = open_rows(path, options)
-    return tally_rows(rows.plain_rows, rows.header)
+    for block in rows.blocks:
+        tally.add(TableBlock(block.cells))
+    # Those of its header are of mavgate, not of the program that wrote the log.
+    plain = {"mavgate_version": "", "settings": {}, "calibration": {}}
+    return tally.flown(msgspec.structs.replace(rows.header, **plain))

@@ -1,5 +1,6 @@
 """Facts of one flight for the catalogue, computed from its recording in one pass."""
 
+import math
 import struct
 from collections.abc import Iterable, Mapping, Sequence
 from hashlib import sha256
@@ -13,17 +14,25 @@ from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID, is_station
-from gateway.recordings.columns import TableRow
+from gateway.recordings.columns import (
+    COLUMNS,
+    GPS,
+    GPS_CODEC,
+    NODE_TIME,
+    RAW,
+    FloatArray,
+    has_group,
+    has_position,
+)
 from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import (
     GLOBAL_POSITION_INT_ID,
-    STEP_US,
     GroundDistance,
     TimesSpan,
 )
-from gateway.recordings.table import TableEvent, TableFault, TableHeader, TableReader
+from gateway.recordings.table import TableBlock, TableFault, TableHeader
 from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, payload_of
-from gateway.records import NavFlags, NodeStatus
+from gateway.records import NodeStatus
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 
 TOLERANCE_M: Final = 3.0
@@ -283,150 +292,79 @@ _FIRMWARE: Final = struct.Struct("<16xI")
 _PARAMETER: Final = struct.Struct("<4s4x16s")
 CHECKSUM_DIGITS: Final = 12
 
+_PLACE_AND_SPEED: Final = [
+    *(COLUMNS.index(name) for name in ("time_us", "nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m")),
+    *(COLUMNS.index(name) for name in ("nav_vel_north_mps", "nav_vel_east_mps")),
+]
+
 Flown = tuple[FlightFacts, list[Place]]
 """The facts of a flight, and its track."""
 
 
-class RowsTally:
+class TableTally:
     """Sums up a table, or the rows that another format was read as."""
 
     def __init__(self) -> None:
-        self._tally, self._states = FlightTally(), FlightTally()
+        self._fixes, self._states = FlightTally(), FlightTally()
         self._span = TimesSpan()
         self._last_us = 0
+        self._node_us: list[FloatArray] = []
+        self._damaged = 0
         self._nodes: dict[int, NodeStatus] = {}
 
-    def add_time(self, time_us: int) -> None:
-        """Take in that there is a row of this time."""
-        self._span.add(time_us)
-        self._last_us = max(time_us, self._last_us)
-
-    def add(self, row: TableRow) -> None:
-        """Take a whole row in: its fix, and its state."""
-        fix, state = row.gps, row.state
-        if fix is not None:
-            self._tally.add_gps(fix.time_us, fixed=fix.fix_ok)
+    def add(self, block: TableBlock) -> None:
+        """Take in the next block of the file."""
+        for _, comment in block.comments:
+            if isinstance(comment, NodeStatus):
+                self._add_status(comment)
+            elif isinstance(comment, TableFault):
+                self._damaged += comment.size
+        cells = block.cells
+        if not len(cells):
+            return
+        times_us = cells[:, 0].astype(np.int64)
+        self._span.add_all(times_us)
+        self._last_us = max(int(times_us.max()), self._last_us)
+        self._node_us.append(cells[has_group(cells, RAW), NODE_TIME])
+        for values in cells[has_group(cells, GPS), GPS].tolist():
+            fix = GPS_CODEC.read(values)
+            self._fixes.add_gps(fix.time_us, fixed=fix.fix_ok)
             if fix.fix_ok:
                 place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
-                speed_mps = float(np.hypot(*fix.vel_n_mps[:2]))
-                self._tally.add_position(fix.time_us, (*place, fix.alt_amsl_m), speed_mps)
-        if state is not None and NavFlags.POSITION_VALID in state.flags:
-            speed_mps = float(np.hypot(*state.vel_n_mps[:2]))
-            place3 = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
-            self._states.add_position(row.time_us, place3, speed_mps)
+                speed_mps = math.hypot(*fix.vel_n_mps[:2])
+                self._fixes.add_position(fix.time_us, (*place, fix.alt_amsl_m), speed_mps)
+        placed = cells[has_position(cells)]
+        for time_us, *place, north, east in placed[:, _PLACE_AND_SPEED].tolist():
+            self._states.add_position(int(time_us), tuple(place), math.hypot(north, east))
 
-    def add_status(self, status: NodeStatus) -> None:
+    def _add_status(self, status: NodeStatus) -> None:
         """Count the failures of a node since its last report."""
         before = self._nodes.get(status.node.node_id)
         errors, failed = (before.bus_errors, before.sensors_failed) if before else (0, 0)
         # A restart sets the counter back.
-        self._tally.faults += max(status.bus_errors - errors, 0)
-        self._tally.faults += (status.sensors_failed & ~failed).bit_count()
+        self._fixes.faults += max(status.bus_errors - errors, 0)
+        self._fixes.faults += (status.sensors_failed & ~failed).bit_count()
         self._nodes[status.node.node_id] = status
 
-    def flown(self, header: TableHeader | None, node_us: list[int], damaged: int) -> list[Flown]:
+    def flown(self, header: TableHeader | None) -> list[Flown]:
         """Return the one flight of the table; none if it holds no row."""
         first_us = self._span.first_us
         if first_us is None:
             return []
-        self._tally.prefer_positions_of(self._states)
+        self._fixes.prefer_positions_of(self._states)
         head = header or TableHeader()
         zero_us = head.unix_us_at_zero
         known = msgspec.structs.replace(
-            self._tally.facts(self._last_us),
+            self._fixes.facts(self._last_us),
             vehicle=head.vehicle_id,
             began=began_text(None if zero_us is None else zero_us + first_us),
             duration=self._span.length_us / US_PER_S,
-            loss=lost_share(np.array(node_us, np.int64)),
-            damaged=damaged,
+            loss=lost_share(np.concatenate(self._node_us).astype(np.int64)),
+            damaged=self._damaged,
             version=head.mavgate_version or None,
             settings=_checksum(head),
         )
-        return [(known, self._tally.track())]
-
-
-class TableSkimmer:
-    """Sums up a table from its bytes: of most rows it reads the times alone."""
-
-    def __init__(self) -> None:
-        self._tally, self._reader = RowsTally(), TableReader()
-        self._rest = b""
-        self._node_us: list[int] = []
-        self._damaged = 0
-        self._places: tuple[int, int, int, int] | None = None
-        """Where the time, the node's time, the fix and the state stand in a row."""
-        self._state_us = 0
-        """Time of the next state that is read."""
-
-    def feed(self, data: bytes) -> None:
-        """Take the next chunk of the file."""
-        *lines, self._rest = (self._rest + data).split(b"\n")
-        for line in lines:
-            if line.startswith(b"#") or self._places is None:
-                self._read(line)
-                if line.startswith(b"time_us") or b",time_us" in line:
-                    self._find_places(line)
-            elif line.strip():
-                self._skim(line)
-
-    def flown(self) -> list[Flown]:
-        """Return the one flight of the table, once all of it was fed."""
-        return self._tally.flown(
-            self._reader.header, self._node_us, self._damaged + len(self._rest)
-        )
-
-    def _find_places(self, line: bytes) -> None:
-        if self._places is not None or line.startswith(b"#"):
-            return
-        names = line.decode(errors="replace").strip().split(",")
-        wanted = ("time_us", "node_time_us", "gps_time_us", "nav_time_us")
-        time, node, gps, nav = (names.index(n) if n in names else -1 for n in wanted)
-        self._places = (time, node, gps, nav)
-
-    def _skim(self, line: bytes) -> None:
-        assert self._places is not None
-        time, node, gps, nav = self._places
-        cells = line.split(b",")
-        try:
-            time_us = int(cells[time])
-            node_us = int(cells[node]) if node >= 0 and cells[node] else None
-            # Of a row without its end the cells behind it are missing.
-            has_fix, has_state = (at >= 0 and bool(cells[at]) for at in (gps, nav))
-        except (ValueError, IndexError):
-            self._damaged += len(line) + 1
-            return
-        if node_us is not None:
-            self._node_us.append(node_us)
-        self._tally.add_time(time_us)
-        if has_fix or (has_state and time_us >= self._state_us):
-            self._read(line)
-
-    def _read(self, line: bytes) -> None:
-        for event in self._reader.feed(line + b"\n"):
-            self._take(event)
-
-    def _take(self, event: TableEvent) -> None:
-        match event:
-            case TableRow():
-                self._tally.add(event)
-                state = event.state
-                is_placed = state is not None and NavFlags.POSITION_VALID in state.flags
-                if is_placed and event.time_us >= self._state_us:
-                    self._state_us = event.time_us + STEP_US
-            case NodeStatus():
-                self._tally.add_status(event)
-            case TableFault(is_cut=False):
-                self._damaged += event.size
-
-
-def tally_rows(rows: Iterable[TableRow], header: TableHeader) -> list[Flown]:
-    """Sum up a flight of another format from its rows."""
-    tally = RowsTally()
-    for row in rows:
-        tally.add_time(row.time_us)
-        tally.add(row)
-    plain = msgspec.structs.replace(header, mavgate_version="", settings={}, calibration={})
-    return tally.flown(plain, [], 0)
+        return [(known, self._fixes.track())]
 
 
 class TlogTally:

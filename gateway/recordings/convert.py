@@ -17,16 +17,19 @@ from gateway.recordings.formats.maps import (
     tracks_of_frames,
     tracks_of_table,
 )
-from gateway.recordings.join import NOTHING_WITHIN, Limits, joined_tables, trimmed
 from gateway.recordings.moment import place_in
 from gateway.recordings.reading import (
+    NOTHING_WITHIN,
+    Limits,
     ReadOptions,
     RecordedTable,
     aircraft_of,
     import_format,
     is_table,
+    joined_tables,
     open_rows,
     recorded_frames,
+    trimmed,
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.table import encode_block, encode_head

@@ -12,8 +12,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.geometry.atmosphere import pressure_altitude_m
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
-from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import ReadOptions, open_rows
+from gateway.recordings.reading import ReadOptions, joined_tables, open_rows
 from gateway.recordings.recorded_fusion import aircraft_for
 from gateway.records import ImuCalibrated
 from gateway.sensing.chain import SensorChain

@@ -60,8 +60,7 @@ from gateway.records import (
     GpsFixType,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.sensing.chain import SensorChain
-from gateway.sensing.imu_log import ImuLog, IntArray
+from gateway.sensing.chain import ImuLog, IntArray, SensorChain
 from gateway.settings import Settings
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 

@@ -1,6 +1,7 @@
 """Open any recording as a table: the reader of its format, and the settings to fuse it with.
 
-Readers that need large packages are imported with the first file of their format.
+Readers that need large packages are imported with the first file of their format. Several tables
+of one aircraft are joined, cut and moved in time.
 """
 
 import codecs
@@ -21,7 +22,7 @@ from gateway import __version__
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import migrate_sections
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.columns import TIMES, TableRow
+from gateway.recordings.columns import TIMES, BoolArray, TableRow
 from gateway.recordings.files import (
     MAX_UNPACKED,
     OTHER_FORMATS,
@@ -40,17 +41,20 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
+from gateway.recordings.moment import Moment, place_in
 from gateway.recordings.table import (
     HEAD_LINES,
     MAX_LINE,
+    NO_ROWS,
     TableBlock,
+    TableComment,
     TableFault,
     TableHeader,
     TableMark,
     TableReader,
     block_of,
 )
-from gateway.recordings.tlog import ORDER_US, TlogRecord
+from gateway.recordings.tlog import JUMP_US, ORDER_US, TlogRecord
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import counted
@@ -348,3 +352,146 @@ def _header_of_today(
 _add_packaged("ULog", "ulog")
 _add_packaged("DataFlash", "dataflash")
 _add_packaged(PARQUET, "parquet")
+
+
+Limits = tuple[Moment | None, Moment | None]
+
+NOTHING_WITHIN: Final = (
+    "there is nothing between that begin and end; `mavgate info` shows the length"
+)
+OLDER: Final = "a recording is older than the one before it; give the oldest first"
+OVERLAP: Final = "left out {} that overlap with the recording before"
+LATE_US: Final = 1_000_000
+"""Rows of one clock that are older by less than this came late, and are in their place."""
+
+
+def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
+    """Put tables of one aircraft behind one another on the clock of the first.
+
+    Parts of one recording share a clock; other recordings are put in their place by civil time.
+    Where two overlap, the later one is taken from the end of the earlier one on.
+
+    Raises FlightError if they are of several aircraft; while the rows are read, if one begins
+    before the one that it is given behind.
+    """
+    vehicles = sorted({table.header.vehicle_id for table in tables})
+    if len(vehicles) > 1:
+        listed = " and ".join(map(str, vehicles))
+        raise FlightError(f"these are tables of the aircraft {listed}; take those of one alone")
+    first = tables[0].header
+    remarks: list[str] = []
+
+    def blocks() -> Iterator[TableBlock]:
+        known, begun_us, newest_us = first, -math.inf, -math.inf
+        for table in tables:
+            header, left_out = table.header, 0
+            if (header.settings, header.calibration) != (known.settings, known.calibration):
+                yield TableBlock(NO_ROWS, ((0, header),))
+            shift_us = _shift_us(header, first)
+            is_behind = None
+            for block in table.blocks:
+                for _, comment in block.comments:
+                    known = comment if isinstance(comment, TableHeader) else known
+                placed = shifted(block, shift_us or 0)
+                times_us = placed.cells[:, 0]
+                if len(block) and is_behind is None:
+                    is_behind = _is_behind(times_us[0], shift_us, begun_us, newest_us)
+                    begun_us = times_us[0]
+                if len(block) and not is_behind:
+                    overlap = _first(times_us >= newest_us)
+                    placed, is_behind = _without(placed, overlap), overlap < len(block)
+                    left_out += overlap
+                newest_us = times_us.max(initial=newest_us)
+                yield placed
+            remarks.extend(table.remarks)
+            if left_out:
+                remarks.append(OVERLAP.format(counted(left_out, "row")))
+
+    return RecordedTable(first, blocks(), remarks)
+
+
+def _is_behind(begin_us: float, shift_us: int | None, begun_us: float, newest_us: float) -> bool:
+    """Return whether a recording begins at the end of the one before, as far as that is known."""
+    if shift_us is None:
+        return True
+    if begin_us < begun_us:
+        raise FlightError(OLDER)
+    return shift_us == 0 and begin_us > newest_us - LATE_US
+
+
+def _shift_us(header: TableHeader, first: TableHeader) -> int | None:
+    """Return how far two clocks are apart by civil time; None where it is unknown."""
+    zero_us, first_zero_us = header.unix_us_at_zero, first.unix_us_at_zero
+    if header.session != "" and header.session == first.session:
+        return 0  # parts of a recording, whose time GPS may have corrected in between
+    if zero_us is None or first_zero_us is None:
+        return None
+    shift_us = zero_us - first_zero_us
+    return 0 if abs(shift_us) <= JUMP_US else shift_us
+
+
+def _without(block: TableBlock, count: int) -> TableBlock:
+    """Leave out the first rows and their remarks, but keep changes of settings."""
+    comments = tuple(
+        (max(row - count, 0), comment)
+        for row, comment in block.comments
+        if row >= count or isinstance(comment, TableHeader)
+    )
+    return TableBlock(block.cells[count:], comments)
+
+
+def shifted(block: TableBlock, shift_us: int) -> TableBlock:
+    """Move rows and all that they hold in time; a state holds times of its own and is left out."""
+    if not shift_us:
+        return block
+    cells = block.cells.copy()
+    cells[:, TIMES] += shift_us
+    kept = ((k, c) for k, c in block.comments if not isinstance(c, FusionState))
+    return TableBlock(cells, tuple((k, _moved(c, shift_us)) for k, c in kept))
+
+
+def _moved(comment: TableComment, shift_us: int) -> TableComment:
+    if isinstance(comment, TableMark | NodeStatus):
+        return msgspec.structs.replace(comment, time_us=comment.time_us + shift_us)
+    return comment
+
+
+def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
+    """Cut a table at its begin and end, each a moment or None."""
+    begin, end = limits
+    zero_us = table.header.unix_us_at_zero or 0
+
+    def blocks() -> Iterator[TableBlock]:
+        first_us: int | None = None
+        begun, count = begin is None, 0
+        for block in table.blocks:
+            times_us = zero_us + block.cells[:, 0]
+            if first_us is None and len(block):
+                first_us = int(times_us[0])
+            start, stop, was_begun = 0, len(block), begun
+            if end is not None and first_us is not None:
+                stop = _first(times_us > place_in(end, first_us))
+            if not begun and begin is not None and first_us is not None:
+                start = _first(times_us[:stop] >= place_in(begin, first_us))
+                begun = start < stop
+            # What was changed before the begin still holds, but a state from there does not.
+            comments = tuple(
+                (max(k - start, 0), c)
+                for k, c in block.comments
+                if k <= stop and (was_begun or (begun and k > start) or isinstance(c, TableHeader))
+            )
+            yield TableBlock(block.cells[start:stop], comments)
+            count += stop - start
+            if stop < len(block):
+                break
+        if not count and limits != (None, None):
+            raise FlightError(NOTHING_WITHIN)
+
+    cold_start = table.header.cold_start and begin is None
+    return RecordedTable(msgspec.structs.replace(table.header, cold_start=cold_start), blocks())
+
+
+def _first(where: BoolArray) -> int:
+    """Return the number of the first that is true, or how many there are."""
+    found = np.flatnonzero(where)
+    return int(found[0]) if len(found) else len(where)

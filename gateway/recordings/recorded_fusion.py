@@ -58,7 +58,6 @@ from gateway.recordings.fuse import (
     with_estimator,
     with_reference,
 )
-from gateway.recordings.join import joined_tables
 from gateway.recordings.reading import (
     Line,
     ReadOptions,
@@ -67,6 +66,7 @@ from gateway.recordings.reading import (
     csv_reader,
     header_for,
     is_table,
+    joined_tables,
     open_rows,
     settings_of,
 )
@@ -87,7 +87,7 @@ from gateway.records import (
     NodeStatus,
     Outgoing,
 )
-from gateway.sensing.imu_log import IntArray
+from gateway.sensing.chain import IntArray
 from gateway.vehicle.actions import INFO, StatusText
 
 LONGEST_GAP_US: Final = 1_000_000

@@ -487,8 +487,7 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
 def _describe_by_rows(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
     # They import every stage, which a summary of a recording of our own does not need.
-    from gateway.recordings.join import shifted
-    from gateway.recordings.reading import is_table, open_rows
+    from gateway.recordings.reading import is_table, open_rows, shifted
 
     recorded, table = open_rows(file, options), TableSummary()
     own = is_table(file)

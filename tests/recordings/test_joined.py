@@ -5,8 +5,7 @@ import pytest
 
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.files import FlightError
-from gateway.recordings.join import joined_tables
-from gateway.recordings.reading import RecordedTable
+from gateway.recordings.reading import RecordedTable, joined_tables
 from gateway.recordings.table import TableBlock, TableHeader, TableMark
 
 SECOND_US = 1_000_000

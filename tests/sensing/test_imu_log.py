@@ -5,8 +5,7 @@ import pytest
 
 from gateway.records import ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import MAG_OVERFLOW, NodeCalibration
-from gateway.sensing.chain import SensorChain
-from gateway.sensing.imu_log import ImuLog
+from gateway.sensing.chain import ImuLog, SensorChain
 
 NODE = NodeId(1, 0)
 CALIBRATION = NodeCalibration(

@@ -103,7 +103,7 @@ def info(
     config: ConfigOption = None,
 ) -> None:
     """Describe many files, one by one, as `mavgate info` does."""
-    from gateway.batch.page import flight_table
+    from gateway.batch.statistics import flight_table
 
     work = SeasonWork(files, config, jobs, scheduler)
     task = InfoTask(season_options(config, columns, "recorded"))
@@ -163,8 +163,7 @@ def sweep(
 
 def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
-    from gateway.batch.page import errors_of, flight_table, write_season_page
-    from gateway.batch.statistics import errors_by_group
+    from gateway.batch.statistics import errors_by_group, errors_of, flight_table, write_season_page
 
     compared = None if against is None else _compare(results, against)
     grid = table_of(
@@ -191,8 +190,7 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
 
 
 def _compare(results: Sequence[FlightResult], against: Path) -> "Versus":
-    from gateway.batch.page import errors_of
-    from gateway.batch.statistics import versus
+    from gateway.batch.statistics import errors_of, versus
 
     with refusing():
         found = versus(errors_of(results), errors_of([*read_results(against)]))
