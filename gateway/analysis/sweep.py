@@ -181,10 +181,7 @@ def make_contest(
     hold_out: int = 5,
     interval_s: float = 0.0,
 ) -> Contest:
-    """Prepare a sweep.
-
-    Raises SweepError if the keys belong to several estimators.
-    """
+    """Prepare a sweep; raises SweepError if the keys belong to several estimators."""
     fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:

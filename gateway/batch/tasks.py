@@ -90,10 +90,7 @@ class FlightTask(Protocol):
         ...
 
     def do(self, files: list[Path], name: str) -> Worked:
-        """Do it.
-
-        Raises FlightError, OSError, ValueError if there is no flight in it.
-        """
+        """Do it; raises FlightError, OSError, ValueError if there is no flight in it."""
         ...
 
 
@@ -305,10 +302,7 @@ PARTIAL: Final = ".partial"
 
 
 class ResultFolder:
-    """Results of many recordings.
-
-    Raises OSError if it cannot be written.
-    """
+    """Results of many recordings; raises OSError if it cannot be written."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

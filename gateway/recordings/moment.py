@@ -23,10 +23,7 @@ class Moment:
 
 
 def parse_moment(text: str) -> Moment:
-    """Read a moment.
-
-    Raises ValueError if it is none of these.
-    """
+    """Read a moment; raises ValueError if it is none of these."""
     if len(text) > MAX_TEXT:
         raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")
     if match := _CLOCK.fullmatch(text.strip()):

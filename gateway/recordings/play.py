@@ -108,10 +108,7 @@ class Track:
         return None if self._next is None else self._next.time_us + self._shift_us
 
     def take(self) -> bytes:
-        """Return the next frame and move on.
-
-        Raises ValueError at the end.
-        """
+        """Return the next frame and move on; raises ValueError at the end."""
         record = self._next
         if record is None:
             raise ValueError("the recording has ended")
@@ -206,10 +203,7 @@ class PlayState(StrEnum):
 
 
 def check_speed(speed: float) -> float:
-    """Check a speed: 0.1 to 100, or infinite.
-
-    Raises ValueError if it is outside.
-    """
+    """Check a speed: 0.1 to 100, or infinite; raises ValueError if it is outside."""
     if speed != AS_FAST_AS_POSSIBLE and not LEAST_SPEED <= speed <= GREATEST_SPEED:
         raise ValueError(f"speed {speed:g}; {LEAST_SPEED:g} to {GREATEST_SPEED:g}, or inf")
     return speed

@@ -1,13 +1,11 @@
 """What a pilot is told of a flight, against flights whose answers are known."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from gateway.analysis.flight import FlightTrack, LocalFrame, local_frame
 from gateway.analysis.pilot_figures import pilot_figures
-from tests.analysis.flights import short_case, short_flight
+from tests.analysis.flights import short_case, short_flight, with_imu
 
 RATE_HZ = 50
 
@@ -71,7 +69,7 @@ def test_a_silence_of_the_link_is_found() -> None:
     late = flight.time_us + np.where(flight.time_s > 20.0, 4_000_000, 0)
     case = short_case()
     assert case.frame is not None
-    figures = pilot_figures(replace(flight, time_us=late), case.track, case.frame)
+    figures = pilot_figures(with_imu(flight, time_us=late), case.track, case.frame)
     ((begin, end),) = figures.link_losses_s
     assert end - begin == pytest.approx(4.0 + 1.0 / RATE_HZ, abs=0.05)
 
