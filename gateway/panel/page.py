@@ -18,12 +18,11 @@ from gateway.panel.views import (
     events_view,
     flight_view,
     link_view,
-    map_view,
     plots_view,
     recordings_view,
     tuning_view,
 )
-from gateway.panel.widgets.prompts import notify_failure
+from gateway.panel.widgets import notify_failure
 from gateway.printable import printable
 
 STATE_S: Final = 0.5
@@ -33,7 +32,7 @@ THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"
 
 VIEWS: Final = (
     View("flight", "Flight", "flight", flight_view.build),
-    View("map", "Map", "map", map_view.build),
+    View("map", "Map", "map", flight_view.build_map),
     View("link", "Link", "cell_tower", link_view.build),
     View("recordings", "Recordings", "video_library", recordings_view.build),
     View("calibration", "Calibration", "tune", calibration_view.build),

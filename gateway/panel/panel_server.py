@@ -24,10 +24,8 @@ from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
 from gateway.live.terminal import on_end_signals, on_parent_gone
-from gateway.panel.access import ROLE, AccessControl, Logins
-from gateway.panel.api.rest import RestApi
+from gateway.panel.access import ROLE, AccessControl, Logins, ScriptNonces
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
-from gateway.panel.content_policy import ScriptNonces
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.gateway_client import ControlClient, GatewayWatch
 from gateway.panel.map_tiles import MapTiles
@@ -35,6 +33,7 @@ from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.recording_files import add_recording_files
 from gateway.panel.recording_jobs import RecordingJobs
+from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks

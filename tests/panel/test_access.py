@@ -28,10 +28,10 @@ from gateway.panel.access import (
     ROLE,
     AccessControl,
     Logins,
+    ScriptNonces,
     hash_password,
     matches,
 )
-from gateway.panel.content_policy import ScriptNonces
 from gateway.panel.panel_server import PanelError, tls_files, without_traceback
 from gateway.panel.panel_settings import PanelSettings
 

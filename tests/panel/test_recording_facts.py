@@ -4,7 +4,7 @@ import pytest
 
 from gateway.batch.catalogue import Catalogue, CataloguedFile
 from gateway.batch.facts import FlightFacts
-from gateway.panel.recording_facts import RecordingFacts
+from gateway.panel.recording_jobs import RecordingFacts
 
 pytestmark = pytest.mark.io
 

@@ -9,8 +9,13 @@ import pytest
 from fastapi import FastAPI
 
 from gateway.panel import recording_jobs
-from gateway.panel.recording_facts import RecordingFacts
-from gateway.panel.recording_jobs import FORMATS, MAX_WAITING, ExportError, RecordingJobs
+from gateway.panel.recording_jobs import (
+    FORMATS,
+    MAX_WAITING,
+    ExportError,
+    RecordingFacts,
+    RecordingJobs,
+)
 from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.tlog import encode_record
 from tests.panel.test_flight_page import frames

@@ -15,11 +15,9 @@ from nicegui.page import page
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
 from gateway.panel.state.parameters import ParameterEntry, ParameterMeta
-from gateway.panel.widgets import comparison
-from gateway.panel.widgets.charts import StripChart
-from gateway.panel.widgets.comparison import ComparisonCard
-from gateway.panel.widgets.parameter_row import ParameterRow
-from gateway.panel.widgets.table import DataTable, RowButton
+from gateway.panel.views import tuning_view
+from gateway.panel.views.tuning_view import ComparisonCard, ParameterRow
+from gateway.panel.widgets import DataTable, RowButton, StripChart
 
 NAME = "CAL_GYRO_BIAS_Z"
 
@@ -158,5 +156,5 @@ def comparison_of(
         assert not card._button.enabled
         raise failures.pop(0)
 
-    monkeypatch.setattr(comparison, "compare_apart", fail)
+    monkeypatch.setattr(tuning_view, "compare_apart", fail)
     return card, failures

@@ -22,8 +22,7 @@ from gateway.panel.state.fields import FloatArray, unit_text
 from gateway.panel.state.parameters import ListState
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import LIVE, WEB, ViewContext
-from gateway.panel.widgets.prompts import heading
-from gateway.panel.widgets.table import DataTable
+from gateway.panel.widgets import DataTable, heading
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.2

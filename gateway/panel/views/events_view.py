@@ -9,7 +9,7 @@ from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
 from gateway.panel.state.vehicle import TimedText
 from gateway.panel.view_context import LIVE, ViewContext
-from gateway.panel.widgets.table import Cells, DataTable
+from gateway.panel.widgets import Cells, DataTable
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.5

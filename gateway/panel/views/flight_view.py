@@ -1,13 +1,133 @@
-"""View 1: flight display, numbers, the aircraft in 3D from two viewpoints, map, timeline."""
+"""Views 1 and 2: flight display, numbers, 3D, timeline; and the map."""
 
-from typing import Final
+import math
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, Final
 
 from nicegui import ui
 from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.panel.access import MAPS
+from gateway.panel.state.vehicle import Spot
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.views.map_view import FlightMap
-from gateway.panel.widgets.recorder import RecorderControls
+from gateway.panel.widgets import (
+    RecorderControls,
+    UploadButton,
+    closing,
+    named_dialog,
+    notify_failure,
+)
+
+STYLES_S: Final = 2.0
+LEAFLET: Final = ui.leaflet
+"""The map library is that of NiceGUI's own map, whose import registers it with the page."""
+
+
+class FlightMap(Element, component=WEB / "flight_map.js"):
+    """The map, drawn by the browser from the telemetry.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    full : bool
+        With buttons and clicks, or a small one.
+    """
+
+    def __init__(self, context: ViewContext, *, full: bool) -> None:
+        super().__init__()
+        self._tiles = context.parts.tiles
+        self._props["full"] = full
+        self._props["base"] = "/web/base_map.json"
+        self.refresh()
+        context.every(STYLES_S, self.refresh)
+        self._props["may_mark"] = full and context.may_change
+        if full and context.may_change:
+            self.on("place", partial(_ask, context))
+            with self:
+                upload = UploadButton(
+                    context, MAPS, ".pmtiles", label="Add map…", title="Upload a PMTiles file"
+                )
+            upload.on("uploaded", self.refresh)
+
+    def refresh(self) -> None:
+        """Offer the present styles: any page may have added one."""
+        styles = [
+            {"name": style.name, "attribution": style.attribution, "max_zoom": style.max_zoom}
+            for style in self._tiles.styles
+        ]
+        if styles != self._props.get("styles"):
+            self.props["styles"] = styles
+
+
+def build_map(context: ViewContext) -> None:
+    """Build the view."""
+    with ui.element("div").classes("card fill"):
+        FlightMap(context, full=True)
+
+
+def _ask(context: ViewContext, event: GenericEventArguments) -> None:
+    """Ask what to do at the clicked position."""
+    spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
+    name = f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}"
+    with named_dialog(name) as dialog, ui.card().classes("asks"):
+        ui.label(name).classes("figure title")
+        ui.label(f"aircraft {context.system_id}").classes("soft")
+
+        def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
+            async def run() -> None:
+                with notify_failure(context):
+                    await act()
+
+            return closing(dialog, run)
+
+        mark = ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
+        mark.props("no-caps")
+        home = ui.button("Set home here", on_click=then(partial(_set_home, context, spot)))
+        home.props("no-caps outline")
+        if context.vehicle is not None and context.vehicle.instant(context.now_us).mark:
+            clear = ui.button("Clear the mark", on_click=then(partial(_clear, context)))
+            clear.props("no-caps outline")
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
+def _ground_m(context: ViewContext) -> float:
+    """Return home's height as that of the ground: there is no terrain data."""
+    vehicle = context.vehicle
+    if vehicle is None:
+        return math.nan
+    now = vehicle.instant(context.now_us)
+    return now.alt_amsl_m if now.home is None else now.home.alt_amsl_m
+
+
+async def _mark(context: ViewContext, spot: Spot) -> None:
+    await context.command_at(
+        mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
+    )
+    if context.vehicle is not None:
+        context.vehicle.exact_mark = spot
+    ui.notify("Marked", type="positive")
+
+
+async def _set_home(context: ViewContext, spot: Spot) -> None:
+    await context.command_at(
+        mavlink.MAV_CMD_DO_SET_HOME, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
+    )
+    ui.notify("Home set", type="positive")
+
+
+async def _clear(context: ViewContext) -> None:
+    await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
+    if context.vehicle is not None:
+        context.vehicle.exact_mark = None
+        context.vehicle.newest.pop("NAV_CONTROLLER_OUTPUT", None)
+    ui.notify("Mark cleared", type="positive")
+
 
 THREE: Final = ui.scene
 """The 3D library is that of NiceGUI's own scene, whose import registers it with the page."""

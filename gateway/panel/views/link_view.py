@@ -7,8 +7,7 @@ from nicegui import ui
 
 from gateway.live.control_socket import ControlError
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets.prompts import confirm, heading, notify_failure
-from gateway.panel.widgets.table import Cells, DataTable, RowButton
+from gateway.panel.widgets import Cells, DataTable, RowButton, confirm, heading, notify_failure
 from gateway.printable import printable
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted

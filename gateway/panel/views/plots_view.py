@@ -6,7 +6,7 @@ from typing import Any, Final
 from nicegui import ui
 
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets.charts import LiveChart
+from gateway.panel.widgets import LiveChart
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.25

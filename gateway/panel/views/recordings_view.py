@@ -14,10 +14,13 @@ from nicegui.events import GenericEventArguments
 from gateway.batch.catalogue import Row
 from gateway.panel.access import RECORDINGS
 from gateway.panel.playback import SPEEDS, Playback, Profile
-from gateway.panel.recording_facts import RecordingFacts
-from gateway.panel.recording_jobs import FORMATS
+from gateway.panel.recording_jobs import FORMATS, RecordingFacts
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets.prompts import (
+from gateway.panel.widgets import (
+    Cells,
+    DataTable,
+    RecorderControls,
+    RowButton,
     UploadButton,
     closing,
     confirm,
@@ -25,8 +28,6 @@ from gateway.panel.widgets.prompts import (
     named_dialog,
     notify_failure,
 )
-from gateway.panel.widgets.recorder import RecorderControls
-from gateway.panel.widgets.table import Cells, DataTable, RowButton
 from gateway.printable import printable
 from gateway.recordings.index import delete_recording, list_recordings
 

@@ -1,20 +1,246 @@
-"""View 6: every parameter with its meaning, changed live, next to plots of its effect."""
+"""View 6: every parameter with its meaning, changed live, next to plots of its effect.
 
+A card compares the estimators on the last minutes: overlaid curves, and figures.
+"""
+
+import math
 from typing import Any, Final
 
+import numpy as np
 from nicegui import ui
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.clock import unix_time_us
+from gateway.geometry.angle import wrap_180
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.state.parameters import ListState, ParameterMeta
+from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
+from gateway.panel.state.fields import FloatArray, IntArray, unit_text
+from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_value
 from gateway.panel.uplink import CommandFailedError
-from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets.charts import LiveChart
-from gateway.panel.widgets.comparison import ComparisonCard
-from gateway.panel.widgets.parameter_row import ParameterRow
-from gateway.panel.widgets.prompts import heading
+from gateway.panel.view_context import NotAllowedError, ViewContext
+from gateway.panel.widgets import DataTable, LiveChart, StripChart, heading
 from gateway.printable import printable
+from gateway.reasons import reason_of
 from gateway.units import counted
+
+
+class ParameterRow:
+    """A row, built at the current place of the page.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    dialogue : Dialogue
+        With the aircraft.
+    meta : ParameterMeta
+        Metadata of the parameter.
+    """
+
+    def __init__(self, context: ViewContext, dialogue: Dialogue, meta: ParameterMeta) -> None:
+        self._context = context
+        self._meta = meta
+        self._system_id = dialogue.parameters.system_id
+        self._shown: object = None
+        value = dialogue.parameters.entries[meta.name].value
+        self._settled: float | None = value
+        """What the field holds while nothing else is typed."""
+        with ui.element("div").classes("parameter") as self._row:
+            self._row.props["data-name"] = meta.name
+            with ui.element("div"):
+                ui.label(printable(meta.name)).classes("name")
+                meaning = ui.label(printable(meta.short)).classes("meaning")
+                meaning.tooltip(printable(meta.long or meta.short))
+                ui.label(printable(_range_of(meta))).classes("range")
+                self._trouble = ui.label().classes("trouble").props("role=alert")
+            self._field = self._build_field(value)
+        self.refresh(dialogue)
+
+    def refresh(self, dialogue: Dialogue) -> None:
+        """Show the aircraft's present value."""
+        name, parameters = self._meta.name, dialogue.parameters
+        value, trouble = parameters.entries[name].value, parameters.refused.get(name, "")
+        pending = name in parameters.pending
+        if (value, trouble, pending) == self._shown:
+            return
+        self._shown = (value, trouble, pending)
+        self._trouble.set_text("waiting for the answer …" if pending else printable(trouble))
+        self._trouble.set_visibility(bool(trouble) or pending)
+        changed = math.isfinite(self._meta.default) and not is_same_value(value, self._meta.default)
+        self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
+        if pending:
+            return
+        # What is typed and not sent yet stays; what is the same needs no writing over.
+        settled = self._settled
+        is_shown = settled is not None and is_same_value(settled, value)
+        if self._field.value == settled and not is_shown:
+            self._settled = value
+            self._field.set_value(value)
+
+    def _build_field(self, value: float) -> Any:
+        field: Any
+        meta, may = self._meta, self._context.may_change
+        if meta.choices:
+            options = {number: printable(text) for number, text in meta.choices}
+            options.setdefault(value, f"{value:g}")
+            field = ui.select(options, value=value, on_change=lambda e: self._set(e.value))
+            field.props("dense outlined options-dense")
+        else:
+            field = ui.number(value=value, suffix=printable(unit_text(meta.unit)), format="%.7g")
+            field.props("dense outlined step=any hide-bottom-space")
+            # Only a finished value is sent, not each typed digit.
+            field.on("keydown.enter", lambda: self._set(field.value))
+            field.on("blur", lambda: self._set(field.value))
+        field.props["aria-label"] = meta.name
+        field.set_enabled(may)
+        return field
+
+    def _set(self, value: float | None) -> None:
+        self._settled = value
+        if value is None:
+            return
+        name, dialogues = self._meta.name, self._context.parts.dialogues
+        parameters = dialogues.of(self._system_id).parameters
+        kept = parameters.entries[name].value
+        if name not in parameters.pending and is_same_value(value, kept):
+            return
+        try:
+            self._context.check_may_change()
+            dialogues.change(self._system_id, name, float(value))
+        except (ValueError, NotAllowedError) as error:
+            ui.notify(printable(str(error)), type="negative")
+            return
+        self._shown = None
+
+
+def _range_of(meta: ParameterMeta) -> str:
+    parts = []
+    if math.isfinite(meta.low) or math.isfinite(meta.high):
+        low = f"{meta.low:g}" if math.isfinite(meta.low) else "any"
+        high = f"{meta.high:g}" if math.isfinite(meta.high) else "any"
+        parts.append(f"{low} to {high} {unit_text(meta.unit)}".strip())
+    elif meta.unit:
+        parts.append(unit_text(meta.unit))
+    if math.isfinite(meta.default):
+        word = next((text for number, text in meta.choices if number == meta.default), None)
+        parts.append(f"default {word or f'{meta.default:g}'}")
+    return " · ".join(parts)
+
+
+QUANTITIES: Final = {
+    "roll_deg": ("Roll", "deg", "ATTITUDE.roll", math.degrees(1.0)),
+    "pitch_deg": ("Pitch", "deg", "ATTITUDE.pitch", math.degrees(1.0)),
+    "yaw_deg": ("Heading", "deg", "ATTITUDE.yaw", math.degrees(1.0)),
+    "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
+}
+"""Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
+
+
+class ComparisonCard:
+    """A card, built at the current place of the page.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    """
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._estimates: list[Estimate] = []
+        with ui.element("div").classes("card").props("data-card=comparison"):
+            with ui.element("div").classes("tools"):
+                heading("Estimators on the last minutes")
+                ui.element("div").classes("spring")
+                titles = {key: title for key, (title, *_) in QUANTITIES.items()}
+                self._quantity = ui.select(titles, value="roll_deg", on_change=self._draw)
+                self._quantity.props('dense borderless options-dense aria-label="Compared"')
+                self._button = ui.button("Compare", icon="compare", on_click=self._compare)
+                self._button.props("no-caps unelevated dense")
+            self._story = ui.label(
+                "Fuses the sensor data of the last three minutes with every estimator, each "
+                "with the present parameters."
+            ).classes("soft")
+            self._chart = StripChart().classes("strip")
+            self._chart.set_visibility(False)
+            self._table = DataTable(
+                ("Estimator", "RMS difference from flight", "RMS distance to the GPS fixes")
+            ).classes("residuals")
+            self._table.set_visibility(False)
+
+    async def _compare(self) -> None:
+        context, system_id = self._context, self._context.system_id
+        if system_id is None:
+            return
+        if context.may_change:
+            context.parts.dialogues.ask_for_samples(system_id)
+        parameters = context.parts.dialogues.of(system_id).parameters.entries
+        values = {name: entry.value for name, entry in parameters.items()}
+        self._button.disable()
+        self._story.set_text("Fusing …")
+        try:
+            self._estimates = await compare_apart(context.parts.samples.frames(system_id), values)
+        except ComparisonError as error:
+            self._story.set_text(f"{error}. Samples are being collected; try again in a moment.")
+            return
+        except Exception as error:
+            self._story.set_text(f"Cannot be compared: {reason_of(error)}.")
+            raise
+        finally:
+            self._button.enable()
+        seconds = np.ptp(self._estimates[0].time_us) / 1e6
+        self._story.set_text(f"The last {seconds:.0f} s, and the aircraft's own estimate.")
+        self._chart.set_visibility(True)
+        self._draw()
+
+    def _draw(self) -> None:
+        if not self._estimates:
+            return
+        key = str(self._quantity.value)
+        _, unit, field, factor = QUANTITIES[key]
+        zero_us = unix_time_us() - self._context.now_us
+        flown_us, flown = self._context.parts.history.series(self._context.system_id or 0, field)
+        begin_us, end_us = self._estimates[0].time_us[[0, -1]]
+        inside = (flown_us >= begin_us) & (flown_us <= end_us)
+        curves: list[tuple[str, IntArray, FloatArray]] = [
+            (e.name, e.time_us, np.asarray(getattr(e, key))) for e in self._estimates
+        ]
+        curves.append(("as flown", flown_us[inside], flown[inside] * factor))
+        self._chart.set_fields(
+            [(name, unit) for name, _, _ in curves],
+            [((time_us + zero_us) // 1000, values) for _, time_us, values in curves],
+            (int(end_us) + zero_us) / 1000,
+        )
+        self._chart.set_window(max(int((end_us - begin_us) // 1_000_000), 1))
+        self._chart.pause(paused=True)
+        self._table.set_visibility(True)
+        self._table.show(
+            {
+                e.name: (
+                    (e.name, ""),
+                    (f"{_rms_text(e, key, curves[-1])} {unit}", ""),
+                    (f"{_figure(e.to_fixes_m)} m", ""),
+                )
+                for e in self._estimates
+            }
+        )
+
+
+def _rms_text(estimate: Estimate, key: str, flown: tuple[str, IntArray, FloatArray]) -> str:
+    _, flown_us, values = flown
+    if not len(flown_us):
+        return "—"
+    rows = np.clip(np.searchsorted(flown_us, estimate.time_us), 0, len(flown_us) - 1)
+    apart = getattr(estimate, key) - values[rows]
+    if key.endswith("_deg"):
+        apart = wrap_180(apart)
+    known = apart[np.isfinite(apart)]
+    return _figure(float(np.sqrt(np.mean(known**2)))) if len(known) else "—"
+
+
+def _figure(value: float) -> str:
+    return "—" if not math.isfinite(value) else f"{value:.2f}"
+
 
 REFRESH_S: Final = 0.25
 MAX_ROWS: Final = 120

@@ -5,10 +5,10 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import EstimationSettings
-from gateway.panel.state.files import FileClient
 from gateway.panel.state.parameters import (
     MAX_ATTEMPTS,
     MAX_PARAMETERS,
+    FileClient,
     ListState,
     ParameterClient,
     parameter_path,

@@ -22,10 +22,9 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.panel.access import COOKIE, AccessControl, Logins, hash_password
-from gateway.panel.api.rest import RestApi
-from gateway.panel.api.stream import MAX_WAITING_BYTES, MessageStream, Subscriber
 from gateway.panel.gateway_client import ControlClient
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.rest_api import MAX_WAITING_BYTES, MessageStream, RestApi, Subscriber
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.uplink import Uplink
 from gateway.records import Incoming, Outgoing

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.api import message_book
-from gateway.panel.api.message_book import MessageBook
+from gateway.panel import rest_api
+from gateway.panel.rest_api import MessageBook
 
 
 class Wall:
@@ -95,7 +95,7 @@ def test_nowhere(book: MessageBook, path: str) -> None:
 def test_forged_ids_do_not_fill_the_memory(
     book: MessageBook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(message_book, "MAX_KINDS", 3)
+    monkeypatch.setattr(rest_api, "MAX_KINDS", 3)
     for system_id in range(3, 10):
         book.take(attitude(0, system_id))
     assert len(book.look_up("")["vehicles"]) == 3

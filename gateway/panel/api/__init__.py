@@ -1,1 +1,0 @@
-"""MAVLink as JSON, over HTTP and WebSocket, as in mavlink2rest."""

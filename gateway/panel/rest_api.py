@@ -1,0 +1,536 @@
+"""MAVLink for scripts and pages: REST and JSON over WebSocket, compatible with mavlink2rest.
+
+All paths exist with and without `/v1` in front, and below `/mavlink2rest`. Viewers may not send.
+
+Each message is encoded once for all subscribers, and one that reads too slowly loses its own oldest
+messages. Python's engine of regular expressions backtracks, which takes exponential time for some
+expressions. So a separate process tries the names, once per expression, and the kernel ends it when
+it has taken too much processor time: a busy machine makes no expression wrong.
+
+References
+----------
+.. [1] https://github.com/mavlink/mavlink2rest, README and `/docs`
+"""
+
+import asyncio
+import functools
+import json
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Set
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from http import HTTPStatus
+from pathlib import Path
+from typing import Any, Final
+from urllib.parse import quote
+
+from fastapi import APIRouter, Request, Response
+from starlette.responses import FileResponse
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from gateway import __version__
+from gateway.panel.access import ROLE, WS_POLICY_VIOLATION, Role
+from gateway.panel.uplink import Uplink
+from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template, to_json
+
+MAX_KINDS: Final = 8192
+"""Enough for some fifty aircraft; forged ids must not fill the memory."""
+
+Key = tuple[int, int, str]
+"""System, component and name of the message."""
+
+
+@dataclass(slots=True)
+class _Entry:
+    message: Any
+    first_s: float
+    last_s: float
+    counter: int = 1
+
+    def as_json(self) -> dict[str, Any]:
+        span_s = self.last_s - self.first_s
+        return {
+            "message": to_json(self.message),
+            "status": {
+                "time": {
+                    "first_update": _written(self.first_s),
+                    "last_update": _written(self.last_s),
+                    "counter": self.counter,
+                    "frequency": (self.counter - 1) / span_s if span_s > 0 else 0.0,
+                }
+            },
+        }
+
+
+class MessageBook:
+    """Received MAVLink messages, as a tree.
+
+    Parameters
+    ----------
+    now_s : callable
+        Civil time in s since the epoch, to show when a message came.
+    """
+
+    def __init__(self, now_s: Callable[[], float]) -> None:
+        self._now_s = now_s
+        self._entries: dict[Key, _Entry] = {}
+        self._heard: set[tuple[int, int]] = set()
+        self.left_out = 0
+        """Messages of kinds for which there was no room."""
+
+    def take(self, message: Any, *, is_sent: bool = False) -> None:
+        """Take in one message, received or sent from here."""
+        key = (message.get_srcSystem(), message.get_srcComponent(), message.msgname)
+        if not is_sent:
+            self._heard.add(key[:2])
+        now_s = self._now_s()
+        entry = self._entries.get(key)
+        if entry is not None:
+            entry.message = message
+            entry.last_s = now_s
+            entry.counter += 1
+        elif len(self._entries) < MAX_KINDS:
+            self._entries[key] = _Entry(message, now_s, now_s)
+        else:
+            self.left_out += 1
+
+    def has_heard(self, system_id: int, component_id: int) -> bool:
+        """Return whether anything came from a component."""
+        return (system_id, component_id) in self._heard
+
+    def look_up(self, path: str) -> Any:
+        """Return the value at a path of the tree.
+
+        Parameters
+        ----------
+        path : str
+            As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all. A JSON
+            pointer without its first slash, so a trailing slash means an empty name.
+
+        Returns
+        -------
+        Any
+            A JSON value.
+
+        Raises
+        ------
+        KeyError
+            If the path does not exist.
+        """
+        parts = path.split("/") if path else []
+        node: Any = self._tree(parts)
+        for part in parts:
+            if isinstance(node, dict):
+                node = node[part]
+            elif isinstance(node, list) and part in map(str, range(len(node))):
+                node = node[int(part)]
+            else:
+                raise KeyError(part)
+        return node
+
+    def _tree(self, parts: list[str]) -> dict[str, Any]:
+        """Build as much of the tree as a path needs."""
+        vehicles: dict[str, Any] = {}
+        for (system_id, component_id, name), entry in self._chosen(parts):
+            vehicle = vehicles.setdefault(str(system_id), {"id": system_id, "components": {}})
+            component = vehicle["components"].setdefault(
+                str(component_id), {"id": component_id, "messages": {}}
+            )
+            component["messages"][name] = entry.as_json()
+        return {"vehicles": vehicles}
+
+    def _chosen(self, parts: list[str]) -> Iterator[tuple[Key, _Entry]]:
+        wanted = [*parts[1::2], "", "", ""] if parts[:1] == ["vehicles"] else [""] * 3
+        for key, entry in self._entries.items():
+            if all(want in ("", str(have)) for want, have in zip(wanted, key, strict=False)):
+                yield key, entry
+
+
+def _written(time_s: float) -> str:
+    return datetime.fromtimestamp(time_s, UTC).astimezone().isoformat()
+
+
+MAX_WAITING_BYTES: Final = 1 << 20
+"""Of one subscriber: some seconds of one aircraft."""
+MAX_PATTERN: Final = 1000
+LIMIT_S: Final = 1
+"""Of processor time: many times what the start takes, and an ordinary expression takes less yet."""
+ENDED_BY_KERNEL: Final = (-signal.SIGXCPU, -signal.SIGKILL)
+EVERYTHING: Final = ".*"
+AT_ONCE: Final = 2
+MAX_PENDING: Final = 8
+"""Expressions that are tried or wait for it."""
+
+SIEVE: Final = f"""
+import json, re, resource, sys
+resource.setrlimit(resource.RLIMIT_CPU, ({LIMIT_S}, {LIMIT_S}))
+pattern, names = json.load(sys.stdin)
+try:
+    wanted = re.compile(pattern)
+except re.error as error:
+    json.dump(str(error), sys.stdout)
+else:
+    json.dump([name for name in names if wanted.search(name)], sys.stdout)
+"""
+
+
+class Subscriber:
+    """A client that receives some kinds of message.
+
+    Parameters
+    ----------
+    names : set of str
+        Names of the messages it wants.
+    """
+
+    def __init__(self, names: Set[str]) -> None:
+        self.names = names
+        self.dropped = 0
+        self._waiting: deque[str | bytes] = deque()
+        self._bytes = 0
+        self._news = asyncio.Event()
+
+    def push(self, data: str | bytes) -> None:
+        """Queue a text or bytes; the oldest entries make room for it."""
+        self._waiting.append(data)
+        self._bytes += len(data)
+        while self._bytes > MAX_WAITING_BYTES:
+            self._bytes -= len(self._waiting.popleft())
+            self.dropped += 1
+        self._news.set()
+
+    async def next(self) -> str | bytes:
+        """Return the next entry to send."""
+        while not self._waiting:
+            self._news.clear()
+            await self._news.wait()
+        data = self._waiting.popleft()
+        self._bytes -= len(data)
+        return data
+
+
+class MessageStream:
+    """Pass messages to subscribers."""
+
+    def __init__(self) -> None:
+        self._subscribers: list[Subscriber] = []
+
+    @contextmanager
+    def subscribe(self, names: Set[str]) -> Iterator[Subscriber]:
+        """Receive some kinds of message for a while."""
+        subscriber = Subscriber(names)
+        self._subscribers.append(subscriber)
+        try:
+            yield subscriber
+        finally:
+            self._subscribers.remove(subscriber)
+
+    def send(self, message: Any) -> None:
+        """Pass on one decoded message."""
+        subscribers = [each for each in self._subscribers if message.msgname in each.names]
+        if not subscribers:
+            return
+        text = pretty(with_header(message))
+        for subscriber in subscribers:
+            subscriber.push(text)
+
+
+class NameFilters:
+    """Regular expressions tried on a set of names.
+
+    Parameters
+    ----------
+    names : iterable of str
+        All names.
+    """
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self._names = frozenset(names)
+        self._turns = asyncio.Semaphore(AT_ONCE)
+        self._pending = 0
+        self._known = functools.lru_cache(maxsize=64)(self._remember)
+
+    async def matching(self, pattern: str) -> frozenset[str]:
+        """Return the names in which an expression is found.
+
+        Raises
+        ------
+        ValueError
+            If it is invalid, or takes too long; the text says which.
+        """
+        if pattern == EVERYTHING:
+            return self._names
+        if len(pattern) > MAX_PATTERN:
+            raise ValueError(f"filter: it has more than {MAX_PATTERN} letters")
+        if self._pending >= MAX_PENDING:
+            raise ValueError("filter: too many are being tried; connect again later")
+        # Shielded: a client that leaves meanwhile must not cancel the answer to the others.
+        return await asyncio.shield(self._known(pattern))
+
+    def _remember(self, pattern: str) -> "asyncio.Task[frozenset[str]]":
+        return asyncio.create_task(self._try(pattern))
+
+    async def _try(self, pattern: str) -> frozenset[str]:
+        self._pending += 1
+        try:
+            found = await self._run(pattern)
+        finally:
+            self._pending -= 1
+        if isinstance(found, str):
+            raise ValueError(f"filter {pattern!r}: {found}")  # noqa: TRY004 -- the value is wrong
+        return frozenset(found)
+
+    async def _run(self, pattern: str) -> str | list[str]:
+        """Return the names that match, or why the expression cannot be tried."""
+        async with self._turns:
+            process = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-I", "-S", "-c", SIEVE),
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                stderr=asyncio.subprocess.DEVNULL,
+            )
+            question = json.dumps([pattern, sorted(self._names)]).encode()
+            answer, _ = await process.communicate(question)
+        if process.returncode in ENDED_BY_KERNEL:
+            return "it takes too long"
+        found: str | list[str] = json.loads(answer or b'"it cannot be tried"')
+        return found
+
+
+def with_header(message: Any) -> dict[str, Any]:
+    """Return a message with its sender, as JSON."""
+    header = {
+        "system_id": message.get_srcSystem(),
+        "component_id": message.get_srcComponent(),
+        "sequence": message.get_seq(),
+    }
+    return {"header": header, "message": to_json(message)}
+
+
+def pretty(value: Any) -> str:
+    """Write indented JSON; scripts rely on the line breaks."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+
+
+API_VERSION: Final = 0
+"""Version of the answers' format, as in mavlink2rest."""
+DEFAULT_HEADER: Final = {"system_id": 255, "component_id": 0, "sequence": 0}
+MAX_ID: Final = 255
+NOTHING: Final = "None"
+"""Answer for a path without a value."""
+NOT_A_MESSAGE: Final = "Failed to parse message, not a valid MAVLinkMessage."
+NOT_ALLOWED: Final = "viewers may not send; log in as the operator"
+WS_INVALID: Final = 1007
+PREFIX: Final = "/mavlink2rest"
+"""Prefix under which some clients expect these paths, as BlueOS serves them."""
+DOCS: Final = Path(__file__).parent / "web" / "rest.html"
+DOCS_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class RestApi:
+    """Answer requests from an uplink's received messages, and send through it.
+
+    Parameters
+    ----------
+    uplink : Uplink
+        The panel's MAVLink connection.
+    """
+
+    def __init__(self, uplink: Uplink) -> None:
+        self._uplink = uplink
+        self._book = MessageBook(time.time)
+        self._stream = MessageStream()
+        self._filters: NameFilters | None = None
+        uplink.listen(self._take)
+
+    def routers(self) -> list[APIRouter]:
+        """Return the routers to include in an application."""
+        service = APIRouter(tags=["service"])
+        service.add_api_route("/info", self.info)
+        for path in ("/v1/info", f"{PREFIX}/info", f"{PREFIX}/v1/info"):
+            service.add_api_route(path, self.info, include_in_schema=False)
+        service.add_api_route("/docs", _docs, include_in_schema=False)
+        prefixes = ("", f"{PREFIX}/v1", PREFIX)
+        return [
+            service,
+            self._router("/v1", shown=True),
+            *(self._router(prefix, shown=False) for prefix in prefixes),
+        ]
+
+    async def info(self) -> Response:
+        """Return name and version of the program."""
+        service = {
+            "name": "mavgate",
+            "version": __version__,
+            "sha": __version__.rpartition("+")[2] or __version__,
+            "build_date": "",
+            "authors": "",
+        }
+        return _json({"version": API_VERSION, "service": service})
+
+    async def read_all(self) -> Response:
+        """Return the newest message of each kind of every system and component."""
+        return self._read("")
+
+    async def read(self, path: str) -> Response:
+        """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
+        return self._read(path)
+
+    async def helper(self, name: str | None = None) -> Response:
+        """Return an empty message of a name, to be filled in and sent."""
+        if name is None:
+            text = "Query deserialize error: missing field `name`"
+            return Response(text, HTTPStatus.BAD_REQUEST, media_type="text/plain")
+        try:
+            message = template(name)
+        except ValueError:
+            return _json("Invalid message name.", HTTPStatus.NOT_FOUND)
+        return _json({"header": DEFAULT_HEADER, "message": message})
+
+    async def write(self, request: Request) -> Response:
+        """Send a message, given as `{"header": {...}, "message": {"type": "COMMAND_LONG", ...}}`.
+
+        Its header names the sender: the client's own system and component, such as 255 and 0.
+        The text is JSON or JSON5.
+        """
+        if request.scope[ROLE] is not Role.OPERATOR:
+            return Response(NOT_ALLOWED, HTTPStatus.FORBIDDEN)
+        try:
+            self._send(_read_json5((await request.body()).decode()))
+        except UnicodeDecodeError as error:
+            return _refused(f"Failed to parse input as UTF-8 string: {error}")
+        except ValueError as error:
+            return _refused(NOT_A_MESSAGE, str(error))
+        return Response("Ok.", media_type="application/json")
+
+    async def follow(self, socket: WebSocket) -> None:
+        """Send messages with names that match a regular expression; accept messages to send."""
+        await socket.accept()
+        if self._filters is None:
+            self._filters = NameFilters(CLASSES)
+        pattern = socket.query_params.get("filter", EVERYTHING)
+        try:
+            names = await self._filters.matching(pattern)
+        except ValueError as error:
+            await socket.send_text(pretty({"error": str(error)}))
+            await socket.close(WS_INVALID)
+            return
+        with self._stream.subscribe(names) as subscriber:
+            sending = asyncio.create_task(_send_all(socket, subscriber))
+            try:
+                await self._read_all(socket, subscriber)
+            finally:
+                sending.cancel()
+
+    def _router(self, prefix: str, *, shown: bool) -> APIRouter:
+        router = APIRouter(prefix=prefix, tags=["mavlink"])
+        for path, answer, method in (
+            ("/mavlink", self.read_all, "GET"),
+            ("/mavlink/{path:path}", self.read, "GET"),
+            ("/mavlink", self.write, "POST"),
+            ("/helper/mavlink", self.helper, "GET"),
+        ):
+            router.add_api_route(path, answer, methods=[method], include_in_schema=shown)
+        router.add_api_websocket_route("/ws/mavlink", self.follow)
+        return router
+
+    def _read(self, path: str) -> Response:
+        try:
+            return _json(self._book.look_up(path))
+        except KeyError:
+            return Response(NOTHING, media_type="application/json")
+
+    async def _read_all(self, socket: WebSocket, subscriber: Subscriber) -> None:
+        """Carry out what an operator sends; end the connection of a viewer that sends."""
+        is_operator = socket.scope[ROLE] is Role.OPERATOR
+        with suppress(WebSocketDisconnect):
+            while (given := await socket.receive())["type"] == "websocket.receive":
+                if not is_operator:
+                    await socket.close(WS_POLICY_VIOLATION, NOT_ALLOWED)
+                    return
+                text = given.get("text")
+                subscriber.push(given["bytes"] if text is None else self._answer(text))
+
+    def _answer(self, text: str) -> str:
+        try:
+            return f"Ok({self._send(_read_json(text))})"
+        except ValueError as error:
+            return f"Could not convert input message. {error}"
+
+    def _send(self, given: Any) -> int:
+        """Send a message and return its size; raises BadMessageError if it is invalid."""
+        if not isinstance(given, dict):
+            raise BadMessageError("it is an object with 'header' and 'message'")
+        message = from_json(given.get("message"))
+        system_id, component_id = _sender(given.get("header"))
+        if self._book.has_heard(system_id, component_id):
+            # Ids of a known system must not be used: the gateway would take that for a loop.
+            system_id = component_id = 0
+        size = self._uplink.send_as(message, system_id, component_id)
+        self._book.take(message, is_sent=True)
+        return size
+
+    def _take(self, message: Any) -> None:
+        self._book.take(message)
+        self._stream.send(message)
+
+
+async def _send_all(socket: WebSocket, subscriber: Subscriber) -> None:
+    with suppress(WebSocketDisconnect, RuntimeError):
+        while True:
+            news = await subscriber.next()
+            await (socket.send_bytes(news) if isinstance(news, bytes) else socket.send_text(news))
+
+
+async def _docs() -> FileResponse:
+    return FileResponse(DOCS, headers={"content-security-policy": DOCS_POLICY})
+
+
+def _read_json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise BadMessageError("it is nested too deeply") from None
+    except ValueError as error:
+        raise BadMessageError(str(error)) from None
+
+
+def _read_json5(text: str) -> Any:
+    """Read JSON5; plain JSON, the usual case, is tried first."""
+    with suppress(BadMessageError):
+        return _read_json(text)
+    import pyjson5
+
+    try:
+        return pyjson5.decode(text)
+    except pyjson5.Json5Exception as error:
+        raise BadMessageError(str(error.args[0])) from None
+
+
+def _refused(text: str, detail: str = "") -> Response:
+    """Return mavlink2rest's text, on which its clients rely; the reason is in a header."""
+    answer = Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+    if detail:
+        answer.headers["x-error-detail"] = quote(detail, safe=" '\":;,./()[]{}<>|=+*&-_")
+    return answer
+
+
+def _sender(header: Any) -> tuple[int, int]:
+    if not isinstance(header, dict):
+        raise BadMessageError("'header' is an object with system_id, component_id and sequence")
+    ids = [header.get(key, DEFAULT_HEADER[key]) for key in ("system_id", "component_id")]
+    for value in ids:
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
+            raise BadMessageError(f"header: {value!r} is not 0 to {MAX_ID}")
+    return ids[0], ids[1]
+
+
+def _json(value: Any, status: HTTPStatus = HTTPStatus.OK) -> Response:
+    return Response(pretty(value), status, media_type="application/json")

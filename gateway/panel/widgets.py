@@ -1,0 +1,430 @@
+"""Elements that several views share: headings, dialogues, uploads, tables, the recorder, charts."""
+
+import math
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.elements.mixins.text_element import TextElement
+from nicegui.events import GenericEventArguments
+
+from gateway.clock import unix_time_us
+from gateway.live.control_socket import ControlError
+from gateway.panel.playback import PlaybackError
+from gateway.panel.recording_jobs import ExportError
+from gateway.panel.state.fields import FloatArray, IntArray, fields_csv, shown_unit
+from gateway.panel.uplink import CommandFailedError
+from gateway.panel.view_context import WEB, NotAllowedError, ViewContext
+from gateway.printable import printable
+from gateway.recordings.index import RecordingError
+
+FAILURES: Final = (
+    ControlError, CommandFailedError, ExportError, NotAllowedError, PlaybackError, RecordingError,
+    OSError,
+)  # fmt: skip
+
+
+def heading(text: str) -> TextElement:
+    """Add the heading of a card."""
+    return TextElement(tag="h2", text=text).classes("title")
+
+
+class UploadButton(Element, component=WEB / "upload_button.js"):
+    """Upload a file; emits `uploaded` with the result, which is also shown on the page.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page of an operator.
+    path : str
+        Path of the server below which files of this kind are put.
+    accept : str
+        Endings of their names.
+    label, title : str
+        Text of the button, and its name for screen readers.
+    """
+
+    def __init__(
+        self, context: ViewContext, path: str, accept: str, *, label: str, title: str
+    ) -> None:
+        super().__init__()
+        self._props |= {"path": path, "accept": accept, "label": label, "title": title}
+        self._props["limit"] = context.parts.settings.upload_limit_mb * 1_000_000
+        self.on("uploaded", _show_upload)
+
+
+def _show_upload(event: GenericEventArguments) -> None:
+    text = printable(str(event.args["text"]))
+    ui.notify(text, type="positive" if event.args["ok"] else "negative")
+
+
+@contextmanager
+def notify_failure(context: ViewContext) -> Iterator[None]:
+    """Show on the page why a request was not carried out."""
+    try:
+        yield
+    except FAILURES as error:
+        text = printable(str(error))
+        if context.parts.uplink.is_local or not isinstance(error, ControlError):
+            ui.notify(text, type="negative", multi_line=True)
+        else:
+            ui.notify(f"only a gateway on this machine can: {text}", type="negative")
+
+
+def named_dialog(name: str) -> ui.dialog:
+    """Create a dialog that a screen reader announces by its name."""
+    dialog = ui.dialog()
+    dialog.props["aria-label"] = name
+    return dialog
+
+
+def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
+    """Return what closes a dialog and then acts, for a button in it.
+
+    What it shows is shown on the page: the dialog is deleted before a slow link has answered.
+    """
+    page = ui.context.client
+
+    async def run() -> None:
+        dialog.close()
+        with page:
+            await act()
+
+    return run
+
+
+def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
+    """Ask for confirmation, and act on a yes.
+
+    Parameters
+    ----------
+    question : str
+        The question.
+    word : str
+        Label of the confirming button: the verb.
+    act : callable
+        Called on a yes.
+    """
+    with named_dialog(question) as dialog, ui.card().classes("asks"):
+        ui.label(printable(question)).classes("title")
+        ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
+Cells = Sequence[tuple[str, ...]]
+"""Text, style class, icon and track of each cell; the class is `""`, `good`, `warn`, `bad`,
+`info` or `soft`; the icon, a name of a Material icon, and the track, corners of a line in a box of
+46 by 24, may be left out."""
+
+
+@dataclass(frozen=True, slots=True)
+class RowButton:
+    """A button at the end of each row."""
+
+    icon: str
+    title: str
+    """Its tooltip."""
+    act: Callable[[str], object]
+    """Called with the key of its row."""
+
+
+class DataTable(Element, component=WEB / "data_table.js"):
+    """Rows with a key each.
+
+    Parameters
+    ----------
+    columns : sequence of str
+        Headings; the first column is text, the others figures.
+    empty : str
+        Shown while there are no rows.
+    buttons : sequence of RowButton
+        At the end of each row.
+    """
+
+    def __init__(
+        self, columns: Sequence[str], empty: str = "", *, buttons: Sequence[RowButton] = ()
+    ) -> None:
+        super().__init__()
+        self._buttons = buttons
+        self._rows: list[dict[str, Any]] = []
+        self._props["columns"] = list(columns)
+        self._props["empty"] = empty
+        self._props["buttons"] = [[button.icon, button.title] for button in buttons]
+        self._props["rows"] = []
+        if buttons:
+            self.on("act", self._on_act)
+
+    def show(self, rows: Mapping[str, Cells]) -> None:
+        """Show these rows, in this order."""
+        shown = [
+            {"key": key, "cells": [[printable(cell[0]), *cell[1:]] for cell in cells]}
+            for key, cells in rows.items()
+        ]
+        if shown != self._rows:
+            self._rows = shown
+            self.props["rows"] = shown
+
+    async def _on_act(self, event: GenericEventArguments) -> None:
+        number, key = event.args
+        if any(row["key"] == key for row in self._rows):
+            result = self._buttons[int(number)].act(key)
+            if hasattr(result, "__await__"):
+                await result
+
+
+REFRESH_S: Final = 0.5
+IDLE: Final = "idle"
+LOOKS: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle": ""}
+
+
+class RecorderControls:
+    """A line with the recorder's state and buttons, built at the current place of the page.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    """
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        with ui.element("div").classes("line recorder"):
+            self._state = ui.label().classes("chip").props("data-role=recorder")
+            self._detail = ui.label().classes("soft figure spring")
+            self._buttons = ui.element("div").classes("line")
+            if context.may_change:
+                with self._buttons:
+                    self._build_buttons()
+        context.every(REFRESH_S, self.refresh)
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Show the recorder's state."""
+        recorder = self._context.parts.watch.recorder
+        self._buttons.set_visibility(recorder is not None)
+        if recorder is None:
+            self._state.set_text("no gateway on this machine")
+            self._detail.set_text("")
+            return
+        self._state.set_text(recorder["state"])
+        self._state.classes(replace="chip").classes(LOOKS.get(recorder["state"], ""))
+        self._detail.set_text(printable(_detail_of(recorder)))
+
+    def _build_buttons(self) -> None:
+        for text, icon, look, act in (
+            ("Start", "fiber_manual_record", "no-caps dense color=negative", self._order("start")),
+            ("Stop", "stop", "no-caps dense outline", self._order("stop")),
+            ("Save …", "save", "no-caps dense flat", self._ask_save),
+            ("Delete …", "delete", "no-caps dense flat", self._ask_delete),
+        ):
+            button = ui.button(text, icon=icon, on_click=act)
+            button.props["aria-label"] = f"{text.removesuffix(' …')} recording"
+            _apply(button, look)
+
+    def _order(self, verb: str) -> Any:
+        async def order() -> None:
+            with notify_failure(self._context):
+                await self._context.ask(f"record.{verb}")
+                await self._refresh_status()
+
+        return order
+
+    async def _refresh_status(self) -> None:
+        await self._context.parts.watch.refresh()
+        self.refresh()
+
+    def _ask_save(self) -> None:
+        with named_dialog("Save the recording") as dialog, ui.card().classes("asks"):
+            ui.label("Name for this recording, or the last one").classes("title")
+            name = ui.input().props('dense outlined autofocus aria-label="Name of the recording"')
+            save = closing(dialog, lambda: self._save(name.value))
+            name.on("keydown.enter", save)
+            ui.button("Save", on_click=save).props("no-caps")
+            ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+        dialog.on("hide", dialog.delete)
+        dialog.open()
+
+    async def _save(self, name: str) -> None:
+        with notify_failure(self._context):
+            await self._context.ask("record.save", name=name.strip())
+            ui.notify(f"Saved as {printable(name.strip())}", type="positive")
+            await self._refresh_status()
+
+    async def _ask_delete(self) -> None:
+        with notify_failure(self._context):
+            recordings = await self._context.ask("record.list")
+            if not recordings:
+                ui.notify("Nothing was recorded yet.", type="warning")
+                return
+            name = recordings[-1]["name"]
+            question = f"Delete the last recording, {name}, permanently?"
+            confirm(question, "Delete", partial(self._delete, name))
+
+    async def _delete(self, name: str) -> None:
+        with notify_failure(self._context):
+            await self._context.ask("record.delete", name=name)
+            ui.notify(f"{printable(name)} is deleted", type="positive")
+            await self._refresh_status()
+
+
+def _apply(button: ui.button, look: str) -> None:
+    """Set properties of a constant of this file: words, or `name=value`."""
+    for part in look.split():
+        name, _, value = part.partition("=")
+        button.props[name] = value or True
+
+
+def _detail_of(recorder: dict[str, Any]) -> str:
+    parts = [recorder["reason"]] if recorder["reason"] else []
+    if recorder["name"] and recorder["state"] != IDLE:
+        parts += [recorder["name"], f"{recorder['part_bytes'] / 1e6:.1f} MB"]
+    parts += [f"{recorder['free_bytes'] / 1e9:.1f} GB free in {recorder['folder']}"]
+    return " · ".join(parts)
+
+
+ANSWER_S: Final = 60.0
+"""Longest wait for the browser: drawing a picture takes seconds of a small or busy computer."""
+
+Points = tuple[IntArray, FloatArray]
+"""Times in ms since 1970, and values."""
+
+
+class StripChart(ui.echart, component=WEB / "strip_chart.js"):
+    """A chart that follows the time until it is paused; wheel and drag pause and zoom it.
+
+    It emits `ready` once fields can be set, and `paused` when the operator paused it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__({})
+        # The browser draws the chart by itself.
+        self._update_method = None
+
+    def set_fields(
+        self, fields: Sequence[tuple[str, str]], points: Sequence[Points], now_ms: float
+    ) -> None:
+        """Show these fields from now on.
+
+        Parameters
+        ----------
+        fields : sequence of (str, str)
+            Their names and units; each unit gets its own axis.
+        points : sequence of (ndarray, ndarray)
+            Existing data of each: times in ms since 1970, values.
+        now_ms : float
+            The present time on the same clock.
+        """
+        named = [{"name": printable(name), "unit": unit} for name, unit in fields]
+        self.run_method("set_fields", named, [_plain(p) for p in points], now_ms)
+
+    def append(self, points: Sequence[Points], now_ms: float) -> None:
+        """Add new data, field by field."""
+        self.run_method("append", [_plain(p) for p in points], now_ms)
+
+    def pause(self, *, paused: bool) -> None:
+        """Pause, or follow the time again."""
+        self.run_method("pause", paused)
+
+    def set_window(self, seconds: int) -> None:
+        """Set how much of the past is shown."""
+        self.run_method("set_window", seconds)
+
+    async def span_ms(self) -> tuple[float, float]:
+        """Return the visible span, in ms since 1970."""
+        begin, end = await self.run_method("range", timeout=ANSWER_S)
+        return float(begin), float(end)
+
+    async def picture(self) -> str:
+        """Return the chart as a data URL of a PNG."""
+        return str(await self.run_method("picture", timeout=ANSWER_S))
+
+
+class LiveChart:
+    """A strip chart of any fields of the selected aircraft, fed from their history.
+
+    Parameters
+    ----------
+    context : ViewContext
+        The page.
+    fields : sequence of str
+        Message and field of each; see `FieldHistory.series`.
+    """
+
+    def __init__(self, context: ViewContext, fields: Sequence[str]) -> None:
+        self._context = context
+        self.fields = list(fields)
+        self._sent_us: dict[str, int] = {}
+        self._is_ready = False
+        self.element = StripChart().classes("strip")
+        self.element.on("ready", self._on_ready)
+
+    def choose(self, fields: Sequence[str]) -> None:
+        """Show other fields."""
+        self.fields = list(fields)
+        self.reload()
+
+    def reload(self) -> None:
+        """Send all data, as after another aircraft was selected."""
+        if not self._is_ready:
+            return
+        self._sent_us = {}
+        history, system_id = self._context.parts.history, self._context.system_id or 0
+        named = [(name, shown_unit(history.unit(system_id, name))[1]) for name in self.fields]
+        self.element.set_fields(named, self._news(), unix_time_us() / 1000)
+
+    def refresh(self) -> None:
+        """Send the new data."""
+        if not (self._is_ready and self.fields):
+            return
+        history, system_id = self._context.parts.history, self._context.system_id or 0
+        if any(name not in self._sent_us and history.unit(system_id, name) for name in self.fields):
+            # The unit is known only since the first message of its kind came.
+            self.reload()
+            return
+        self.element.append(self._news(), unix_time_us() / 1000)
+
+    async def table(self) -> str:
+        """Return the visible data as CSV."""
+        begin_ms, end_ms = await self.element.span_ms()
+        zero_us = self._zero_unix_us()
+        history, system_id = self._context.parts.history, self._context.system_id or 0
+        begin_us, end_us = round(begin_ms * 1000) - zero_us, round(end_ms * 1000) - zero_us
+        shown = {name: shown_unit(history.unit(system_id, name)) for name in self.fields}
+        series = {}
+        for name, (factor, _) in shown.items():
+            time_us, values = history.series(system_id, name, begin_us, end_us)
+            series[name] = (time_us, values * factor)
+        units = {name: unit for name, (_, unit) in shown.items()}
+        return fields_csv(series, units, zero_us)
+
+    def _on_ready(self) -> None:
+        self._is_ready = True
+        self.reload()
+
+    def _zero_unix_us(self) -> int:
+        return unix_time_us() - self._context.now_us
+
+    def _news(self) -> list[Points]:
+        history, system_id = self._context.parts.history, self._context.system_id or 0
+        zero_us, found = self._zero_unix_us(), []
+        for name in self.fields:
+            time_us, values = history.series(system_id, name, self._sent_us.get(name, -1))
+            if len(time_us):
+                self._sent_us[name] = int(time_us[-1])
+            factor, _ = shown_unit(history.unit(system_id, name))
+            found.append(((time_us + zero_us) // 1000, values * factor))
+        return found
+
+
+def _plain(points: Points) -> tuple[list[int], list[float | None]]:
+    """Convert to JSON, which has no NaN; a 32-bit float has seven digits."""
+    time_ms, values = points
+    return time_ms.tolist(), [
+        float(f"{value:.7g}") if math.isfinite(value) else None for value in values.tolist()
+    ]
