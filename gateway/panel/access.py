@@ -116,13 +116,7 @@ def matches(password: str, hashed: str) -> bool:
 
 @dataclass(slots=True)
 class Logins:
-    """Sessions, and the attempts of each address.
-
-    Parameters
-    ----------
-    operator_hash, viewer_hash : str
-        From the settings; without the first no password is needed.
-    """
+    """Sessions, and the attempts of each address."""
 
     operator_hash: str
     viewer_hash: str
@@ -190,19 +184,7 @@ class _TooLargeError(Exception):
 
 
 class AccessControl:
-    """ASGI middleware in front of the whole page.
-
-    Parameters
-    ----------
-    app : ASGI application
-        The application to protect.
-    settings : PanelSettings
-        Names, passwords and limits.
-    logins : Logins
-        Sessions.
-    on_authenticated : callable
-        Called with address and port of every connection whose request is passed on.
-    """
+    """ASGI middleware in front of the whole page."""
 
     def __init__(
         self,
@@ -366,15 +348,7 @@ class AccessControl:
 
 
 class _SessionSocket:
-    """A WebSocket that ends with the session of its user.
-
-    Parameters
-    ----------
-    receive, send : callable
-        Of the connection.
-    is_valid : callable
-        Returns whether the session lasts.
-    """
+    """A WebSocket that ends with the session of its user."""
 
     def __init__(self, receive: Receive, send: Send, is_valid: Callable[[], bool]) -> None:
         self._receive = receive
@@ -524,13 +498,7 @@ SCRIPT: Final = re.compile(rb"<script(?=[\s>])")
 
 
 class ScriptNonces:
-    """ASGI middleware that gives the scripts of an HTML page a nonce.
-
-    Parameters
-    ----------
-    app : ASGI application
-        Its HTML contains text of others only escaped, as NiceGUI's does.
-    """
+    """ASGI middleware that gives the scripts of an HTML page a nonce."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app

@@ -61,13 +61,7 @@ class ConnectionLimits:
         """Connections that were closed to keep to the limits."""
 
     def admit(self, client: Client, sock: socket.socket) -> bool:
-        """Add a connection; the oldest anonymous one may be closed for it.
-
-        Returns
-        -------
-        bool
-            Whether it is admitted.
-        """
+        """Add a connection; the oldest anonymous one may be closed for it."""
         self._remove_closed()
         group = address_group(client[0])
         of_group = [other for other in self._anonymous if address_group(other[0]) == group]
@@ -152,15 +146,7 @@ class LimitedProtocol(HttpToolsProtocol):
 
 
 class LimitedServer(uvicorn.Server):
-    """A server that accepts connections within the limits.
-
-    Parameters
-    ----------
-    config : uvicorn.Config
-        With `http=LimitedProtocol`.
-    limits : ConnectionLimits
-        The limits.
-    """
+    """A server that accepts connections within the limits."""
 
     def __init__(self, config: uvicorn.Config, limits: ConnectionLimits) -> None:
         super().__init__(config)

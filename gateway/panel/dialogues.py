@@ -111,17 +111,7 @@ class Dialogue:
 
 
 class Dialogues:
-    """The dialogues with all aircraft.
-
-    Parameters
-    ----------
-    fleet : FleetState
-        Passes on their messages.
-    send : callable
-        Sends one MAVLink message.
-    clock : GatewayClock
-        The panel's.
-    """
+    """The dialogues with all aircraft."""
 
     def __init__(self, fleet: FleetState, send: Callable[[Any], None], clock: GatewayClock) -> None:
         self._all: dict[int, Dialogue] = {}

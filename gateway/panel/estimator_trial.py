@@ -60,25 +60,7 @@ class Estimate:
 
 
 def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
-    """Fuse the frames with each estimator.
-
-    Parameters
-    ----------
-    frames : list of (int, bytes)
-        Of one aircraft, with the time of each in µs.
-    parameters : mapping of str to float
-        Its parameters; those of the estimators and filters are applied, others ignored.
-
-    Returns
-    -------
-    list of Estimate
-        One for each estimator, thinned to `SHOWN_HZ`.
-
-    Raises
-    ------
-    ComparisonError
-        If the frames are too few.
-    """
+    """Fuse the frames with each estimator; raises ComparisonError if the frames are too few."""
     settings = settings_of(parameters)
     flight, zero_us = _flight_of(frames, settings)
     found = []
@@ -89,17 +71,7 @@ def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estima
 
 
 def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
-    """Convert MAVLink parameters back to the settings of filters and estimators.
-
-    Parameters
-    ----------
-    parameters : mapping of str to float
-        By name; what is unknown or not allowed is left at its default.
-
-    Returns
-    -------
-    FusionSettings
-    """
+    """Convert MAVLink parameters back to the settings of filters and estimators."""
     table = ParameterTable({"estimation": EstimationSettings()})
     for name, value in parameters.items():
         index = table.index.get(name)

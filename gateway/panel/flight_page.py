@@ -101,25 +101,7 @@ class PageFlight:
 def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageFlight:
     """Read a recording in any format that can be played.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Its parts.
-    options : ReadOptions
-        How to fuse a table.
-    name : str
-        Name of the flight.
-
-    Returns
-    -------
-    PageFlight
-
-    Raises
-    ------
-    FlightError
-        If it contains no position.
-    OSError
-        If it cannot be read.
+    Raises FlightError if it contains no position; OSError if it cannot be read.
     """
     flight = PageFlight(name)
     with ExitStack() as opened:
@@ -163,17 +145,7 @@ def _read_source(track: Track, flight: PageFlight) -> None:
 
 
 def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadOptions) -> None:
-    """Fuse the sensor data of a recording with every estimator; a remark says if there is none.
-
-    Parameters
-    ----------
-    flight : PageFlight
-        Gets the results.
-    files : sequence of Path
-        Tables of the recording, or another log with sensor data.
-    options : ReadOptions
-        How to read them.
-    """
+    """Fuse the sensor data of a recording with every estimator; a remark says if there is none."""
     try:
         sensors, table, _ = flight_of_files(files, options, name=flight.name)
         case = make_case(sensors)
@@ -199,18 +171,7 @@ def _compared(track: FlightTrack, zero_us: int) -> dict[str, FloatArray]:
 
 
 def render_page(flight: PageFlight) -> str:
-    """Return the HTML of a page.
-
-    Parameters
-    ----------
-    flight : PageFlight
-        As `read_flight` makes it.
-
-    Returns
-    -------
-    str
-        An HTML document that loads nothing.
-    """
+    """Return the HTML of a page."""
     packed = {"data": _packed(json.dumps(_data_of(flight), separators=(",", ":")))}
     folder = _nicegui_folder()
     modules = {name: folder / file for name, (file, _) in LIBRARIES.items()}

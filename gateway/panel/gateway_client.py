@@ -17,13 +17,7 @@ READING: Final = frozenset(
 
 
 class ControlClient:
-    """Send requests to a running gateway (or player).
-
-    Parameters
-    ----------
-    path : Path or None
-        Its socket; None for the gateway on this machine, searched at each request.
-    """
+    """Send requests to a running gateway (or player)."""
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
@@ -31,10 +25,7 @@ class ControlClient:
     async def ask(self, verb: str, **params: Any) -> Any:
         """Send a request, and return the result, decoded from JSON.
 
-        Raises
-        ------
-        ControlError
-            If no gateway listens, or the request is refused.
+        Raises ControlError if no gateway listens, or the request is refused.
         """
         return await asyncio.to_thread(self._ask, verb, params)
 
@@ -46,15 +37,7 @@ INTERVAL_S: Final = 1.0
 
 
 class GatewayWatch:
-    """The newest answers of the gateway on this machine.
-
-    Parameters
-    ----------
-    control : ControlClient
-        Sends the requests.
-    fleet : FleetState
-        Gets the gateway's exact marks; MAVLink rounds them.
-    """
+    """The newest answers of the gateway on this machine."""
 
     def __init__(self, control: ControlClient, fleet: FleetState) -> None:
         self.status: dict[str, Any] | None = None

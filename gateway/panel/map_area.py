@@ -65,10 +65,7 @@ def tiles_in(box: Box, zoom: int) -> list[tuple[int, int]]:
 def open_source(source: str, client: httpx.Client | None = None) -> GetBytes:
     """Return what reads a range of bytes of a PMTiles file on a web server or a disk.
 
-    Raises
-    ------
-    MapAreaError
-        If the source is a tile server.
+    Raises MapAreaError if the source is a tile server.
     """
     if "{" in source:
         raise MapAreaError(
@@ -110,23 +107,7 @@ def extract_area(
 ) -> int:
     """Copy the tiles of a box into a new PMTiles file, and return how many there are.
 
-    Parameters
-    ----------
-    get_bytes : callable
-        Reads a range of bytes of the source.
-    target : Path
-        The new file.
-    box : Box
-        The area.
-    max_zoom : int
-        Greatest zoom.
-    on_progress : callable
-        Called with how many tiles were looked up, and of how many.
-
-    Raises
-    ------
-    MapAreaError
-        If the source is no raster map, or the area is too large.
+    Raises MapAreaError if the source is no raster map, or the area is too large.
     """
     try:
         reader = PmTiles(get_bytes)

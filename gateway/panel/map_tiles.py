@@ -90,17 +90,8 @@ def kind_of_image(data: bytes) -> str | None:
 class PmTiles:
     """A PMTiles file of raster tiles, read with bounds: its contents may be hostile.
 
-    The library's own reader unpacks directories without a limit.
-
-    Parameters
-    ----------
-    get_bytes : callable
-        Reads a range of bytes of the file.
-
-    Raises
-    ------
-    ValueError
-        If it is no such file; the text says why.
+    The library's own reader unpacks directories without a limit. Raises ValueError if it is no such
+    file; the text says why.
     """
 
     def __init__(self, get_bytes: GetBytes) -> None:
@@ -211,13 +202,7 @@ def styles_of(settings: PanelSettings) -> list[MapStyle]:
 
 
 class MapTiles:
-    """The styles of the settings.
-
-    Parameters
-    ----------
-    settings : PanelSettings
-        Styles, folder and its limit.
-    """
+    """The styles of the settings."""
 
     def __init__(self, settings: PanelSettings) -> None:
         self._folder = Path(settings.tiles_folder).expanduser()
@@ -253,15 +238,7 @@ class MapTiles:
             return answer
 
     async def tile(self, style: int, z: int, x: int, y: int) -> bytes | None:
-        """Return one tile; None if there is none, or it cannot be fetched.
-
-        Parameters
-        ----------
-        style : int
-            Place in the settings.
-        z, x, y : int
-            Zoom, column from the west, row from the north.
-        """
+        """Return one tile; None if there is none, or it cannot be fetched."""
         inside = 0 <= z <= MAX_ZOOM and 0 <= x < 1 << z and 0 <= y < 1 << z
         if not inside or not 0 <= style < len(self._sources):
             return None

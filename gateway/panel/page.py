@@ -44,15 +44,7 @@ VIEWS: Final = (
 
 
 def build_page(parts: PanelParts, role: Role) -> None:
-    """Build the page for one browser.
-
-    Parameters
-    ----------
-    parts : PanelParts
-        Parts shared by all pages.
-    role : Role
-        Role of its user.
-    """
+    """Build the page for one browser."""
     page = ui.context.client
     playback = Playback(parts.uplink, parts.fleet, page.id)
     page.on_delete(playback.close)

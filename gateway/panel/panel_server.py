@@ -66,25 +66,7 @@ def run_panel(
 ) -> None:
     """Serve the page until interrupted.
 
-    Parameters
-    ----------
-    settings : PanelSettings
-        Where and for whom.
-    recordings : Path
-        Folder of the recordings.
-    connect : str or None
-        A MAVLink endpoint; None for the gateway on this machine.
-    control_socket : Path or None
-        That of the gateway; None for the one that is found.
-    on_link : callable
-        Called with the page's address once it can be opened.
-    attached : bool
-        Whether to end when standard input closes, because the gateway that started us was killed.
-
-    Raises
-    ------
-    PanelError
-        If the port or the certificate cannot be used.
+    Raises PanelError if the port or the certificate cannot be used.
     """
     certificate, key = tls_files(settings)
     sock = _bound(settings, or_any=attached)
@@ -119,10 +101,7 @@ def run_panel(
 def tls_files(settings: PanelSettings) -> tuple[Path | None, Path | None]:
     """Return the files of certificate and key, both None for no TLS.
 
-    Raises
-    ------
-    PanelError
-        If they cannot be used.
+    Raises PanelError if they cannot be used.
     """
     if not settings.certificate:
         return None, None

@@ -58,22 +58,9 @@ class RecordedAircraft:
 
 
 def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
-    """Read which aircraft the files hold.
+    """Read which aircraft the files hold: a list for each flight that a player makes of them.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Tlogs and tables of one recording.
-
-    Returns
-    -------
-    list of list of RecordedAircraft
-        One list for each flight that a player makes of these files, in its order.
-
-    Raises
-    ------
-    OSError
-        If one cannot be read.
+    Raises OSError if a file cannot be read.
     """
     flights = []
     for parts in parts_together(files):
@@ -87,17 +74,7 @@ def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
 def free_ids(count: int, taken: Collection[int]) -> range:
     """Find consecutive free system ids, the highest possible.
 
-    Parameters
-    ----------
-    count : int
-        Number of ids.
-    taken : collection of int
-        Ids of others.
-
-    Raises
-    ------
-    ValueError
-        If there are not enough.
+    Raises ValueError if there are not enough.
     """
     for first in range(FIRST_GROUND_STATION - count, 0, -1):
         wanted = range(first, first + count)
@@ -173,17 +150,7 @@ class PlaybackError(Exception):
 
 
 class Playback:
-    """The recording that one page plays.
-
-    Parameters
-    ----------
-    uplink : Uplink
-        Takes its frames.
-    fleet : FleetState
-        Gets its aircraft.
-    page : str
-        Id of the page.
-    """
+    """The recording that one page plays."""
 
     def __init__(self, uplink: Uplink, fleet: FleetState, page: str) -> None:
         self._page = page
@@ -209,19 +176,7 @@ class Playback:
     async def open(self, folder: Path, name: str, *, fused_again: bool) -> None:
         """Open a recording, instead of the present one.
 
-        Parameters
-        ----------
-        folder : Path
-            Of the recordings.
-        name : str
-            Name of an existing one.
-        fused_again : bool
-            Whether to also play a copy that is fused again.
-
-        Raises
-        ------
-        PlaybackError
-            If it cannot be played.
+        Raises PlaybackError if it cannot be played.
         """
         async with self._opening:
             self.close()
@@ -266,10 +221,7 @@ class Playback:
     async def order(self, verb: str, **params: Any) -> None:
         """Send the player a request; see docs/control.md.
 
-        Raises
-        ------
-        PlaybackError
-            If none plays, or it refuses.
+        Raises PlaybackError if none plays, or it refuses.
         """
         async with self._ordering:
             await self._order(verb, **params)

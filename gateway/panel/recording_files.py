@@ -36,15 +36,7 @@ KINDS: Final[dict[FileKind | None, str]] = {FileKind.TLOG: "_01.tlog", FileKind.
 
 
 def add_recording_files(app: FastAPI, folder_of: Callable[[], Path]) -> None:
-    """Serve `GET /recordings/NAME` (a ZIP of its files) and `PUT /recordings/NAME`.
-
-    Parameters
-    ----------
-    app : FastAPI
-        The page's.
-    folder_of : callable
-        Returns their folder.
-    """
+    """Serve `GET /recordings/NAME` (a ZIP of its files) and `PUT /recordings/NAME`."""
 
     @app.get(RECORDINGS + "{name}")
     async def _download(name: str) -> Response:
@@ -79,16 +71,9 @@ async def answer_upload(
 ) -> Response:
     """Store the body of an operator's request in a folder, and return its file name.
 
-    Parameters
-    ----------
-    request : Request
-        Its size is limited by `AccessControl`.
-    folder : Path
-        Created if it does not exist.
-    check : callable
-        Raises ValueError or RecordingError if the upload is not welcome.
-    name_of : callable
-        Returns the name for a stored file, or raises ValueError if its contents are wrong.
+    `check` raises ValueError or RecordingError before anything is received; `name_of` returns the
+    name for the received file, or raises ValueError if its contents are wrong. `AccessControl`
+    limits the size.
     """
     if request.scope[ROLE] is not Role.OPERATOR:
         return PlainTextResponse("viewers have read-only access", HTTPStatus.FORBIDDEN)

@@ -48,12 +48,7 @@ class RecordingFacts:
     def look(self, folder: Path, search: str = "") -> None:
         """Reload the catalogue if it changed, and search; some tens of ms for thousands of rows.
 
-        Parameters
-        ----------
-        folder : Path
-            Of the recordings.
-        search : str
-            A part of a name, or a condition as for `mavgate catalogue list --where`.
+        A search is a part of a name, or a condition as for `mavgate catalogue list --where`.
         """
         stamp = _stamp(folder)
         if self._asked == (folder, stamp, search):
@@ -202,12 +197,7 @@ class RecordingJobs:
     async def export(self, folder: Path, name: str, kind: str) -> str:
         """Export a recording, and return the address of the file.
 
-        Raises
-        ------
-        ExportError
-            If it cannot be made.
-        RecordingError
-            If there is no such recording.
+        Raises ExportError if it cannot be made; RecordingError if there is no such recording.
         """
         if self._waiting >= MAX_WAITING:
             raise ExportError("other exports are being made; try again in a while")

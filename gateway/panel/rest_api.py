@@ -67,13 +67,7 @@ class _Entry:
 
 
 class MessageBook:
-    """Received MAVLink messages, as a tree.
-
-    Parameters
-    ----------
-    now_s : callable
-        Civil time in s since the epoch, to show when a message came.
-    """
+    """Received MAVLink messages, as a tree."""
 
     def __init__(self, now_s: Callable[[], float]) -> None:
         self._now_s = now_s
@@ -103,23 +97,10 @@ class MessageBook:
         return (system_id, component_id) in self._heard
 
     def look_up(self, path: str) -> Any:
-        """Return the value at a path of the tree.
+        """Return the value at a path such as `vehicles/1/components/1/messages/ATTITUDE`.
 
-        Parameters
-        ----------
-        path : str
-            As in `vehicles/1/components/1/messages/ATTITUDE/message/roll`; empty is all. A JSON
-            pointer without its first slash, so a trailing slash means an empty name.
-
-        Returns
-        -------
-        Any
-            A JSON value.
-
-        Raises
-        ------
-        KeyError
-            If the path does not exist.
+        It is a JSON pointer without its first slash; empty is the whole tree. Raises KeyError if
+        there is none.
         """
         parts = path.split("/") if path else []
         node: Any = self._tree(parts)
@@ -179,13 +160,7 @@ else:
 
 
 class Subscriber:
-    """A client that receives some kinds of message.
-
-    Parameters
-    ----------
-    names : set of str
-        Names of the messages it wants.
-    """
+    """A client that receives some kinds of message."""
 
     def __init__(self, names: Set[str]) -> None:
         self.names = names
@@ -240,13 +215,7 @@ class MessageStream:
 
 
 class NameFilters:
-    """Regular expressions tried on a set of names.
-
-    Parameters
-    ----------
-    names : iterable of str
-        All names.
-    """
+    """Regular expressions tried on a set of names."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._names = frozenset(names)
@@ -257,10 +226,7 @@ class NameFilters:
     async def matching(self, pattern: str) -> frozenset[str]:
         """Return the names in which an expression is found.
 
-        Raises
-        ------
-        ValueError
-            If it is invalid, or takes too long; the text says which.
+        Raises ValueError if it is invalid, or takes too long; the text says which.
         """
         if pattern == EVERYTHING:
             return self._names
@@ -335,13 +301,7 @@ DOCS_POLICY: Final = (
 
 
 class RestApi:
-    """Answer requests from an uplink's received messages, and send through it.
-
-    Parameters
-    ----------
-    uplink : Uplink
-        The panel's MAVLink connection.
-    """
+    """Answer requests from an uplink's received messages, and send through it."""
 
     def __init__(self, uplink: Uplink) -> None:
         self._uplink = uplink

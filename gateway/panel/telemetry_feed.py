@@ -34,15 +34,7 @@ GRANTS: Final = 2
 
 
 class TelemetryFeed:
-    """Serve all open pages.
-
-    Parameters
-    ----------
-    fleet : FleetState
-        The aircraft.
-    clock : GatewayClock
-        The panel's clock.
-    """
+    """Serve all open pages."""
 
     def __init__(self, fleet: FleetState, clock: GatewayClock) -> None:
         self._fleet = fleet

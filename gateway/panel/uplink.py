@@ -54,19 +54,7 @@ class CommandFailedError(Exception):
 
 
 class Uplink:
-    """Frames in, requests out.
-
-    Parameters
-    ----------
-    url : str or None
-        An endpoint as in the settings; None for the gateway on this machine.
-    fleet : FleetState
-        Gets every message.
-    control : ControlClient
-        Finds where the gateway on this machine listens.
-    clock : GatewayClock
-        The panel's clock.
-    """
+    """Frames in, requests out."""
 
     def __init__(
         self, url: str | None, fleet: FleetState, control: ControlClient, clock: GatewayClock
@@ -121,38 +109,13 @@ class Uplink:
         self._send(message, self._mav)
 
     def send_as(self, message: Any, system_id: int, component_id: int) -> int:
-        """Send one message for a program with its own ids.
-
-        Parameters
-        ----------
-        message : MAVLink_message
-            As pymavlink makes it.
-        system_id, component_id : int
-            The sender; system 0 is the panel itself.
-
-        Returns
-        -------
-        int
-            Bytes sent.
-        """
+        """Send a message from a client's own ids (system 0: the panel's); return its bytes."""
         return self._send(message, self._sender(system_id, component_id))
 
     async def command(self, system_id: int, number: int, *params: float) -> None:
         """Send a command, and wait until it is acknowledged.
 
-        Parameters
-        ----------
-        system_id : int
-            The aircraft.
-        number : int
-            MAV_CMD.
-        *params : float
-            Up to seven; the others are 0.
-
-        Raises
-        ------
-        CommandFailedError
-            If it is refused or not answered.
+        Raises CommandFailedError if it is refused or not answered.
         """
         filled = (*params, *(0.0,) * (7 - len(params)))
         message = mavlink.MAVLink_command_long_message(

@@ -144,12 +144,7 @@ class ViewContext:
     async def command(self, number: int, *params: float) -> None:
         """Send a MAV_CMD to the selected aircraft.
 
-        Raises
-        ------
-        CommandFailedError
-            If it is refused, or nobody answers.
-        NotAllowedError
-            For a viewer.
+        Raises CommandFailedError if it is refused, or nobody answers; NotAllowedError for a viewer.
         """
         self.check_may_change()
         await self.parts.uplink.command(self.system_id or 0, number, *params)
@@ -165,12 +160,8 @@ class ViewContext:
     async def ask(self, verb: str, **params: Any) -> Any:
         """Send a request to the gateway's control socket; see docs/control.md.
 
-        Raises
-        ------
-        ControlError
-            If there is none, or it refuses.
-        NotAllowedError
-            For a viewer who requests a change.
+        Raises ControlError if there is none, or it refuses; NotAllowedError for a viewer who
+        requests a change.
         """
         if verb not in READING:
             self.check_may_change()

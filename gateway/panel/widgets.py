@@ -34,19 +34,7 @@ def heading(text: str) -> TextElement:
 
 
 class UploadButton(Element, component=WEB / "upload_button.js"):
-    """Upload a file; emits `uploaded` with the result, which is also shown on the page.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page of an operator.
-    path : str
-        Path of the server below which files of this kind are put.
-    accept : str
-        Endings of their names.
-    label, title : str
-        Text of the button, and its name for screen readers.
-    """
+    """Upload a file; emits `uploaded` with the result, which is also shown on the page."""
 
     def __init__(
         self, context: ViewContext, path: str, accept: str, *, label: str, title: str
@@ -98,17 +86,7 @@ def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[]
 
 
 def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
-    """Ask for confirmation, and act on a yes.
-
-    Parameters
-    ----------
-    question : str
-        The question.
-    word : str
-        Label of the confirming button: the verb.
-    act : callable
-        Called on a yes.
-    """
+    """Ask for confirmation, and act on a yes."""
     with named_dialog(question) as dialog, ui.card().classes("asks"):
         ui.label(printable(question)).classes("title")
         ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
@@ -135,17 +113,7 @@ class RowButton:
 
 
 class DataTable(Element, component=WEB / "data_table.js"):
-    """Rows with a key each.
-
-    Parameters
-    ----------
-    columns : sequence of str
-        Headings; the first column is text, the others figures.
-    empty : str
-        Shown while there are no rows.
-    buttons : sequence of RowButton
-        At the end of each row.
-    """
+    """Rows with a key each."""
 
     def __init__(
         self, columns: Sequence[str], empty: str = "", *, buttons: Sequence[RowButton] = ()
@@ -184,13 +152,7 @@ LOOKS: Final = {"recording": "bad", "opening": "warn", "blocked": "bad", "idle":
 
 
 class RecorderControls:
-    """A line with the recorder's state and buttons, built at the current place of the page.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    """
+    """A line with the recorder's state and buttons, built at the current place of the page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -309,17 +271,7 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
     def set_fields(
         self, fields: Sequence[tuple[str, str]], points: Sequence[Points], now_ms: float
     ) -> None:
-        """Show these fields from now on.
-
-        Parameters
-        ----------
-        fields : sequence of (str, str)
-            Their names and units; each unit gets its own axis.
-        points : sequence of (ndarray, ndarray)
-            Existing data of each: times in ms since 1970, values.
-        now_ms : float
-            The present time on the same clock.
-        """
+        """Show these fields from now on."""
         named = [{"name": printable(name), "unit": unit} for name, unit in fields]
         self.run_method("set_fields", named, [_plain(p) for p in points], now_ms)
 
@@ -346,15 +298,7 @@ class StripChart(ui.echart, component=WEB / "strip_chart.js"):
 
 
 class LiveChart:
-    """A strip chart of any fields of the selected aircraft, fed from their history.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    fields : sequence of str
-        Message and field of each; see `FieldHistory.series`.
-    """
+    """A strip chart of any fields of the selected aircraft, fed from their history."""
 
     def __init__(self, context: ViewContext, fields: Sequence[str]) -> None:
         self._context = context

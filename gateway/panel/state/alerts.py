@@ -53,19 +53,7 @@ class Alert:
 
 
 def alerts_of(vehicle: VehicleState, now_us: int) -> list[Alert]:
-    """Return the present problems of one aircraft, the most severe first.
-
-    Parameters
-    ----------
-    vehicle : VehicleState
-        Its state.
-    now_us : int
-        The panel's clock.
-
-    Returns
-    -------
-    list of Alert
-    """
+    """Return the present problems of one aircraft, the most severe first."""
     silent_s = vehicle.silent_s(now_us)
     if silent_s > SILENT_S:
         since = f"no heartbeat for {silent_s:.0f} s" if silent_s < 1e6 else "no heartbeat yet"
@@ -151,22 +139,7 @@ OWN_KEYS: Final = ("node ", "receiver", "recording")
 def with_status(
     alerts: Iterable[Alert], status: Mapping[str, Any] | None, vehicle_id: int
 ) -> list[Alert]:
-    """Replace alerts from the gateway's texts by those from its status of link and recorder.
-
-    Parameters
-    ----------
-    alerts : iterable of Alert
-        As `alerts_of` finds them for one aircraft.
-    status : mapping or None
-        Result of the control verb `status`; None without a gateway.
-    vehicle_id : int
-        The aircraft.
-
-    Returns
-    -------
-    list of Alert
-        The most severe first.
-    """
+    """Replace alerts from the gateway's texts by those from its status of link and recorder."""
     if status is None:
         return list(alerts)
     kept = [alert for alert in alerts if not alert.key.startswith(OWN_KEYS)]

@@ -172,17 +172,7 @@ class _Samples:
 
 
 class CalibrationRun:
-    """One calibration of one vehicle.
-
-    Parameters
-    ----------
-    system_id : int
-        Whose.
-    step : CalibrationStep
-        What to calibrate.
-    now_us : int
-        The panel's clock.
-    """
+    """One calibration of one vehicle."""
 
     def __init__(self, system_id: int, step: CalibrationStep, now_us: int) -> None:
         self.system_id = system_id

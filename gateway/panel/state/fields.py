@@ -67,17 +67,7 @@ class FieldHistory:
         self._vehicles: dict[int, dict[str, _Columns]] = {}
 
     def take(self, system_id: int, message: Any, now_us: int) -> None:
-        """Store one message.
-
-        Parameters
-        ----------
-        system_id : int
-            Whose it is.
-        message : MAVLink_message
-            As pymavlink decodes it. One with instances, such as a battery's, is kept by instance.
-        now_us : int
-            When it came, on the panel's clock.
-        """
+        """Store one message."""
         kinds = self._vehicles.setdefault(system_id, {})
         name = _kind_of(message)
         columns = kinds.get(name)
@@ -226,23 +216,7 @@ def _kind_of(message: Any) -> str:
 def fields_csv(
     series: Mapping[str, tuple[IntArray, FloatArray]], units: Mapping[str, str], zero_unix_us: int
 ) -> str:
-    """Write fields side by side.
-
-    Parameters
-    ----------
-    series : mapping of str to (ndarray, ndarray)
-        By name: times in µs on the panel's clock, growing, and values.
-    units : mapping of str to str
-        By name; appended to the name in the header.
-    zero_unix_us : int
-        Civil time of the clock's zero.
-
-    Returns
-    -------
-    str
-        A row for each time with any value, its first column seconds since 1970; empty where a
-        field has no value, or NaN.
-    """
+    """Write fields side by side."""
     heads = [f"{name} ({units[name]})" if units.get(name) else name for name in series]
     lines = [",".join(["time_unix_s", *heads])]
     columns = [dict(zip(t.tolist(), v.tolist(), strict=True)) for t, v in series.values()]

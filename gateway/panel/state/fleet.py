@@ -73,15 +73,7 @@ class FleetState:
             callback(system_id)
 
     def take(self, message: Any, now_us: int) -> None:
-        """Take in one decoded message of any sender.
-
-        Parameters
-        ----------
-        message : MAVLink_message
-            As pymavlink decodes it; those of ground stations and of other components are ignored.
-        now_us : int
-            The panel's clock.
-        """
+        """Take in a decoded message; those of ground stations and other components are ignored."""
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
         # Other components, such as a camera, have the system id of their vehicle.
         is_vehicle = component_id == mavlink.MAV_COMP_ID_AUTOPILOT1

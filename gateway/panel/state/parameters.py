@@ -40,13 +40,7 @@ class _Reading:
 
 
 class FileClient:
-    """Read files of one vehicle; results are in `files` and `refused`.
-
-    Parameters
-    ----------
-    system_id : int
-        Whose.
-    """
+    """Read files of one vehicle; results are in `files` and `refused`."""
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
@@ -170,18 +164,7 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def parameter_path(general: bytes) -> str | None:
-    """Return the path of the parameters' file in a general metadata file.
-
-    Parameters
-    ----------
-    general : bytes
-        JSON, packed with xz or not.
-
-    Returns
-    -------
-    str or None
-        On the vehicle; None if there is none, or it is elsewhere.
-    """
+    """Return the path of the parameters' file on the vehicle, by the general file."""
     for kind in _items(_parsed(general), "metadataTypes"):
         uri = str(kind.get("uri", ""))
         if kind.get("type") == TYPE_PARAMETER and uri.startswith("mftp://"):
@@ -190,18 +173,7 @@ def parameter_path(general: bytes) -> str | None:
 
 
 def parse_parameters(content: bytes) -> dict[str, ParameterMeta]:
-    """Read a parameters' file.
-
-    Parameters
-    ----------
-    content : bytes
-        JSON, packed with xz or not.
-
-    Returns
-    -------
-    dict of str to ParameterMeta
-        By name; unreadable entries are left out.
-    """
+    """Read a parameters' file; unreadable entries are left out."""
     found = (_meta_of(item) for item in _items(_parsed(content), "parameters"))
     return {meta.name: meta for meta in found if meta is not None}
 
@@ -302,13 +274,7 @@ def is_same_value(value: float, other: float) -> bool:
 
 
 class ParameterClient:
-    """Parameters of one vehicle.
-
-    Parameters
-    ----------
-    system_id : int
-        Whose.
-    """
+    """Parameters of one vehicle."""
 
     def __init__(self, system_id: int) -> None:
         self.system_id = system_id
@@ -339,10 +305,7 @@ class ParameterClient:
     def change(self, name: str, value: float, now_us: int) -> list[Any]:
         """Set one; return the messages to send now: none while its last change is not answered.
 
-        Raises
-        ------
-        ValueError
-            If there is no such parameter, or the value is no number that it can hold.
+        Raises ValueError if there is no such parameter, or the value is no number that it can hold.
         """
         entry = self.entries.get(name)
         if entry is None:

@@ -168,13 +168,7 @@ class PathPoint:
 
 
 class FlightHistory:
-    """States of one aircraft as columns over time.
-
-    Parameters
-    ----------
-    limit : int
-        Most states, beyond which the oldest quarter is deleted.
-    """
+    """States of one aircraft as columns over time."""
 
     def __init__(self, limit: int = MAX_TRACK) -> None:
         self._limit = limit
@@ -213,17 +207,7 @@ class FlightHistory:
 
 
 class VehicleState:
-    """Everything known about one system.
-
-    Parameters
-    ----------
-    system_id : int
-        MAVLink system.
-    origin : str
-        `live`, `recorded` or `fused again`.
-    number : int, optional
-        Its displayed number, if it is not the system id.
-    """
+    """Everything known about one system."""
 
     def __init__(self, system_id: int, origin: str = "live", number: int | None = None) -> None:
         self.system_id = system_id
@@ -253,15 +237,7 @@ class VehicleState:
         }
 
     def take(self, message: Any, now_us: int) -> None:
-        """Take in one decoded message of this system's autopilot.
-
-        Parameters
-        ----------
-        message : MAVLink_message
-            As pymavlink decodes it.
-        now_us : int
-            The panel's clock.
-        """
+        """Take in one decoded message of this system's autopilot."""
         name = message.get_type()
         self.newest[name] = message
         self.heard_us[name] = now_us

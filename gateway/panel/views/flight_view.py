@@ -27,15 +27,7 @@ LEAFLET: Final = ui.leaflet
 
 
 class FlightMap(Element, component=WEB / "flight_map.js"):
-    """The map, drawn by the browser from the telemetry.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    full : bool
-        With buttons and clicks, or a small one.
-    """
+    """The map, drawn by the browser from the telemetry."""
 
     def __init__(self, context: ViewContext, *, full: bool) -> None:
         super().__init__()

@@ -25,13 +25,7 @@ Record = Mapping[str, Any]
 
 
 class LinkView:
-    """The view's tables.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    """
+    """The view's tables."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context

@@ -44,13 +44,7 @@ class TimeSlider(Element, component=WEB / "time_slider.js"):
 
 
 class RecordingsView:
-    """The view's elements.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    """
+    """The view's elements."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context

@@ -25,17 +25,7 @@ from gateway.units import counted
 
 
 class ParameterRow:
-    """A row, built at the current place of the page.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    dialogue : Dialogue
-        With the aircraft.
-    meta : ParameterMeta
-        Metadata of the parameter.
-    """
+    """A row, built at the current place of the page."""
 
     def __init__(self, context: ViewContext, dialogue: Dialogue, meta: ParameterMeta) -> None:
         self._context = context
@@ -137,13 +127,7 @@ QUANTITIES: Final = {
 
 
 class ComparisonCard:
-    """A card, built at the current place of the page.
-
-    Parameters
-    ----------
-    context : ViewContext
-        The page.
-    """
+    """A card, built at the current place of the page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
