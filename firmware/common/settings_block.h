@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 // The settings block: 34 bytes of each program's image that hold what differs between users.
 // `mavgate flash` patches them in the image before it is uploaded, so nobody needs a compiler; as
-// built, they hold the values of settings.h. gateway/flashing/settings_block.py reads and writes the
+// built, they hold the values of settings.h. gateway/flashing/boards.py reads and writes the
 // same bytes.
 #pragma once
 
@@ -39,7 +39,7 @@ struct __attribute__((packed)) SettingsBlock {
     uint8_t reserved[2];
     uint16_t crc;  // CRC-16 of all before it
 };
-static_assert(sizeof(SettingsBlock) == 34, "gateway/flashing/settings_block.py");
+static_assert(sizeof(SettingsBlock) == 34, "gateway/flashing/boards.py");
 
 // The block as the bytes of the image. A constant expression cannot look at a struct's bytes, and
 // the CRC has to be one: so the fields are written one by one.

@@ -15,26 +15,23 @@ import numpy as np
 
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, NodeId
 from gateway.simulator.gps import GpsSampler, GpsSamples
-from gateway.simulator.noise import FloatArray
-from gateway.simulator.samplers import (
+from gateway.simulator.sensors import (
+    ACCEL_RANGE,
+    GYRO_RANGE,
+    MAG_GAIN,
     BaroSampler,
     BaroSamples,
     Chance,
     DeviceClock,
     ImuSampler,
     ImuSamples,
-    generator,
-)
-from gateway.simulator.sensors import (
-    ACCEL_RANGE,
-    GYRO_RANGE,
-    MAG_GAIN,
     IntArray,
     SensorErrors,
     errors_of,
+    generator,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S, SensorMotion, Trajectory
+from gateway.simulator.trajectory import FLIGHT_S, FloatArray, SensorMotion, Trajectory
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, MAG_LSB_PER_GAUSS
 
 SampleRecord = ImuRaw | BaroRaw | GpsFix

@@ -8,10 +8,9 @@ import numpy as np
 
 from gateway.geometry.geodesy import radii_m
 from gateway.records import GpsFixType
-from gateway.simulator.noise import FloatArray, Wander, White
-from gateway.simulator.sensors import BoolArray, IntArray
+from gateway.simulator.sensors import BoolArray, IntArray, Wander, White
 from gateway.simulator.simulator_settings import GpsOutages, SimulatorSettings
-from gateway.simulator.trajectory import FLIGHT_S, SensorMotion
+from gateway.simulator.trajectory import FLIGHT_S, FloatArray, SensorMotion
 
 GPS_RATE_HZ: Final = 5
 EPOCH_US: Final = 1_000_000 // GPS_RATE_HZ

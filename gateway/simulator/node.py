@@ -14,10 +14,17 @@ import numpy as np
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import GPS_NODE, IMU_NODE, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
-from gateway.simulator.noise import FloatArray
-from gateway.simulator.samplers import BaroSamples, DeviceClock, ImuSamples
-from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, IntArray
+from gateway.simulator.sensors import (
+    ACCEL_RANGE,
+    GYRO_RANGE,
+    MAG_GAIN,
+    BaroSamples,
+    DeviceClock,
+    ImuSamples,
+    IntArray,
+)
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.trajectory import FloatArray
 from gateway.wire.chips import GPS_ACKNOWLEDGES, SENSOR_IMU, Chips
 from gateway.wire.payloads import (
     BaroPayload,

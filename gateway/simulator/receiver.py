@@ -21,7 +21,7 @@ import numpy as np
 from gateway.records import PipeCounters
 from gateway.simulator.flight import START_UNIX_US, SimulatedAircraft
 from gateway.simulator.node import Node, Sent, nodes_of
-from gateway.simulator.samplers import Chance, DeviceClock, generator
+from gateway.simulator.sensors import Chance, DeviceClock, generator
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import encode_frame

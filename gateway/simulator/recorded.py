@@ -29,17 +29,17 @@ from gateway.simulator.node import (
     pack_baro,
     pack_imu,
 )
-from gateway.simulator.noise import FloatArray
 from gateway.simulator.receiver import SimulatedReceiver
-from gateway.simulator.samplers import IMU_BOOT_US, DeviceClock
 from gateway.simulator.sensors import (
     FACE_UP,
     GYRO_LSB_PER_DPS,
+    IMU_BOOT_US,
     INT16_MAX,
     MAG_LIMIT,
     SEA_LEVEL_PA,
     UT_PER_GAUSS,
     BoolArray,
+    DeviceClock,
     IntArray,
     mag_counts,
     pressure_at,
@@ -48,6 +48,7 @@ from gateway.simulator.sensors import (
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.simulator.trajectory import FloatArray
 from gateway.units import STANDARD_GRAVITY_MPS2, counted
 from gateway.wire.payloads import ACCEL_RANGES_G, HMC5883L_LSB_PER_GAUSS
 

@@ -14,8 +14,7 @@ from firmware.rig.boards import Board
 from firmware.rig.build import make
 from firmware.rig.mcu import WATCHDOG
 from firmware.rig.usb_serial import BOOTLOADERS, NEW_BOOTLOADER, OLD_BOOTLOADER, UsbSerial
-from gateway.flashing.settings_block import BoardSettings, find_block
-from gateway.flashing.upload import with_settings
+from gateway.flashing.boards import BoardSettings, find_block, with_settings
 from gateway.wire.payloads import ImuPayload, NodeStatusPayload
 from tests.firmware.harness import Bench
 

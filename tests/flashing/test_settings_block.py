@@ -5,7 +5,7 @@ import itertools
 import msgspec
 import pytest
 
-from gateway.flashing.settings_block import (
+from gateway.flashing.boards import (
     MAGIC,
     SIZE,
     USED_BY,

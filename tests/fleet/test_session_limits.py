@@ -9,7 +9,7 @@ import pytest
 import zenoh
 
 from gateway.fleet import session as fleet_session
-from gateway.fleet.server import FleetServer
+from gateway.fleet.server import MAX_SESSIONS, FleetServer
 from gateway.fleet.session import (
     MAX_ANSWER,
     NoAnswerError,
@@ -17,7 +17,6 @@ from gateway.fleet.session import (
     missing_authentication,
 )
 from gateway.fleet.settings import FleetSettings
-from gateway.fleet.site import MAX_SESSIONS
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.zenoh.session import MAX_MESSAGE, MAX_WAITING, Subscription
 from tests.fleet.conftest import World

@@ -8,7 +8,7 @@ import pytest
 
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw
 from gateway.simulator.flight import SimulatedAircraft, SimulatedFlight, fly
-from gateway.simulator.samplers import DeviceClock
+from gateway.simulator.sensors import DeviceClock
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
 

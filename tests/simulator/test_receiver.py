@@ -16,7 +16,7 @@ from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
 from gateway.simulator.flight import fly
 from gateway.simulator.gps import GpsSampler
 from gateway.simulator.receiver import damage, simulate
-from gateway.simulator.samplers import BaroSampler, ImuSampler
+from gateway.simulator.sensors import BaroSampler, ImuSampler
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame

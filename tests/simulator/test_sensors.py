@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from gateway.simulator.noise import Walk, Wander
 from gateway.simulator.sensors import (
     FACE_UP,
     MAG_OVERFLOW,
     Bmp180,
     Hmc5883l,
     Mpu6050,
+    Walk,
+    Wander,
     errors_of,
     mag_counts,
     pressure_at,

@@ -33,7 +33,7 @@ from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.workbench import Workbench
+from gateway.simulator.trajectory import Workbench
 from gateway.wire.chips import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 from gateway.wire.link import Link
 

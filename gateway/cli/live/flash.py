@@ -10,17 +10,15 @@ import typer
 from intelhex import IntelHex
 
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.flashing.settings_block import (
+from gateway.flashing.boards import (
+    CLOCKS_MHZ,
     USED_BY,
     BoardSettings,
+    FlashError,
     Program,
     SettingsBlock,
-    default_pipe,
-)
-from gateway.flashing.upload import (
-    CLOCKS_MHZ,
-    FlashError,
     block_of,
+    default_pipe,
     find_bootloader,
     image_path,
     read_flash,

@@ -7,8 +7,8 @@ from intelhex import IntelHex
 from typer.testing import CliRunner, Result
 
 from gateway.cli.app import app
-from gateway.flashing import upload
-from gateway.flashing.settings_block import find_block
+from gateway.flashing import boards
+from gateway.flashing.boards import find_block
 from gateway.live.serial_port import Port
 from tests.flashing.test_settings_block import BLOCK, image_with, sealed
 
@@ -24,7 +24,7 @@ def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     image.puts(0, image_with(sealed(BLOCK)))
     for mhz in (16, 8):
         image.write_hex_file(str(folder / f"imu_{mhz}mhz.hex"))
-    monkeypatch.setattr(upload, "IMAGES", folder)
+    monkeypatch.setattr(boards, "IMAGES", folder)
     monkeypatch.setattr("gateway.cli.live.flash.list_serial_ports", list[Port])
     return folder
 
@@ -101,5 +101,5 @@ def test_missing_avrdude_is_named_with_the_way_to_install_it(
     images: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shutil.which", lambda _: None)
-    with pytest.raises(upload.FlashError, match="apt-get install avrdude"):
-        upload.write_flash("/dev/null", upload.BOOTLOADERS[0], b"")
+    with pytest.raises(boards.FlashError, match="apt-get install avrdude"):
+        boards.write_flash("/dev/null", boards.BOOTLOADERS[0], b"")
