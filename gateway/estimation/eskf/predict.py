@@ -185,19 +185,26 @@ def raise_bias_variance(s: State, p: Gains, k: int, more: float) -> None:
 def apply_transition(s: State, P: FloatArray, columns: int) -> None:
     """Multiply the first columns of `P` by the transition matrix from the left."""
     R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
-    for j in range(columns):
-        if s.aided == 1:
-            for k in range(3):
-                P[POS + k, j] += dt * P[VEL + k, j]
-            P[VEL, j] += P[ATT + 1, j] * f[2] - P[ATT + 2, j] * f[1]
-            P[VEL + 1, j] += P[ATT + 2, j] * f[0] - P[ATT, j] * f[2]
-            P[VEL + 2, j] += P[ATT, j] * f[1] - P[ATT + 1, j] * f[0]
+    if s.aided == 1:
+        for k in range(3):
+            add_row(P, POS + k, dt, VEL + k, columns)
+        for k in range(3):
+            a, b = (k + 1) % 3, (k + 2) % 3
+            add_row(P, VEL + k, f[b], ATT + a, columns)
+            add_row(P, VEL + k, -f[a], ATT + b, columns)
             for i in range(3):
-                for k in range(3):
-                    P[VEL + i, j] -= R[i, k] * P[ACCEL_BIAS + k, j]
+                add_row(P, VEL + k, -R[k, i], ACCEL_BIAS + i, columns)
+    for k in range(3):
         for i in range(3):
-            for k in range(3):
-                P[ATT + i, j] -= R[i, k] * P[GYRO_BIAS + k, j] + W[i, k] * P[GYRO_SCALE + k, j]
+            add_row(P, ATT + k, -R[k, i], GYRO_BIAS + i, columns)
+            add_row(P, ATT + k, -W[k, i], GYRO_SCALE + i, columns)
+
+
+@compiled
+def add_row(P: FloatArray, to: int, factor: float, row: int, columns: int) -> None:
+    """Add a multiple of one row to another, in its first columns."""
+    for j in range(columns):
+        P[to, j] += factor * P[row, j]
 
 
 @compiled
@@ -217,8 +224,12 @@ def mirror(P: FloatArray) -> None:
 
 @compiled
 def symmetrise(P: FloatArray) -> None:
-    """Remove the asymmetry of rounding, which would grow without bound in long flights."""
-    for i in range(STATES):
+    """Remove the asymmetry of rounding, which would grow without bound in long flights.
+
+    The moving states alone have any: the covariances with the others are copies, and an update
+    subtracts a symmetric product.
+    """
+    for i in range(MOVING_STATES):
         for j in range(i):
             P[i, j] = P[j, i] = 0.5 * (P[i, j] + P[j, i])
 

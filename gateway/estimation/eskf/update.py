@@ -52,11 +52,13 @@ def consider(s: State, first: int, count: int) -> None:
 @compiled
 def innovation_variance(s: State, variance: float) -> float:
     """Compute `P h`, and return `h^T P h` plus the variance of the measurement."""
-    fill(s.Ph, 0.0)
+    P, Ph = s.P, s.Ph
+    fill(Ph, 0.0)
     for j in range(STATES):
-        if s.h[j] != 0.0:
+        factor = s.h[j]
+        if factor != 0.0:
             for i in range(STATES):
-                s.Ph[i] += s.P[i, j] * s.h[j]
+                Ph[i] += factor * P[j, i]
     total = variance
     for i in range(STATES):
         total += s.h[i] * s.Ph[i]
@@ -78,11 +80,18 @@ def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) 
             column = s.Ph[GYRO_BIAS + k]
             s.bias_sum[k] += column * innovation / total
             s.bias_sum_var[k] += column * column / total
+    P, u, considered, std = s.P, s.Ph, s.considered, math.sqrt(total)
     for i in range(STATES):
-        gain = s.Ph[i] / total
-        s.dx[i] += (1.0 - s.considered[i]) * gain * innovation
-        for j in range(STATES):
-            s.P[i, j] -= (1.0 - s.considered[i] * s.considered[j]) * gain * s.Ph[j]
+        u[i] /= std
+    for i in range(STATES):
+        factor = u[i]
+        if considered[i] == 0.0:
+            s.dx[i] += factor * innovation / std
+            for j in range(STATES):
+                P[i, j] -= factor * u[j]
+        else:
+            for j in range(STATES):
+                P[i, j] -= (1.0 - considered[j]) * factor * u[j]
 
 
 @compiled
