@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from msgspec.structs import replace as replace_struct
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.estimation.columns import (
@@ -26,6 +27,7 @@ from gateway.estimation.columns import (
     GYRO_UNCALIBRATED,
     MAG,
 )
+from gateway.geometry.geodesy import SEMI_MAJOR_M
 from tools.flights import GPS_NAMES, IMU_NAMES, Flight, read_flight
 
 IMU_GAP_S = 4.0
@@ -35,6 +37,15 @@ RECOVERY_S = 20.0
 GYRO_OFF_RADPS = math.radians(1.0)
 UNCALIBRATED_RADPS = np.radians([9.0, -8.0, 12.0])
 UNCALIBRATED_MPS2 = (0.4, -0.35, 0.5)
+BIAS_STEP_RADPS = np.radians([1.2, -1.2, 1.0])
+BLOW_S = 0.5
+BLOW_RADPS = (1.5, -1.0, 2.0)
+GLITCH_S = 5.0
+GLITCH_M = 60.0
+GLITCH_MPS = 5.0
+CURRENT_S = 20.0
+CURRENT_UT = (20.0, 20.0, -10.0)
+LATENCY_S = 0.25
 ZERO_ROWS = 3
 ODD_SHARE = 0.003
 BLANK_SHARE = 0.01
@@ -76,6 +87,11 @@ def turn_s(flight: Flight) -> float:
     return float(time_s[np.argmax(np.where(usable, span, -1.0))])
 
 
+def with_imu(flight: Flight, imu: np.ndarray, ends_s: float) -> Spoilt:
+    """Replace the samples of the IMU."""
+    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), ends_s)
+
+
 def zero_rows(flight: Flight) -> Spoilt:
     """Send all-zero samples first, as an MPU6050 may that has just been woken."""
     imu = flight.log.imu.copy()
@@ -112,7 +128,7 @@ def no_mag(flight: Flight) -> Spoilt:
     """Take the magnetometer."""
     imu = flight.log.imu.copy()
     imu[:, MAG : MAG + 3] = math.nan
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+    return with_imu(flight, imu, first_fix_s(flight))
 
 
 def no_baro(flight: Flight) -> Spoilt:
@@ -154,7 +170,7 @@ def gyro_off(flight: Flight) -> Spoilt:
     """Let every axis of the gyroscope read too much throughout."""
     imu = flight.log.imu.copy()
     imu[:, GYRO : GYRO + 3] += GYRO_OFF_RADPS
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+    return with_imu(flight, imu, first_fix_s(flight))
 
 
 def uncalibrated(flight: Flight) -> Spoilt:
@@ -163,7 +179,7 @@ def uncalibrated(flight: Flight) -> Spoilt:
     imu[:, GYRO : GYRO + 3] += UNCALIBRATED_RADPS
     imu[:, ACCEL : ACCEL + 3] += UNCALIBRATED_MPS2
     imu[:, [GYRO_UNCALIBRATED, ACCEL_UNCALIBRATED]] = 1.0
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+    return with_imu(flight, imu, first_fix_s(flight))
 
 
 def half_rate(flight: Flight) -> Spoilt:
@@ -185,7 +201,7 @@ def odd_samples(flight: Flight) -> Spoilt:
     imu[odd, GYRO : GYRO + 3] = rng.uniform(-ODD_RADPS, ODD_RADPS, (odd.sum(), 3))
     imu[odd, ACCEL : ACCEL + 3] = rng.uniform(-ODD_MPS2, ODD_MPS2, (odd.sum(), 3))
     imu[blank, : len(IMU_NAMES)] = 0.0
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), first_fix_s(flight))
+    return with_imu(flight, imu, first_fix_s(flight))
 
 
 def imu_hangs(flight: Flight) -> Spoilt:
@@ -193,7 +209,7 @@ def imu_hangs(flight: Flight) -> Spoilt:
     imu, time_s, begin_s = flight.log.imu.copy(), flight.log.imu_time_us * 1e-6, turn_s(flight)
     hung = np.flatnonzero((time_s > begin_s) & (time_s <= begin_s + HANG_S))
     imu[hung, : GYRO + 3] = imu[hung[0], : GYRO + 3]
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), begin_s + HANG_S)
+    return with_imu(flight, imu, begin_s + HANG_S)
 
 
 def mag_hangs(flight: Flight) -> Spoilt:
@@ -201,7 +217,47 @@ def mag_hangs(flight: Flight) -> Spoilt:
     imu, begin_s = flight.log.imu.copy(), middle_s(flight)
     hung = np.flatnonzero((flight.log.imu_time_us * 1e-6 > begin_s) & np.isfinite(imu[:, MAG]))
     imu[hung, MAG : MAG + 3] = imu[hung[0], MAG : MAG + 3]
-    return Spoilt(replace(flight, log=replace(flight.log, imu=imu)), begin_s)
+    return with_imu(flight, imu, begin_s)
+
+
+def bias_step(flight: Flight) -> Spoilt:
+    """Let the bias of the gyroscope change at once in the middle of the flight."""
+    imu, begin_s = flight.log.imu.copy(), middle_s(flight)
+    imu[flight.log.imu_time_us * 1e-6 > begin_s, GYRO : GYRO + 3] += BIAS_STEP_RADPS
+    return with_imu(flight, imu, begin_s + RECOVERY_S)
+
+
+def blow(flight: Flight) -> Spoilt:
+    """Let the gyroscope measure a turn of 80 degrees that did not occur, as after a blow."""
+    imu, begin_s = flight.log.imu.copy(), middle_s(flight)
+    time_s = flight.log.imu_time_us * 1e-6
+    imu[(time_s > begin_s) & (time_s <= begin_s + BLOW_S), GYRO : GYRO + 3] += BLOW_RADPS
+    return with_imu(flight, imu, begin_s + BLOW_S)
+
+
+def field_jump(flight: Flight) -> Spoilt:
+    """Switch on a current for a while in the middle of the flight, which changes the field."""
+    imu, begin_s = flight.log.imu.copy(), middle_s(flight)
+    time_s = flight.log.imu_time_us * 1e-6
+    imu[(time_s > begin_s) & (time_s <= begin_s + CURRENT_S), MAG : MAG + 3] += CURRENT_UT
+    return with_imu(flight, imu, begin_s + CURRENT_S)
+
+
+def gps_jump(flight: Flight) -> Spoilt:
+    """Shift position and velocity of the fixes of some seconds in the middle of the flight."""
+    gps, begin_s = flight.log.gps.copy(), middle_s(flight)
+    time_s = flight.log.gps_time_us * 1e-6
+    wrong = (time_s > begin_s) & (time_s <= begin_s + GLITCH_S)
+    gps[wrong, GPS_LAT] += math.degrees(GLITCH_M / SEMI_MAJOR_M)
+    gps[wrong, GPS_VEL : GPS_VEL + 3] += GLITCH_MPS
+    return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), begin_s + GLITCH_S)
+
+
+def wrong_latency(flight: Flight) -> Spoilt:
+    """Set the latency of the fixes too long; manoeuvres show it."""
+    latency_s = flight.reference.gps_latency_s + LATENCY_S
+    spoilt = replace(flight, reference=replace_struct(flight.reference, gps_latency_s=latency_s))
+    return Spoilt(spoilt, middle_s(flight))
 
 
 SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
@@ -219,8 +275,14 @@ SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
     "odd_samples": odd_samples,
     "imu_hangs": imu_hangs,
     "mag_hangs": mag_hangs,
+    "bias_step": bias_step,
+    "blow": blow,
+    "field_jump": field_jump,
+    "gps_jump": gps_jump,
+    "wrong_latency": wrong_latency,
 }
-GPS_SPOILS = ("late_gps", "no_velocity", "no_height")
+GPS_SPOILS = ("late_gps", "no_velocity", "no_height", "gps_jump", "wrong_latency")
+MAG_SPOILS = ("no_mag", "mag_hangs", "field_jump")
 
 
 def applies(how: str, flight: Flight) -> bool:
@@ -228,7 +290,7 @@ def applies(how: str, flight: Flight) -> bool:
     log = flight.log
     if how in GPS_SPOILS:
         return len(log.gps) > 0
-    if how in ("no_mag", "mag_hangs"):
+    if how in MAG_SPOILS:
         return bool(np.isfinite(log.imu[:, MAG]).any())
     return how != "no_baro" or len(log.baro_alt_m) > 0
 

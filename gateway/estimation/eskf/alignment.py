@@ -28,6 +28,7 @@ from gateway.geometry.quaternion import (
     from_rotation_vector,
     multiply,
     normalise,
+    rotate,
     rotate_inverse,
 )
 from gateway.records import Quat, Vec3
@@ -45,6 +46,9 @@ TRACK_NOISE_MPS: Final = 0.6
 """The same of a velocity derived from two positions."""
 HARDEST_MPS2: Final = 100.0
 """A larger acceleration of GPS is an error; one such pair would outweigh all others."""
+CONTRADICTION_SIGMA: Final = 4.0
+CONTRADICTION_MPS2: Final = 4.0
+"""Differences beyond both contradict the other pairs; a turn by 25 deg causes the second one."""
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 """Drift of the gyroscope frame by an unknown bias."""
 SQUARINGS: Final = 14
@@ -53,6 +57,8 @@ UNKNOWN_RAD: Final = 3.0
 """Standard deviation of an unknown angle."""
 ANY_HEADING_VAR: Final = 2.0
 """Mean squared chord of a uniformly distributed heading, rad2."""
+ENOUGH_PAIRS: Final = MEMORY_S / PAIR_S
+"""Pairs of the whole memory."""
 FITTED: Final = 3.0
 """Pairs used up by the constant, the ramp and the noise of the heading fit."""
 
@@ -98,8 +104,32 @@ def add_velocity(
     late_sq = p.gps_jitter_sq * (north * north + east * east)
     # Over one second the noise that successive differences share averages out.
     weight = dt / (2.0 * (noise_mps * noise_mps + late_sq))
-    add_pair(s, (north, east, down - STANDARD_GRAVITY_MPS2), force, weight, dt)
+    reference = (north, east, down - STANDARD_GRAVITY_MPS2)
+    excess = contradiction(s, reference, force, weight)
+    if excess > 0.0:
+        s.fix_excess = max(s.fix_excess, excess)
+        clear_pairs(s)
+        begin_pair(s, valid_s, vel, force_i)
+        return 0.0
+    add_pair(s, reference, force, weight, dt)
     return dt
+
+
+@compiled
+def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> float:
+    """Return the noise that a pair would add if it contradicts the level of the earlier ones, or 0.
+
+    Either GPS is wrong or the gyroscope has missed a turn, as in a blow.
+    """
+    if s.pairs < FITTED + 1.0:
+        return 0.0
+    q_ni, misfit = solve_rotation(s)
+    north, east, down = rotate(q_ni, force)
+    level_off = math.hypot(north, east) - math.hypot(reference[0], reference[1])
+    off_sq = level_off * level_off + (down - reference[2]) ** 2
+    if off_sq < CONTRADICTION_MPS2**2 + CONTRADICTION_SIGMA**2 * misfit / weight:
+        return 0.0
+    return off_sq * weight / (2.0 * ENOUGH_PAIRS)
 
 
 @compiled

@@ -129,13 +129,13 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
     for k in range(3):
         repeated = repeated and (vel[k] == last[2 + k] or not has_velocity)
     if not repeated:
-        last[0], last[1], s.fix_last_s = lat, lon, s.time_s
+        last[0], last[1], last[5] = lat, lon, s.time_s
         for k in range(3):
             last[2 + k] = vel[k]
         return True
     if has_velocity:
         return math.sqrt(vel[0] ** 2 + vel[1] ** 2 + vel[2] ** 2) <= STATIONARY_MPS
-    return bool(s.time_s - s.fix_last_s >= SLOWEST_FIXES_S)
+    return bool(s.time_s - last[5] >= SLOWEST_FIXES_S)
 
 
 @compiled

@@ -14,9 +14,8 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.alignment import (
+    ENOUGH_PAIRS,
     MAX_PAIR_S,
-    MEMORY_S,
-    PAIR_S,
     align,
     clear_pairs,
     heading_difference,
@@ -53,8 +52,6 @@ FOUND_HEADING_RAD: Final = 0.3
 """Alignments with smaller standard deviations are accepted: the filter is linear within them."""
 PATIENCE_S: Final = 8.0
 """For each of these times that the attitude has been lost, a worse level is accepted."""
-ENOUGH_PAIRS: Final = MEMORY_S / PAIR_S
-"""The noise of GPS velocities follows the pairs of the whole alignment memory."""
 MISMATCH_SIGMA: Final = 4.0
 MISMATCH_LEVEL_RAD: Final = 0.14
 MISMATCH_HEADING_RAD: Final = 0.3

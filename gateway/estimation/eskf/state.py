@@ -139,10 +139,9 @@ class State:
     update_s: float
     """Arrival of the last fix that was fused or rejected."""
     fix_vel: Annotated[FloatArray, (3,)]
-    fix_last: Annotated[FloatArray, (5,)]
-    """Latitude, longitude and velocity of the newest fix, to recognise repetitions."""
-    fix_last_s: float
-    """Arrival of the first fix with these values."""
+    fix_last: Annotated[FloatArray, (6,)]
+    """Latitude, longitude and velocity of the newest fix, to recognise repetitions, and the arrival
+    of the first fix with these values."""
     track_from: Annotated[FloatArray, (4,)]
     """Time and position from which a velocity is derived where fixes have none."""
     zero_from: Annotated[FloatArray, (4,)]
