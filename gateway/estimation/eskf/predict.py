@@ -242,9 +242,9 @@ def unexpected_bias_density(s: State, k: int) -> float:
 
 @compiled
 def follow_bias_steps(s: State, dt: float) -> None:
-    """Fade the sums; they start once GPS has corrected a sound IMU for `BIAS_MEMORY_S`."""
-    aided = s.aided == 1 and s.heading_known == 1
-    s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if aided else 0.0
+    """Fade the sums; they start once a known attitude was corrected for `BIAS_MEMORY_S`."""
+    known = s.lost == 0 and s.heading_known == 1
+    s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if known else 0.0
     if min(s.bias_watch_s, s.sound_s) < BIAS_MEMORY_S:
         fill(s.bias_sum, 0.0)
         fill(s.bias_sum_var, 0.0)
