@@ -68,7 +68,7 @@ MECHANISMS: Final = (
     Mechanism("integrity check of the attitude", "integrity", "differs_from_alignment", FALSE),
     Mechanism("heading from motion", "integrity", "FOUND_HEADING_RAD", 0.0),
     Mechanism("norm and dip of the field", "magnetometer", "field_weight", FULL_WEIGHT),
-    Mechanism("jumps of the field", "magnetometer", "has_jumped", FALSE),
+    Mechanism("restart of the alignment", "alignment", "contradiction", NO_NUMBER),
     Mechanism("hard iron by the model's dip", "fixes", "raise_hard_iron_by_dip", NOTHING),
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present),
     Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING),

@@ -1,10 +1,10 @@
 """Magnetometer: sound readings, disturbances, misplaced axes, hard iron, and the heading.
 
-Four checks need no attitude. A reading that does not change during a turn is stuck. The field must
-turn as the gyroscope does, or axes are swapped. A field that jumps in the gyroscope frame, where
-the Earth's field stands still, has a new source. And its norm and dip must be the usual ones; a new
-field that stays the same while the aircraft turns becomes the usual one [1]_. The hard iron itself
-is three states of the filter: turns separate it from the heading, since it turns with the body.
+Three checks precede the heading. A reading that does not change during a turn is stuck. The field
+must turn as the gyroscope does, or axes are swapped. And its norm and dip must be the usual ones; a
+new field that stays the same while the aircraft turns becomes the usual one [1]_. The hard iron
+itself is three states of the filter: turns separate it from the heading, since it turns with the
+body.
 
 References
 ----------
@@ -86,18 +86,6 @@ NORM_SHARE: Final = 0.1
 UNTURNED_RAD: Final = 4.0 * math.pi
 """An apparent turn of two circles without a turn of anything else is a gyroscope bias."""
 
-JUMP_WINDOW_S: Final = 0.5
-JUMP_SIGMA_SQ: Final = 16.0
-"""Within this time a change beyond so many squared standard deviations is a jump."""
-JUMP_NOISE_UT: Final = 4.0
-"""Field noise until `JUMP_PRIOR_S` of readings have shown it: that of the noisiest compasses."""
-LEAST_NOISE_UT: Final = 1.5
-"""Noise of a quiet compass on a moving aircraft."""
-JUMP_PRIOR_S: Final = 2.0
-JUMP_MEMORY_S: Final = 20.0
-CARRIED_SHARE: Final = 0.7
-"""Hard iron of this share of the field turns with the aircraft and is no jump."""
-
 
 @compiled
 def is_zero(v: Vec3) -> bool:
@@ -175,47 +163,6 @@ def check_placement(s: State, mag_b: Vec3) -> None:
 
 
 @compiled
-def has_jumped(s: State, mag_b: Vec3) -> bool:
-    """Return whether the field has a new source, and raise the variance of the hard iron if so."""
-    f = s.jump_from
-    since_s, from_i, from_b = s.time_s - f[0], (f[1], f[2], f[3]), (f[4], f[5], f[6])
-    if is_zero(from_b) or not 0.0 <= since_s <= min(3.0 * JUMP_WINDOW_S, s.sound_s):
-        jump_compare_from(s, mag_b)
-        return False
-    carried = rotate_inverse(as_quat(s.q_ib), from_i)
-    off = difference(mag_b, carried)
-    known = s.jump_noise[1] / (s.jump_noise[1] + JUMP_PRIOR_S)
-    noise_sq = JUMP_NOISE_UT**2 + known * (s.jump_noise[0] - JUMP_NOISE_UT**2)
-    noise_sq = max(noise_sq, LEAST_NOISE_UT * LEAST_NOISE_UT)
-    carried_sq = CARRIED_SHARE**2 * norm_sq(difference(carried, from_b))
-    if norm_sq(off) > JUMP_SIGMA_SQ * noise_sq + carried_sq:
-        if s.jump_seen == 0:
-            # A single odd reading is no jump.
-            s.jump_seen = 1
-            return False
-        for k in range(3):
-            raise_variance(s, HARD_IRON + k, off[k] * off[k])
-        jump_compare_from(s, mag_b)
-        return True
-    s.jump_seen = 0
-    if since_s >= JUMP_WINDOW_S:
-        s.jump_noise[1] = min(s.jump_noise[1] + since_s, JUMP_MEMORY_S)
-        s.jump_noise[0] += since_s / s.jump_noise[1] * (norm_sq(off) - s.jump_noise[0])
-        jump_compare_from(s, mag_b)
-    return False
-
-
-@compiled
-def jump_compare_from(s: State, mag_b: Vec3) -> None:
-    """Compare the following fields with this one."""
-    field_i = rotate(as_quat(s.q_ib), mag_b)
-    s.jump_seen = 0
-    s.jump_from[0] = s.time_s
-    for k in range(3):
-        s.jump_from[1 + k], s.jump_from[4 + k] = field_i[k], mag_b[k]
-
-
-@compiled
 def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> float:
     """Compare a field with the usual one; return the weight of its heading, 0 to 1."""
     if s.mag_ref[0] == 0.0:
@@ -262,8 +209,6 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     """Use one sound reading of the calibrated field in body FRD, uT."""
     if s.lost == 1:
         return
-    if s.aided == 1 and has_jumped(s, mag_b):
-        propagate(s, p)
     turned = (
         s.rate_b[0] * s.mag_latency_s,
         s.rate_b[1] * s.mag_latency_s,

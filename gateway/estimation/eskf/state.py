@@ -229,12 +229,6 @@ class State:
     of the change of the norm, uT2."""
     mag_misplaced: int
     """1 while the field turns otherwise than the aircraft."""
-    jump_from: Annotated[FloatArray, (7,)]
-    """Time, and field in the gyroscope and the body frame, that the newest one is compared with."""
-    jump_noise: Annotated[FloatArray, (2,)]
-    """Mean square of field noise in uT2, and the time it was averaged over in s."""
-    jump_seen: int
-    """1 where the last field differed by a jump."""
     field_n: Annotated[FloatArray, (3,)]
     """Field of the last heading update, uT."""
 
