@@ -46,9 +46,8 @@ from gateway.vehicle.actions import (
     StatusText,
 )
 from gateway.vehicle.actions import Action as VehicleAction
-from gateway.vehicle.location import Home, Location
-from gateway.vehicle.plan import StoredPlan
-from gateway.vehicle.signing import SigningClock, SigningTimestamps
+from gateway.vehicle.plan import Home, Location, StoredPlan
+from gateway.vehicle.requests import SigningClock, SigningTimestamps
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 

@@ -4,7 +4,7 @@ import math
 
 from gateway.aircraft import Aircraft
 from gateway.status import AircraftStatus, Way
-from gateway.vehicle.location import Location, distance_and_bearing
+from gateway.vehicle.plan import Location, distance_and_bearing
 
 
 def status_of(aircraft: Aircraft) -> AircraftStatus:

@@ -27,13 +27,11 @@ from gateway.records import (
 )
 from gateway.units import US_PER_S
 from gateway.vehicle.actions import StatusText
-from gateway.vehicle.location import Location
-from gateway.vehicle.plan import StoredPlan
-from gateway.vehicle.requests import BAD_SIGNATURE
-from gateway.vehicle.signing import KeptTimestamps, SigningClock, SigningTimestamps
-from gateway.wire.gps_time import GpsTime
+from gateway.vehicle.plan import Location, StoredPlan
+from gateway.vehicle.requests import BAD_SIGNATURE, KeptTimestamps, SigningClock, SigningTimestamps
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.timesync import GpsTime
 
 REPORT_INTERVAL_US: Final = US_PER_S
 GONE_US: Final = 600 * US_PER_S

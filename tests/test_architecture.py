@@ -68,7 +68,6 @@ PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "aircraft_status
 IMPURE_PARTS = {
     "hub/hub.py",
     "hub/router.py",
-    "hub/accepting.py",
     "hub/transports",
     "hub/transports/zenoh",
 }

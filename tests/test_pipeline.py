@@ -20,8 +20,8 @@ from gateway.records import (
     Outgoing,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.location import Location
-from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
+from gateway.vehicle.plan import Location
+from gateway.vehicle.requests import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame

@@ -77,7 +77,7 @@ def load(ways, rate, seconds):
 GENERATOR = (
     LOAD
     + """
-from gateway.hub.transports.zenoh.keys import out_key, presence_key
+from gateway.hub.transports.zenoh.session import out_key, presence_key
 from gateway.hub.transports.zenoh.session import open_session, session_config
 import zenoh
 session = open_session(session_config(sys.argv[1], ""))

@@ -40,7 +40,7 @@ from gateway.recordings.table import TableHeader, TableReader, encode_head, enco
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.location import Location
+from gateway.vehicle.plan import Location
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 from gateway.wire.link import Link

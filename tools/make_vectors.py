@@ -13,8 +13,8 @@ import msgspec
 
 from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters, RadioState
 from gateway.wire import payloads
-from gateway.wire.chips import Chips
 from gateway.wire.framing import encode_frame
+from gateway.wire.payloads import Chips
 
 TARGET = Path(__file__).resolve().parent.parent / "tests" / "vectors" / "frames.json"
 

@@ -32,7 +32,7 @@ from pymavlink.dialects.v20 import all as dialect
 from gateway.fleet.id_map import IdMap
 from gateway.fleet.loop_detection import LoopDetection
 from gateway.units import US_PER_S
-from gateway.vehicle.signing import NEW_STREAM_TICKS, TICKS_PER_S, SigningClock
+from gateway.vehicle.requests import NEW_STREAM_TICKS, TICKS_PER_S, SigningClock
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, offset_of
 from gateway.wire.mavlink_signing import HASH_BYTES, TIMESTAMP_BYTES, signature_hash
 from gateway.wire.mavlink_splitter import (

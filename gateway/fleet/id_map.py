@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from gateway.hub.endpoint import SITE_NAME
-from gateway.live.worker import begin_worker, done_by
+from gateway.live.kept_files import begin_worker, done_by
 from gateway.output import write_new
 from gateway.reasons import reason_of
 

@@ -15,7 +15,7 @@ from gateway.fleet.session import (
     key_pattern,
 )
 from gateway.hub.endpoint import SITE_NAME
-from gateway.hub.transports.zenoh.keys import recordings_key
+from gateway.hub.transports.zenoh.session import recordings_key
 from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
 from gateway.live.control_socket import ControlError, ControlServer
 

@@ -25,8 +25,7 @@ from gateway.hub.endpoint import SITE_NAME, Endpoint
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.base import Client
-from gateway.hub.transports.zenoh.keys import in_key
-from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers
+from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers, in_key
 from gateway.live.control_socket import (
     ControlError,
     ControlServer,
@@ -35,7 +34,7 @@ from gateway.live.control_socket import (
 )
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
-from gateway.vehicle.signing import key_from_passphrase
+from gateway.vehicle.requests import key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})

@@ -15,16 +15,10 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import msgspec
 
 from gateway.fleet.settings import FleetSettings
-from gateway.hub.hosts import is_loopback
-from gateway.hub.transports.zenoh.keys import (
+from gateway.hub.endpoint import is_loopback
+from gateway.hub.transports.zenoh.session import (
     MAX_KEY,
     OWN,
-    out_key,
-    ping_key,
-    presence_key,
-    site_of,
-)
-from gateway.hub.transports.zenoh.session import (
     LoopQueue,
     Payload,
     Publishers,
@@ -32,8 +26,12 @@ from gateway.hub.transports.zenoh.session import (
     end_session,
     off_loop,
     open_session,
+    out_key,
     payload_of,
+    ping_key,
+    presence_key,
     session_config,
+    site_of,
 )
 
 if TYPE_CHECKING:

@@ -31,6 +31,6 @@ Theory of operation
 An endpoint kind is one file in `transports/` over `base.Client` or `base.Listener`, with
 `datagram` and `stream` between for what datagram sockets and byte streams share. No transport
 blocks or raises; each closes itself on an error, and `tick` opens it again. Everything but
-`transports/`, `hub.py`, `router.py` and `accepting.py` is pure: time is an argument, and nothing is
+`transports/`, `hub.py` and `router.py` is pure: time is an argument, and nothing is
 read or written.
 """

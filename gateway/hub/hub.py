@@ -13,10 +13,9 @@ import msgspec
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout, Route, recipient_of
 from gateway.hub.limits import TokenBucket
-from gateway.hub.own_vehicles import OwnVehicles
 from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
-from gateway.hub.routing_table import Origin
+from gateway.hub.routing_table import Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import (

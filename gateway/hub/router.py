@@ -13,13 +13,14 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.fanout import Fanout, recipient_of
 from gateway.hub.limits import RequestQueue
-from gateway.hub.own_vehicles import HEARTBEAT_ID, OwnVehicles
 from gateway.hub.round_trip import RoundTrip, is_of_gateway
 from gateway.hub.routing_table import (
+    HEARTBEAT_ID,
     LATE,
     NEW,
     DuplicateFilter,
     Origin,
+    OwnVehicles,
     Path,
     RedundantLinks,
     RoutingTable,

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
-from gateway.live.log_line import UNKNOWN, figure_of
+from gateway.live.log_limit import UNKNOWN, figure_of
 from gateway.printable import PrintableFormatter
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way

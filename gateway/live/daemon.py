@@ -23,19 +23,15 @@ from gateway.config import (
 )
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
-from gateway.live.control_verbs import AircraftVerbs, HubVerbs, RecorderVerbs, SerialVerbs
-from gateway.live.imu_tap import ImuTap
-from gateway.live.loop_lag import LoopLag
+from gateway.live.control_verbs import AircraftVerbs, HubVerbs, ImuTap, RecorderVerbs, SerialVerbs
+from gateway.live.kept_files import PlaceFiles, StampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
-from gateway.live.place_files import PlaceFiles
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
 from gateway.live.serial_port import SerialPort
-from gateway.live.service import ServiceNotifier, set_realtime_priority
+from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
-from gateway.live.stamp_file import StampFile
-from gateway.live.worker import begin_worker
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.reasons import reason_of
 from gateway.recordings.reading import header_for
@@ -64,7 +60,7 @@ from gateway.vehicle.actions import (
     SaveSettings,
     StatusText,
 )
-from gateway.vehicle.location import Location
+from gateway.vehicle.plan import Location
 from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Final
 
-from gateway.hub.accepting import accept_each
-from gateway.hub.hosts import names_loopback
+from gateway.hub.endpoint import names_loopback
 from gateway.hub.stats import ListenerStats
+from gateway.hub.transports.stream import accept_each
 from gateway.reasons import reason_of
 
 log = logging.getLogger(__name__)

@@ -22,9 +22,11 @@ from pathlib import Path
 
 import msgspec
 
-from gateway.live.part import PENDING_LIMIT, Part
-from gateway.live.part_files import (
+from gateway.live.kept_files import begin_worker, done_by
+from gateway.live.part import (
+    PENDING_LIMIT,
     DiskState,
+    Part,
     PartFiles,
     Restamper,
     clear_copies,
@@ -42,7 +44,6 @@ from gateway.live.session import (
     SessionAction,
     SessionState,
 )
-from gateway.live.worker import begin_worker, done_by
 from gateway.output import sync_folder
 from gateway.recordings.index import RecordingError, find_recording, move_recording, part_of
 from gateway.recordings.table import REMARK, TableHeader, TableMark

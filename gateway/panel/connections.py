@@ -17,7 +17,7 @@ from typing import Any, Final
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
-from gateway.hub.accepting import accept_each
+from gateway.hub.transports.stream import accept_each
 
 log = logging.getLogger(__name__)
 

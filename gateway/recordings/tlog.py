@@ -27,7 +27,6 @@ from gateway.recordings.tlog_scan import (
     scan,
 )
 from gateway.units import US_PER_S
-from gateway.wire.gps_time import GpsTime
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import (
     SIGNATURE_SIZE,
@@ -36,6 +35,7 @@ from gateway.wire.mavlink_splitter import (
     is_station_heartbeat,
     message_id_of,
 )
+from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
 """Records that lie further apart are of different days: nothing is known of the time between."""

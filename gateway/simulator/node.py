@@ -25,9 +25,11 @@ from gateway.simulator.sensors import (
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FloatArray
-from gateway.wire.chips import GPS_ACKNOWLEDGES, SENSOR_IMU, Chips
 from gateway.wire.payloads import (
+    GPS_ACKNOWLEDGES,
+    SENSOR_IMU,
     BaroPayload,
+    Chips,
     GpsFixPayload,
     GpsQualityPayload,
     ImuPayload,

@@ -31,6 +31,7 @@ from gateway.vehicle.services.commands import (
     SHORTHANDS,
     UNSUPPORTED,
     Command,
+    QueryService,
     read_command,
     whole,
 )
@@ -46,7 +47,6 @@ from gateway.vehicle.services.parameter_service import (
     UNKNOWN,
 )
 from gateway.vehicle.services.parameters import Metadata
-from gateway.vehicle.services.queries import QueryService
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
 

@@ -19,7 +19,7 @@ from gateway.records import (
 )
 from gateway.settings import Settings
 from gateway.units import US_PER_S
-from gateway.vehicle import identity
+from gateway.vehicle import encoding
 from gateway.vehicle.actions import (
     INFO,
     NOTICE,
@@ -36,14 +36,21 @@ from gateway.vehicle.encoding import (
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
     Encoder,
 )
-from gateway.vehicle.location import Location
-from gateway.vehicle.plan import StoredPlan
-from gateway.vehicle.requests import RequestLog, RequestReader
+from gateway.vehicle.plan import Location, StoredPlan
+from gateway.vehicle.requests import (
+    RequestLog,
+    RequestReader,
+    SigningClock,
+    SigningTimestamps,
+    Verifier,
+    key_from_passphrase,
+)
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW, Calibrator
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     FAILED,
     CommandService,
+    QueryService,
     RecordingService,
     read_command,
 )
@@ -56,8 +63,6 @@ from gateway.vehicle.services.parameters import (
     ParameterTable,
 )
 from gateway.vehicle.services.plan_service import PlanService
-from gateway.vehicle.services.queries import QueryService
-from gateway.vehicle.signing import SigningClock, SigningTimestamps, Verifier, key_from_passphrase
 from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
@@ -163,14 +168,14 @@ class Vehicle:
             self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
         )
         self._identity = {
-            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: identity.autopilot_version(
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: encoding.autopilot_version(
                 self.system_id, self.health.boards.firmware, self.telemetry.autopilot
             ),
-            MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: identity.protocol_version(),
-            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: identity.available_modes(
+            MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: encoding.protocol_version(),
+            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: encoding.available_modes(
                 self.telemetry.autopilot
             ),
-            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: identity.current_mode(
+            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: encoding.current_mode(
                 self.telemetry.autopilot
             ),
             MAVLINK_MSG_ID_COMPONENT_METADATA: self._metadata.announcement,

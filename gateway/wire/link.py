@@ -24,8 +24,8 @@ from gateway.records import (
 )
 from gateway.units import M_PER_CM, M_PER_MM, US_PER_S
 from gateway.wire import payloads
-from gateway.wire.chips import chip_names
 from gateway.wire.framing import Fault, FrameDecoder
+from gateway.wire.payloads import chip_names
 from gateway.wire.timesync import WRAP_US, ClockTracker
 
 UINT16_MAX: Final = 65_535

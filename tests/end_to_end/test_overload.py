@@ -11,7 +11,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import request, socket_path
-from gateway.live.loop_lag import WARM_UP_US
+from gateway.live.service import WARM_UP_US
 from gateway.units import US_PER_S
 from tests.end_to_end.processes import Client, Gateway
 

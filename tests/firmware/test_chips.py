@@ -12,7 +12,6 @@ from firmware.rig.gps import GPS_MODULES
 from firmware.rig.imu import IMU_CHIPS
 from firmware.rig.world import Moment, Solution, World
 from gateway.records import GpsFixType, ImuFlags, RadioState
-from gateway.wire.chips import chip_names
 from gateway.wire.payloads import (
     MAG_LSB_PER_GAUSS,
     BaroPayload,
@@ -20,6 +19,7 @@ from gateway.wire.payloads import (
     GpsQualityPayload,
     ImuPayload,
     NodeStatusPayload,
+    chip_names,
 )
 from tests.firmware.harness import Bench
 

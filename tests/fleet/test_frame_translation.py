@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import FrameTranslation, SiteSignatures
 from gateway.fleet.id_map import IdMap
-from gateway.vehicle.signing import EPOCH_2015_US
+from gateway.vehicle.requests import EPOCH_2015_US
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import frame_of, target_of
 from tests.kit.mavlink import frames_in

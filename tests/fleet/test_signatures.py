@@ -6,7 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.fleet.frame_translation import MAX_STREAMS, WINDOW_TICKS, Rejection, SiteSignatures
-from gateway.vehicle.signing import EPOCH_2015_US, TICK_US, TICKS_PER_S
+from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, TICKS_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 KEY = bytes(range(32))

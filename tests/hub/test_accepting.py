@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.hub import accepting
-from gateway.hub.accepting import accept_each
+from gateway.hub.transports import stream as accepting
+from gateway.hub.transports.stream import accept_each
 from gateway.live.control_socket import ControlServer
 from gateway.live.metrics_server import MetricsServer
 from tests.ports import free_port

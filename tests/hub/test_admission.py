@@ -1,6 +1,6 @@
 """The clients of a listening port on the manual clock."""
 
-from gateway.hub.admission import SILENT_AFTER_US, ClientTable
+from gateway.hub.limits import SILENT_AFTER_US, ClientTable
 
 S = 1_000_000
 GCS = (255, 190)

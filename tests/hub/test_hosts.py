@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.hub.hosts import admits_page
+from gateway.hub.endpoint import admits_page
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub import accepting
+from gateway.hub.transports import stream as accepting
 from gateway.wire.mavlink_splitter import frame_of
 
 pytestmark = pytest.mark.io

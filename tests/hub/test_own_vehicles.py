@@ -2,7 +2,7 @@
 
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.own_vehicles import OWN_FRESH_US, OwnVehicles
+from gateway.hub.routing_table import OWN_FRESH_US, OwnVehicles
 from gateway.wire.mavlink_splitter import MavFrame
 from tests.kit.mavlink import numbered
 

@@ -17,12 +17,12 @@ import zenoh
 
 from gateway.hub.transports.zenoh import client as zenoh_client
 from gateway.hub.transports.zenoh import session as zenoh_session
-from gateway.hub.transports.zenoh.keys import OWN
 from gateway.hub.transports.zenoh.session import (
     AT_ONCE,
     BYTES_AT_ONCE,
     MAX_MESSAGE,
     MAX_WAITING,
+    OWN,
     LoopQueue,
     Subscription,
 )

@@ -12,7 +12,7 @@ import pytest
 from gateway.live.control_socket import ControlServer
 from gateway.live.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
 from gateway.recordings.index import Recording
-from gateway.vehicle.location import Location
+from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
 from tests.live.test_player_edge import Played
 from tests.live.test_recorder import Bench

@@ -20,7 +20,7 @@ from gateway.live.daemon import Daemon
 from gateway.live.part import BURST_S, UNTRUSTED_RATE
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
 from gateway.vehicle.actions import Request, SaveSettings
-from gateway.vehicle.signing import EPOCH_2015_US, key_from_passphrase
+from gateway.vehicle.requests import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import MavFrame
 

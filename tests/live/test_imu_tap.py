@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from gateway.cli.app import app
 from gateway.cli.live import calibrate
 from gateway.live.control_socket import ControlServer, NoParams, socket_path
-from gateway.live.imu_tap import IDLE_US, MAX_SAMPLES, ImuParams, ImuTap, raw_of, values_of
+from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuParams, ImuTap, raw_of, values_of
 from gateway.records import FusedSample
 from gateway.sensing.calibration import NodeCalibration
 from tests.recordings.samples import make_fused

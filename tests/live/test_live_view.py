@@ -11,7 +11,7 @@ from rich.console import Console
 from gateway.geometry.quaternion import from_euler
 from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.console import LiveView
-from gateway.live.log_line import summary_line
+from gateway.live.log_limit import summary_line
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

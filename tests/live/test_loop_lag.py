@@ -1,4 +1,4 @@
-from gateway.live.loop_lag import LagReport, LoopLag
+from gateway.live.service import LagReport, LoopLag
 
 S = 1_000_000
 

@@ -9,10 +9,9 @@ from typing import Any
 
 import pytest
 
-from gateway.live import place_files
-from gateway.live.place_files import PlaceFiles
-from gateway.vehicle.location import Location
-from gateway.vehicle.plan import StoredPlan
+from gateway.live import kept_files
+from gateway.live.kept_files import PlaceFiles
+from gateway.vehicle.plan import Location, StoredPlan
 
 pytestmark = pytest.mark.io
 
@@ -102,7 +101,7 @@ async def test_what_could_not_be_written_is_tried_again_and_reported_once(
         fsync(fd)
 
     monkeypatch.setattr(os, "fsync", ill)
-    monkeypatch.setattr(place_files, "RETRY_S", 0)
+    monkeypatch.setattr(kept_files, "RETRY_S", 0)
     await bench.save(1, FIRST)
     assert len(attempts) == 1, "the next attempt is not made at once"
     async with asyncio.timeout(60):

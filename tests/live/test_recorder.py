@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateway.live.part import PENDING_LIMIT
-from gateway.live.part_files import PartFiles
+from gateway.live.part import PENDING_LIMIT, PartFiles
 from gateway.live.recorder import Recorder
 from gateway.live.session import RETRY_US, RecordingSettings
 from gateway.recordings.columns import TableRow
@@ -18,7 +17,7 @@ from gateway.recordings.index import RecordingError, list_recordings
 from gateway.recordings.table import TableHeader, TableMark, TableReader
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.records import FusedSample, FusionState
-from gateway.wire.gps_time import ENOUGH
+from gateway.wire.timesync import ENOUGH
 from tests.conftest import ManualClock
 from tests.recordings.frames import make_frames
 from tests.recordings.samples import make_baro, make_flight, make_fused

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.live.part_files import STEP, Restamper, clear_copies
+from gateway.live.part import STEP, Restamper, clear_copies
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_header
 from gateway.recordings.tlog import TlogScanner
 from tests.recordings.frames import START_US, make_records, make_tlog

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.live.stamp_file import NAME, StampFile
+from gateway.live.kept_files import STAMPS_NAME, StampFile
 
 pytestmark = pytest.mark.io
 
@@ -18,7 +18,7 @@ def test_what_is_saved_is_loaded_again(tmp_path: Path) -> None:
     file.save({1: {}})
     file.close(STAMPS)
     assert StampFile(tmp_path / "new").load() == STAMPS
-    assert stat.S_IMODE((tmp_path / "new" / NAME).stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "new" / STAMPS_NAME).stat().st_mode) == 0o600
 
 
 def test_nothing_to_keep_leaves_what_is_there(tmp_path: Path) -> None:
@@ -31,7 +31,7 @@ def test_nothing_to_keep_leaves_what_is_there(tmp_path: Path) -> None:
 def test_a_broken_file_is_reported(
     tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / NAME).write_text(text)
+    (tmp_path / STAMPS_NAME).write_text(text)
     assert StampFile(tmp_path).load() == {}
     assert "cannot be read" in caplog.text
 
@@ -39,7 +39,7 @@ def test_a_broken_file_is_reported(
 def test_a_disk_that_does_not_take_it_is_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / NAME).mkdir()
+    (tmp_path / STAMPS_NAME).mkdir()
     file = StampFile(tmp_path)
     file._write()
     file._write()

@@ -2,7 +2,7 @@
 
 import threading
 
-from gateway.live.worker import begin_worker
+from gateway.live.kept_files import begin_worker
 
 
 def test_the_thread_is_there_before_its_first_job() -> None:

@@ -28,9 +28,9 @@ from gateway.recordings.tlog import (
 from gateway.recordings.tlog import (
     STEP_US as STAMP_STEP_US,
 )
-from gateway.wire.gps_time import ENOUGH
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.timesync import ENOUGH
 from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
 
 

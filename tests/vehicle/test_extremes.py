@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import NavFlags, Outgoing
 from gateway.vehicle.encoding import Encoder
-from gateway.vehicle.location import Location
+from gateway.vehicle.plan import Location
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.signing import (
+from gateway.vehicle.requests import (
     EPOCH_2015_US,
     KEY_BYTES,
     MAX_KEYS,

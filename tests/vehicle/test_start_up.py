@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pymavlink.dialects.v20 import development
 
-from gateway.vehicle import encoding, identity
+from gateway.vehicle import encoding
 from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
@@ -102,7 +102,7 @@ def test_autopilot_version(station: GroundStation) -> None:
     [("1.2.3", 0x010203FF), ("0.10.0", 0x000A00FF), ("2.0", 0x020000FF), ("1.2rc1.3", 0x010003FF)],
 )
 def test_software_version(text: str, number: int) -> None:
-    assert identity.software_version(text) == number
+    assert encoding.software_version(text) == number
 
 
 def test_protocol_version(station: GroundStation) -> None:
@@ -114,7 +114,7 @@ def test_modes_are_as_the_development_dialect_has_them() -> None:
     parser = development.MAVLink(None)
     modes, mode = (
         parser.decode(bytearray(Encoder(1).encode(message).frame))
-        for message in (identity.available_modes(0), identity.current_mode(0))
+        for message in (encoding.available_modes(0), encoding.current_mode(0))
     )
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0

@@ -7,8 +7,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
 from gateway.vehicle.actions import INFO
-from gateway.vehicle.location import Location
-from gateway.vehicle.plan import StoredPlan
+from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId, RadioState
-from gateway.wire.chips import Chips, chip_names
 from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.payloads import (
     ACCEL_RANGES_G,
@@ -17,11 +16,13 @@ from gateway.wire.payloads import (
     MAG_LSB_PER_GAUSS,
     MAX_PAYLOAD,
     BaroPayload,
+    Chips,
     GpsFixPayload,
     Header,
     ImuPayload,
     RadioFrame,
     ReceiverStatusFrame,
+    chip_names,
     decode_content,
     decode_payload,
     encode_payload,

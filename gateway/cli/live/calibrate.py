@@ -28,7 +28,7 @@ from gateway.cli.support.recording_options import files_of, refusing
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
-from gateway.live.imu_tap import raw_of
+from gateway.live.control_verbs import raw_of
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialPort,
@@ -53,8 +53,8 @@ from gateway.sensing.calibrating import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
-from gateway.wire.chips import SENSOR_IMU
 from gateway.wire.link import Link
+from gateway.wire.payloads import SENSOR_IMU
 
 POLL_S: Final = 0.5
 """Interval of the requests to a running gateway."""

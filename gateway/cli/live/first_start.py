@@ -34,8 +34,8 @@ from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Workbench
-from gateway.wire.chips import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 from gateway.wire.link import Link
+from gateway.wire.payloads import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 
 LOOK_S: Final = 5.0
 """After opening: a bootloader takes up to 2 s, and every board reports once a second."""

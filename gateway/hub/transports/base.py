@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
-from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind
+from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
 from gateway.hub.fanout import Route
-from gateway.hub.hosts import is_loopback
 from gateway.hub.limits import TokenBucket
 from gateway.hub.routing_table import Origin
 from gateway.hub.settings import HubSettings

@@ -6,8 +6,8 @@ import struct
 from collections import deque
 from typing import Final
 
-from gateway.hub.admission import SILENT_AFTER_US
 from gateway.hub.endpoint import Endpoint
+from gateway.hub.limits import SILENT_AFTER_US
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import RETRY_US, Client, Write, not_open
 from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram

@@ -6,8 +6,7 @@ from typing import Any, Final
 from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind
 from gateway.hub.transports.base import Client, HubContext, Listener
 from gateway.hub.transports.serial_line import SerialClient
-from gateway.hub.transports.tcp import TcpClient
-from gateway.hub.transports.tcp_listen import TcpListener
+from gateway.hub.transports.tcp import TcpClient, TcpListener
 from gateway.hub.transports.udp import UdpClient
 from gateway.hub.transports.udp_group import GroupClient
 from gateway.hub.transports.udp_listen import UdpListener

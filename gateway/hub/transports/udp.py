@@ -9,8 +9,7 @@ import asyncio
 import socket
 from typing import Any, Final
 
-from gateway.hub.endpoint import host_and_port
-from gateway.hub.hosts import is_numeric
+from gateway.hub.endpoint import host_and_port, is_numeric
 from gateway.hub.transports.base import RETRY_US
 from gateway.hub.transports.datagram import RECEIVE_BUFFER_BYTES, DatagramClient
 from gateway.units import US_PER_S

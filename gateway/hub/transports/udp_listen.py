@@ -9,8 +9,8 @@ import itertools
 import socket
 from typing import Final
 
-from gateway.hub.admission import ClientTable, Presence
 from gateway.hub.endpoint import Endpoint, host_and_port
+from gateway.hub.limits import ClientTable, Presence
 from gateway.hub.transports.base import READ_BYTES, RETRY_US, HubContext, Listener
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-from gateway.hub.endpoint import TLS_KINDS, Endpoint
-from gateway.hub.hosts import admits_page
+from gateway.hub.endpoint import TLS_KINDS, Endpoint, admits_page
 from gateway.hub.stats import LogRateLimiter
 from gateway.hub.transports.base import Client, HubContext
 from gateway.hub.transports.stream import StreamListener

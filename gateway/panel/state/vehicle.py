@@ -15,7 +15,7 @@ from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
-from gateway.vehicle.location import is_on_earth
+from gateway.vehicle.plan import is_on_earth
 
 
 class Spot(msgspec.Struct, frozen=True):

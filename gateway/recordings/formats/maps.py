@@ -21,7 +21,7 @@ from gateway.recordings.table import REMARK, TableMark
 from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, payload_of
 from gateway.records import FusionState, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
-from gateway.vehicle.location import is_good_enough, location_of
+from gateway.vehicle.plan import is_good_enough, location_of
 from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")

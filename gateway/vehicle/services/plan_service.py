@@ -16,11 +16,17 @@ from gateway.records import NAN, GpsFix, NavState
 from gateway.settings import Settings
 from gateway.vehicle import encoding
 from gateway.vehicle.actions import INFO, Answer, Reply, SavePlan, StatusText
-from gateway.vehicle.location import (
+from gateway.vehicle.plan import (
+    FENCE,
     GLOBAL_FRAMES,
+    KINDS,
+    MISSION,
+    RALLY,
     Home,
     HomeParameters,
+    Item,
     Location,
+    StoredPlan,
     describe_location_fault,
     distance_and_bearing,
     height_amsl_m,
@@ -28,7 +34,6 @@ from gateway.vehicle.location import (
     is_on_earth,
     location_of,
 )
-from gateway.vehicle.plan import FENCE, KINDS, MISSION, RALLY, Item, StoredPlan
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -23,8 +23,8 @@ from gateway.records import (
 )
 from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
 from gateway.vehicle import encoding
-from gateway.vehicle.identity import CUSTOM_MODES
-from gateway.vehicle.location import DEGE7, Home, Location, distance_and_bearing, is_3d
+from gateway.vehicle.encoding import CUSTOM_MODES
+from gateway.vehicle.plan import DEGE7, Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5

@@ -36,8 +36,8 @@ from gateway.records import (
     Vec3,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.identity import AUTOPILOTS, CUSTOM_MODES
-from gateway.vehicle.location import Home, Location, is_good_enough, location_of
+from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES
+from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.messages import high_latency2

@@ -3,7 +3,7 @@ import math
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.location import Location
+from gateway.vehicle.plan import Location
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
 from tests.vehicle.ground_station import GroundStation, kinds

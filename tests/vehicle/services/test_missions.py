@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.location import Location, distance_and_bearing
-from gateway.vehicle.plan import MAX_ITEMS
+from gateway.vehicle.plan import MAX_ITEMS, Location, distance_and_bearing
 from tests.vehicle.ground_station import GroundStation, kinds
 from tests.vehicle.samples import STATE
 

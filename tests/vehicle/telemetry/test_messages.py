@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.geometry.quaternion import from_euler
 from gateway.records import GpsFixType, NavFlags
 from gateway.vehicle.encoding import Encoder
-from gateway.vehicle.location import Home, Location
+from gateway.vehicle.plan import Home, Location
 from gateway.vehicle.telemetry import messages
 from tests.vehicle.samples import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
 

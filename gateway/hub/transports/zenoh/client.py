@@ -11,33 +11,31 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import READ_BYTES, RETRY_US, Client
-from gateway.hub.transports.zenoh.keys import (
+from gateway.hub.transports.zenoh.session import (
     ALL_SYSTEMS,
     JSON_IN,
     JSON_OUT,
+    MAX_MESSAGE,
+    NOT_INSTALLED,
     OWN,
     RAW_IN,
     RAW_OUT,
-    ROOT,
-    in_key,
-    out_key,
-    ping_key,
-    presence_key,
-    recordings_key,
-)
-from gateway.hub.transports.zenoh.session import (
-    MAX_MESSAGE,
-    NOT_INSTALLED,
     RELIABLE_IDS,
+    ROOT,
     SECURED,
     LoopQueue,
     Payload,
     Publishers,
     end_session,
+    in_key,
     off_loop,
     open_session,
+    out_key,
     part_of_turn,
     payload_of,
+    ping_key,
+    presence_key,
+    recordings_key,
     session_config,
 )
 from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAnswers

@@ -1,22 +1,47 @@
-"""The stored places of each aircraft: one JSON file each, next to its settings.
+"""Files kept for the next start: each aircraft's stored locations, and the signing timestamps.
 
 A file is replaced whole or not at all, by a separate thread, since writing to a disk may block. A
-failed write is retried until it succeeds. A file that cannot be read is reported and left as it
-is: it may hold a mission that a person can repair.
+failed write of locations is retried until it succeeds. A file that cannot be read is reported and
+left as it is: it may hold a mission that a person can repair.
 """
 
 import asyncio
 import contextlib
 import logging
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final, ParamSpec, TypeVar
 
-from gateway.live.worker import begin_worker
-from gateway.output import write_new
+import msgspec
+
+from gateway.output import PRIVATE, write_new
 from gateway.reasons import reason_of
 from gateway.vehicle.plan import StoredPlan, decode_plan, encode_plan
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def begin_worker(name: str, most: int = 1) -> ThreadPoolExecutor:
+    """Start a thread at once: when its first job comes, the loop would wait for it."""
+    worker = ThreadPoolExecutor(most, name)
+    worker.submit(int)
+    return worker
+
+
+async def done_by(
+    worker: ThreadPoolExecutor,
+    job: Callable[Parameters, Result],
+    *args: Parameters.args,
+    **kwargs: Parameters.kwargs,
+) -> Result:
+    """Return a job's result; the job is done even if the task that waits for it is cancelled."""
+    job_alone = partial(job, *args, **kwargs)
+    return await asyncio.shield(asyncio.get_running_loop().run_in_executor(worker, job_alone))
+
 
 log = logging.getLogger(__name__)
 
@@ -133,3 +158,62 @@ class PlaceFiles:
 
 def _broken(file: Path) -> str:
     return f"{file.name} is broken: repair or remove it"
+
+
+STAMPS_NAME: Final = "signing-stamps.json"
+
+_Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
+_Stamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
+Kept = Mapping[int, dict[str, dict[str, int]]]
+"""By vehicle id; see `SigningTimestamps`."""
+
+
+class StampFile:
+    """The file of all aircraft."""
+
+    def __init__(self, folder: Path) -> None:
+        self._file = folder / STAMPS_NAME
+        self._worker = begin_worker("stamps")
+        self._waiting: Kept | None = None
+        self._is_reported = False
+
+    def load(self) -> Kept:
+        """Read the file; nothing if there is none, or it cannot be read."""
+        kind = dict[int, dict[str, dict[_Stream, _Stamp]]]
+        try:
+            return msgspec.json.decode(self._file.read_bytes(), type=kind, strict=False)
+        except FileNotFoundError:
+            return {}
+        except (OSError, msgspec.DecodeError) as error:
+            log.warning(
+                "%s cannot be read: %s. Signed commands of the last minute could be sent again "
+                "by whoever recorded them.",
+                self._file,
+                reason_of(error),
+            )
+            return {}
+
+    def save(self, stamps: Kept) -> None:
+        """Store these; returns at once, only the newest are written."""
+        is_busy, self._waiting = self._waiting is not None, stamps
+        if not is_busy:
+            self._worker.submit(self._write)
+
+    def close(self, stamps: Kept) -> None:
+        """Write these last if there are any, and end."""
+        if stamps:
+            self.save(stamps)
+        self._worker.shutdown(wait=True)
+
+    def _write(self) -> None:
+        stamps, self._waiting = self._waiting, None
+        try:
+            self._file.parent.mkdir(parents=True, exist_ok=True)
+            text = msgspec.json.encode({str(key): kept for key, kept in (stamps or {}).items()})
+            write_new(self._file, [text], overwrite=True, rights=PRIVATE)
+        except OSError as error:
+            if not self._is_reported:
+                log.warning("%s cannot be written: %s", self._file, reason_of(error))
+            self._is_reported = True
+        else:
+            self._is_reported = False
