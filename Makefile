@@ -3,7 +3,7 @@
 # make kernels  the compiled kernels, if their sources have changed
 # make coverage  the lines of each package that the quick tests run, without a threshold
 # make wheel  wheels for x86-64 and aarch64, in dist/
-# make image  an OCI image, with podman, buildah or docker
+# make image  an OCI image, with podman, buildah or docker; BASE= names another base than Python's
 # make lint   formatting, lint and types
 # make firmware   the ready-made images of `mavgate flash`; make deb builds them too
 # make deb    a Debian package with the service, in dist/
@@ -52,7 +52,8 @@ wheel: .venv/.run
 	done
 
 image:
-	$(firstword $(shell command -v podman buildah docker) podman) build --tag mavgate .
+	$(firstword $(shell command -v podman buildah docker) podman) build --tag mavgate \
+		$(if $(BASE),--build-arg BASE=$(BASE)) .
 
 deb: .venv/.run firmware
 	tools/make_deb.sh dist

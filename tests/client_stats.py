@@ -1,4 +1,4 @@
-"""A client as the hub tells of it, before anything has come or gone."""
+"""The statistics of a client before anything was received or sent."""
 
 from gateway.hub.stats import ClientStats
 

@@ -19,7 +19,7 @@ USERS_OWN = (
     *("XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_RUNTIME_DIR"),
     *("MAVGATE_SOCKET", "NOTIFY_SOCKET", "RUNTIME_DIRECTORY"),
 )
-"""What tells a program where its user keeps things, or that it is a service."""
+"""Variables that name a user's folders, or mark a process as a service."""
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -116,7 +116,7 @@ def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
     assert len(str(caught.value).splitlines()) == 3
 
 
-def test_every_endpoint_is_reported_also_beside_other_errors(tmp_path: Path) -> None:
+def test_every_endpoint_is_reported_next_to_other_errors(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     urls = ["udp:", "tcp:host:99999", "udp:127.0.0.1:14550", "udp:127.0.0.1:14550?name=b"]
     file.write_text(f"[hub]\nmax_clients = 0\nendpoints = {urls}\n[serial]\nbaud = 1\n")
@@ -125,11 +125,11 @@ def test_every_endpoint_is_reported_also_beside_other_errors(tmp_path: Path) -> 
     lines = str(caught.value).splitlines()
     assert len(lines) == 5
     assert all(line.startswith(f"{file}: ") for line in lines)
-    for told in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
-        assert sum(told in line for line in lines) == 1
+    for text in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
+        assert sum(text in line for line in lines) == 1
 
 
-def test_a_choice_tells_what_may_be_chosen(tmp_path: Path) -> None:
+def test_error_of_a_choice_lists_the_allowed_values(tmp_path: Path) -> None:
     file = tmp_path / "wrong.toml"
     file.write_text('[estimation.paper]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n')
     with pytest.raises(ConfigError) as caught:

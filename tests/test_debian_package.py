@@ -42,7 +42,7 @@ def unpacked(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def dpkg(root: Path, *words: object) -> str:
-    """Run dpkg as for a system below `root`, with the scripts told so."""
+    """Run dpkg as for a system below `root`, which its scripts know."""
     command = ["dpkg", f"--root={root}", "--force-script-chrootless", "--force-depends"]
     done = subprocess.run([*command, *map(str, words)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -173,7 +173,7 @@ def test_documents_and_completion_come_along(unpacked: Path) -> None:
         assert "_MAVGATE_COMPLETE" in (unpacked / "usr/share" / path).read_text()
 
 
-def test_nothing_tells_where_it_was_built(unpacked: Path) -> None:
+def test_no_file_names_the_folder_of_the_build(unpacked: Path) -> None:
     names = [path for path in unpacked.rglob("*") if path.is_file() and path.suffix != ".pyc"]
     texts = [path.read_bytes() for path in names]
     assert not [name for name, text in zip(names, texts, strict=True) if bytes(ROOT) in text]

@@ -29,6 +29,7 @@ STUB = """#!/bin/sh
 STUBBED = (
     *("mavgate", "make", "python", "python3", "pio", "pipx", "uv"),
     *("sudo", "pip", "curl", "dask", "avrdude", "apt", "apt-get", "systemctl", "usermod", "gcloud"),
+    "podman",
     *("mavproxy.py", "mkdocs", "pre-commit", "openssl"),
     *("mkdir", "sed", "chmod", "chgrp", "cp", "ln"),
 )
@@ -119,7 +120,11 @@ def test_shell_blocks_run_with_valid_commands(name: str, tmp_path: Path) -> None
     for block in blocks:
         # Paths of a virtual environment or of the system are the stubs too.
         text = re.sub(r"(?:\.venv|/opt/mavgate)/bin/(\w+)", r"\1", block)
-        text = text.replace("/etc/mavgate", str(tmp_path)).replace("cd mavgate", ":")
+        text = (
+            text.replace("/etc/mavgate", str(tmp_path))
+            .replace("cd mavgate", ":")
+            .replace("cd config", ":")
+        )
         done = subprocess.run(
             [bash, "-euc", text], env=environment, cwd=tmp_path, capture_output=True, text=True,
             check=False,

@@ -120,7 +120,7 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path, overwrite: bool) ->
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"1")]
 
 
-def test_a_file_of_the_user_beside_it_is_left_alone(tmp_path: Path) -> None:
+def test_a_file_of_the_user_next_to_it_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "a.partial").write_bytes(b"mine")
     write_new(tmp_path / "a", [b"1"])
     assert (tmp_path / "a.partial").read_bytes() == b"mine"
@@ -144,7 +144,7 @@ def test_an_output_is_checked_before_the_work(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_a_full_disk_is_told_by_the_file_that_was_wanted(
+def test_error_of_a_full_disk_names_the_requested_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     full = os.open("/dev/full", os.O_WRONLY)
@@ -214,7 +214,7 @@ def test_a_long_name_in_any_script_can_be_written(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_a_folder_that_is_missing_or_read_only_is_told_before_the_work(
+def test_missing_or_read_only_folder_is_reported_before_the_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(FileNotFoundError, match="folder that is not there"):

@@ -31,7 +31,7 @@ LIMIT_S = 60
 
 
 def recording(step_us: int = 1) -> list[TlogRecord]:
-    """Vehicle 3 tells its parameters, and station 255 arms it."""
+    """Vehicle 3 sends its parameters, and station 255 arms it."""
     vehicle, station = mavlink.MAVLink(None, 3, 1), mavlink.MAVLink(None, 255, 190)
     said: list[tuple[Any, Any]] = [(vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
     said += [

@@ -1,4 +1,4 @@
-"""Every number that may be set, at both ends of its range, beside them, and at almost nothing."""
+"""Every number that may be set, at both ends of its range, next to them, and near zero."""
 
 import math
 import sys
@@ -76,7 +76,7 @@ FUSION = [
 
 
 def concerns(path: str, estimator: str) -> bool:
-    """Tell whether an estimator reads a setting."""
+    """Return whether an estimator reads a setting."""
     owner = path.split(".")[1]
     return owner not in ESTIMATORS or owner == estimator
 
@@ -192,7 +192,7 @@ def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> No
             assert all_known(fly(aircraft, 1_000_000 + 5_000_000 * n, 14)), (path, value)
 
 
-# Without shrinking, which takes minutes; the failing draws are told all the same.
+# Without shrinking, which takes minutes; the failing draws are reported all the same.
 @settings(deadline=None, derandomize=True, max_examples=40, phases=[Phase.generate])
 @given(st.data())
 def test_any_ends_together_give_attitudes(data: st.DataObject) -> None:
@@ -265,7 +265,7 @@ def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
         CalibrationKind.MAG,
         msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0)),
     )
-    told = aircraft.perform([measured], 0)
-    assert b"Calibration refused" in told[0].frame
-    assert all(isinstance(action, Outgoing) for action in told)
+    actions = aircraft.perform([measured], 0)
+    assert b"Calibration refused" in actions[0].frame
+    assert all(isinstance(action, Outgoing) for action in actions)
     assert aircraft.settings.calibration == NodeCalibration()

@@ -1,4 +1,4 @@
-"""Measure how the hub forwards MAVLink over UDP and WebSocket, beside a plain UDP forwarder.
+"""Measure how the hub forwards MAVLink over UDP and WebSocket, next to a plain UDP forwarder.
 
 A source sends frames of foreign vehicles to the forwarder, which passes them to N clients, all on
 loopback. Three figures for each forwarder and N:
@@ -320,7 +320,7 @@ class Bench:
         )
 
     def commanded(self, systems: int) -> int:
-        """Let the first client send a command to each of so many vehicles; tell how many came."""
+        """Send a command to each of so many vehicles; return how many arrived."""
         for number in range(2 * systems):
             self._send(self._frames[number])
         self._sinks[0].setblocking(True)

@@ -96,18 +96,18 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
     settings = settings_in(folder, options.vehicles, ports)
     load_entry_points()
     watch = TurnWatch()
-    visitors = subprocess.Popen(
-        [sys.executable, Path(__file__).with_name("visitors.py"), *map(str, ports)],
+    stations = subprocess.Popen(
+        [sys.executable, Path(__file__).with_name("changing_stations.py"), *map(str, ports)],
         stderr=subprocess.DEVNULL,
     )
     try:
         with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
             runner.run(fly(settings, watch, 60.0 * options.minutes))
-        if visitors.poll() is not None:
+        if stations.poll() is not None:
             raise SystemExit("the stations have died")
     finally:
-        visitors.terminate()
-        visitors.wait()
+        stations.terminate()
+        stations.wait()
     return watch
 
 

@@ -1,10 +1,10 @@
 """Measure what trouble with one client costs the others.
 
 Four healthy clients of the hub are sent 500 messages a second while something happens to a fifth,
-or strangers forge, ask too much and crowd in (`fault_traffic.py`). For each fault, runs with and
-without it take turns; the healthy clients must lose nothing, hear nothing for 100 ms at most, and
-their p99 latency must be within twice the undisturbed one. What makes the trouble takes processor
-time of its own, which on two cores is part of what is measured.
+or untrusted clients forge, ask too much and crowd in (`fault_traffic.py`). For each fault, runs
+with and without it take turns; the healthy clients must lose nothing, hear nothing for 100 ms at
+most, and their p99 latency must be within twice the undisturbed one. What makes the trouble takes
+processor time of its own, which on two cores is part of what is measured.
 
 Root, where network namespaces are allowed, runs all of it in a network of its own, with a virtual
 Ethernet cable that can be pulled out; otherwise that one fault is left out.
@@ -37,13 +37,13 @@ RATE_HZ = 500
 LIMIT = 2.0
 """Times the undisturbed p99."""
 GAP_LIMIT_US = 100_000
-STRANGERS = {
-    "strangers forge heartbeats and copies": "forge",
-    "a stranger asks for answers to all, 400/s": "to-all",
-    "31 strangers ask 4000 times a second": "ports",
+UNTRUSTED_CLIENTS = {
+    "untrusted clients forge heartbeats and copies": "forge",
+    "an untrusted client asks for answers to all, 400/s": "to-all",
+    "31 untrusted clients ask 4000 times a second": "ports",
     "31 trusted clients ask 4000 times a second": "trusted-ports",
-    "31 strangers want all parameters, 400/s": "lists",
-    "16 strangers have files sent byte by byte": "bursts",
+    "31 untrusted clients request all parameters, 400/s": "lists",
+    "16 untrusted clients have files sent byte by byte": "bursts",
     "one machine crowds a port": "crowd",
     "two stations with one id ask the same": "twins",
 }
@@ -222,7 +222,7 @@ class FaultBench(Bench):
 
     @contextmanager
     def troubled(self, kind: str) -> Iterator[None]:
-        """Have strangers make trouble of some kind."""
+        """Run one kind of hostile traffic."""
         with process(TRAFFIC.read_text(), self.port, kind):
             time.sleep(1.0)
             yield
@@ -240,7 +240,7 @@ def pulled() -> Iterator[None]:
 
 
 def lay_cable() -> bool:
-    """Lay a cable in a network of our own; tell whether that could be done."""
+    """Lay a cable in a network of our own; return whether that succeeded."""
     ip("link", "set", "lo", "up")
     try:
         ip("link", "add", NEAR, "type", "veth", "peer", FAR, "address", FAR_ADDRESS)
@@ -259,7 +259,7 @@ def ip(*words: str) -> None:
 
 @contextmanager
 def process(code: str, *arguments: object) -> Iterator["subprocess.Popen[bytes]"]:
-    """Run a piece of Python beside us."""
+    """Run a piece of Python as a child process."""
     child = subprocess.Popen([sys.executable, "-c", code, *map(str, arguments)], cwd=TRAFFIC.parent)
     try:
         time.sleep(0.3)
@@ -293,7 +293,7 @@ def main() -> None:
         "datagrams of 0 and 65507 bytes": bench.spoken("odd"),
         "settings reloaded 5 times a second": bench.reloaded,
     }
-    for name, kind in STRANGERS.items():
+    for name, kind in UNTRUSTED_CLIENTS.items():
         faults[name] = partial(bench.troubled, kind)
     faults["joined twice to another gateway"] = bench.joined
     if cable:

@@ -1,4 +1,4 @@
-"""Trouble for a hub, as `fault_hub.py` wants it: strangers that forge, ask too much, or crowd in.
+"""Hostile traffic for `fault_hub.py`: untrusted clients that forge, ask too much, or crowd in.
 
     python fault_traffic.py PORT KIND
 
@@ -54,13 +54,13 @@ def caller(host: str, port: int) -> socket.socket:
 
 def forge(port: int) -> Batch:
     """Call the source a station, claim its components, and say what it will say in advance."""
-    stranger = caller(UNTRUSTED, port)
+    client = caller(UNTRUSTED, port)
     frames = itertools.cycle(source_frames())
     names = itertools.cycle(range(1, 250))
     while True:
-        yield lambda: stranger.send(heartbeat(SOURCE_SYSTEM, 1))
-        yield lambda: stranger.send(heartbeat(next(names), next(names)))
-        yield lambda: stranger.send(next(frames))
+        yield lambda: client.send(heartbeat(SOURCE_SYSTEM, 1))
+        yield lambda: client.send(heartbeat(next(names), next(names)))
+        yield lambda: client.send(next(frames))
 
 
 def asking(port: int, host: str, frame: bytes, ports: int = PORTS) -> Batch:

@@ -24,7 +24,7 @@ from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
 
 GPS_EVERY = 40
-"""One fix to so many IMU payloads: 5 Hz beside 200 Hz."""
+"""IMU payloads for each fix: 200 Hz and 5 Hz."""
 ALLOWED_GROWTH_KIB = 2048
 SETTLED_SHARE = 0.2
 """The memory after this share of the run is the one to compare with."""
@@ -116,7 +116,7 @@ async def soak(options: argparse.Namespace) -> int:
 
 
 def judge(report: LinkReport, tracker: Tracker, settled_kib: int) -> int:
-    """Print the account and tell whether it adds up."""
+    """Print the account and return whether it adds up."""
     status = 0
     for link in sorted(report.nodes, key=lambda node: node.node.node_id):
         if link.node.vehicle_id != 1 or link.node.node_id > 1:

@@ -1,4 +1,4 @@
-"""Commands are imported when they are called, and the list tells the truth about them."""
+"""Commands are imported when they are called, and the list agrees with them."""
 
 import subprocess
 import sys

@@ -53,6 +53,6 @@ def test_a_summary_of_a_recording_needs_neither_settings_nor_stages() -> None:
 
 def test_a_listing_of_commands_loads_no_extension() -> None:
     code = "from gateway.cli.app import app; app(['--help'], standalone_mode=False)"
-    tell = f"import sys; {code}; print('gateway.extensions' in sys.modules, 'numpy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", tell], capture_output=True, check=True, text=True)
+    code = f"import sys; {code}; print('gateway.extensions' in sys.modules, 'numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)
     assert done.stdout.splitlines()[-1] == "False False"

@@ -154,7 +154,7 @@ def test_the_gyroscope_from_a_flight(tmp_path: Path, config: Path) -> None:
 
 @pytest.mark.io
 def test_a_steady_turn_counts_as_no_rest(tmp_path: Path, config: Path) -> None:
-    """In smooth air a long turn is as even as a rest: only the fixes tell it from one."""
+    """In smooth air a long turn is as even as a rest: only the fixes distinguish them."""
     rng = np.random.default_rng(2)
     lines = [encode_head(TableHeader(vehicle_id=3))]
     for time_us in range(0, 80_000_000, 20_000):

@@ -193,8 +193,8 @@ def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
     assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
     assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
     assert gateway.asked == [Url("udp:10.0.0.8:14550")]
-    told = "observers: Address already in use; trying again until it works"
-    assert told in run("clients", "add", CLOSED.endpoint).output
+    reported = "observers: Address already in use; trying again until it works"
+    assert reported in run("clients", "add", CLOSED.endpoint).output
     refused = run("clients", "remove", "phone")
     assert refused.exit_code == 2
     assert "no endpoint is called 'phone'" in refused.output

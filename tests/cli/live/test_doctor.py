@@ -163,7 +163,9 @@ def test_missing_extras_are_named(
 
 
 @pytest.mark.parametrize("grade", list(Grade))
-def test_the_exit_code_tells_programs(monkeypatch: pytest.MonkeyPatch, grade: Grade) -> None:
+def test_exit_code_is_1_if_something_is_wrong(
+    monkeypatch: pytest.MonkeyPatch, grade: Grade
+) -> None:
     def check(_: GatewaySettings) -> list[Diagnosis]:
         return [Diagnosis(grade, "thing", "is so")]
 
@@ -185,11 +187,11 @@ def test_the_exit_code_tells_programs(monkeypatch: pytest.MonkeyPatch, grade: Gr
 def test_a_certificate_that_ends(
     settings: GatewaySettings, tmp_path: Path, days: int, grade: Grade, word: str
 ) -> None:
-    key, wish, file = (tmp_path / name for name in ("key.pem", "wish.pem", "panel.pem"))
+    key, request, file = (tmp_path / name for name in ("key.pem", "request.pem", "panel.pem"))
     curve = ("ec", "-pkeyopt", "ec_paramgen_curve:P-256")
     made = ("openssl", "req", "-new", "-newkey", *curve, "-nodes", "-subj", "/CN=mavgate")
-    subprocess.run([*made, "-keyout", key, "-out", wish], check=True, capture_output=True)
-    signed = ("openssl", "x509", "-req", "-in", wish, "-signkey", key, "-days", str(days))
+    subprocess.run([*made, "-keyout", key, "-out", request], check=True, capture_output=True)
+    signed = ("openssl", "x509", "-req", "-in", request, "-signkey", key, "-days", str(days))
     subprocess.run([*signed, "-out", file], check=True, capture_output=True)
     panel = replace(settings.panel, certificate=str(file), certificate_key=str(key))
     found = one(doctor.check_certificates, replace(settings, panel=panel))

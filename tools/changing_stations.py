@@ -1,6 +1,6 @@
 """Ground stations that come and go: by UDP, TCP and WebSocket, each asking for all there is.
 
-    python tools/visitors.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
+    python tools/changing_stations.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
 
 For `bench_pauses.py`: they ask a gateway for parameters, missions, messages, rates and files, stay
 for some seconds and leave, until the process is ended. Its metrics are scraped meanwhile.
