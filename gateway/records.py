@@ -39,10 +39,10 @@ class ImuFlags(IntFlag):
     ACCEL_CLIPPED = 1 << 6
     GYRO_CLIPPED = 1 << 7
     MAG_UNCALIBRATED = 1 << 8
-    """The gateway's own: the compass was never calibrated: hard and soft iron are not removed."""
+    """Set by the gateway: the compass was never calibrated, hard and soft iron are not removed."""
     GYRO_UNCALIBRATED = 1 << 9
     ACCEL_UNCALIBRATED = 1 << 10
-    """The same of the inertial sensors: their biases are not removed."""
+    """Set by the gateway too: a sensor whose bias is not removed."""
 
     __and__ = int.__and__  # type: ignore[assignment]
     """Returns a plain int to test a bit: building a flag would cost six times as much."""
@@ -177,7 +177,7 @@ class RadioState(IntEnum):
 
     @property
     def problem(self) -> str:
-        """What is wrong, for people; empty if it works."""
+        """The fault, for people; empty if it works."""
         match self:
             case RadioState.ABSENT:
                 return "radio module does not answer"
@@ -209,7 +209,7 @@ class NodeStatus(msgspec.Struct, frozen=True, gc=False):
 
 
 class PipeCounters(msgspec.Struct, frozen=True, gc=False):
-    """What the receiver counted on one of its six radio pipes since it started."""
+    """Counts of the receiver on one of its six radio pipes since it started."""
 
     received: int
     lost: int
@@ -303,7 +303,7 @@ class FusionState(msgspec.Struct, frozen=True, gc=False):
 
 
 class NodeLink(msgspec.Struct, frozen=True, gc=False):
-    """What the gateway counted of one node since it started."""
+    """Counts of the gateway for one node since it started."""
 
     node: NodeId
     pipe: int

@@ -363,7 +363,10 @@ def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack,
     """Smooth a flight; also return the GPS latency that was used, s. See `fuse`."""
     estimator = make_estimator(with_estimator(settings, SMOOTHED_ESTIMATOR).estimation)
     fused = fuse(flight.samples, estimator, smoothed=True)
-    return track_of(np.sort(flight.time_us, kind="stable"), fused.states), fused.latency_s
+    # Smoothed states are in the order of time, in which a late sample is not.
+    states = np.empty_like(fused.states)
+    states[np.argsort(flight.time_us, kind="stable")] = fused.states
+    return track_of(flight.time_us, states), fused.latency_s
 
 
 def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:

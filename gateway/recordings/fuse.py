@@ -124,7 +124,7 @@ def fuse(
         The recording, or its next stretch.
     estimator : Estimator
         In the order of arrival it advances over the samples, with the bits of live states.
-        Smoothed it has to be the Kalman filter, and is not changed.
+        Smoothed it has to be the Kalman filter, and is not changed; states are in order of time.
     smoothed : bool
         Whether states use the samples after them too; see `smooth`.
     on_fix : callable, optional

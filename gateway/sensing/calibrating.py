@@ -370,8 +370,8 @@ def gyro_at_rest(samples: NodeSamples) -> FloatArray:
     apart = float(np.ptp(means, axis=0).max())
     if apart > MAX_RESTS_APART_RADPS:
         raise CalibrationError(
-            f"what seems to be {len(spans)} rests is {apart / RAD_PER_DEG:.1f} deg/s apart: the "
-            "node turned steadily in some of them; calibrate from a recording on the ground"
+            f"the rates of {len(spans)} apparent rests differ by {apart / RAD_PER_DEG:.1f} deg/s: "
+            "the node turned steadily in some of them; calibrate from a recording on the ground"
         )
     return np.vstack([samples.gyro[span] for span in spans])
 

@@ -42,7 +42,7 @@ def test_the_fused_track_is_near_the_truth(name: str) -> None:
     assert rms(np.hypot(error[:, 0], error[:, 1])) < 4.0
 
 
-def test_what_an_estimator_does_not_vouch_for_is_not_known() -> None:
+def test_values_without_a_validity_flag_are_unknown() -> None:
     track: FlightTrack = short_case().tracks["paper"]
     first_s = short_flight().seconds(
         np.array([f.time_us for f in short_flight().fixes if f.fix_ok])

@@ -16,7 +16,7 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import DURATION_S, short_case, short_flight
 
 
-def test_the_summary_tells_the_flight() -> None:
+def test_summary_contains_the_key_figures() -> None:
     found = summarise(short_case())
     assert found["duration, s"] == pytest.approx(DURATION_S, abs=0.1)
     assert found["longest time without a fix, s"] == pytest.approx(3.2, abs=0.3)
@@ -26,7 +26,7 @@ def test_the_summary_tells_the_flight() -> None:
     assert 300.0 < found["distance flown, m"] < 900.0
 
 
-def test_every_estimator_foretells_withheld_fixes_and_each_its_own_way() -> None:
+def test_error_at_withheld_fixes_differs_between_estimators() -> None:
     names = (*ESTIMATORS, SMOOTHED)
     errors_m = {withheld_error_m(short_case(), name) for name in names}
     assert len(errors_m) == len(names)

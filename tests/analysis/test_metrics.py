@@ -20,7 +20,7 @@ def quats(rotation: Rotation) -> np.ndarray:
     return np.atleast_2d(rotation.as_quat(scalar_first=True))
 
 
-def test_numbers_leave_out_what_is_not_known() -> None:
+def test_unknown_values_are_left_out_of_means() -> None:
     values = np.array([3.0, np.nan, -4.0])
     assert rms(values) == pytest.approx(np.sqrt(12.5))
     assert mean_abs(values) == 3.5

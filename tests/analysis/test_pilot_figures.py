@@ -1,4 +1,4 @@
-"""What a pilot is told of a flight, against flights whose answers are known."""
+"""Figures for pilots, of flights whose figures are known."""
 
 import numpy as np
 import pytest
@@ -64,7 +64,7 @@ def test_a_hop_of_a_second_is_no_flight() -> None:
     assert pilot_figures(flight, track, frame).airborne_s == 0.0
 
 
-def test_a_silence_of_the_link_is_found() -> None:
+def test_gap_in_the_samples_is_a_loss_of_the_link() -> None:
     flight = short_flight()
     late = flight.time_us + np.where(flight.time_s > 20.0, 4_000_000, 0)
     case = short_case()
@@ -74,7 +74,7 @@ def test_a_silence_of_the_link_is_found() -> None:
     assert end - begin == pytest.approx(4.0 + 1.0 / RATE_HZ, abs=0.05)
 
 
-def test_what_is_not_known_is_nan() -> None:
+def test_unknown_figures_are_nan() -> None:
     flight = short_flight()
     count = len(flight.time_us)
     unknown = np.full(count, np.nan)

@@ -13,7 +13,7 @@ def test_white_noise_has_a_flat_spectrum(rng: np.random.Generator) -> None:
     assert density.mean(axis=0) == pytest.approx([2.0 * 4.0 / RATE_HZ] * 3, rel=0.03)
 
 
-def test_a_sine_stands_at_its_frequency() -> None:
+def test_spectrum_of_a_sine_peaks_at_its_frequency() -> None:
     t = np.arange(3000) / RATE_HZ
     frequency, density = power_density(np.outer(np.sin(2 * np.pi * 12.5 * t), [1, 1, 1]), RATE_HZ)
     assert frequency[density[:, 0].argmax()] == pytest.approx(12.5)

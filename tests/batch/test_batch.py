@@ -68,7 +68,7 @@ def test_one_broken_file_stops_nothing_and_is_reported(fused: tuple[Path, int, s
     assert "broken.csv" in page
 
 
-def test_what_is_fused_is_what_the_command_fuses(
+def test_batch_fuses_as_the_command(
     season: Path, fused: tuple[Path, int, str], tmp_path: Path
 ) -> None:
     single = tmp_path / "alone.csv"
@@ -77,7 +77,7 @@ def test_what_is_fused_is_what_the_command_fuses(
     assert (fused[0] / "fused" / "alpha.csv").read_bytes() == single.read_bytes()
 
 
-def test_what_is_done_is_not_done_again(season: Path, fused: tuple[Path, int, str]) -> None:
+def test_finished_recordings_are_not_done_again(season: Path, fused: tuple[Path, int, str]) -> None:
     out, _, _ = fused
     before = {path: path.stat().st_mtime_ns for path in (out / RESULTS).iterdir()}
     assert len(before) == 5
@@ -155,14 +155,14 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
     assert again.find("k") is None
 
 
-def test_a_file_that_has_gone_is_said_in_plain_words(season: Path, tmp_path: Path) -> None:
+def test_missing_file_is_reported_in_plain_words(season: Path, tmp_path: Path) -> None:
     gone = tmp_path / "gone.csv"
     items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((StoredFile(str(gone)),))]
-    told: list[tuple[str, int, int]] = []
+    reported: list[tuple[str, int, int]] = []
     results = run_season(
-        InfoTask(OPTIONS), items, LocalProcesses(1), None, lambda *now: told.append(now)
+        InfoTask(OPTIONS), items, LocalProcesses(1), None, lambda *now: reported.append(now)
     )
-    assert [done for _, done, total in told if total == 2] == [1, 2, 2]
+    assert [done for _, done, total in reported if total == 2] == [1, 2, 2]
     assert [result.error for result in results] == [None, f"{gone}: No such file or directory"]
     assert results[0].began == "2026-05-28 20:26:40"
 
@@ -189,7 +189,7 @@ def test_results_of_one_tick_of_the_clock_stand_by_name(tmp_path: Path) -> None:
     assert [found.place for found in read_results(tmp_path)] == [*"acmyzb"]
 
 
-def test_info_tells_every_file(season: Path, tmp_path: Path) -> None:
+def test_info_describes_every_file(season: Path, tmp_path: Path) -> None:
     code, text = run("info", season, "-o", tmp_path)
     assert code == 1
     assert all(name in text for name in FLIGHTS)
@@ -288,7 +288,7 @@ def memory(season: Path) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("pattern", ["", "/*.csv", f"/{FLIGHTS[1]}"])
-def test_urls_give_what_local_files_give(
+def test_urls_give_the_results_of_local_files(
     memory: str, pattern: str, season: Path, fused: tuple[Path, int, str], tmp_path: Path
 ) -> None:
     code, text = run("fuse", memory + pattern, "-o", tmp_path, "--jobs", 2)
@@ -307,7 +307,7 @@ def test_a_local_url_is_read_too(season: Path, tmp_path: Path) -> None:
 
 
 class _Elsewhere(MemoryFileSystem):
-    """A storage with marks of change, a host and an error of its own, which tells what was read."""
+    """A storage with marks of change, a host and an error of its own, which counts the reads."""
 
     protocol = "elsewhere"
     store: ClassVar[dict[str, Any]] = {}
@@ -342,9 +342,7 @@ class _InThisProcess:
                 yield number, failure_of(error)
 
 
-def test_what_is_elsewhere_is_fetched_once_and_only_if_it_changed(
-    season: Path, tmp_path: Path
-) -> None:
+def test_remote_files_are_fetched_once_unless_changed(season: Path, tmp_path: Path) -> None:
     fsspec.register_implementation("elsewhere", _Elsewhere, clobber=True)
     storage = fsspec.filesystem("elsewhere")
     for name in FLIGHTS[:2]:
@@ -380,7 +378,7 @@ def test_a_broken_file_elsewhere_is_reported_by_its_url(memory: str, tmp_path: P
     assert "/tmp" not in text
 
 
-def test_a_storage_without_its_package_says_how_to_add_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_of_a_storage_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(url: str) -> None:
         raise ImportError("Install s3fs to access S3")
 
@@ -389,7 +387,7 @@ def test_a_storage_without_its_package_says_how_to_add_it(monkeypatch: pytest.Mo
         items_of(["s3://season/"])
 
 
-def test_a_url_that_leads_nowhere_is_said(tmp_path: Path) -> None:
+def test_url_without_a_file_is_reported(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="no recording is there"):
         items_of(["memory://nothing/*.csv"])
     with pytest.raises(StorageError, match="gopher"):
@@ -402,7 +400,7 @@ def test_a_url_that_leads_nowhere_is_said(tmp_path: Path) -> None:
     ("words", "lacking"),
     [(("memory://flights",), "has_fsspec"), (("{season}", "--scheduler", "tcp://x:1"), "has_dask")],
 )
-def test_without_the_extra_it_says_how_to_add_it(
+def test_missing_extra_is_named(
     words: tuple[str, ...], lacking: str, season: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip

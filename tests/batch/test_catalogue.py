@@ -51,7 +51,7 @@ class InThisProcess:
 
 
 def write_tlog(path: Path) -> Path:
-    """Ten minutes of two vehicles: one flies two sides of a square, the other tells no position."""
+    """Ten minutes of two vehicles: one flies two sides of a square, the other sends no position."""
     records = []
 
     def send(time_s: float, system: int, message: mavlink.MAVLink_message) -> None:
@@ -101,7 +101,7 @@ def row_of(folder: Path, path: str) -> dict:
     return found
 
 
-def test_a_table_tells_its_flight(folder: Path) -> None:
+def test_facts_of_a_table_are_those_of_its_flight(folder: Path) -> None:
     row = row_of(folder, "one_01_v1.csv")
     flown = simulated()
     truth = flown.trajectory.truth_at(np.arange(0.0, DURATION_S, 0.2))
@@ -120,14 +120,14 @@ def test_a_table_tells_its_flight(folder: Path) -> None:
     assert len(row["settings"]) == 12
 
 
-def test_lost_samples_and_settings_tell_flights_apart(folder: Path) -> None:
+def test_loss_and_settings_differ_between_flights(folder: Path) -> None:
     one, two = row_of(folder, "one_01_v1.csv"), row_of(folder, "deeper/two_01_v2.csv")
     assert two["loss"] == pytest.approx(0.1, abs=0.005)
     assert two["settings"] == one["settings"]
     assert two["began"] == "2026-05-31 20:26:40"
 
 
-def test_a_tlog_tells_each_of_its_vehicles(folder: Path) -> None:
+def test_tlog_has_one_row_for_each_vehicle(folder: Path) -> None:
     first, second = find_flights(folder, "path = 'far.tlog'")
     assert (first["vehicle"], second["vehicle"]) == (1, 2)
     assert first["distance"] == pytest.approx(1050.0 + 1196.0, rel=0.01)
@@ -179,7 +179,7 @@ def test_a_packed_file_is_known_by_its_first_bytes(tmp_path: Path, name: str) ->
     assert log in [*recordings_below(tmp_path)]
 
 
-def test_a_broken_file_has_a_row_that_says_why(folder: Path) -> None:
+def test_broken_file_has_a_row_with_the_reason(folder: Path) -> None:
     broken = {row["path"]: row["error"] for row in find_flights(folder, "error is not null")}
     assert set(broken) == {"empty.csv", "noise.tlog"}
     assert "is no recording" in broken["noise.tlog"]
@@ -195,7 +195,7 @@ def test_a_name_that_is_not_utf8_and_a_time_beyond_all(tmp_path: Path, folder: P
     assert (row["name"], row["vehicle"], row["error"]) == (r"fl\xfcg", 1, None)
 
 
-def test_only_what_changed_is_read_again(tmp_path: Path) -> None:
+def test_only_changed_files_are_read_again(tmp_path: Path) -> None:
     for name in ("a", "b", "c"):
         (tmp_path / f"{name}.csv").write_text(f"time_us,x\n{name},1\n")
     index_folder(tmp_path, OPTIONS, InThisProcess())
@@ -266,7 +266,7 @@ def test_a_condition_can_only_read(folder: Path, where: str, message: str) -> No
     assert len(find_flights(folder)) == 6
 
 
-def test_what_is_no_catalogue_is_said(tmp_path: Path) -> None:
+def test_file_that_is_no_catalogue_is_reported(tmp_path: Path) -> None:
     with pytest.raises(CatalogueError, match="no catalogue yet"):
         find_flights(tmp_path)
     (tmp_path / CATALOGUE_NAME).write_text("a diary" * 1000)
@@ -274,7 +274,7 @@ def test_what_is_no_catalogue_is_said(tmp_path: Path) -> None:
         Catalogue(tmp_path)
 
 
-def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
+def test_catalogue_of_another_version_is_made_again(tmp_path: Path) -> None:
     catalogue = Catalogue(tmp_path)
     catalogue.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
     catalogue._db.execute("PRAGMA user_version = 99")
@@ -289,7 +289,7 @@ def test_a_catalogue_of_another_version_is_made_anew(tmp_path: Path) -> None:
     ("code", "message"),
     [(sqlite3.SQLITE_FULL, "make room"), (sqlite3.SQLITE_IOERR | 9 << 8, "delete it and index")],
 )
-def test_a_catalogue_that_cannot_be_written_says_what_to_do(
+def test_unwritable_catalogue_is_reported_with_advice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, message: str
 ) -> None:
     opened = []
@@ -328,7 +328,7 @@ def test_a_catalogue_that_another_indexing_made_meanwhile_is_kept(
         catalogue.close()
 
 
-def test_a_damaged_catalogue_is_said(tmp_path: Path) -> None:
+def test_damaged_catalogue_is_reported(tmp_path: Path) -> None:
     catalogue = Catalogue(tmp_path)
     catalogue.put(catalogued(number) for number in range(200))
     catalogue.close()
@@ -410,7 +410,7 @@ def test_every_column_has_a_place_in_the_book() -> None:
     assert [name for name in COLUMNS if f"`{name}`" not in text] == []
 
 
-def test_processes_give_what_this_one_gives(folder: Path, tmp_path: Path) -> None:
+def test_processes_give_the_results_of_one(folder: Path, tmp_path: Path) -> None:
     for name in ("one_01_v1.csv", "far.tlog"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     index_folder(tmp_path, OPTIONS, LocalProcesses(2))

@@ -45,7 +45,7 @@ def _fail(marker: Path) -> int:
     raise KeyError(marker.name)
 
 
-def test_a_cluster_gives_what_this_machine_gives(
+def test_cluster_gives_the_results_of_this_machine(
     address: str, season: Path, tmp_path: Path
 ) -> None:
     code, text = _run(season, tmp_path / "cluster", "--scheduler", address)
@@ -80,7 +80,7 @@ def test_work_that_fails_fails_alone(address: str, tmp_path: Path) -> None:
     assert outcome == WorkFailed("KeyError: 'x'")
 
 
-def test_a_scheduler_that_is_not_there_is_said(
+def test_missing_scheduler_is_reported(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gateway.batch.executors.CONNECT_S", 0.3)

@@ -31,7 +31,7 @@ def test_flights_of_a_single_day_are_folds_of_their_own() -> None:
     assert sorted(folds_of(["1 2026-06-01"] * 4).tolist()) == [0, 1, 2, 3]
 
 
-def test_no_flight_judges_what_it_chose() -> None:
+def test_flights_are_judged_by_the_choice_of_other_folds() -> None:
     """On noise alone the best of many points leads by luck; judged by others, on average not."""
     in_sample, judged = [], []
     for seed in range(12):
@@ -69,7 +69,7 @@ def test_flights_that_know_nothing_are_left_out() -> None:
         choose(np.full((2, 2), np.nan), np.ones(2), ["a", "b"])
 
 
-def test_a_single_day_tells_nothing_from_chance() -> None:
+def test_single_day_cannot_be_separated_from_chance() -> None:
     lead = lead_of(np.array([1.0, 1.0]), np.array([2.0, 2.0]), ["a", "a"])
     assert lead is not None
     assert (lead.ratio, lead.p) == (pytest.approx(0.5), None)
@@ -98,7 +98,7 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
     ]
 
 
-def test_what_got_worse_is_listed_the_worst_first() -> None:
+def test_worse_flights_are_listed_the_worst_first() -> None:
     then = [flight("a", 1, eskf=1.0), flight("b", 1, eskf=1.0), flight("c", 1, eskf=1.0)]
     now = [flight("a", 1, eskf=1.04), flight("b", 1, eskf=2.0), flight("c", 1, eskf=3.0)]
     found = versus([*now, flight("new", 1, eskf=9.0)], then)

@@ -1,4 +1,4 @@
-"""What a recording tells of parameters, missions, home and version, and from when on."""
+"""Parameters, missions, home and version in a recording, and since when each is known."""
 
 import struct
 from typing import Any
@@ -67,7 +67,7 @@ def decode(frame: bytes) -> Any:
     return mavlink.MAVLink(None).decode(bytearray(frame))
 
 
-def test_parameters_are_whole_and_numbered_anew(day: Day) -> None:
+def test_parameters_are_complete_and_renumbered(day: Day) -> None:
     day.say(day.vehicle, value("BETA", 2.0, 7, 900), value("ALPHA", 1.0, 3, 900))
     day.say(day.vehicle, value("GAMMA", 5.0, 65535, 900))
     day.say(day.gimbal, value("GIMBAL", 9.0))
@@ -147,7 +147,7 @@ def test_home_is_that_of_the_moment(day: Day) -> None:
     assert latitudes == [470_000_000, 470_000_000, 480_000_000]
 
 
-def test_what_was_not_sent_is_not_known(day: Day) -> None:
+def test_values_never_sent_are_unknown(day: Day) -> None:
     day.say(day.station, value("ALPHA", 1.0))
     answers = day.answers()
     assert answers.parameters() == {}

@@ -136,7 +136,7 @@ def test_written_as_python_writes_and_read_as_it_reads(rows: list[tuple[float, f
     "text",
     [b"1,2\n3\n", b"1\n2,3\n", b"1,2,3,4\n", b"1,x\n", b"1,nan\n", b"1,-\n", b"-0,1\n", b"1,01\n"],
 )
-def test_what_is_not_so_many_plain_numbers_is_left_to_python(text: bytes) -> None:
+def test_lines_of_other_cells_are_left_to_python(text: bytes) -> None:
     assert read_lines(b"5,6\n" + text, 2) is None
 
 

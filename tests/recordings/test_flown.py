@@ -99,7 +99,7 @@ def test_another_programs_csv(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
     assert "left out 1 line that cannot be read" in caplog.text
 
 
-def test_what_holds_no_flight_is_refused(tmp_path: Path) -> None:
+def test_file_without_a_flight_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tlog"
     path.write_bytes(make_tlog(make_records(9)))
     with pytest.raises(FlightError, match=r"a\.tlog: holds no HIGHRES_IMU"):

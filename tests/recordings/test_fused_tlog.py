@@ -23,7 +23,7 @@ END_US = RECORDS[-1].time_us
 
 
 class Making:
-    """Records that tell how many of them were made."""
+    """Records that count how many of them were made."""
 
     def __init__(self) -> None:
         self.made = 0
@@ -120,7 +120,7 @@ def test_a_full_disk_ends_the_playback_and_nothing_else(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_a_copy_that_finds_no_room_says_where(
+def test_full_disk_of_a_copy_is_reported_with_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "a.bin"

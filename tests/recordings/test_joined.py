@@ -61,7 +61,7 @@ def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int
         (((0, 40), (0, 40)), range(40), 39),
     ],
 )
-def test_what_two_recordings_hold_is_taken_once(
+def test_rows_in_two_recordings_are_taken_once(
     spans: tuple[tuple[int, int], ...], kept: range, left_out: int, session: str
 ) -> None:
     joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])

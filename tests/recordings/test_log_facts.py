@@ -1,4 +1,4 @@
-"""What a log of another program tells of its GPS, the same for every command that fuses it."""
+"""GPS latency of other programs' logs: the same for every command that fuses them."""
 
 import gzip
 from pathlib import Path
@@ -32,7 +32,7 @@ def without_latency(tmp_path: Path) -> Path:
     return path
 
 
-def test_every_command_takes_the_latency_that_the_manoeuvres_tell(without_latency: Path) -> None:
+def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latency: Path) -> None:
     table = open_rows(without_latency, OPTIONS)
     latency_s = aircraft_for([without_latency], table, OPTIONS).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
@@ -67,10 +67,10 @@ def test_a_recording_that_was_fused_with_another_latency_is_reported(
     assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
 
 
-def test_what_the_log_the_user_or_the_settings_tell_is_taken(without_latency: Path) -> None:
-    def latency_s(path: Path, options: ReadOptions, told_s: float | None = None) -> float:
+def test_latency_of_user_log_or_settings_is_used(without_latency: Path) -> None:
+    def latency_s(path: Path, options: ReadOptions, given_s: float | None = None) -> float:
         table = open_rows(path, options)
-        found = aircraft_for([path], table, options, told_s).estimation.reference.gps_latency_s
+        found = aircraft_for([path], table, options, given_s).estimation.reference.gps_latency_s
         assert table.remarks == []
         return found
 

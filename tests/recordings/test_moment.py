@@ -27,7 +27,7 @@ def test_ways_to_write_a_moment(text: str, moment: Moment) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "soon", "1:2:3:4", "--5", "1:", "2026-13-01", "nan", "1e3"])
-def test_what_is_no_moment(text: str) -> None:
+def test_invalid_moment_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="no moment"):
         parse_moment(text)
 

@@ -84,7 +84,7 @@ def test_speed_changes_from_here_on() -> None:
     assert player.next_due_us() == STEP_US // 2 + STEP_US // 4
 
 
-def test_seek_tells_the_context_first() -> None:
+def test_seek_sends_state_messages_first() -> None:
     player = make_player()
     player.poll(0, MANY)
     player.seek(START_US + 50 * STEP_US, 1000)

@@ -60,7 +60,7 @@ def played(track: Track) -> list[bytes]:
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda said: said[1].get_type())
 def test_commands_stay_out(command: tuple[tuple[int, int], Any]) -> None:
-    # The last heartbeat tells who was a station all the time.
+    # The last heartbeat shows which system was a station all the time.
     data = tlog_of([*TELEMETRY[:2], command, *TELEMETRY[2:], COMMANDS[0]])
     assert played(make_track(data)) == frames_of(tlog_of(TELEMETRY))
 
@@ -79,12 +79,12 @@ def test_answers_stay_out_and_leave_no_gap_in_the_sequence(
     assert [m.get_seq() for m in found] == [0, 1, 2]
 
 
-def test_they_are_played_to_who_asks_for_them() -> None:
+def test_commands_are_played_on_request() -> None:
     data = tlog_of([*TELEMETRY, *COMMANDS])
     assert played(make_track(data, with_commands=True)) == frames_of(data)
 
 
-def test_nor_does_a_seek_tell_of_them() -> None:
+def test_seek_leaves_out_recorded_commands() -> None:
     data = tlog_of([*TELEMETRY, *COMMANDS, TELEMETRY[0]])
     last_us = START_US + len(TELEMETRY) + len(COMMANDS)
     context = make_track(data).seek(last_us)

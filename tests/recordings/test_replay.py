@@ -261,22 +261,24 @@ def test_rows_without_counts_are_fused_too(rng: np.random.Generator) -> None:
     assert repr(again) == repr(states)
 
 
-def test_replay_tells_the_vehicle_at_its_rates(rng: np.random.Generator) -> None:
+def test_replay_sends_messages_at_their_rates(rng: np.random.Generator) -> None:
     settings = make_settings("eskf")
     table, _ = fly(settings, make_flight(rng, 10))
     replay = Replay(Pipeline(PipelineSettings(settings)))
-    told = [
+    sent = [
         (now_us, action.message_id)
         for row in read(table)[1]
         for now_us, action in replay.take(row)
         if isinstance(action, Outgoing)
     ]
-    times = [now_us for now_us, _ in told]
+    times = [now_us for now_us, _ in sent]
     assert times == sorted(times)
-    assert 9 <= sum(message_id == 0 for _, message_id in told) <= 11
+    assert 9 <= sum(message_id == 0 for _, message_id in sent) <= 11
 
 
-def test_what_was_noted_in_flight_happens_again_at_its_time(rng: np.random.Generator) -> None:
+def test_marks_and_settings_of_the_flight_are_replayed_at_their_time(
+    rng: np.random.Generator,
+) -> None:
     settings = make_settings("eskf")
     _, rows = read(fly(settings, make_flight(rng, 3))[0])
     for follow in (True, False):

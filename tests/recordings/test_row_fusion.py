@@ -73,7 +73,9 @@ def test_the_same_bits(estimator: str) -> None:
 
 
 @pytest.mark.parametrize("estimator", ["eskf"])
-def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -> None:
+def test_fixes_before_heights_and_repeated_or_decreasing_times_give_the_same_bits(
+    estimator: str,
+) -> None:
     lines, settings = flown()[:900], settings_for(estimator)
     rows = [row for row in lines if isinstance(row, TableRow)]
     for k, row in enumerate(rows):
@@ -93,7 +95,7 @@ def test_fixes_before_heights_and_a_clock_that_stands_or_falls(estimator: str) -
     ] == expected
 
 
-def test_what_stands_between_keeps_its_place_and_settings_are_followed() -> None:
+def test_lines_between_rows_keep_their_place_and_settings_are_followed() -> None:
     lines, settings = flown(), settings_for("eskf")
     other = msgspec.structs.replace(settings, estimation=EstimationSettings())
     mark, header = TableMark(1, "here"), header_for(other, 1)

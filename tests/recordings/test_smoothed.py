@@ -38,12 +38,12 @@ def test_samples_that_came_late_are_put_into_their_place(tmp_path: Path) -> None
         np.testing.assert_array_equal(found, expected)
 
 
-def test_a_clock_that_was_set_back_is_refused_with_what_can_be_done(tmp_path: Path) -> None:
+def test_clock_that_was_set_back_is_refused_with_advice(tmp_path: Path) -> None:
     head, rows = rows_of_golden()
     path, own, out = (tmp_path / f"{name}.csv" for name in ("log", "own", "out"))
     path.write_text("\n".join([*head, *rows]))
     assert CliRunner().invoke(app, ["convert", str(path), "-o", str(own)]).exit_code == 0
-    # A recording of our own tells the gateway's clock, so nothing goes on where it stood.
+    # A recording of our own has the gateway's clock, which is not continued where it goes back.
     lines = own.read_text().splitlines()
     own.write_text("\n".join([*lines, *lines[-500:]]))
     text = "own.csv: its clock goes back by 20.0 s at IMU sample 1877"

@@ -16,7 +16,7 @@ M_PER_DEG_LAT = 111_132.0
 
 
 def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list[TlogRecord]:
-    """Fly north at 10 m/s, telling so once a second."""
+    """Fly north at 10 m/s, with a position once a second."""
     mav = mavlink.MAVLink(None, system_id, 1)
     records = []
     for i in range(seconds):
@@ -110,7 +110,7 @@ def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(years: int, chunk:
     assert [gap.duration_s for gap in info.gaps] == ([leap_us / 1e6 + 1.0] if years > 0 else [])
 
 
-def test_vehicles_are_told_apart() -> None:
+def test_vehicles_are_summarised_separately() -> None:
     records = [r for pair in zip(make_flight(9, 1), make_flight(9, 2), strict=True) for r in pair]
     info = sum_up(make_tlog(records))
     assert [vehicle.system_id for vehicle in info.vehicles] == [1, 2]

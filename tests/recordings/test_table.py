@@ -46,7 +46,7 @@ def read(data: bytes, chunk: int | None = None) -> tuple[TableReader, list[Table
 
 
 @pytest.mark.parametrize("chunk", [None, 1, 13, 1000])
-def test_what_is_written_is_read_in_any_chunks(chunk: int | None) -> None:
+def test_written_file_is_read_in_any_chunks(chunk: int | None) -> None:
     rows = make_rows(1)
     reader, events = read(make_table(rows), chunk)
     assert reader.header == HEADER
@@ -60,7 +60,7 @@ def test_marks_stand_between_rows() -> None:
     assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
 
 
-def test_what_a_node_reports_of_itself_stands_between_rows() -> None:
+def test_reports_of_nodes_are_read_between_rows() -> None:
     rows = make_rows(2, 4)
     status = NodeStatus(5, NodeId(3, 1), 4, (1, 2), 1, 8, 0, 3, 2, 1, 900, 5, 3290)
     data = "".join(map(encode_line, [rows[0], status, rows[1]]))

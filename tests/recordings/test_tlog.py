@@ -54,14 +54,14 @@ def index_of(batches: list[Batch]) -> TlogIndex:
 
 @pytest.mark.parametrize("chunk", [None, 1, 7, 100])
 @pytest.mark.parametrize("strict", [False, True])
-def test_what_is_written_is_read_in_any_chunks(chunk: int | None, strict: bool) -> None:
+def test_written_file_is_read_in_any_chunks(chunk: int | None, strict: bool) -> None:
     records = make_records(40)
     batches = scan(make_tlog(records), strict=strict, chunk=chunk)
     assert records_of(batches) == records
     assert index_of(batches).damage == []
 
 
-def test_columns_tell_sender_and_message() -> None:
+def test_columns_contain_sender_and_message() -> None:
     batch = TlogScanner().feed(make_tlog(make_records(3, system_id=7)), final=True)
     assert batch.origins.tolist() == [7 << 8 | 1] * 3
     assert batch.message_ids.tolist() == [0, 31, 253]
@@ -185,8 +185,8 @@ def test_a_flipped_time_is_no_gap(chunk: int | None, hit: tuple[int, ...], flip:
         r.time_us for i, r in enumerate(records) if i not in hit
     ]
     for i in hit:
-        beside = records[abs(i - 1)].time_us
-        assert found[i].time_us == (beside if is_seen else spoilt[i].time_us)
+        neighbour_us = records[abs(i - 1)].time_us
+        assert found[i].time_us == (neighbour_us if is_seen else spoilt[i].time_us)
 
 
 @pytest.mark.parametrize("chunk", [None, 1, 50])
@@ -237,7 +237,7 @@ UTC_US = 1_781_000_000_000_000
 MINUTE_US = 60_000_000
 
 
-def test_the_machine_counts_until_gps_tells_better() -> None:
+def test_clock_of_the_machine_counts_until_gps_has_the_time() -> None:
     clock = CivilClock()
     assert clock.offset_us is None
     clock.hear_machine(5_000_000, 1_000_000)

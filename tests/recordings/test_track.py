@@ -1,4 +1,4 @@
-"""A track reads on, seeks, and tells what came before."""
+"""A track reads on, seeks, and returns the state before."""
 
 import pytest
 
@@ -61,7 +61,7 @@ def test_seek_beyond_the_ends() -> None:
     assert play_all(track) == records
 
 
-def test_seek_tells_the_newest_of_what_must_be_known() -> None:
+def test_seek_sends_the_newest_state_messages() -> None:
     records = make_records(300)
     track = make_track(make_tlog(records))
     context = track.seek(records[100].time_us)

@@ -66,7 +66,7 @@ def test_no_magnetometer_value_where_there_is_none(chain: SensorChain, raw: ImuR
     assert chain.imu(raw).mag_b_ut is None
 
 
-def test_a_payload_of_a_sensor_that_was_just_reset_tells_nothing(chain: SensorChain) -> None:
+def test_payload_after_a_sensor_reset_has_no_values(chain: SensorChain) -> None:
     sample = chain.imu(replace(LEVEL, time_us=10_000, accel_raw=(0, 0, 0), gyro_raw=(0, 0, 0)))
     assert all(math.isnan(value) for value in (*sample.accel_b_mps2, *sample.gyro_b_radps))
 

@@ -62,8 +62,8 @@ def test_the_page_is_well_formed_and_needs_no_network(folder: Path) -> None:
     for _, attributes in tags.seen:
         for name in ("src", "href", "xlink:href"):
             target = attributes.get(name) or "#"
-            beside = "/" not in target and (folder / target).is_file()
-            assert target.startswith(("#", "data:")) or beside
+            is_local = "/" not in target and (folder / target).is_file()
+            assert target.startswith(("#", "data:")) or is_local
     assert "@import" not in text
     assert "<script" not in text
 

@@ -26,7 +26,7 @@ def test_texts_keep_their_digits_while_paths_lose_theirs() -> None:
     assert all("." not in p or len(p.split(".")[1].split()[0]) <= 2 for p in paths)
 
 
-def test_the_page_colours_what_the_file_does_not() -> None:
+def test_page_colours_by_css_and_file_does_not() -> None:
     svg = drawn()
     assert style.BLUE in style.stand_alone(svg)
     assert "#ffffff" in style.stand_alone(svg)

@@ -69,7 +69,7 @@ def test_withheld_fixes_find_the_latency() -> None:
     assert copied.iloc[0][LATENCY] <= table.iloc[0][LATENCY]
 
 
-def test_the_best_stands_first_and_what_is_not_known_is_left_out() -> None:
+def test_trials_are_sorted_and_unknown_columns_left_out() -> None:
     scores = [((k,), {"held_m": m, "reference_m": math.nan}) for k, m in enumerate((3.0, 1.0, 2.0))]
     table = tabulate(["k"], scores, "held")
     assert table["k"].tolist() == [1, 2, 0]

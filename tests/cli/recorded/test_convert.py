@@ -220,7 +220,7 @@ def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
         (("-o", "x.tlog", "--from", "4", "--to", "2"), "nothing lies between --from 4 and --to 2"),
     ],
 )
-def test_wrong_wishes_are_refused(tlog: Path, args: tuple[str, ...], text: str) -> None:
+def test_invalid_options_are_refused(tlog: Path, args: tuple[str, ...], text: str) -> None:
     assert text in " ".join(run("convert", tlog, *args, code=2).split())
 
 
@@ -235,9 +235,7 @@ def test_an_end_before_the_beginning_is_refused(tlog: Path, range_: tuple[str, .
     assert "nothing between that begin and end" in " ".join(text.split())
 
 
-def test_a_part_that_is_given_twice_is_taken_once_and_that_is_told(
-    table: Path, tmp_path: Path
-) -> None:
+def test_part_given_twice_is_taken_once_and_reported(table: Path, tmp_path: Path) -> None:
     written = table.read_text()
     assert '"session":""' in written
     table.write_text(written.replace('"session":""', '"session":"flight"'))
@@ -272,7 +270,7 @@ def test_info_for_people(tlog: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not MAVLink at all"])
-def test_info_of_what_is_no_recording(tmp_path: Path, content: bytes) -> None:
+def test_file_that_is_no_recording_is_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "x.tlog"
     path.write_bytes(content)
     for command in ("info", "recover", "play"):
@@ -337,7 +335,7 @@ def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> N
     assert [row.time_us for row in rows] == within
 
 
-def test_a_table_tells_what_it_was_fused_with(table: Path, tmp_path: Path) -> None:
+def test_head_of_a_table_has_the_settings_of_its_fusion(table: Path, tmp_path: Path) -> None:
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
@@ -353,7 +351,7 @@ def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> N
     assert "aircraft 1 and 2" in " ".join(text.split())
 
 
-def test_recover_of_a_sound_file_says_so(tlog: Path, tmp_path: Path) -> None:
+def test_recover_reports_a_sound_file(tlog: Path, tmp_path: Path) -> None:
     assert "nothing was damaged" in run("recover", tlog)
     assert (tmp_path / "flight.recovered.tlog").read_bytes() == tlog.read_bytes()
 

@@ -72,7 +72,7 @@ def test_a_recording_gives_its_own_states_also_from_its_middle(
 
 
 @pytest.mark.io
-def test_what_it_writes_is_a_table(log: Path) -> None:
+def test_written_file_is_a_table(log: Path) -> None:
     run(log)
     reader = TableReader()
     events = reader.feed(log.with_name("out.csv").read_bytes(), final=True)
@@ -108,7 +108,7 @@ def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.io
 @pytest.mark.parametrize("force", [[], ["--force"]])
-def test_a_recording_is_not_replaced_by_what_is_made_of_it(log: Path, force: list[str]) -> None:
+def test_recording_is_not_overwritten_by_its_own_states(log: Path, force: list[str]) -> None:
     before = log.read_bytes()
     result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(log), *force])
     assert result.exit_code == 2
@@ -128,7 +128,7 @@ def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
 
 @pytest.mark.io
 @pytest.mark.slow
-def test_a_latency_that_neither_log_nor_settings_tell_is_estimated(tmp_path: Path) -> None:
+def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> None:
     log, out = tmp_path / "log.csv", tmp_path / "out.csv"
     flight = gzip.decompress((GOLDEN / "take_off.csv.gz").read_bytes()).decode()
     log.write_text(flight.replace("gps_latency_s=0.16", ""))
@@ -145,7 +145,7 @@ def test_a_latency_that_neither_log_nor_settings_tell_is_estimated(tmp_path: Pat
 
 
 @pytest.mark.io
-def test_a_latency_that_no_manoeuvre_tells_is_assumed(log: Path) -> None:
+def test_latency_without_manoeuvres_is_assumed(log: Path) -> None:
     log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
     arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
     words = " ".join(CliRunner().invoke(app, arguments).output.split())

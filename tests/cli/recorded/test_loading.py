@@ -43,7 +43,7 @@ def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
     assert today.fusion.estimation == TODAY.settings.default_aircraft.estimation
 
 
-def test_a_doubtful_latency_is_told(
+def test_latency_contradicted_by_the_motion_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01, 0.9))

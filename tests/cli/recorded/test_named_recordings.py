@@ -55,7 +55,7 @@ def run(*arguments: object) -> str:
     return result.output
 
 
-def test_the_list_tells_length_vehicles_size_and_path(config: Path) -> None:
+def test_list_contains_length_vehicles_size_and_path(config: Path) -> None:
     lines = run("record", "list", "--config", config).splitlines()
     (alps,) = (line.split() for line in lines if line.strip().startswith("alps"))
     assert alps[1:3] == ["0:01:20", "1"]
@@ -131,7 +131,7 @@ def test_sweep_takes_the_name(config: Path, tmp_path: Path) -> None:
     assert "beta_velocity" in best.read_text()
 
 
-def test_the_demo_flies_what_the_name_says(config: Path) -> None:
+def test_demo_flies_the_named_recording(config: Path) -> None:
     frames, aircraft = recorded_line(load(config), Path("alps"))
     assert list(aircraft) == [1]
     assert next(frames).data

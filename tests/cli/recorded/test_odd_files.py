@@ -103,7 +103,7 @@ def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover", "play"])
 @pytest.mark.parametrize("kind", ["pipe", "zeros", "link"])
-def test_what_has_no_end_is_not_read(tmp_path: Path, command: str, kind: str) -> None:
+def test_pipe_without_an_end_is_not_read(tmp_path: Path, command: str, kind: str) -> None:
     path = Path("/dev/zero") if kind == "zeros" else tmp_path / "log.csv"
     if kind == "pipe":
         os.mkfifo(path)
@@ -130,7 +130,7 @@ def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> Non
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_first_bytes_tell_whether_a_file_is_packed_and_not_its_name(
+def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(
     tmp_path: Path, packed: bool
 ) -> None:
     data = log(tmp_path / "plain").read_bytes()
@@ -273,7 +273,7 @@ def test_settings_with_a_byte_order_mark_are_settings(tmp_path: Path) -> None:
     assert "all settings are right" in run("check-config", file)
 
 
-def test_a_log_whose_clock_begins_anew_goes_on(tmp_path: Path) -> None:
+def test_times_run_on_when_the_clock_of_a_log_begins_again(tmp_path: Path) -> None:
     path = log(tmp_path / "log.csv")
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, *rows, *rows[:50], *rows, ""]))
@@ -294,7 +294,7 @@ def test_a_log_whose_clock_begins_anew_goes_on(tmp_path: Path) -> None:
     assert times_us == sorted(times_us)
 
 
-def test_a_terminal_does_not_obey_what_a_recording_says(tmp_path: Path) -> None:
+def test_text_of_a_recording_cannot_control_the_terminal(tmp_path: Path) -> None:
     evil = "\x1b]0;owned\x07 \x9b2J [red] :bomb: \u202egnp.exe"
     recorded = table(tmp_path / "a\x1b[31m[red].csv")
     mark = msgspec.json.encode({"time_us": 1000, "text": evil}).decode()

@@ -17,7 +17,7 @@ from tests.analysis.test_sources import rows
 pytestmark = pytest.mark.io
 
 
-def test_a_recording_is_reported_beside_other_settings(
+def test_recording_is_compared_with_other_settings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One section stands for all of them, which take ten seconds to draw."""
@@ -45,7 +45,7 @@ def test_a_file_without_a_flight_is_reported(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_what_must_be_installed_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def without(name: str) -> ModuleSpec | None:
         return None if name == "jinja2" else find_spec(name)
 

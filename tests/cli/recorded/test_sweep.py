@@ -89,7 +89,7 @@ def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: P
         (["--alpha", "0.1,0.2", "--metric", "reference"], "no reference of the position"),
     ],
 )
-def test_what_cannot_be_done_is_reported(recording: Path, arguments: list[str], text: str) -> None:
+def test_impossible_sweep_is_reported(recording: Path, arguments: list[str], text: str) -> None:
     result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
     assert result.exit_code == 2
     assert text in result.output

@@ -51,8 +51,8 @@ def records() -> tuple[Record, ...]:
 
 
 @dataclass(frozen=True)
-class Believed:
-    """What the autopilot believed: the truth, ten times a second."""
+class Estimated:
+    """The estimate of the autopilot: the truth, ten times a second."""
 
     time_us: int
     q_nb: tuple[float, ...]
@@ -63,20 +63,20 @@ class Believed:
 
 
 @cache
-def believed() -> tuple[Believed, ...]:
+def estimated() -> tuple[Estimated, ...]:
     time_s = np.arange(0.1, DURATION_S, 0.1)
     truth = simulated().trajectory.truth_at(time_s)
     columns = (truth.q_nb, truth.lat_deg, truth.lon_deg, truth.alt_amsl_m, truth.vel_n_mps)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     return tuple(
-        Believed(round(t * 1e6), tuple(q), lat, lon, alt, tuple(vel))
+        Estimated(round(t * 1e6), tuple(q), lat, lon, alt, tuple(vel))
         for t, (q, lat, lon, alt, vel) in zip(time_s.tolist(), rows, strict=True)
     )
 
 
 def timed(
-    *streams: Iterable[Record | Believed], seconds: float = DURATION_S
-) -> list[Record | Believed]:
+    *streams: Iterable[Record | Estimated], seconds: float = DURATION_S
+) -> list[Record | Estimated]:
     found = (r for stream in streams for r in stream if r.time_us <= seconds * 1e6)
     return sorted(found, key=lambda r: r.time_us)
 
@@ -153,9 +153,9 @@ def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
     formats["vehicle_gps_position"] = OLD_GPS if old else NEW_GPS
     formats.pop("vehicle_air_data" if old else "sensor_baro")
     log = Ulog(formats, {"MAV_SYS_ID": 7})
-    for r in timed(records(), believed(), seconds=seconds):
+    for r in timed(records(), estimated(), seconds=seconds):
         t = r.time_us
-        if isinstance(r, Believed) and t % 500_000 == 0:
+        if isinstance(r, Estimated) and t % 500_000 == 0:
             log.parts.append(ulog_message(b"S", SYNC))
         match r:
             case ImuCalibrated():
@@ -178,7 +178,7 @@ def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
                 log.add(
                     "vehicle_gps_position", t, r.utc_us or 0, *place, *acc, 0.8, 1.1, *vel, *end
                 )
-            case Believed():
+            case Estimated():
                 log.add("vehicle_local_position", t, *r.vel_n_mps)
                 log.add("vehicle_global_position", t, r.lat_deg, r.lon_deg, r.alt_m, 1.0)
                 log.add("vehicle_attitude", t, *r.q_nb)
@@ -214,7 +214,7 @@ def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
         for name, (number, form, columns) in DATAFLASH.items()
     ]
     rows.append(("PARM", (BOOT_US, b"SYSID_THISMAV", 9.0, 1.0)))
-    for r in timed(records(), believed(), seconds=seconds):
+    for r in timed(records(), estimated(), seconds=seconds):
         t = BOOT_US + r.time_us
         match r:
             case ImuCalibrated():
@@ -243,7 +243,7 @@ def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
                 )
                 acc = (r.h_acc_m, r.v_acc_m, r.speed_acc_mps)
                 rows.append(("GPA", (t, 0, 1.1, *acc, 0.0, 1, 0, 200)))
-            case Believed():
+            case Estimated():
                 roll, pitch, yaw = np.degrees(to_euler(r.q_nb))
                 rows.append(("POS", (t, r.lat_deg, r.lon_deg, r.alt_m, 0.0, 0.0)))
                 rows.append(("XKF1", (t, 0, roll, pitch, yaw % 360, *r.vel_n_mps)))

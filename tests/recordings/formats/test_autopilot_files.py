@@ -64,7 +64,7 @@ def run(*arguments: object, code: int = 0) -> str:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_what_was_logged_is_read(folder: Path, name: str) -> None:
+def test_logged_samples_are_read(folder: Path, name: str) -> None:
     table, rows = whole(folder / name)
     assert table.header.vehicle_id == MAKERS[name][1]
     assert table.remarks == []
@@ -99,7 +99,7 @@ def test_a_field_that_was_not_new_is_not_read_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
+def test_fixes_have_all_values_of_the_log(folder: Path, name: str) -> None:
     table, rows = whole(folder / name)
     fixes = [row.gps for row in rows if row.gps]
     sent = [r for r in flown.records() if isinstance(r, GpsFix)]
@@ -128,13 +128,13 @@ def test_fixes_have_all_that_the_log_tells(folder: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_what_the_autopilot_believed_is_there_to_compare_with(folder: Path, name: str) -> None:
+def test_states_of_the_autopilot_are_read_for_comparison(folder: Path, name: str) -> None:
     _, rows = whole(folder / name)
     states = [row.state for row in rows if row.state]
-    assert len(states) > 0.9 * len(flown.believed())
+    assert len(states) > 0.9 * len(flown.estimated())
     zero_us = flown.records()[0].time_us
-    believed = {b.time_us - zero_us: b for b in flown.believed()}
-    near = [(s, believed[s.time_us]) for s in states if s.time_us in believed]
+    estimated = {b.time_us - zero_us: b for b in flown.estimated()}
+    near = [(s, estimated[s.time_us]) for s in states if s.time_us in estimated]
     assert len(near) > 0.9 * len(states)
     error = total_error_rad(
         rotation_error(np.array([s.q_nb for s, _ in near]), np.array([b.q_nb for _, b in near]))
@@ -146,7 +146,9 @@ def test_what_the_autopilot_believed_is_there_to_compare_with(folder: Path, name
 
 
 @pytest.mark.parametrize("name", ["new.ulg", "flight.bin"])
-def test_it_is_fused_to_what_was_true(folder: Path, tmp_path: Path, name: str) -> None:
+def test_log_is_fused_to_the_true_attitude_and_position(
+    folder: Path, tmp_path: Path, name: str
+) -> None:
     out = tmp_path / "states.csv"
     run("fuse", folder / name, "-o", out, "--gps-latency", "0.15", "--estimator", "eskf")
     rows = [
@@ -184,7 +186,7 @@ def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
     assert flight.duration_s == pytest.approx(flown.DURATION_S, abs=1.0)
 
 
-def test_what_is_not_installed_is_named(
+def test_missing_package_is_named(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delitem(sys.modules, "gateway.recordings.formats.ulog", raising=False)
@@ -210,7 +212,7 @@ def test_damage_is_counted_and_reported(folder: Path, tmp_path: Path, name: str)
 
 @pytest.mark.parametrize("name", MAKERS)
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.01])
-def test_what_is_cut_off_early_is_refused(
+def test_log_cut_before_its_samples_is_refused(
     folder: Path, tmp_path: Path, name: str, share: float
 ) -> None:
     data = (folder / name).read_bytes()
@@ -247,7 +249,7 @@ def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: li
 @pytest.mark.parametrize(
     ("odd", "is_read"),
     [
-        # A dropout tells its length in two bytes.
+        # A dropout has its length in two bytes.
         (flown.ulog_message(b"O", b"\0"), True),
         # A message that seems to last beyond the end.
         (b"\xff\xffD", False),

@@ -83,7 +83,9 @@ def test_a_file_without_the_columns_is_refused() -> None:
         ("time_s,ax,ay,az,gx,gy,gz,mx,my", "mz"),
     ],
 )
-def test_a_file_without_a_map_lacks_only_what_is_needed(names: str, missing: str) -> None:
+def test_missing_columns_of_a_file_without_a_map_are_the_needed_ones(
+    names: str, missing: str
+) -> None:
     with pytest.raises(
         ValueError, match=f"no column {missing}; found, separated by commas: time_s"
     ):

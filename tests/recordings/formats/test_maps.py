@@ -209,7 +209,7 @@ def places(track: VehicleTrack) -> list[tuple[PlaceKind, str]]:
     return [(place.kind, place.name) for place in track.places]
 
 
-def test_every_vehicle_and_nobody_else() -> None:
+def test_tracks_are_those_of_the_vehicles_only() -> None:
     one, two = tracks_of_frames(records(), None)
     assert (one.name, two.name) == ("system 1", "system 7")
     assert [round(p.lat_deg * 1e7) for p in two.points] == [480_000_000, 480_000_001]
@@ -217,7 +217,7 @@ def test_every_vehicle_and_nobody_else() -> None:
     assert tracks_of_frames(records(), 9) == []
 
 
-def test_attitude_stands_with_the_points() -> None:
+def test_points_have_the_attitude_of_their_time() -> None:
     one, two = tracks_of_frames(records(), None)
     assert one.points[0].attitude_deg == pytest.approx(
         (math.degrees(0.1), math.degrees(-0.2), math.degrees(1.5)), abs=1e-4
@@ -240,7 +240,7 @@ def test_home_marks_and_events() -> None:
     assert by_name["Home"].alt_amsl_m == pytest.approx(400.0)
 
 
-def test_a_table_tells_the_same(rng: np.random.Generator) -> None:
+def test_tracks_of_a_table_have_home_and_marks(rng: np.random.Generator) -> None:
     settings = GatewaySettings().default_aircraft
     header, rows = read(fly(settings, make_flight(rng, 12))[0])
     rows = [

@@ -182,10 +182,10 @@ def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
     return [r for r in read([(0, raw(0)), *messages]) if isinstance(r, GpsFix)]
 
 
-@pytest.mark.parametrize(("age_us", "is_told"), [(500_000, True), (500_001, False)])
-def test_a_climb_of_long_ago_is_unknown(age_us: int, is_told: bool) -> None:
+@pytest.mark.parametrize(("age_us", "is_known"), [(500_000, True), (500_001, False)])
+def test_a_climb_of_long_ago_is_unknown(age_us: int, is_known: bool) -> None:
     (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
-    assert math.isfinite(fix.vel_n_mps[2]) == is_told
+    assert math.isfinite(fix.vel_n_mps[2]) == is_known
 
 
 def test_a_lost_fix_makes_no_climb() -> None:
@@ -212,7 +212,7 @@ def attitude(time_ms: int) -> Message:
     return mavlink.MAVLink_attitude_message(time_ms, 0.1, -0.2, 1.5, 0.01, 0.02, 0.03)
 
 
-def test_what_the_autopilot_believes_goes_along() -> None:
+def test_states_of_the_autopilot_are_kept() -> None:
     own = [(0, raw(0)), (0, position(0, -150)), (10_000, attitude(10)), (20_000, raw(20_000))]
     later = [(590_000, attitude(590)), (600_000, attitude(600)), (600_000, raw(600_000))]
     records = read([*own, *later])

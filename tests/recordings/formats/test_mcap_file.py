@@ -172,7 +172,7 @@ def paths_of(value: Any, key: str = "") -> Iterator[str]:
         yield value
 
 
-def test_the_layout_shows_what_is_in_a_file(flight: Path) -> None:
+def test_layout_names_topics_of_the_file(flight: Path) -> None:
     text = (ROOT / "config" / "foxglove-layout.json").read_text()
     layout = json.loads(text)
     with flight.open("rb") as stream:

@@ -110,7 +110,7 @@ def test_one_message_is_one_typed_table(tmp_path: Path) -> None:
         (("--message", "HEARTBEAT", "-o", "a.csv"), "--message is for .parquet"),
     ],
 )
-def test_wrong_wishes_are_refused(
+def test_invalid_options_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], said: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -20,7 +20,7 @@ def topics() -> dict[str, Topic]:
     }
 
 
-def test_what_is_as_documented_is_read() -> None:
+def test_documented_topics_are_read() -> None:
     flight = Px4Log(topics(), 1)
     assert flight.left_out == []
     assert len(list(flight.records())) == 2 * ROWS
