@@ -11,7 +11,6 @@ import fsspec
 import pandas as pd
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
-from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.ground_track import ground_track
@@ -27,9 +26,9 @@ from gateway.batch.tasks import (
     run_season,
     without_secrets,
 )
-from gateway.cli.app import app
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.reading import ReadOptions
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -38,7 +37,7 @@ FLIGHTS = ("alpha_01_v1.csv", "beta_01_v1.csv", "gamma_01_v2.csv", "delta_01_v2.
 
 
 def run(*words: object) -> tuple[int, str]:
-    done = CliRunner().invoke(app, ["batch", *map(str, words)])
+    done = invoke("batch", *map(str, words))
     return done.exit_code, done.output
 
 
@@ -73,7 +72,7 @@ def test_batch_fuses_as_the_command(
 ) -> None:
     single = tmp_path / "alone.csv"
     words = ["fuse", str(season / "alpha_01_v1.csv"), "-o", str(single)]
-    assert CliRunner().invoke(app, words).exit_code == 0
+    assert invoke(*words).exit_code == 0
     assert (fused[0] / "fused" / "alpha.csv").read_bytes() == single.read_bytes()
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
-from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.batch import catalogue as indexing
@@ -26,12 +25,12 @@ from gateway.batch.catalogue import (
 )
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import FlightFacts, FlightTally, feature, lost_share, simplified
-from gateway.cli.app import app
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S
 from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -384,25 +383,22 @@ def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> No
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "bad.csv").write_text("")
-    run = CliRunner().invoke
-    done = run(app, ["catalogue", str(tmp_path), "--jobs", "1"])
+    done = invoke("catalogue", tmp_path, "--jobs", "1")
     assert done.exit_code == 0, done.output
     assert "4 files read (1 of them broken), 0 unchanged, 0 gone" in done.output
-    listed = run(app, ["catalogue", "list", "--folder", str(tmp_path)])
+    listed = invoke("catalogue", "list", "--folder", tmp_path)
     assert "one_01_v1.csv" in listed.output
     assert re.search(r"2 flights, \S+ h, in 4 files; 1 broken", listed.output)
     wanted = ["catalogue", "list", "-d", str(tmp_path), "--json", "--where", "duration > 30"]
-    assert [row["name"] for row in json.loads(run(app, wanted).output)] == ["one"] * 3
-    shown = run(app, ["catalogue", "show", "one", "-d", str(tmp_path)])
+    assert [row["name"] for row in json.loads(invoke(*wanted).output)] == ["one"] * 3
+    shown = invoke("catalogue", "show", "one", "-d", tmp_path)
     assert re.search(r"fastest +\d+\.\d +m/s", shown.output)
-    geo = json.loads(
-        run(app, ["catalogue", "show", "one", "-d", str(tmp_path), "--geojson"]).output
-    )
+    geo = json.loads(invoke("catalogue", "show", "one", "-d", tmp_path, "--geojson").output)
     assert geo["type"] == "FeatureCollection"
-    refused = run(app, ["catalogue", "list", "-d", str(tmp_path), "--where", "nonsense"])
+    refused = invoke("catalogue", "list", "-d", tmp_path, "--where", "nonsense")
     assert refused.exit_code == 2
     assert "no such column" in refused.output
-    assert run(app, ["catalogue", "show", "nobody", "-d", str(tmp_path)]).exit_code == 2
+    assert invoke("catalogue", "show", "nobody", "-d", tmp_path).exit_code == 2
 
 
 def test_every_column_has_a_place_in_the_book() -> None:

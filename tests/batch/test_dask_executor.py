@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from gateway.batch.executors import ClusterError, DaskCluster, WorkFailed
+from tests.kit.cli import invoke
 
 distributed = pytest.importorskip("distributed")
 pytestmark = pytest.mark.io
@@ -24,11 +25,7 @@ def address() -> Iterator[str]:
 
 
 def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
-    from typer.testing import CliRunner
-
-    from gateway.cli.app import app
-
-    done = CliRunner().invoke(app, ["batch", "fuse", str(season), "-o", str(out), *more])
+    done = invoke("batch", "fuse", season, "-o", out, *more)
     return done.exit_code, done.output
 
 

@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
 from gateway.batch.statistics import (
     FlightErrors,
@@ -14,8 +13,8 @@ from gateway.batch.statistics import (
     lead_of,
     versus,
 )
-from gateway.cli.app import app
 from gateway.config import load
+from tests.kit.cli import invoke
 
 GROUPS = [f"{1 + k % 2} 2026-06-{1 + k // 4:02d}" for k in range(40)]
 
@@ -109,7 +108,7 @@ def test_worse_flights_are_listed_the_worst_first() -> None:
 @pytest.mark.io
 def test_one_set_is_found_for_a_season(season: Path, tmp_path: Path) -> None:
     words = ["batch", "sweep", str(season), "-o", str(tmp_path), "--vary", "beta=0.1,0.5,0.9"]
-    done = CliRunner().invoke(app, [*words, "--jobs", "2"])
+    done = invoke(*words, "--jobs", "2")
     assert done.exit_code == 1, done.output
     assert "3 points on 4 flights, in 4 folds by aircraft and day" in done.output
     assert "against the settings that the flights came with" in done.output
@@ -129,10 +128,10 @@ def test_sweep_takes_many_flights(season: Path, tmp_path: Path) -> None:
     flights = [str(season / name) for name in ("alpha_01_v1.csv", "gamma_01_v2.csv")]
     best = tmp_path / "best.toml"
     words = ["sweep", *flights, "--beta", "0.1,0.9", "-o", str(best), "--jobs", "2"]
-    done = CliRunner().invoke(app, words)
+    done = invoke(*words)
     assert done.exit_code == 0, done.output
     assert "2 points on 2 flights" in done.output
     assert load(best).estimation.estimator == "paper"
-    refused = CliRunner().invoke(app, [*words[:3], "--optimise", "3", "--beta", "0:1"])
+    refused = invoke(*words[:3], "--optimise", "3", "--beta", "0:1")
     assert refused.exit_code == 2
     assert "give a grid" in refused.output

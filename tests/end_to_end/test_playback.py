@@ -11,14 +11,13 @@ import pytest
 from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.live.control_socket import request
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
 from tests.end_to_end.test_demo import NEAR_DEG
+from tests.kit.cli import invoke
 from tests.ports import free_port
 from tests.recordings.frames import START_US, make_tlog
 
@@ -191,7 +190,7 @@ folder = "FOLDER"
     assert "BAD_DATA" not in dumped.stdout
     table, *_ = sorted(tmp_path.glob("*_v1.csv"))
     again = tmp_path / "again.csv"
-    done = CliRunner().invoke(app, ["convert", str(table), "--fuse", "-o", str(again)])
+    done = invoke("convert", table, "--fuse", "-o", again)
     assert done.exit_code == 0, done.output
     assert again.read_bytes() == table.read_bytes()
 

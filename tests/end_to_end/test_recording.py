@@ -6,10 +6,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
 
 from gateway.aircraft import Action
-from gateway.cli.app import app
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
 from gateway.live.recorder import Recorder
@@ -25,6 +23,7 @@ from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
 from gateway.simulator.receiver import simulate
 from tests.conftest import ManualClock
+from tests.kit.cli import invoke
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -157,6 +156,6 @@ async def test_the_table_alone_gives_the_recorded_states_to_the_last_bit(
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.
     out = folder / "again.csv"
-    done = CliRunner().invoke(app, ["convert", str(paths[-1]), "--fuse", "-o", str(out)])
+    done = invoke("convert", paths[-1], "--fuse", "-o", out)
     assert done.exit_code == 0, done.output
     assert out.read_bytes() == paths[-1].read_bytes()

@@ -7,13 +7,12 @@ from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
 from tests.hub.conftest import LIMIT_S, Rig, Sender, Station, rig
+from tests.kit.cli import invoke
 from tests.ports import free_port
 
 __all__ = ["rig"]
@@ -91,7 +90,7 @@ class World:
 
 async def run(*words: str) -> str:
     """Run a command as a person does, in a thread, since the fleet answers it here."""
-    result = await asyncio.to_thread(CliRunner().invoke, app, list(words))
+    result = await asyncio.to_thread(invoke, *words)
     assert result.exit_code == 0, result.output
     return result.output
 

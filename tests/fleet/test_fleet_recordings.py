@@ -13,9 +13,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.live import fleet as fleet_command
 from gateway.cli.live.fleet import FetchError, PiecePace, RecordingFetch
 from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
@@ -29,6 +27,7 @@ from gateway.hub.transports.zenoh.site_queries import (
 from gateway.live.control_socket import ControlError, request
 from tests.fleet.conftest import World
 from tests.hub.conftest import LIMIT_S
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -71,10 +70,9 @@ class TestOverTheSession:
         self, world: World, folder: Path, tmp_path: Path
     ) -> None:
         await opened(world, folder)
-        runner = CliRunner()
 
         async def run(*words: str) -> Any:
-            task = asyncio.create_task(asyncio.to_thread(runner.invoke, app, list(words)))
+            task = asyncio.create_task(asyncio.to_thread(invoke, *words))
             return await spoken_for(world, task)
 
         listed = await run("fleet", "recordings", "--json")

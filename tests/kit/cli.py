@@ -23,6 +23,13 @@ def invoke(*words: object, answers: str = "", code: int | None = None) -> Result
         Exit code and output.
     """
     result = CliRunner().invoke(app, [str(word) for word in words], input=answers)
+    # An exit is the one exception that a user may see.
+    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     if code is not None:
         assert result.exit_code == code, result.output
     return result
+
+
+def run(*words: object, code: int = 0) -> str:
+    """Return the output of `mavgate` with one space for each run of white space."""
+    return " ".join(invoke(*words, code=code).output.split())

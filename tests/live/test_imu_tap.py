@@ -6,14 +6,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.live import calibrate
 from gateway.live.control_socket import ControlServer, NoParams, socket_path
 from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuParams, ImuTap, raw_of, values_of
 from gateway.records import FusedSample
 from gateway.sensing.calibration import NodeCalibration
+from tests.kit.cli import invoke
 from tests.recordings.samples import make_fused
 
 STEP_US = 10_000
@@ -76,7 +75,7 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
     await server.start()
     try:
         words = ["calibrate", "gyro", "--vehicle", "3"]
-        result = await asyncio.to_thread(CliRunner().invoke, app, words, input="\n")
+        result = await asyncio.to_thread(invoke, *words, answers="\n")
     finally:
         server.close()
     assert result.exit_code == 0, result.output

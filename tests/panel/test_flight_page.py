@@ -12,14 +12,13 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.support.options import read_options
 from gateway.config import GatewaySettings
 from gateway.panel.flight_page import PageFlight, read_flight, render_page
 from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
+from tests.kit.cli import invoke
 from tests.panel.browsing import needs_chromium
 
 BEGIN_US = 1_750_000_000_000_000
@@ -104,10 +103,10 @@ def test_command_writes_one_file_and_overwrites_none(tmp_path: Path) -> None:
     flight_of(tmp_path, 30)
     output = tmp_path / "flight.html"
     command = ["page", str(tmp_path / "day_01.tlog"), "-o", str(output), "--no-compare"]
-    done = CliRunner().invoke(app, command)
+    done = invoke(*command)
     assert done.exit_code == 0, done.output
     assert "MB" in done.output
-    again = CliRunner().invoke(app, command)
+    again = invoke(*command)
     assert again.exit_code != 0
     assert "--force" in again.output
 

@@ -6,9 +6,7 @@ import httpx
 import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.panel.map_area import (
     MapAreaError,
     box_around,
@@ -19,6 +17,7 @@ from gateway.panel.map_area import (
 )
 from gateway.panel.map_tiles import MapTiles, styles_of
 from gateway.panel.panel_settings import PanelSettings
+from tests.kit.cli import invoke
 from tests.panel.test_map_tiles import picture
 
 pytestmark = pytest.mark.io
@@ -109,9 +108,9 @@ def test_command_writes_into_the_folder_of_the_tiles(world: Path, tmp_path: Path
     config = tmp_path / "gateway.toml"
     config.write_text(f'[panel]\ntiles_folder = "{tmp_path}/tiles"\n')
     command = ["map", "get", "--from", str(world), "--around", "47.0,8.0", "--name", "Home field"]
-    done = CliRunner().invoke(app, [*command, "--config", str(config)])
+    done = invoke(*command, "--config", config)
     assert done.exit_code == 0, done.output
     assert (tmp_path / "tiles" / "Home field.pmtiles").is_file()
-    again = CliRunner().invoke(app, [*command, "--config", str(config)])
+    again = invoke(*command, "--config", config)
     assert again.exit_code != 0
     assert "already" in again.output

@@ -6,12 +6,11 @@ import socket
 from collections.abc import Iterator
 
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.panel import panel_server
 from gateway.panel.panel_server import PanelError
 from gateway.panel.panel_settings import PanelSettings
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -44,5 +43,5 @@ def test_the_gateway_alone_stamps_lines_of_its_panel(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(logging.root, "level", logging.WARNING)
     monkeypatch.setattr(panel_server, "run_panel", run_panel)
     monkeypatch.setattr(os, "nice", lambda _: 0)
-    attached = CliRunner().invoke(app, ["panel", "--attached"], input="run.sock\n")
+    attached = invoke("panel", "--attached", answers="run.sock\n")
     assert attached.output == "the port is taken\n"

@@ -5,18 +5,17 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
 
 from gateway.analysis.case import make_case
 from gateway.analysis.reporting.estimators import estimators
 from gateway.batch.tasks import read_season_flight
-from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
 from gateway.recordings.reading import ReadOptions, open_rows, settings_of
 from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
+from tests.kit.cli import invoke
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -61,7 +60,7 @@ def test_a_recording_that_was_fused_with_another_latency_is_reported(
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"
     config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
     convert = ["convert", str(without_latency), "-o", str(own), "--fuse", "--config", str(config)]
-    assert CliRunner().invoke(app, convert).exit_code == 0
+    assert invoke(*convert).exit_code == 0
     assert load_flight(own, Loading(GatewaySettings())).latency_s == set_s
     words = " ".join(capsys.readouterr().err.split())
     assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
@@ -89,7 +88,7 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     text = gzip.decompress(GOLDEN.read_bytes()).decode()
     path.write_text(text.replace("gps_latency_s=0.16", "gps_latency_s=0.4"))
     remark = "smoothed with a GPS latency of 0.1"
-    fused = CliRunner().invoke(app, ["fuse", str(path), "-o", str(out), "--smooth"])
+    fused = invoke("fuse", path, "-o", out, "--smooth")
     assert remark in " ".join(fused.output.split())
     table = open_rows(out, OPTIONS)
     latency_s = settings_of(table.header).estimation.reference.gps_latency_s

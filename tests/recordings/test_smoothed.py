@@ -5,15 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
-from gateway.cli.app import app
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.files import FlightError
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.recorded_fusion import RecordedFusion
+from tests.kit.cli import invoke
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
@@ -42,12 +41,12 @@ def test_clock_that_was_set_back_is_refused_with_advice(tmp_path: Path) -> None:
     head, rows = rows_of_golden()
     path, own, out = (tmp_path / f"{name}.csv" for name in ("log", "own", "out"))
     path.write_text("\n".join([*head, *rows]))
-    assert CliRunner().invoke(app, ["convert", str(path), "-o", str(own)]).exit_code == 0
+    assert invoke("convert", path, "-o", own).exit_code == 0
     # A recording of our own has the gateway's clock, which is not continued where it goes back.
     lines = own.read_text().splitlines()
     own.write_text("\n".join([*lines, *lines[-500:]]))
     text = "own.csv: its clock goes back by 20.0 s at IMU sample 1877"
-    refused = CliRunner().invoke(app, ["fuse", str(own), "-o", str(out), "--smooth"])
+    refused = invoke("fuse", own, "-o", out, "--smooth")
     assert text in " ".join(refused.output.split())
     assert refused.exit_code == 2
     with pytest.raises(FlightError, match=f"{text}.*leave out --smooth"):

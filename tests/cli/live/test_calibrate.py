@@ -4,9 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.live import calibrate
 from gateway.config import load, load_aircraft
 from gateway.recordings.columns import TableRow, row_to_line
@@ -16,6 +14,7 @@ from gateway.sensing.calibrating import NodeSamples
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.estimation.samples import fix
+from tests.kit.cli import invoke
 
 NODE = NodeId(3, 0)
 G = 9.80665
@@ -63,7 +62,7 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, link: Link) -> Path:
 
 def run(config: Path, *arguments: str) -> str:
     command = ["calibrate", *arguments, "--config", str(config), "--vehicle", "3"]
-    result = CliRunner().invoke(app, command, input="\n" * 40)
+    result = invoke(*command, answers="\n" * 40)
     assert result.exit_code == 0, result.output
     return result.output
 
@@ -84,7 +83,7 @@ def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None
 @pytest.mark.io
 def test_a_port_that_is_not_there_is_said_before_anything_is_asked(tmp_path: Path) -> None:
     command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
-    result = CliRunner().invoke(app, command, input="\n")
+    result = invoke(*command, answers="\n")
     assert result.exit_code == 2
     assert "none: No such file or directory" in result.output
     assert "Lay the aircraft down" not in result.output
@@ -128,7 +127,7 @@ def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
 @pytest.mark.io
 def test_leaving_at_a_question_keeps_what_is_done(config: Path) -> None:
     command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
-    result = CliRunner().invoke(app, command, input="\n")
+    result = invoke(*command, answers="\n")
     assert result.exit_code == 0, result.output
     assert "Not done: mag" in result.output
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.cli.live import demo
 from gateway.config import GatewaySettings, aircraft_folder
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -34,7 +33,7 @@ def settings_of_demo(
 
         monkeypatch.setattr(demo, "serve", serve)
         monkeypatch.setattr(demo, "Daemon", make_daemon)
-        result = CliRunner().invoke(app, ["demo", "--config", str(file), "--no-panel", *options])
+        result = invoke("demo", "--config", file, "--no-panel", *options)
         assert result.exit_code == 0, result.output
         return found
 

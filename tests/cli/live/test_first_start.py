@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from gateway.cli.app import app
 from gateway.cli.live import calibrate, first_start
 from gateway.config import load, load_aircraft
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -26,7 +26,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def setup(*words: str) -> Result:
-    return CliRunner().invoke(app, ["setup", *words], input="\n" * 10)
+    return invoke("setup", *words, answers="\n" * 10)
 
 
 @pytest.mark.slow

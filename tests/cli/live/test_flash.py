@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 from intelhex import IntelHex
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from gateway.cli.app import app
 from gateway.flashing import boards
 from gateway.flashing.boards import find_block
 from gateway.live.serial_port import Port
 from tests.flashing.test_settings_block import BLOCK, image_with, sealed
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -30,7 +30,7 @@ def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def flash(*words: str) -> Result:
-    return CliRunner().invoke(app, ["flash", *words])
+    return invoke("flash", *words)
 
 
 def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: Path) -> None:

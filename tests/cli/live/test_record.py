@@ -6,13 +6,12 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from gateway.batch.catalogue import CATALOGUE_NAME
-from gateway.cli.app import app
 from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.control_verbs import RecorderVerbs
 from tests.conftest import ManualClock
+from tests.kit.cli import invoke
 from tests.live.test_recorder import Bench
 from tests.recordings.frames import make_frames
 
@@ -38,7 +37,7 @@ async def gateway(
 
 
 async def run(*args: str, code: int = 0) -> str:
-    result = await asyncio.to_thread(CliRunner().invoke, app, ["record", *args])
+    result = await asyncio.to_thread(invoke, "record", *args)
     assert result.exit_code == code, result.output
     return result.output
 

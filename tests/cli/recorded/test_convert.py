@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.wire.mavlink_splitter import origin_of
+from tests.kit.cli import invoke
 from tests.recordings.frames import START_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight
 
@@ -27,9 +26,7 @@ RECORDS = make_records(500)
 
 
 def run(*args: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(arg) for arg in args])
-    assert result.exit_code == code, result.output
-    return result.output
+    return invoke(*args, code=code).output
 
 
 @pytest.fixture(autouse=True)

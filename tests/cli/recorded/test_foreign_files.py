@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
+from tests.kit.cli import run
 
 pytestmark = pytest.mark.io
 
@@ -22,12 +21,6 @@ SECONDS = 20
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-def run(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
 
 
 def info(path: Path, *words: object) -> dict[str, object]:

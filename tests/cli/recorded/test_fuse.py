@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableReader, encode_head, encode_state
 from tests.estimation.test_golden import GOLDEN
+from tests.kit.cli import invoke
 from tests.recordings.test_replay import fly_from_the_middle
 
 HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
@@ -36,7 +35,7 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
     out = log.with_name("out.csv")
     empty = log.with_name("defaults.toml")
     empty.write_text("")
-    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out), "--force", *arguments])
+    result = invoke("fuse", log, "-o", out, "--force", *arguments)
     assert result.exit_code == 0, result.output
     lines = out.read_text().splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
@@ -101,7 +100,7 @@ def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
 def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("a,b\n1,2\n")
-    result = CliRunner().invoke(app, ["fuse", str(path), "-o", str(tmp_path / "out.csv")])
+    result = invoke("fuse", path, "-o", tmp_path / "out.csv")
     assert result.exit_code == 2
     assert not (tmp_path / "out.csv").exists()
 
@@ -110,7 +109,7 @@ def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_recording_is_not_overwritten_by_its_own_states(log: Path, force: list[str]) -> None:
     before = log.read_bytes()
-    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(log), *force])
+    result = invoke("fuse", log, "-o", log, *force)
     assert result.exit_code == 2
     assert "is what the output is made of" in result.output
     assert log.read_bytes() == before
@@ -120,7 +119,7 @@ def test_recording_is_not_overwritten_by_its_own_states(log: Path, force: list[s
 def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
     out = log.with_name("out.csv")
     out.write_text("precious")
-    result = CliRunner().invoke(app, ["fuse", str(log), "-o", str(out)])
+    result = invoke("fuse", log, "-o", out)
     assert result.exit_code == 2
     assert "--force overwrites it" in result.output
     assert out.read_text() == "precious"
@@ -135,7 +134,7 @@ def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> Non
     config = tmp_path / "c.toml"
     config.write_text('[estimation]\nestimator = "eskf"\n')
     arguments = ["fuse", str(log), "-o", str(out), "--config", str(config)]
-    result = CliRunner().invoke(app, arguments)
+    result = invoke(*arguments)
     assert result.exit_code == 0, result.output
     words = " ".join(result.output.split())
     estimate = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
@@ -148,7 +147,7 @@ def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> Non
 def test_latency_without_manoeuvres_is_assumed(log: Path) -> None:
     log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
     arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
-    words = " ".join(CliRunner().invoke(app, arguments).output.split())
+    words = " ".join(invoke(*arguments).output.split())
     assert "0.15 s is assumed, since no manoeuvre shows it" in words
-    result = CliRunner().invoke(app, [*arguments, "--gps-latency", "0.2"])
+    result = invoke(*arguments, "--gps-latency", "0.2")
     assert "gives no GPS latency" not in result.output

@@ -9,10 +9,8 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from gateway.analysis.flight import Flight
-from gateway.cli.app import app
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
 from gateway.cli.support.recording_options import files_of
@@ -23,6 +21,7 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.summary import END_BYTES, glance
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import TlogRecord
+from tests.kit.cli import invoke
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight, read
 
@@ -49,10 +48,8 @@ def config(tmp_path: Path, rng: np.random.Generator) -> Path:
     return file
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output
-    return result.output
+def run(*arguments: object, code: int = 0) -> str:
+    return invoke(*arguments, code=code).output
 
 
 def test_list_contains_length_vehicles_size_and_path(config: Path) -> None:
@@ -138,7 +135,7 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
 
 
 def test_a_name_that_is_none_is_refused(config: Path) -> None:
-    result = CliRunner().invoke(app, ["info", "sea", "--config", str(config)])
+    result = invoke("info", "sea", "--config", config)
     assert result.exit_code == 2
     assert "record list" in result.output
 

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
-from gateway.cli.app import app
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
+from tests.kit.cli import run
 from tests.recordings.frames import make_frames
 
 pytestmark = pytest.mark.io
@@ -29,13 +28,6 @@ NUMBERS = ("0", "0", "-9.8", "0", "0", "0", "100", "0.1", "47", "8", "500")
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
-def run(*words: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
 
 
 def log(path: Path, **odd: str) -> Path:

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -13,20 +12,20 @@ pytestmark = pytest.mark.io
 def test_without_a_yes_no_command_leaves_this_machine(tmp_path: Path) -> None:
     file = str(tmp_path / "missing.tlog")
     away = ("--endpoint", "udp:tablet.example:14550")
-    asked = CliRunner().invoke(app, ["play", file, "--with-commands", *away], input="n\n")
+    asked = invoke("play", file, "--with-commands", *away, answers="n\n")
     assert asked.exit_code == 1
     assert "udp:tablet.example:14550" in asked.output
     for options in (("--yes", *away), ("--endpoint", "udp:127.0.0.1:14550")):
         # They get as far as the file.
-        done = CliRunner().invoke(app, ["play", file, "--with-commands", *options])
+        done = invoke("play", file, "--with-commands", *options)
         assert (done.exit_code, "No such file" in done.output) == (2, True)
-    plain = CliRunner().invoke(app, ["play", file, *away])
+    plain = invoke("play", file, *away)
     assert (plain.exit_code, "No such file" in plain.output) == (2, True)
 
 
 @pytest.mark.parametrize("speed", ["0", "nan", "101", "fast", ""])
 @pytest.mark.parametrize("words", [["play", "x.tlog", "--speed"], ["player", "speed"]])
 def test_a_speed_out_of_range_is_refused(words: list[str], speed: str) -> None:
-    done = CliRunner().invoke(app, [*words, speed])
+    done = invoke(*words, speed)
     assert done.exit_code == 2
     assert f"speed {speed!r}: write 0.1 to 100, or max" in done.output

@@ -4,15 +4,14 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from gateway.analysis.reporting.page import Report
 from gateway.analysis.reporting.raw_sensors import timing
-from gateway.cli.app import app
 from gateway.cli.recorded import report
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import TableHeader, encode_head
 from tests.analysis.test_sources import rows
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -27,7 +26,7 @@ def test_recording_is_compared_with_other_settings(
     other.write_text('[estimation]\nestimator = "paper"\n')
     folder = tmp_path / "out"
     arguments = ["--against-config", str(other), "--reference", str(recording), "-o", str(folder)]
-    result = CliRunner().invoke(app, ["report", str(recording), *arguments])
+    result = invoke("report", recording, *arguments)
     assert result.exit_code == 0, result.output
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Flight report: flight.csv" in page
@@ -39,7 +38,7 @@ def test_recording_is_compared_with_other_settings(
 def test_a_file_without_a_flight_is_reported(tmp_path: Path) -> None:
     empty = tmp_path / "empty.csv"
     empty.write_text(encode_head(TableHeader()))
-    result = CliRunner().invoke(app, ["report", str(empty), "-o", str(tmp_path / "out")])
+    result = invoke("report", empty, "-o", tmp_path / "out")
     assert result.exit_code == 2
     assert "holds no row" in result.output
     assert not (tmp_path / "out").exists()
@@ -50,7 +49,7 @@ def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         return None if name == "jinja2" else find_spec(name)
 
     monkeypatch.setattr(report, "find_spec", without)
-    result = CliRunner().invoke(app, ["report"])
+    result = invoke("report")
     assert result.exit_code == 2
     assert "needs jinja2, the extra mavgate[plot]" in result.output
     assert "-m pip install 'mavgate[plot]'\n" in result.output
@@ -67,14 +66,14 @@ def test_a_folder_that_cannot_be_written_is_reported(
     monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda *_: empty)
     monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_, **__: None)
     monkeypatch.setattr(report, "load_flight", lambda *_: None)
-    result = CliRunner().invoke(app, ["report", "-o", str(tmp_path / "page")])
+    result = invoke("report", "-o", tmp_path / "page")
     assert result.exit_code == 2
     assert f"{tmp_path / 'page'}: No space left" in result.output
 
 
 def test_a_folder_that_holds_something_is_not_written_into_unasked(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("mine")
-    result = CliRunner().invoke(app, ["report", "-o", str(tmp_path)])
+    result = invoke("report", "-o", tmp_path)
     assert result.exit_code == 2
     assert "--force overwrites it" in result.output
     assert (tmp_path / "index.html").read_text() == "mine"

@@ -3,13 +3,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.config import load
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import TableHeader, encode_head
 from tests.analysis.test_sources import rows
+from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
@@ -34,7 +33,7 @@ def test_the_best_settings_become_a_settings_file(recording: Path, tmp_path: Pat
         "--table",
         str(table),
     ]
-    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 0, result.output
     assert "Best of 6 trials, by the error at withheld fixes" in result.output
     trials = pd.read_csv(table)
@@ -49,7 +48,7 @@ def test_the_best_settings_become_a_settings_file(recording: Path, tmp_path: Pat
 def test_a_search_writes_its_best_too(recording: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
     arguments = ["--beta", "0:1", "--optimise", "2", "-o", str(best), "--jobs", "1"]
-    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 0, result.output
     # On this short, smooth flight the withheld fixes are nearest at 0.7; 0 and 1 are both worse.
     assert 0.5 < load(best).estimation.paper.beta_velocity < 0.9
@@ -59,7 +58,7 @@ def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) 
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
     arguments = ["--vary", "estimator=paper,eskf", "--vary", "gps_latency_s=0.0,0.2"]
     arguments += ["-o", str(best), "--table", str(table), "--jobs", "1"]
-    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 0, result.output
     winner = pd.read_csv(table).iloc[0]
     estimation = load(best).estimation
@@ -70,11 +69,11 @@ def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) 
 def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: Path) -> None:
     idle = ["--vary", "dead_reckoning_s=30.0,60.0"]
     base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1", "--force"]
-    result = CliRunner().invoke(app, [*base, "--vary", "baro_noise_m=0.1,5.0", *idle])
+    result = invoke(*base, "--vary", "baro_noise_m=0.1,5.0", *idle)
     assert result.exit_code == 0, result.output
     assert "estimation.eskf.dead_reckoning_s: changes nothing" in result.output
     assert "baro_noise_m:" not in result.output
-    result = CliRunner().invoke(app, [*base, *idle])
+    result = invoke(*base, *idle)
     assert result.exit_code == 2
     assert "vary another setting" in result.output
 
@@ -90,13 +89,13 @@ def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: P
     ],
 )
 def test_impossible_sweep_is_reported(recording: Path, arguments: list[str], text: str) -> None:
-    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 2
     assert text in result.output
 
 
 def test_a_file_that_is_not_there_is_reported(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["sweep", str(tmp_path / "no.csv"), "--alpha", "0.1,0.2"])
+    result = invoke("sweep", tmp_path / "no.csv", "--alpha", "0.1,0.2")
     assert result.exit_code == 2
     assert "no.csv" in result.output
 
@@ -105,7 +104,7 @@ def test_settings_that_are_there_are_not_replaced_unasked(recording: Path, tmp_p
     best = tmp_path / "best.toml"
     best.write_text("# mine")
     arguments = ["--beta", "0.1,0.9", "-o", str(best), "--jobs", "1"]
-    result = CliRunner().invoke(app, ["sweep", str(recording), *arguments])
+    result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 2
     assert "--force overwrites it" in result.output
     assert best.read_text() == "# mine"

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
-from gateway.cli.app import app
 from gateway.cli.support.loading import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
@@ -26,6 +24,7 @@ from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import ReadOptions, RecordedTable, open_rows
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
+from tests.kit.cli import invoke
 from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
@@ -58,9 +57,7 @@ def rows_of(path: Path) -> tuple[RecordedTable, list[TableRow]]:
 
 
 def run(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return result.output
+    return invoke(*arguments, code=code).output
 
 
 @pytest.mark.parametrize("name", MAKERS)

@@ -12,15 +12,14 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from pymavlink.dialects.v20 import all as mavlink
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.config import GatewaySettings
 from gateway.geometry.quaternion import rotate
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord
+from tests.kit.cli import invoke
 from tests.recordings.formats import flown
 from tests.recordings.frames import START_US, make_tlog
 
@@ -144,7 +143,7 @@ def test_every_message_of_a_tlog_is_in_it(tmp_path: Path) -> None:
     records = [TlogRecord(START_US + k * 1000, frame) for k, (frame, _) in enumerate(said)]
     path = tmp_path / "a.tlog"
     path.write_bytes(make_tlog(records))
-    done = CliRunner().invoke(app, ["convert", str(path), "-o", str(tmp_path / "a.mcap")])
+    done = invoke("convert", path, "-o", tmp_path / "a.mcap")
     assert done.exit_code == 0, done.output
     found = messages_of(tmp_path / "a.mcap")
     raw = [(topic, ns) for topic, _, ns, _ in found if topic.startswith("/mavlink")]

@@ -7,9 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from typer.testing import CliRunner
 
-from gateway.cli.app import app
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import COLUMNS
@@ -17,18 +15,13 @@ from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.table import TableMark, encode_header, encode_mark
+from tests.kit.cli import run
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 
 OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
-
-
-def run(*arguments: object, code: int = 0) -> str:
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == code, result.output
-    return " ".join(result.output.split())
 
 
 @pytest.fixture
