@@ -99,17 +99,7 @@ class Bandwidth:
     def plan(
         self, offered: Mapping[Key, tuple[int, int, int]], answered: int, elapsed_s: float
     ) -> None:
-        """Find new intervals.
-
-        Parameters
-        ----------
-        offered : mapping
-            Since the last plan, by kind: message id, frames, bytes.
-        answered : int
-            Bytes of answers to this link since then.
-        elapsed_s : float
-            Time since then.
-        """
+        """Find new intervals from what was offered by kind and answered since the last plan."""
         if elapsed_s <= 0:
             return
         for key in self._offered.keys() | offered.keys():

@@ -53,22 +53,10 @@ NULL_ORIGIN: Final = "null"
 
 
 def admits_page(origin: str, local_host: str, named: Collection[str]) -> bool:
-    """Return whether a page may connect.
+    """Return whether a page of this origin may connect.
 
-    Parameters
-    ----------
-    origin : str
-        As the browser sends it, such as `http://localhost:8080`.
-    local_host : str
-        Address of ours that the browser connected to. A page from there is of this machine too;
-        the host name that the browser used proves nothing.
-    named : collection of str
-        Origins that are allowed in addition to those of this machine, in lower case.
-
-    Returns
-    -------
-    bool
-        Whether it may.
+    A page from `local_host`, the address of ours that the browser connected to, is of this machine
+    too; the host name that the browser used proves nothing. `named` are further allowed origins.
     """
     if origin.lower() in named:
         return True
@@ -445,22 +433,8 @@ def _path(text: str) -> str:
 def respell(address: str) -> tuple[str, str]:
     """Read an endpoint without its options, in any of the spellings.
 
-    Parameters
-    ----------
-    address : str
-        In our own spelling or in one of the table above.
-
-    Returns
-    -------
-    kind : str
-        The word before our own first colon, whether there is such a kind or not.
-    rest : str
-        What follows it.
-
-    Raises
-    ------
-    ValueError
-        If programs differ about its meaning; the error names the unambiguous spellings.
+    Raises ValueError if programs differ about its meaning; the error names the unambiguous
+    spellings.
     """
     if address.startswith("/"):
         device, comma, baud = address.partition(",")
@@ -504,10 +478,7 @@ def _either(kind: str, rest: str) -> str:
 def message_id_from(text: str) -> int:
     """Return a message id from its name or number.
 
-    Raises
-    ------
-    ValueError
-        If no message has that name.
+    Raises ValueError if no message has that name.
     """
     if text.isdecimal():
         return number_from(text, "message id", 0, MAX_MESSAGE_ID)

@@ -233,10 +233,7 @@ class Hub:
     def add(self, url: str) -> None:
         """Open one more endpoint.
 
-        Raises
-        ------
-        ValueError
-            If the URL is not understood, or the same endpoint exists already.
+        Raises ValueError if the URL is not understood, or the same endpoint exists already.
         """
         endpoint = parse_endpoint(url)
         if endpoint.location in self._endpoints:
@@ -254,15 +251,7 @@ class Hub:
     def remove(self, name: str) -> None:
         """Close an endpoint.
 
-        Parameters
-        ----------
-        name : str
-            Its URL, with or without options, or its name.
-
-        Raises
-        ------
-        ValueError
-            If there is no such endpoint.
+        Raises ValueError if there is no such endpoint.
         """
         for location, opened in self._endpoints.items():
             if name in (location, opened.endpoint.name, opened.endpoint.url):

@@ -190,14 +190,7 @@ class ClientTable:
     def admit(
         self, address: tuple[str, int], client_id: int, now_us: int
     ) -> tuple[Presence | None, Presence | None]:
-        """Admit a client at a new address.
-
-        Returns
-        -------
-        tuple
-            The client, or None if the table is full of clients that are alive; and the client that
-            was removed for it, if any.
-        """
+        """Admit a client at a new address; return it, None if full, and the one removed for it."""
         removed = None
         if len(self._by_address) >= self.max_clients:
             present = self._by_address.values()
@@ -250,24 +243,10 @@ class ClientTable:
 def client_to_remove(
     present: Collection[Presence], host: str, max_clients: int, now_us: int
 ) -> Presence | None:
-    """Choose the client to remove from a full port.
+    """Choose the client to remove from a full port for a new one from `host`.
 
-    Parameters
-    ----------
-    present : collection of Presence
-        All clients, in the order of admission.
-    host : str
-        Address of the new client.
-    max_clients : int
-        Most clients at once.
-    now_us : int
-        Gateway time.
-
-    Returns
-    -------
-    Presence or None
-        The client that has been silent longest, else the newest of the host that holds more than
-        its share; None if all are alive and no host, or only the new client's, holds more.
+    It is the one that has been silent longest, else the newest of the host that holds more than its
+    share; None if all are alive and no host, or only the new client's, holds more.
     """
     stalest = min(present, key=lambda presence: presence.heard_us)
     if now_us - stalest.heard_us >= SILENT_AFTER_US:

@@ -57,19 +57,7 @@ class RoundTrip:
         return self._sender.srcSystem, PROBE_COMPONENT
 
     def ask(self, system: int, now_us: int) -> list[MavFrame]:
-        """Build the requests of one round.
-
-        Parameters
-        ----------
-        system : int
-            One of our vehicles; the gateway sends as one of its components.
-        now_us : int
-            Gateway time; the answers contain it.
-
-        Returns
-        -------
-        list of MavFrame
-        """
+        """Build the requests of one round."""
         self._sender.srcSystem = system
         self._asked_us.append(now_us)
         return [
@@ -101,22 +89,7 @@ class RoundTrip:
         return round_trip_us if 0 <= round_trip_us <= LONGEST_US else None
 
     def answer(self, frame: MavFrame, system: int, now_us: int) -> MavFrame | None:
-        """Answer a round-trip request of another gateway.
-
-        Parameters
-        ----------
-        frame : MavFrame
-            Any frame.
-        system : int
-            One of our vehicles; the gateway sends as one of its components.
-        now_us : int
-            Gateway time.
-
-        Returns
-        -------
-        MavFrame or None
-            None if the frame is no such request.
-        """
+        """Answer a round-trip request of another gateway."""
         asked = self._decode(frame) if is_of_gateway(frame) else None
         if asked is None:
             return None

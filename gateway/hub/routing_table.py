@@ -132,13 +132,7 @@ class RoutingTable:
         self._streams: dict[Origin, FrameStream] = {}
 
     def hear(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
-        """Register that a client has brought a frame of a system.
-
-        Returns
-        -------
-        Path or None
-            The path; None if there is no room for it.
-        """
+        """Register a client's frame of a system; return the path, or None without room for it."""
         paths = self._to.get(origin)
         path = paths.get(client_id) if paths else None
         if path is None:
@@ -183,22 +177,9 @@ class RoutingTable:
         return tuple(self._of_client.get(client_id, ()))
 
     def clients_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
-        """Find the clients that lead to a target.
+        """Return the clients that recently brought exactly this component, else this system.
 
-        Parameters
-        ----------
-        target : tuple of int
-            System and component; component 0 is all of the system.
-        source_id : int
-            The client that sends; never part of the result.
-        now_us : int
-            Gateway time.
-
-        Returns
-        -------
-        list of int
-            Clients that recently brought exactly this component, else this system; silent ones
-            only if there is no other. Empty if the target is unknown.
+        Silent ones only if there is no other, and never the sender. Component 0 is all of it.
         """
         system, component = target
         exact = self._to.get(target, {}) if component else {}
@@ -298,25 +279,9 @@ class DuplicateFilter:
         its bytes were accepted before."""
 
     def check(self, frame: MavFrame, client_id: int, path: Path, now_us: int, limit_us: int) -> int:
-        """Register a frame of a system with several paths.
+        """Return `NEW`, `LATE`, or the id of the client that brought the same bytes first.
 
-        Parameters
-        ----------
-        frame : MavFrame
-            A complete frame.
-        client_id : int
-            The client that brings it.
-        path : Path
-            The path on which it arrives.
-        now_us : int
-            Gateway time.
-        limit_us : int
-            A frame older than the newest of its stream by more than this is late.
-
-        Returns
-        -------
-        int
-            `NEW`, `LATE`, or the id of the client that brought the same bytes first.
+        A frame older than the newest of its stream by more than `limit_us` is late.
         """
         self._memory.turn(now_us)
         digest = hash(frame.data)

@@ -142,22 +142,7 @@ class SendQueue:
         return sum(self._sizes)
 
     def push(self, frame: MavFrame, step: int | None = None, now_us: int = 0) -> int:
-        """Add a frame.
-
-        Parameters
-        ----------
-        frame : MavFrame
-            Its message decides in which queue it waits.
-        step : int, optional
-            Returned with the frame; see `Numbering`.
-        now_us : int, optional
-            Gateway time; see `expire`.
-
-        Returns
-        -------
-        int
-            Number of older frames that were dropped for it.
-        """
+        """Add a frame to the queue of its message; return how many older ones were dropped."""
         message_id, size, dropped = frame.message_id, len(frame.data), 0
         if message_id in BULK_IDS:
             queue = self._bulk

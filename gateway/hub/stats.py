@@ -173,22 +173,7 @@ class ClientAlerts:
         listeners: tuple[ListenerStats, ...],
         now_us: int,
     ) -> list[ClientAlert]:
-        """Compare all figures with the previous ones.
-
-        Parameters
-        ----------
-        clients : tuple of ClientStats
-            All clients at this moment.
-        listeners : tuple of ListenerStats
-            All listening ports at this moment.
-        now_us : int
-            Gateway time.
-
-        Returns
-        -------
-        list of ClientAlert
-            Short texts.
-        """
+        """Compare all figures with the previous ones."""
         ports = {listener.endpoint for listener in listeners}
         self._keep_only({client.client_id for client in clients}, ports)
         alerts = [ClientAlert(True, text) for text in self._limiter.poll(now_us)]

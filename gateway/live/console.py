@@ -81,18 +81,7 @@ class LiveView:
         self._snapshots: deque[Snapshot] = deque(maxlen=RATE_SNAPSHOTS)
 
     def draw(self, snapshot: Snapshot) -> RenderableType:
-        """Build the view of one snapshot.
-
-        Parameters
-        ----------
-        snapshot : Snapshot
-            The daemon's state now.
-
-        Returns
-        -------
-        RenderableType
-            To be shown by a rich `Live` or `Console`.
-        """
+        """Build the view of one snapshot."""
         self._snapshots.append(snapshot)
         top: list[RenderableType] = [_link_line(snapshot), *_recorder_line(snapshot.recorder)]
         if self.link:

@@ -98,27 +98,17 @@ class ControlServer:
         params: type[Params],
         handler: Callable[[Params], Awaitable[object] | object],
     ) -> None:
-        """Register a verb.
+        """Register a verb: words joined by dots, its parameters' structure, and its handler.
 
-        Parameters
-        ----------
-        verb : str
-            One or more words joined by dots: `record.start`.
-        params : type
-            A msgspec structure; should forbid unknown fields.
-        handler : callable
-            Takes the parameters and returns, or awaits, what is JSON or a msgspec structure or
-            dataclass. Raises ControlError to refuse.
+        The handler returns, or awaits, what is JSON or a msgspec structure or dataclass, and raises
+        ControlError to refuse.
         """
         self._verbs[verb] = (params, handler)
 
     async def start(self) -> None:
         """Create the socket and listen.
 
-        Raises
-        ------
-        ControlError
-            If the socket cannot be created, or `MOST_GATEWAYS` run already.
+        Raises ControlError if the socket cannot be created, or `MOST_GATEWAYS` run already.
         """
         check_length(self.path)
         try:

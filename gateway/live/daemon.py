@@ -185,15 +185,7 @@ class Daemon:
 
         Other changes apply at the next start: ground stations may have changed them meanwhile.
 
-        Returns
-        -------
-        str
-            What was done.
-
-        Raises
-        ------
-        ConfigError
-            If the settings are wrong; then nothing is changed.
+        Raises ConfigError if the settings are wrong; then nothing is changed.
         """
         # In a thread, as in `_save`: files take some milliseconds, or longer on a slow disk.
         loop = asyncio.get_running_loop()

@@ -240,33 +240,12 @@ FIX_GAUGES: Final[tuple[tuple[str, str, Callable[[GpsFix], float]], ...]] = (
 
 
 def prometheus_text(snapshot: Snapshot) -> Iterator[str]:
-    """Write a snapshot in the Prometheus text format.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-        The daemon's state now.
-
-    Yields
-    ------
-    str
-        One family: its help and type, then one line per sample.
-    """
+    """Write a snapshot in the Prometheus text format."""
     return text_of(families(snapshot))
 
 
 def families(snapshot: Snapshot) -> Iterator[Metric]:
-    """Yield the metrics of a snapshot.
-
-    Parameters
-    ----------
-    snapshot : Snapshot
-
-    Yields
-    ------
-    Metric
-        Names begin with `mavgate_`; unknown values are left out.
-    """
+    """Yield the metrics of a snapshot."""
     yield from _gateway(snapshot)
     yield from _refusals(snapshot)
     yield from _nodes(snapshot.report.nodes, snapshot.time_us)

@@ -209,10 +209,7 @@ def why_not_open(error: Exception, ports: list[Port]) -> str:
 def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
     """Open the receiver's port, for this program alone.
 
-    Raises
-    ------
-    PortNotFoundError
-        If there is none, or it cannot be opened.
+    Raises PortNotFoundError if there is none, or it cannot be opened.
     """
     try:
         return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)

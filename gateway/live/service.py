@@ -92,12 +92,8 @@ def set_realtime_priority(priority: int) -> None:
     """Request the round-robin real-time scheduler, for this thread and none that it starts.
 
     On a busy machine this keeps the worst latency below a millisecond, which niceness does not.
-    The threads that write to the disk do not get it.
-
-    Parameters
-    ----------
-    priority : int
-        1 to 99, and 1 is already above everything ordinary; 0 goes back to the usual scheduler.
+    The threads that write to the disk do not get it. Priority 1 to 99, of which 1 is already above
+    everything ordinary; 0 goes back to the usual scheduler.
     """
     policy = os.SCHED_RR if priority else os.SCHED_OTHER
     try:
@@ -161,17 +157,7 @@ class LoopLag:
         self.stalled_after_us = due_us + STALL_US
 
     def update(self, now_us: int) -> LagReport:
-        """Add one call of a timer.
-
-        Parameters
-        ----------
-        now_us : int
-            When it was called.
-
-        Returns
-        -------
-        LagReport
-        """
+        """Add one call of a timer."""
         self.stalled_after_us = NEVER_US
         if self._begin_us is None:
             self._begin_us = now_us

@@ -183,19 +183,7 @@ _NAMES: Final = {"A": "up", "B": "down", "C": "right", "D": "left", "H": "home",
 
 
 def keys_of(text: str) -> Iterator[str]:
-    """Yield the names of the keys that a terminal sent.
-
-    Parameters
-    ----------
-    text : str
-        What was read.
-
-    Yields
-    ------
-    str
-        A printable character, `space`, `up`, `down`, `left`, `right`, `home` or `end`; others are
-        left out.
-    """
+    """Yield the keys that a terminal sent: printable characters, `space`, `up`, `home` and such."""
     at = 0
     while at < len(text):
         sequence = _SEQUENCE.match(text, at)

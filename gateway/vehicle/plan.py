@@ -224,18 +224,7 @@ class Item:
 
 
 def read_item(message: Any) -> Item:
-    """Read an item from MISSION_ITEM_INT or MISSION_ITEM.
-
-    Parameters
-    ----------
-    message : MAVLink_message
-        The older MISSION_ITEM has floats in degrees.
-
-    Returns
-    -------
-    Item
-        Unchecked. A float beyond the integer range becomes a value that every check refuses.
-    """
+    """Read an unchecked item from MISSION_ITEM_INT, or MISSION_ITEM with its floats in degrees."""
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
         scale = DEGE7 if message.frame in GLOBAL_FRAMES else 1.0
@@ -289,20 +278,7 @@ def write_float_item(
 
 
 def check_item(item: Item, kind: int) -> int:
-    """Check an item of an upload.
-
-    Parameters
-    ----------
-    item : Item
-    kind : int
-        MAV_MISSION_TYPE of the upload.
-
-    Returns
-    -------
-    int
-        MAV_MISSION_RESULT; `MAV_MISSION_ACCEPTED` if it may be stored. Nothing here executes
-        items, so any command of the standard may be in a mission.
-    """
+    """Return the MAV_MISSION_RESULT for an item of an upload; any command may be in a mission."""
     known = {FENCE: FENCE_COMMANDS, RALLY: RALLY_COMMANDS}.get(kind, mavlink.enums["MAV_CMD"])
     result: int = ACCEPTED
     if item.command not in known:

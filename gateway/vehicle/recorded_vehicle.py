@@ -112,19 +112,7 @@ class RecordedVehicle:
         }
 
     def handle(self, incoming: Incoming, now_us: int) -> list[RecordedAction]:
-        """Answer one frame of a client; ignore one that is not for this vehicle.
-
-        Parameters
-        ----------
-        incoming : Incoming
-            A whole frame, whatever is in it.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        list of Outgoing or ClientInterval
-        """
+        """Answer one frame of a client; ignore one that is not for this vehicle."""
         request = self._reader.read(incoming, now_us)
         if request is None:
             return []

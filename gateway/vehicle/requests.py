@@ -170,19 +170,7 @@ class Verifier:
         self._book = SigningTimestamps() if book is None else book
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
-        """Return whether a whole frame is signed by a holder of the key, and not a replay.
-
-        Parameters
-        ----------
-        frame : bytes
-            A whole MAVLink 2 frame whose signed bit is set.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        bool
-        """
+        """Return whether a whole frame is signed by a holder of the key, and not a replay."""
         signature = frame[-6:]
         wanted = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
         if not hmac.compare_digest(signature, wanted):
@@ -228,20 +216,7 @@ class RequestReader:
         self._mav: Any = mavlink.MAVLink(None)
 
     def read(self, incoming: Incoming, now_us: int) -> Request | None:
-        """Decode one whole frame.
-
-        Parameters
-        ----------
-        incoming : Incoming
-            MAVLink 1 or 2.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        Request or None
-            None if it is damaged, unknown, forged, or for another system.
-        """
+        """Decode one whole frame; None if it is damaged, unknown, forged, or for others."""
         frame = incoming.frame
         message = self._decode(frame)
         if isinstance(message, str):

@@ -269,19 +269,7 @@ class Vehicle:
         return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
-        """Answer one frame of a client; ignore one that is not for this vehicle.
-
-        Parameters
-        ----------
-        incoming : Incoming
-            A whole frame, whatever is in it.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        list of Action
-        """
+        """Answer one frame of a client; ignore one that is not for this vehicle."""
         request = self._reader.read(incoming, now_us)
         if request is None:
             return []
@@ -389,10 +377,7 @@ class Vehicle:
     def put_mark(self, location: Location | None, now_us: int) -> list[Action]:
         """Mark a location (its height may be NaN), or clear the mark.
 
-        Raises
-        ------
-        ValueError
-            If its coordinates are out of range.
+        Raises ValueError if its coordinates are out of range.
         """
         return self._finish(self.plan.put_mark(location, now_us))
 

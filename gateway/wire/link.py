@@ -169,21 +169,7 @@ class Link:
         self._last_frame_seq = None
 
     def report(self, now_us: int, *, connected: bool, port: str) -> LinkReport:
-        """Sum up the line and every node behind it.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-        connected : bool
-            Whether the port is open.
-        port : str
-            Name of the port, for people.
-
-        Returns
-        -------
-        LinkReport
-        """
+        """Sum up the line and every node behind it."""
         return LinkReport(
             time_us=now_us,
             connected=connected,

@@ -196,10 +196,7 @@ def frame_from_json(data: bytes) -> bytes:
 def class_of(name: Any) -> Any:
     """Return pymavlink's class of a message.
 
-    Raises
-    ------
-    BadMessageError
-        If no message has this name.
+    Raises BadMessageError if no message has this name.
     """
     if not isinstance(name, str) or name not in CLASSES:
         raise BadMessageError(f"no MAVLink message is called {name!r}")

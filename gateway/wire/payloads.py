@@ -338,17 +338,7 @@ def _decode_radio(content: bytes, size: int) -> RadioFrame | Fault:
 
 
 def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
-    """Read one radio payload.
-
-    Parameters
-    ----------
-    data : bytes
-        Header and body, as the node sent them.
-
-    Returns
-    -------
-    tuple of Header and Payload, or Fault
-    """
+    """Read one radio payload."""
     if len(data) < _HEADER.size:
         return Fault(FaultKind.PAYLOAD, len(data))
     first, address, seq, node_time_us = _HEADER.unpack_from(data)

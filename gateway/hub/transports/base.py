@@ -235,17 +235,7 @@ class Client:
     def limit_reads(
         self, sock: socket.socket, read: Callable[[socket.socket], None], size: int
     ) -> None:
-        """Stop reading for a while from an untrusted client, if all such sent too much.
-
-        Parameters
-        ----------
-        sock : socket
-            The socket for which `read` is called.
-        read : callable
-            Reads from it.
-        size : int
-            Bytes that were just read.
-        """
+        """Stop reading for a while from an untrusted client, if all such sent too much."""
         if self.trusted:
             return
         self.context.untrusted_reads.level -= size

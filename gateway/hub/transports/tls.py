@@ -39,15 +39,8 @@ class TlsLayer:
     def feed(self, data: bytes) -> tuple[bytes, bytes]:
         """Process network bytes.
 
-        Returns
-        -------
-        tuple of bytes
-            Received plain bytes, and bytes to send at once.
-
-        Raises
-        ------
-        ssl.SSLError
-            If they are not TLS, or a certificate is not accepted; `outgoing` then holds the alert.
+        Raises ssl.SSLError if they are not TLS, or a certificate is not accepted;
+        `outgoing` then holds the alert.
         """
         self._inward.write(data)
         plain = b""
@@ -82,10 +75,7 @@ class TlsLayer:
 def server_context(settings: HubSettings) -> ssl.SSLContext:
     """Return the context of a listening port; a replaced certificate is read again.
 
-    Raises
-    ------
-    OSError
-        If the files cannot be read or are invalid.
+    Raises OSError if the files cannot be read or are invalid.
     """
     if not settings.tls_certificate:
         raise OSError("set hub.tls_certificate to a PEM file")
@@ -97,10 +87,7 @@ def server_context(settings: HubSettings) -> ssl.SSLContext:
 def caller_context(settings: HubSettings) -> ssl.SSLContext:
     """Return the context for connecting to servers.
 
-    Raises
-    ------
-    OSError
-        If the file cannot be read or is invalid.
+    Raises OSError if the file cannot be read or is invalid.
     """
     if not settings.tls_authority:
         return ssl.create_default_context()

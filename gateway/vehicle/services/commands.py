@@ -259,21 +259,7 @@ class RecordingService:
         commands.register(mavlink.MAV_CMD_LOGGING_STOP, self._stop)
 
     def update(self, trouble: str, now_us: int, *, recording: bool) -> list[Answer]:
-        """Note the state of the recorder.
-
-        Parameters
-        ----------
-        trouble : str
-            Why it cannot record although it should; empty if there is no problem.
-        now_us : int
-            Gateway clock.
-        recording : bool
-            Whether a recording runs.
-
-        Returns
-        -------
-        list of Answer
-        """
+        """Note the state of the recorder."""
         self._recording = recording
         if not self._waiting:
             return []
@@ -363,20 +349,7 @@ class QueryService:
         return [_no_parameter(request)] if request.message.get_type() == "PARAM_EXT_SET" else []
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
-        """Answer a request at once.
-
-        Parameters
-        ----------
-        request : Request
-            A PING with target 0, 0 is a request; one with a target is an answer. A
-            TIMESYNC with `tc1` 0 is a request.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        list of Answer
-        """
+        """Answer a request at once."""
         message = request.message
         match message.get_type():
             case "PING":

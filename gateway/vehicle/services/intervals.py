@@ -129,13 +129,7 @@ class IntervalService:
         return self._take(request.client_id, message_id, requested_us)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
-        """Return how often a client gets a message, as in MESSAGE_INTERVAL.
-
-        Returns
-        -------
-        int
-            Interval, -1 if it gets none, 0 if the vehicle never sends it.
-        """
+        """Return a client's MESSAGE_INTERVAL: -1 if it gets none, 0 if it is never sent."""
         stream = self._telemetry.streams.get(message_id)
         if stream is None:
             return DEFAULT

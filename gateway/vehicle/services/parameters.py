@@ -203,10 +203,8 @@ class Parameter:
     def from_number(self, number: float, old: Any) -> Any:
         """Convert a parameter's value to the setting's.
 
-        Raises
-        ------
-        ValueError
-            If the number is not finite or out of range; the error gives the range.
+        Raises ValueError if the number is not finite or out of range; the error gives the
+        range.
         """
         if not math.isfinite(number):
             raise ValueError("not a number")
@@ -262,15 +260,7 @@ class ParameterTable:
     def change(self, parameter: Parameter, number: float) -> Settings:
         """Write a parameter.
 
-        Returns
-        -------
-        Settings
-            The whole tree with the change in it.
-
-        Raises
-        ------
-        ValueError
-            If the value is not allowed; nothing changes then.
+        Raises ValueError if the value is not allowed; nothing changes then.
         """
         value = parameter.from_number(number, self._value(parameter))
         if parameter.field.is_rotation:
@@ -281,13 +271,7 @@ class ParameterTable:
         return tree
 
     def reset(self, section: str) -> Settings:
-        """Set every parameter of a tree to its default; other settings stay as they are.
-
-        Returns
-        -------
-        Settings
-            The whole tree.
-        """
+        """Set every parameter of a tree to its default; other settings stay as they are."""
         for parameter in self.parameters:
             if parameter.section == section:
                 self.change(parameter, parameter.to_number(parameter.field.default))
@@ -358,15 +342,7 @@ def parameters_of(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[Parame
 
     They are worked out once, which takes some milliseconds, and shared by all vehicles.
 
-    Parameters
-    ----------
-    kinds : tuple
-        Key and class of each section.
-
-    Raises
-    ------
-    ValueError
-        If two settings would share a name.
+    Raises ValueError if two settings would share a name.
     """
     found = [parameter for key, kind in kinds for parameter in _walk(key, kind)]
     names = Counter(parameter.name for parameter in found)

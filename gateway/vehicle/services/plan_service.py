@@ -59,27 +59,14 @@ class Mark:
     def put(self, location: Location | None) -> None:
         """Mark a location, or none.
 
-        Raises
-        ------
-        ValueError
-            If its coordinates are out of range; its height may be NaN.
+        Raises ValueError if its coordinates are out of range; its height may be NaN.
         """
         if location is not None and not is_on_earth(location.lat_deg, location.lon_deg):
             raise ValueError(describe_location_fault(location))
         self.location, self.of = location, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
-        """Mark the first location among stored items; without one, clear a mark that they had set.
-
-        Parameters
-        ----------
-        kind : int
-            MAV_MISSION_TYPE of the items.
-        items : tuple of Item
-            From the current one on.
-        home_alt_m : float
-            Height of home above mean sea level, NaN while there is none.
-        """
+        """Mark the first location among stored items, or clear a mark that they had set."""
         locations = (item.location(home_alt_m) for item in items)
         location = next((location for location in locations if location is not None), None)
         if location is not None:
@@ -88,19 +75,7 @@ class Mark:
             self.put(None)
 
     def way(self, state: NavState) -> tuple[float, float] | None:
-        """Measure distance and bearing from the vehicle to the mark.
-
-        Parameters
-        ----------
-        state : NavState
-            Where the vehicle is.
-
-        Returns
-        -------
-        tuple of 2 floats, or None
-            Distance along the ellipsoid in metres and bearing at the vehicle in rad from north;
-            None without a mark or a position.
-        """
+        """Return the distance to the mark, m, and its bearing from north, rad; None if unknown."""
         if self.location is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
         here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
@@ -179,23 +154,7 @@ class HomeService:
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
         """Apply the change of one parameter.
 
-        Parameters
-        ----------
-        settings : HomeParameters
-            With the change in it.
-        key : str
-            What changed.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        list of Answer
-
-        Raises
-        ------
-        ValueError
-            If there is no such home to name a source of.
+        Raises ValueError if there is no such home to name a source of.
         """
         value: Any = getattr(settings, key)
         if key == "source":

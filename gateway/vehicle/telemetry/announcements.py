@@ -127,19 +127,7 @@ class Announcer:
 
 
 def chunks(text: StatusText, number: int = 1) -> list[Any]:
-    """Encode a text as one STATUSTEXT, or as several chunks.
-
-    Parameters
-    ----------
-    text : StatusText
-        ASCII; cut at `MAX_TEXT_BYTES`.
-    number : int, optional
-        Id of a long text, different from the one before, 1 to 65535.
-
-    Returns
-    -------
-    list of MAVLink_message
-    """
+    """Encode a text as one STATUSTEXT, or as several chunks."""
     data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
     if len(data) <= TEXT_BYTES:
         # Id 0 means a text of one chunk.

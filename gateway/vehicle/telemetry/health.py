@@ -131,20 +131,7 @@ class NodeHealth:
         return 0
 
     def take(self, status: NodeStatus, name: str) -> list[Finding]:
-        """Note a report.
-
-        Parameters
-        ----------
-        status : NodeStatus
-            The node's newest.
-        name : str
-            Name of the node in texts.
-
-        Returns
-        -------
-        list of Finding
-            The state of each topic, to announce changes.
-        """
+        """Note a report."""
         known = self._nodes.get(status.node.node_id)
         if known is None:
             known = self._nodes[status.node.node_id] = _Node(status)
@@ -377,18 +364,7 @@ class Health:
         return self._fix is not None and is_3d(self._fix) and self.is_alive(GPS, now_us)
 
     def sensors(self, now_us: int) -> tuple[int, int, int]:
-        """Compute the bit masks of SYS_STATUS.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        tuple of 3 ints
-            Present (has sent a sample, and is not reported absent), enabled, healthy.
-        """
+        """Compute the bit masks of SYS_STATUS: present, enabled, healthy."""
         present = 0
         healthy = 0
         absent = MAG if self._imu_flags & ImuFlags.MAG_ABSENT else 0

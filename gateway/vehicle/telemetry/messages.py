@@ -117,17 +117,6 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
     nothing is sent before the first position, and the estimate always from then on:
     ESTIMATOR_STATUS reports its quality. Velocities have no "unknown" either and are zero in the
     rare state that has a position but no velocity.
-
-    Parameters
-    ----------
-    state : NavState
-        With finite latitude, longitude and height.
-    reference_alt_m : float
-        Height of home above mean sea level.
-
-    Returns
-    -------
-    MAVLink_message
     """
     heading = NAN
     if state.flags & NavFlags.HEADING_VALID:
@@ -209,11 +198,6 @@ def local_position_m(state: NavState, origin: Location) -> Vec3:
 
     The projection is azimuthal equidistant, as autopilots use: distance and bearing from the origin
     are exact.
-
-    Returns
-    -------
-    tuple of 3 floats
-        North, east and down in metres.
     """
     here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
     distance_m, bearing_rad = distance_and_bearing(origin, here)
@@ -469,25 +453,6 @@ def high_latency2(
     Latitude, longitude and altitude have no "unknown" in this message, which is the only one of
     its link, so it is sent before the first fix too: as PX4 does, with 0, 0, errors of UINT8_MAX
     and the GPS failure flag. Nothing measures wind, airspeed or throttle.
-
-    Parameters
-    ----------
-    kind : int
-        A MAV_TYPE.
-    autopilot : int
-        A MAV_AUTOPILOT.
-    state : NavState, optional
-        The newest.
-    fix : GpsFix, optional
-        The newest.
-    health : Health
-        State of the sensors.
-    now_us : int
-        Gateway clock.
-
-    Returns
-    -------
-    MAVLink_message
     """
     failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
     h_acc_m, v_acc_m = NAN, NAN

@@ -78,17 +78,7 @@ class Stream:
         self.due_us = None
 
     def offer(self, time_us: int) -> bool:
-        """Return whether the sample of this time is to be sent.
-
-        Parameters
-        ----------
-        time_us : int
-            Time of the sample on the gateway clock.
-
-        Returns
-        -------
-        bool
-        """
+        """Return whether the sample of this time is to be sent."""
         return self.offer_paced(time_us, self._pace.take(time_us))
 
     def offer_paced(self, time_us: int, period_us: int) -> bool:
@@ -102,17 +92,7 @@ class Stream:
         return True
 
     def tick(self, now_us: int) -> bool:
-        """Return whether a message that no sample carries is due.
-
-        Parameters
-        ----------
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        bool
-        """
+        """Return whether a message that no sample carries is due."""
         if self.interval_us == OFF:
             return False
         late = 0 if self.due_us is None else now_us - self.due_us

@@ -74,15 +74,7 @@ class Motion:
         self._since_us = 0
 
     def update(self, state: NavState, ground_alt_m: float) -> None:
-        """Update the landed state from one navigation state.
-
-        Parameters
-        ----------
-        state : NavState
-            The estimate; without a valid velocity nothing changes.
-        ground_alt_m : float
-            Height of the ground above mean sea level, NaN while it is not known.
-        """
+        """Update the landed state from one navigation state."""
         candidate = UNDEFINED
         if state.flags & VELOCITY_VALID:
             candidate = self._candidate_of(state, ground_alt_m)
@@ -352,13 +344,7 @@ class Telemetry:
         return self._timed_due_us
 
     def build(self, message_id: int, now_us: int) -> Any:
-        """Build one message from the newest records.
-
-        Returns
-        -------
-        MAVLink_message or None
-            None if the vehicle never sends it, or has nothing to send in it yet.
-        """
+        """Build one message from the newest records; None if it is never sent, or not yet."""
         builder = self._builders.get(message_id)
         return builder(now_us) if builder else None
 

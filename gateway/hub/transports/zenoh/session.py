@@ -422,19 +422,7 @@ class Publishers:
     def publish(
         self, key: str, payload: bytes, *, reliable: bool, attachment: bytes | None = None
     ) -> bool:
-        """Publish without waiting; return whether the message was accepted.
-
-        Parameters
-        ----------
-        key : str
-            Key to publish under.
-        payload : bytes
-            Some frames.
-        reliable : bool
-            Whether it waits for a congested link instead of being dropped.
-        attachment : bytes, optional
-            Sent with the message.
-        """
+        """Publish without waiting; return whether the message was accepted."""
         publisher = self._publishers.get((key, reliable)) or self._declare(key, reliable=reliable)
         if not reliable:
             publisher.put(payload, attachment=attachment)

@@ -141,20 +141,7 @@ class RecordingAnswers:
     def __call__(self, asked: bytes) -> bytes:
         """Answer one query.
 
-        Parameters
-        ----------
-        asked : bytes
-            A `RecordingQuery` as JSON; empty for the list.
-
-        Returns
-        -------
-        bytes
-            JSON list of `RemoteRecording`, a piece of a file, or a SHA-256 in hexadecimal.
-
-        Raises
-        ------
-        RefusedQueryError
-            If the query is malformed, or there is no such file.
+        Raises RefusedQueryError if the query is malformed, or there is no such file.
         """
         try:
             query = msgspec.json.decode(asked or b"{}", type=RecordingQuery)
