@@ -38,15 +38,8 @@ def interpolate(fixes: Fixes, time_us: IntArray) -> FlightTrack:
     """Interpolate linearly between the fixes, at the times at which they were valid."""
     size = len(time_us)
     if len(fixes) < 2:
-        unknown = np.full(size, np.nan)
-        return FlightTrack(
-            time_us,
-            np.full((size, 4), np.nan),
-            unknown,
-            unknown,
-            unknown,
-            np.full((size, 3), np.nan),
-        )
+        unknown = (np.full((size, *shape), np.nan) for shape in ((4,), (), (), (), (3,)))
+        return FlightTrack(time_us, *unknown)
     lon_deg = np.unwrap(fixes.lon_deg, period=360.0)
     columns = [fixes.lat_deg, lon_deg, fixes.alt_amsl_m, *fixes.vel_n_mps.T]
     after = np.searchsorted(fixes.valid_us, time_us, side="right").clip(1, len(fixes) - 1)

@@ -4,7 +4,7 @@ Flights of all sources have the same form: the samples of a recording in the ord
 were processed, on the gateway clock.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -75,28 +75,10 @@ class FlightTrack:
     vel_n_mps: FloatArray
     """Shape (N, 3), NED."""
 
-    def where_valid(self, flags: IntArray) -> "FlightTrack":
-        """Set values to NaN that the estimator does not flag as valid.
-
-        An attitude counts as known without a heading only if there never is one.
-        """
-
-        def masked(values: FloatArray, flag: NavFlags) -> FloatArray:
-            valid = (flags & int(flag)) != 0
-            return np.where(valid if values.ndim == 1 else valid[:, np.newaxis], values, np.nan)
-
-        q_nb = masked(self.q_nb, NavFlags.ATTITUDE_VALID)
-        headed = (flags & int(NavFlags.HEADING_VALID)) != 0
-        if headed.any():
-            q_nb[: int(np.argmax(headed))] = np.nan
-        return FlightTrack(
-            time_us=self.time_us,
-            q_nb=q_nb,
-            lat_deg=masked(self.lat_deg, NavFlags.POSITION_VALID),
-            lon_deg=masked(self.lon_deg, NavFlags.POSITION_VALID),
-            alt_amsl_m=masked(self.alt_amsl_m, NavFlags.ALTITUDE_VALID),
-            vel_n_mps=masked(self.vel_n_mps, NavFlags.VELOCITY_VALID),
-        )
+    def each(self, time_us: IntArray, change: Callable[[FloatArray], FloatArray]) -> "FlightTrack":
+        """Return the track at other times, its columns changed by a function."""
+        columns = (self.q_nb, self.lat_deg, self.lon_deg, self.alt_amsl_m, self.vel_n_mps)
+        return FlightTrack(time_us, *map(change, columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -370,16 +352,30 @@ def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack,
 
 
 def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
-    """Return the values that the flags of fused states mark as valid."""
-    track = FlightTrack(
-        time_us=time_us,
-        q_nb=states[:, NAV_QUAT : NAV_QUAT + 4],
-        lat_deg=states[:, NAV_LAT],
-        lon_deg=states[:, NAV_LON],
-        alt_amsl_m=states[:, NAV_ALT],
-        vel_n_mps=states[:, NAV_VEL : NAV_VEL + 3],
+    """Return the values that the flags of fused states mark as valid, others as NaN.
+
+    An attitude counts as known without a heading only if there never is one.
+    """
+    flags = states[:, NAV_FLAGS].astype(np.int64)
+
+    def valid(flag: NavFlags, first: int, count: int = 0) -> FloatArray:
+        known = (flags & int(flag)) != 0
+        if not count:
+            return np.where(known, states[:, first], np.nan)
+        return np.where(known[:, np.newaxis], states[:, first : first + count], np.nan)
+
+    q_nb = valid(NavFlags.ATTITUDE_VALID, NAV_QUAT, 4)
+    headed = (flags & int(NavFlags.HEADING_VALID)) != 0
+    if headed.any():
+        q_nb[: int(np.argmax(headed))] = np.nan
+    return FlightTrack(
+        time_us,
+        q_nb,
+        valid(NavFlags.POSITION_VALID, NAV_LAT),
+        valid(NavFlags.POSITION_VALID, NAV_LON),
+        valid(NavFlags.ALTITUDE_VALID, NAV_ALT),
+        valid(NavFlags.VELOCITY_VALID, NAV_VEL, 3),
     )
-    return track.where_valid(states[:, NAV_FLAGS].astype(np.int64))
 
 
 def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
@@ -408,11 +404,4 @@ def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
     def chosen(values: FloatArray) -> FloatArray:
         return np.where(near if values.ndim == 1 else near[:, np.newaxis], values[nearest], np.nan)
 
-    return FlightTrack(
-        time_us=time_us,
-        q_nb=chosen(track.q_nb),
-        lat_deg=chosen(track.lat_deg),
-        lon_deg=chosen(track.lon_deg),
-        alt_amsl_m=chosen(track.alt_amsl_m),
-        vel_n_mps=chosen(track.vel_n_mps),
-    )
+    return track.each(time_us, chosen)

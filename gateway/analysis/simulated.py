@@ -68,12 +68,6 @@ def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
 
 def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
     truth = trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
-    track = FlightTrack(
-        time_us=flight.time_us,
-        q_nb=truth.q_nb,
-        lat_deg=truth.lat_deg,
-        lon_deg=truth.lon_deg,
-        alt_amsl_m=truth.alt_amsl_m,
-        vel_n_mps=truth.vel_n_mps,
-    )
+    columns = (truth.q_nb, truth.lat_deg, truth.lon_deg, truth.alt_amsl_m, truth.vel_n_mps)
+    track = FlightTrack(flight.time_us, *columns)
     return Reference(track, is_exact=True, story=TRUTH_STORY)

@@ -22,7 +22,7 @@ from pymavlink.DFReader import DFReader_binary, DFReader_text
 from gateway.geometry.quaternion import from_euler
 from gateway.recordings.columns import Imported, RowBuilder, TableRow
 from gateway.recordings.files import ERASED, FlightError, read_chunks, temporary_copy
-from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US
+from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
@@ -32,8 +32,6 @@ from gateway.records import (
     GpsFixType,
     ImuCalibrated,
     ImuFlags,
-    NavFlags,
-    NavState,
     NodeId,
     Vec3,
 )
@@ -257,30 +255,14 @@ class ArdupilotReader:
 
     def _attitude(self, m: Message, time_us: int) -> list[Imported]:
         """Take the autopilot's own solution, for comparison."""
-        flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-        lat, lon, alt, vel = NAN, NAN, NAN, UNKNOWN_VEC3
+        place: tuple[float, float, float] | None = None
+        vel = UNKNOWN_VEC3
         if self._place is not None and time_us - self._place[0] <= VELOCITY_AGE_US:
-            _, lat, lon, alt = self._place
-            flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
+            place = self._place[1:]
         if self._motion is not None and time_us - self._motion[0] <= VELOCITY_AGE_US:
             _, vel = self._motion
-            flags |= NavFlags.VELOCITY_VALID
         angles_rad = (math.radians(degrees) for degrees in (m.Roll, m.Pitch, m.Yaw))
-        return [
-            NavState(
-                time_us=time_us,
-                q_nb=from_euler(*angles_rad),
-                rate_b_radps=UNKNOWN_VEC3,
-                lat_deg=lat,
-                lon_deg=lon,
-                alt_amsl_m=alt,
-                vel_n_mps=vel,
-                attitude_std_rad=UNKNOWN_VEC3,
-                vel_std_mps=UNKNOWN_VEC3,
-                pos_std_m=UNKNOWN_VEC3,
-                flags=flags,
-            )
-        ]
+        return [autopilot_state(time_us, from_euler(*angles_rad), place, vel)]
 
 
 MAGIC: Final = b"\xa3\x95"

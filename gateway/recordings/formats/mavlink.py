@@ -33,7 +33,16 @@ from gateway.recordings.columns import (
 from gateway.recordings.stream_clock import STREAMS, times_on_clock
 from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
-from gateway.records import NAN, GpsFixType, ImuFlags, NavFlags
+from gateway.records import (
+    NAN,
+    UNKNOWN_VEC3,
+    GpsFixType,
+    ImuFlags,
+    NavFlags,
+    NavState,
+    Quat,
+    Vec3,
+)
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.mavlink_splitter import START_V2
 
@@ -210,6 +219,23 @@ def _of_place(places: Fields, place_at: IntArray, name: str, scale: float) -> Fl
 
 VELOCITY_AGE_US: Final = US_PER_S // 2
 """An older velocity down is not used."""
+
+
+def autopilot_state(
+    time_us: int, q_nb: Quat, place: tuple[float, float, float] | None, vel_n_mps: Vec3
+) -> NavState:
+    """Make a state of an autopilot's own solution, without standard deviations."""
+    flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+    if place is not None:
+        flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
+    if math.isfinite(sum(vel_n_mps)):
+        flags |= NavFlags.VELOCITY_VALID
+    unknown = UNKNOWN_VEC3
+    lat_deg, lon_deg, alt_m = place or unknown
+    return NavState(
+        time_us, q_nb, unknown, lat_deg, lon_deg, alt_m, vel_n_mps, unknown, unknown, unknown, flags
+    )
+
 
 ATTITUDE: Final = mavlink.MAVLINK_MSG_ID_ATTITUDE
 POSITION: Final = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT

@@ -28,7 +28,7 @@ from pyulog.exceptions import ULogException
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, TableRow
 from gateway.recordings.files import FlightError, read_chunks, temporary_copy
-from gateway.recordings.formats.mavlink import UT_PER_GAUSS, VELOCITY_AGE_US
+from gateway.recordings.formats.mavlink import UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import (
@@ -39,7 +39,6 @@ from gateway.records import (
     GpsFixType,
     ImuCalibrated,
     ImuFlags,
-    NavFlags,
     NavState,
     NodeId,
     Vec3,
@@ -212,24 +211,14 @@ class Px4Log:
         motions = _Newest(self._rows("vehicle_local_position", "vehicle_global_position"))
         for row in self._rows("vehicle_attitude"):
             place, motion = places.at(row["timestamp"]), motions.at(row["timestamp"])
-            flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-            if "lat" in place:
-                flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
             north, east, down = (motion.get(k, motion.get(old, NAN)) for k, old in _VELOCITY)
-            if math.isfinite(north + east + down):
-                flags |= NavFlags.VELOCITY_VALID
-            yield NavState(
-                time_us=self._time(row),
-                q_nb=(row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"]),
-                rate_b_radps=UNKNOWN_VEC3,
-                lat_deg=place.get("lat", NAN),
-                lon_deg=place.get("lon", NAN),
-                alt_amsl_m=place.get("alt", NAN),
-                vel_n_mps=(north, east, down),
-                attitude_std_rad=UNKNOWN_VEC3,
-                vel_std_mps=UNKNOWN_VEC3,
-                pos_std_m=UNKNOWN_VEC3,
-                flags=flags,
+            yield autopilot_state(
+                self._time(row),
+                (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"]),
+                (place["lat"], place.get("lon", NAN), place.get("alt", NAN))
+                if "lat" in place
+                else None,
+                (north, east, down),
             )
 
 
