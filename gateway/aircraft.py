@@ -36,18 +36,19 @@ from gateway.sensing.calibrating import corrected_by
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.settings import Settings
-from gateway.vehicle.actions import (
+from gateway.vehicle.plan import Home, Location, StoredPlan
+from gateway.vehicle.requests import (
     WARNING,
     CalibrationMeasured,
     RecordingRequest,
     SavePlan,
     SaveSettings,
     SettingsChange,
+    SigningClock,
+    SigningTimestamps,
     StatusText,
 )
-from gateway.vehicle.actions import Action as VehicleAction
-from gateway.vehicle.plan import Home, Location, StoredPlan
-from gateway.vehicle.requests import SigningClock, SigningTimestamps
+from gateway.vehicle.requests import Action as VehicleAction
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 

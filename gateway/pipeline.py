@@ -26,9 +26,14 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import StatusText
 from gateway.vehicle.plan import Location, StoredPlan
-from gateway.vehicle.requests import BAD_SIGNATURE, KeptTimestamps, SigningClock, SigningTimestamps
+from gateway.vehicle.requests import (
+    BAD_SIGNATURE,
+    KeptTimestamps,
+    SigningClock,
+    SigningTimestamps,
+    StatusText,
+)
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.timesync import GpsTime

@@ -26,7 +26,7 @@ from gateway.records import (
 from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured, SettingsChange
+from gateway.vehicle.requests import CalibrationKind, CalibrationMeasured, SettingsChange
 
 ESTIMATORS = ("paper", "eskf")
 IMU, GPS = NodeId(1, 0), NodeId(1, 1)

@@ -24,7 +24,7 @@ Theory of operation
    event loop. When the processor is short of time, old telemetry is dropped and answers are not.
    `fanout.Fanout` renumbers for each client, so that filters leave no gaps; `FrameSigner` signs.
 5. A client whose link is slow has a bounded `send_queue.SendQueue`, where answers and attitudes
-   overtake; a link of known bandwidth gets telemetry at lower rates (`bandwidth.Bandwidth`).
+   overtake; a link of known bandwidth gets telemetry at lower rates (`send_queue.Bandwidth`).
 6. Untrusted clients may cause a bounded number of reads, requests and answers (`limits`), are in no
    routing table, and reach our vehicles only.
 

@@ -14,7 +14,7 @@ same count share one copy, which is signed too if its vehicle signs. Frames of o
 never changed; a filter on those does show as loss.
 
 The frames to a client of known bandwidth are counted, and thinned once a second so that they fit:
-see `bandwidth.py`. A client whose endpoint has `monitor=yes` gets every frame. One that knows only
+see `send_queue.py`. A client whose endpoint has `monitor=yes` gets every frame. One that knows only
 MAVLink 1 gets the messages that this version can carry, without extensions and signatures.
 """
 
@@ -22,14 +22,14 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
-from gateway.hub.bandwidth import (
+from gateway.hub.endpoint import NO_MESSAGES, Endpoint
+from gateway.hub.routing_table import Origin, Path
+from gateway.hub.send_queue import (
     HIGH_LATENCY2,
     HIGH_LATENCY2_BYTES,
     SATELLITE_BUDGET,
     Bandwidth,
 )
-from gateway.hub.endpoint import NO_MESSAGES, Endpoint
-from gateway.hub.routing_table import Origin, Path
 from gateway.hub.stats import ClientCounters
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S

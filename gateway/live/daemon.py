@@ -51,7 +51,8 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import (
+from gateway.vehicle.plan import Location
+from gateway.vehicle.requests import (
     INFO,
     WARNING,
     RecordingRequest,
@@ -60,7 +61,6 @@ from gateway.vehicle.actions import (
     SaveSettings,
     StatusText,
 )
-from gateway.vehicle.plan import Location
 from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)

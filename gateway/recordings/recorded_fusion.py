@@ -88,7 +88,7 @@ from gateway.records import (
     Outgoing,
 )
 from gateway.sensing.chain import IntArray
-from gateway.vehicle.actions import INFO, StatusText
+from gateway.vehicle.requests import INFO, StatusText
 
 LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""

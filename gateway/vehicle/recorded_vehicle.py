@@ -21,10 +21,9 @@ from typing import Any, Final, Protocol
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
 from gateway.vehicle.plan import MISSION, read_item
-from gateway.vehicle.requests import RequestReader
+from gateway.vehicle.requests import Answer, Reply, Request, RequestReader
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

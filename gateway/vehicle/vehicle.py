@@ -20,17 +20,6 @@ from gateway.records import (
 from gateway.settings import Settings
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
-from gateway.vehicle.actions import (
-    INFO,
-    NOTICE,
-    WARNING,
-    Action,
-    Answer,
-    Reply,
-    Request,
-    SettingsChange,
-    StatusText,
-)
 from gateway.vehicle.encoding import (
     MAVLINK_MSG_ID_COMPONENT_METADATA,
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
@@ -38,10 +27,19 @@ from gateway.vehicle.encoding import (
 )
 from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.requests import (
+    INFO,
+    NOTICE,
+    WARNING,
+    Action,
+    Answer,
+    Reply,
+    Request,
     RequestLog,
     RequestReader,
+    SettingsChange,
     SigningClock,
     SigningTimestamps,
+    StatusText,
     Verifier,
     key_from_passphrase,
 )

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.hub.bandwidth import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandwidth
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
 from gateway.hub.routing_table import Path
+from gateway.hub.send_queue import FLOOR_HZ, HIGH_LATENCY2, NEVER_THINNED, Bandwidth
 from gateway.hub.stats import ClientCounters
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner

@@ -41,7 +41,7 @@ from gateway.records import (
     RawRecord,
 )
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.actions import SettingsChange
+from gateway.vehicle.requests import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 IMU_US = 16_000

@@ -7,7 +7,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.vehicle.actions import Action
+from gateway.vehicle.requests import Action
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
 

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import SavePlan, SettingsChange
 from gateway.vehicle.plan import Location, StoredPlan
+from gateway.vehicle.requests import SavePlan, SettingsChange
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

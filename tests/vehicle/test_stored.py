@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import SavePlan
 from gateway.vehicle.plan import MAX_ITEMS, Item, Location, StoredPlan, decode_plan, encode_plan
+from gateway.vehicle.requests import SavePlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

@@ -6,8 +6,8 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
-from gateway.vehicle.actions import INFO
 from gateway.vehicle.plan import Location, StoredPlan
+from gateway.vehicle.requests import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock

@@ -30,7 +30,7 @@ from gateway.config import (
     render,
 )
 from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
-from gateway.hub.transports.tls import valid_until_s
+from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part import free_bytes_near
 from gateway.live.serial_port import (

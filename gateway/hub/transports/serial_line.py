@@ -12,9 +12,8 @@ from typing import Final
 
 import serial
 
-from gateway.hub.bandwidth import RADIO_STATUS
 from gateway.hub.endpoint import BITS_PER_BYTE
-from gateway.hub.send_queue import Pacer
+from gateway.hub.send_queue import RADIO_STATUS, Pacer
 from gateway.hub.transports.base import RETRY_US
 from gateway.hub.transports.stream import QueuedClient
 from gateway.units import US_PER_S

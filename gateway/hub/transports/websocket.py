@@ -14,8 +14,13 @@ from wsproto.frame_protocol import CloseReason
 from gateway.hub.endpoint import TLS_KINDS
 from gateway.hub.transports.stream import StreamClient
 from gateway.hub.transports.tcp import TcpClient
-from gateway.hub.transports.tls import TlsLayer, caller_context
-from gateway.hub.transports.ws_protocol import WsCaller, WsInput, WsProtocol
+from gateway.hub.transports.ws_protocol import (
+    TlsLayer,
+    WsCaller,
+    WsInput,
+    WsProtocol,
+    caller_context,
+)
 from gateway.reasons import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import Event, MavFrame, SplitFault, SplitFaultKind

@@ -22,9 +22,9 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import Answer, RecordingRequest, Reply, Request
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
 from gateway.vehicle.plan import DEGE7, GLOBAL_FRAMES
+from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request
 from gateway.vehicle.services.intervals import IntervalService
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED

@@ -19,7 +19,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request
 
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251

@@ -11,7 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
-from gateway.vehicle.actions import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
 

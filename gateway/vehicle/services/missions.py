@@ -45,7 +45,6 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.plan import (
     ACCEPTED,
     FENCE,
@@ -58,6 +57,7 @@ from gateway.vehicle.plan import (
     write_float_item,
     write_item,
 )
+from gateway.vehicle.requests import Answer, Reply, Request
 
 REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S

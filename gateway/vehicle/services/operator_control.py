@@ -26,8 +26,8 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import Answer, Reply, Request
 from gateway.vehicle.encoding import ControlStatus
+from gateway.vehicle.requests import Answer, Reply, Request
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
 from gateway.settings import Settings
-from gateway.vehicle.actions import Answer, Reply, Request, SaveSettings, SettingsChange
+from gateway.vehicle.requests import Answer, Reply, Request, SaveSettings, SettingsChange
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     IN_PROGRESS,

@@ -15,7 +15,6 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import NAN, GpsFix, NavState
 from gateway.settings import Settings
 from gateway.vehicle import encoding
-from gateway.vehicle.actions import INFO, Answer, Reply, SavePlan, StatusText
 from gateway.vehicle.plan import (
     FENCE,
     GLOBAL_FRAMES,
@@ -34,6 +33,7 @@ from gateway.vehicle.plan import (
     is_on_earth,
     location_of,
 )
+from gateway.vehicle.requests import INFO, Answer, Reply, SavePlan, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

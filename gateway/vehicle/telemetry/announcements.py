@@ -17,7 +17,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
-from gateway.vehicle.actions import CRITICAL, INFO, NOTICE, WARNING, StatusText
+from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, StatusText
 from gateway.vehicle.telemetry.health import Finding, Health
 
 HOLD_US: Final = 5 * US_PER_S

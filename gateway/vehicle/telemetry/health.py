@@ -35,8 +35,8 @@ from gateway.records import (
 )
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
-from gateway.vehicle.actions import INFO, WARNING, StatusText
 from gateway.vehicle.plan import is_3d
+from gateway.vehicle.requests import INFO, WARNING, StatusText
 
 HYSTERESIS_V: Final = 0.1
 QUIET_REPORTS: Final = 10

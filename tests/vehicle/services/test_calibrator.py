@@ -10,7 +10,7 @@ from gateway.geometry.quaternion import from_euler, rotate_inverse
 from gateway.records import Vec3
 from gateway.sensing.calibrating import fit_sphere
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.actions import CalibrationKind, CalibrationMeasured
+from gateway.vehicle.requests import CalibrationKind, CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.samples import sample_at, state_at

@@ -11,7 +11,7 @@ from gateway.config import GatewaySettings
 from gateway.records import RECORDED_ONLY
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, fields_of, setting
-from gateway.vehicle.actions import SaveSettings, SettingsChange
+from gateway.vehicle.requests import SaveSettings, SettingsChange
 from gateway.vehicle.services.parameters import ParameterTable, decode_value, parameter_name
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.vehicle.ground_station import GroundStation, kinds

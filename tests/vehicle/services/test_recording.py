@@ -4,7 +4,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.actions import RecordingRequest
+from gateway.vehicle.requests import RecordingRequest
 from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from tests.vehicle.ground_station import GroundStation
 

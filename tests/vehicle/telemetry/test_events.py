@@ -1,6 +1,6 @@
 import pytest
 
-from gateway.vehicle.actions import INFO, WARNING, StatusText
+from gateway.vehicle.requests import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
 
 GOOD, BAD = StatusText(INFO, "good"), StatusText(WARNING, "bad")

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus, PipeCounters, ReceiverStatus
-from gateway.vehicle.actions import INFO, WARNING
+from gateway.vehicle.requests import INFO, WARNING
 from gateway.vehicle.telemetry.announcements import HOLD_US
 from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
 from gateway.vehicle.vehicle import Vehicle
