@@ -11,18 +11,22 @@ import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from gateway.geometry.quaternion import to_euler
 from gateway.reasons import receiver_state
-from gateway.status import Snapshot
 from gateway.units import counted
+
+if TYPE_CHECKING:
+    from gateway.status import Snapshot
 
 UNKNOWN: Final = "—"
 
 
-def summary_line(snapshot: Snapshot) -> str:
+def summary_line(snapshot: "Snapshot") -> str:
     """Summarise a snapshot in one line for a log."""
+    # Imported here, since it loads NumPy and every command limits its log.
+    from gateway.geometry.quaternion import to_euler
+
     report = snapshot.report
     receiver = receiver_state(report.connected, report.bytes_received, report.frames)
     parts = [f"receiver {report.port} {receiver}"]
