@@ -81,7 +81,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
         "Make a page of figures and tables of a flight, those of the paper included.",
     ),
     "page": CommandEntry(
-        "recorded.page",
+        "recorded.report",
         "Make one HTML file of a flight, which opens offline in any browser.",
         RECORDINGS,
     ),
@@ -101,7 +101,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
     "player": CommandEntry("recorded.play", "Control the running player.", RECORDINGS),
     "convert": CommandEntry("recorded.convert", "Convert, trim and join recordings.", RECORDINGS),
     "fuse": CommandEntry(
-        "recorded.fuse",
+        "recorded.convert",
         "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
         RECORDINGS,
     ),

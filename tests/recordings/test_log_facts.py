@@ -9,7 +9,7 @@ import pytest
 from gateway.analysis.case import make_case
 from gateway.analysis.reporting.estimators import estimators
 from gateway.batch.tasks import read_season_flight
-from gateway.cli.support.loading import Loading, load_flight
+from gateway.cli.support.recording_options import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown

@@ -150,7 +150,7 @@ def sweep(
     force: ForceOption = False,
 ) -> None:
     """Find one set of settings for many flights; those of other days judge what was chosen."""
-    from gateway.cli.support.sweeping import SweepOptions, run_season_sweep
+    from gateway.cli.recorded.sweep import SweepOptions, run_season_sweep
 
     work = SeasonWork(files, config, jobs, scheduler)
     options = SweepOptions(

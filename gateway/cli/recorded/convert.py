@@ -1,8 +1,9 @@
-"""`mavgate convert`: recordings into one another, into tables and maps."""
+"""`mavgate convert` and `fuse`: files that are made of recordings."""
 
 from pathlib import Path
 from typing import Annotated, Final
 
+import numpy as np
 import typer
 
 from gateway.cli.app import RECORDINGS
@@ -32,8 +33,13 @@ from gateway.cli.support.recording_options import (
     refusing,
 )
 from gateway.cli.support.terminal import console_of, refuse
-from gateway.output import write_new
+from gateway.estimation.record import IntArray
+from gateway.estimation.select import DEPRECATED, ESTIMATORS
+from gateway.output import check_output, write_new
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
+from gateway.recordings.files import SettingsChoice
+from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
+from gateway.units import US_PER_S, counted
 
 ONE_KIND: Final = ".parquet"
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
@@ -41,8 +47,9 @@ FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
+    """Add the commands of this file."""
     app.command("convert", rich_help_panel=RECORDINGS)(convert)
+    app.command("fuse", rich_help_panel=RECORDINGS)(fuse_log)
 
 
 def convert(
@@ -116,3 +123,93 @@ def convert(
     if lacks and message is None:
         print_remarks([f"{out} does not hold {lacks}"])
     console_of().print(f"{out}: {size / 1e6:.3f} MB")
+
+
+LEAST_RATE_HZ: Final = 10.0
+"""A hand-held or flying tracker turns within a tenth of a second."""
+
+
+def _known_estimator(name: str | None) -> str | None:
+    if name in DEPRECATED:
+        name, former = DEPRECATED[name], name
+        typer.echo(f"--estimator {former} is deprecated; using {name}", err=True)
+    if name is not None and name not in ESTIMATORS:
+        raise typer.BadParameter(f"{name!r} is none of {', '.join(ESTIMATORS)}")
+    return name
+
+
+def fuse_log(
+    file: Annotated[Path, typer.Argument(help="Recording, by name or file, or log; also gzipped.")],
+    *,
+    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write.")],
+    estimator: Annotated[
+        str | None,
+        typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
+    ] = None,
+    columns: ColumnsOption = None,
+    sensor: SensorOption = None,
+    gps_latency_s: Annotated[
+        float | None,
+        typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
+    ] = None,
+    settings: Annotated[
+        SettingsChoice,
+        typer.Option("--settings", help="For recordings: the recorded or the current settings."),
+    ] = "recorded",
+    smooth: SmoothOption = False,
+    config: ConfigOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
+
+    The columns are those of a recording's table, so every command accepts the file as one.
+    Reads mavgate's own recordings, autopilots' logs (tlog, ULog, DataFlash), and CSV files with
+    the columns time_s, ax, ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or
+    others by a column map.
+    Where the settings leave them at their defaults, gps_latency_s and declination_deg of such a
+    file's # lines are used; a latency that is not given there either is estimated from its
+    manoeuvres, or the default is assumed, with a message.
+    """
+    current = read_settings(config)
+    with refusing():
+        files = files_of([file], recordings_folder(config), "tables")
+    inputs = [*files, columns, config]
+    with progress_of(files) as advance, refusing():
+        check_output(out, inputs, overwrite=force)
+        options = read_options(
+            current,
+            choice="current" if config is not None else settings,
+            columns=read_column_map(columns),
+            progress=advance,
+            sensors=read_sensors(sensor),
+        )
+        fusion = RecordedFusion(
+            files, options, smooth=smooth, estimator=estimator, latency_s=gps_latency_s,
+            states_only=True,
+        )  # fmt: skip
+        time_us, states = fusion.states()
+        lines = fused_lines(fusion.header, time_us, states)
+        write_new(out, lines, overwrite=force, inputs=inputs)
+    print_remarks(fusion.remarks)
+    name = fusion.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
+    _report(file, time_us, f"{out}: ", f" fused by {name}")
+
+
+def _report(file: Path, time_us: IntArray, before: str, behind: str) -> None:
+    """Print count and rate of the samples, and warn if they are too few."""
+    console, rate_hz = console_of(stderr=True), _rate_hz(time_us)
+    count = counted(len(time_us), "sample")
+    console.print(f"{before}{count} at {rate_hz:.3g} Hz{behind}")
+    if 0.0 < rate_hz < LEAST_RATE_HZ:
+        console.print(
+            f"{file}: its IMU samples come at {rate_hz:.2g} Hz; below {LEAST_RATE_HZ:.0f} Hz the "
+            "turns between them are not seen, so attitude and position may be wrong",
+            style="yellow",
+        )
+
+
+def _rate_hz(time_us: IntArray) -> float:
+    """Return the rate of samples by their median interval; 0 of a single one."""
+    intervals_us = np.diff(time_us)
+    intervals_us = intervals_us[intervals_us > 0]
+    return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0

@@ -1,4 +1,4 @@
-"""`mavgate report`: figures and tables of a flight as one page."""
+"""`mavgate report`: figures and tables of a flight; `mavgate page`: a flight as one HTML file."""
 
 from dataclasses import replace
 from importlib.util import find_spec
@@ -9,29 +9,33 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.analysis.flight import Flight
-from gateway.cli.support.loading import (
-    FlightArgument,
-    Loading,
-    ReferenceOption,
-    SystemOption,
-    fusion_of,
-    load_flight,
-)
+from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import (
     ConfigOption,
+    folder_of,
     load_settings,
     or_refuse,
+    read_options,
 )
 from gateway.cli.support.recording_options import (
     ColumnsOption,
+    FlightArgument,
     ForceOption,
+    Loading,
+    ReferenceOption,
     SettingsOption,
     SmoothOption,
+    SystemOption,
+    files_of,
+    fusion_of,
+    load_flight,
     print_remarks,
+    progress_of,
+    read_column_map,
     refusing,
 )
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
-from gateway.output import check_folder
+from gateway.output import check_folder, write_new
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 
@@ -45,8 +49,9 @@ OutputOption = Annotated[
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
+    """Add the commands of this file."""
     app.command()(report)
+    app.command("page", rich_help_panel=RECORDINGS)(page)
 
 
 def report(
@@ -124,3 +129,47 @@ def _refuse_without_packages() -> None:
     if missing:
         needed = " and ".join(missing)
         refuse(f"a report needs {needed}, the extra mavgate[plot]:\n{how_to_add('plot')}")
+
+
+def page(
+    flight: Annotated[
+        Path, typer.Argument(help="A recording by its name, or any flight log.", show_default=False)
+    ],
+    *,
+    output: Annotated[Path, typer.Option("--output", "-o", help="The HTML file.")] = Path(
+        "flight.html"
+    ),
+    compare: Annotated[
+        bool,
+        typer.Option(
+            "--compare/--no-compare",
+            help="Also fuse the sensor data with every estimator, and show the differences.",
+        ),
+    ] = True,
+    columns: ColumnsOption = None,
+    settings: SettingsOption = "recorded",
+    config: ConfigOption = None,
+    force: ForceOption = False,
+) -> None:
+    """Make one HTML file of a flight, which opens offline in any browser.
+
+    It contains the instruments, the flight in 3D and on a plan, a slider, plots and events.
+    """
+    try:
+        # These need an extra, and take a second to import.
+        from gateway.panel.flight_page import compare_estimators, read_flight, render_page
+    except ModuleNotFoundError as error:
+        refuse(f"the page is made by the panel, and {error.name} is missing: {how_to_add('panel')}")
+    gateway = or_refuse(lambda: load_settings(config))
+    with refusing():
+        files = files_of([flight], folder_of(gateway), "tlogs")
+        options = read_options(gateway, choice=settings, columns=read_column_map(columns))
+        with progress_of(files) as advance:
+            made = read_flight(files, replace(options, progress=advance), flight.name)
+        if compare:
+            tables = files_of([flight], folder_of(gateway), "tables")
+            with progress_of(tables) as advance:
+                compare_estimators(made, tables, replace(options, progress=advance))
+        print_remarks(made.remarks)
+        write_new(output, [render_page(made).encode()], overwrite=force, inputs=files)
+    print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")

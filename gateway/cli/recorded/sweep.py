@@ -1,21 +1,67 @@
-"""`mavgate sweep`: try settings on flights, and write the best as a settings file."""
+"""`mavgate sweep`: try settings on one flight or many, and write the best as a settings file."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Final
 
+import msgspec
+import numpy as np
+import pandas as pd
 import typer
+from rich import box
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
 
+from gateway.analysis import sweep as sweeping
+from gateway.analysis.sweep import (
+    COLUMN_OF,
+    ESTIMATOR_KEY,
+    Axis,
+    Contest,
+    Metric,
+    Run,
+    SweepError,
+    Trial,
+    Values,
+    grid,
+    parse_axis,
+    pool,
+    with_estimator_of,
+    with_values,
+)
+from gateway.batch.statistics import Choice, FloatArray, choose, group_of
 from gateway.batch.storage import is_url
-from gateway.cli.support.loading import Loading, ReferenceOption, SystemOption
+from gateway.batch.tasks import FlightResult, SweepTask
+from gateway.cli.support.batch_work import SeasonWork, season_options
 from gateway.cli.support.options import (
     ConfigOption,
     load_settings,
     or_refuse,
 )
-from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
-from gateway.cli.support.terminal import refuse
-
-Metric = Literal["held", "interpolated", "reference", "attitude"]
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    ForceOption,
+    Loading,
+    ReferenceOption,
+    SettingsOption,
+    SystemOption,
+    fusion_of,
+    load_flight,
+    refusing,
+)
+from gateway.cli.support.terminal import console_of, refuse, table_of
+from gateway.config import GatewaySettings, render
+from gateway.output import check_output, write_new
+from gateway.recordings.fuse import FusionSettings
+from gateway.recordings.reading import ReadOptions
+from gateway.units import counted
 
 
 def register(app: typer.Typer) -> None:
@@ -76,9 +122,6 @@ def sweep(
     fixes that are withheld from it. With many flights, the choice is scored by flights of other
     aircraft and days.
     """
-    # It imports pandas and the optimisers, for which no other command should wait.
-    from gateway.cli.support.sweeping import SweepOptions, run_season_sweep, run_sweep
-
     current = or_refuse(lambda: load_settings(config))
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
     options = SweepOptions(
@@ -86,8 +129,6 @@ def sweep(
     )
     given = flights or []
     if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
-        from gateway.cli.support.batch_work import SeasonWork, season_options
-
         if reference is not None or system is not None:
             refuse("--reference and --system belong to one flight")
         read = season_options(config, columns, settings)
@@ -97,4 +138,261 @@ def sweep(
         Path(given[0]) if given else None,
         Loading(current, settings, columns, system, reference),
         options,
+    )
+
+
+SHOWN: Final = 10
+HEADINGS: Final = {
+    "north_m": "latitude error, m",
+    "east_m": "longitude error, m",
+    "held_m": "error at withheld fixes, m",
+    "interpolated_m": "error against interpolated GPS, m",
+    "reference_m": "error against the reference, m",
+    "attitude_deg": "attitude error, deg",
+}
+"""By the columns of a sweep's scores."""
+
+
+@dataclass(frozen=True, slots=True)
+class SweepOptions:
+    """Options of the command line."""
+
+    named: Sequence[tuple[str, str]]
+    """The paper's own weights, with their values as texts."""
+    vary: Sequence[str]
+    """Further settings as `NAME=VALUES`."""
+    generations: int
+    """How long to search; 0 for a grid."""
+    metric: Metric
+    hold_out: int
+    gps_interval_s: float
+    jobs: int | None
+    output: Path
+    table: Path | None
+    overwrite: bool
+
+
+def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
+    """Try the settings, show the best, and write it as a settings file."""
+    with refusing():
+        _check_outputs(options, path)
+    try:
+        axes = _parse_axes(options)
+        flight = load_flight(path, loading)
+        contest = sweeping.make_contest(
+            flight,
+            flight.fusion,
+            [axis.key for axis in axes],
+            hold_out=options.hold_out,
+            interval_s=options.gps_interval_s,
+        )
+        _print_idle(contest, axes)
+        with pool(contest, options.jobs) as run:
+            if options.generations:
+                trials = _search(axes, run, options.generations, options.metric)
+            else:
+                trials = _try_all(grid(axes), run)
+        results = sweeping.tabulate(contest.keys, trials, options.metric)
+    except SweepError as error:
+        refuse(str(error))
+    _show(results, contest, options.metric)
+    best = sweeping.best_of(trials, options.metric)
+    _write(options, _merged(loading.settings, contest, best), results, path)
+
+
+def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
+    """Raise OSError if an output cannot be written, or is the flight itself."""
+    for out in (options.output, options.table):
+        if out is not None:
+            check_output(out, [path], overwrite=options.overwrite)
+
+
+def _write(
+    options: SweepOptions, best: GatewaySettings, table: pd.DataFrame, path: Path | None = None
+) -> None:
+    """Write the best settings, and the table if it is wanted."""
+    with refusing():
+        write_new(
+            options.output, [render(best).encode()], overwrite=options.overwrite, inputs=[path]
+        )
+        print(options.output)
+        if options.table is not None:
+            rows = table.to_csv(index=False).encode()
+            write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
+
+
+def _cell(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _parse_axes(options: SweepOptions) -> list[Axis]:
+    """Read the axes to vary; raises SweepError for invalid ones."""
+    wanted = list(options.named)
+    for item in options.vary:
+        name, equals, text = item.partition("=")
+        if not equals:
+            raise SweepError(f"--vary {item}: write NAME=VALUES")
+        wanted.append((name, text))
+    if not wanted:
+        raise SweepError("nothing to vary: give --alpha, --beta or --vary NAME=VALUES")
+    return [parse_axis(name, text) for name, text in wanted]
+
+
+def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
+    """Print in advance which settings change nothing."""
+    idle = sweeping.idle_axes(contest, axes)
+    if not idle:
+        return
+    estimator = contest.fusion.estimation.estimator
+    text = f"{', '.join(idle)}: changes nothing on this flight"
+    if not any(axis.key == ESTIMATOR_KEY for axis in axes):
+        text += f" with the estimator {estimator}"
+    if len(idle) == len(axes):
+        raise SweepError(f"{text}; vary another setting, or choose the estimator that uses it")
+    console_of(stderr=True).print(text, style="yellow")
+
+
+def _progress() -> Progress:
+    console = console_of(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
+    )  # fmt: skip
+
+
+def _try_all(points: Sequence[Values], run: Run) -> list[Trial]:
+    found: list[Trial] = []
+    with _progress() as progress:
+        task = progress.add_task("trials", total=len(points))
+        for index, scores in run(points):
+            found.append((points[index], scores))
+            progress.advance(task)
+    return found
+
+
+def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) -> list[Trial]:
+    found: list[Trial] = []
+    with _progress() as progress:
+        task = progress.add_task("generations", total=generations)
+
+        def evaluate(points: list[Values]) -> list[float]:
+            scores = dict(run(points))
+            found.extend((values, scores[k]) for k, values in enumerate(points))
+            return [scores[k][COLUMN_OF[metric]] for k in range(len(points))]
+
+        def show_progress(best: float) -> None:
+            progress.update(task, advance=1, description=f"generations, best {best:.3f}")
+
+        sweeping.optimise(axes, evaluate, generations, show_progress)
+    return found
+
+
+def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
+    judged = COLUMN_OF[metric]
+    others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
+    names = [*contest.keys, judged, *(name for name in others if name != judged)]
+    title = (
+        f"Best of {counted(len(results), 'trial')}, by the {HEADINGS[judged].rpartition(',')[0]}"
+    )
+    shown = Table(box=box.SIMPLE_HEAD, title=title)
+    for name in names:
+        shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
+    for row in results[names].head(SHOWN).itertuples(index=False):
+        shown.add_row(*map(_cell, row))
+    console_of().print(shown)
+
+
+def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:
+    """Put the best values into the whole settings."""
+    fusion: FusionSettings = sweeping.settings_at(contest, best)
+    return msgspec.structs.replace(settings, estimation=fusion.estimation)
+
+
+def run_season_sweep(
+    work: SeasonWork,
+    read: ReadOptions,
+    settings: GatewaySettings,
+    options: SweepOptions,
+    kept: Path | None = None,
+) -> list[FlightResult]:
+    """Score every point on every flight, show what is best for all, and write it."""
+    with refusing():
+        if kept is not None:
+            kept.mkdir(parents=True, exist_ok=True)
+        _check_outputs(options)
+    if options.generations:
+        refuse("--optimise searches on one flight; give a grid for many")
+    fusion = fusion_of(settings)
+    try:
+        axes = tuple(_parse_axes(options))
+        points, keys = grid(axes), [axis.key for axis in axes]
+        fusion = with_estimator_of(fusion, keys)
+    except SweepError as error:
+        refuse(str(error))
+    column = COLUMN_OF[options.metric]
+    task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
+    results = work.run(task, work.items(), kept)
+    swept = [result for result in results if result.error is None]
+    if not swept:
+        refuse("no flight could be swept")
+    base, choice = _chosen(swept)
+    _show_choice(axes, points, choice, column, len(swept))
+    best = with_values(fusion, keys, points[choice.winner])
+    merged = msgspec.structs.replace(settings, estimation=best.estimation)
+    _write(options, merged, _table_of(swept, base, choice))
+    return results
+
+
+def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
+    """Return the errors with the settings that the flights came with, and what is best."""
+    errors = np.array([_numbers(result.figures["scores"]) for result in swept])
+    base = np.array(_numbers([result.figures["base"] for result in swept]))
+    groups = [group_of(result.vehicle, result.began, result.digest) for result in swept]
+    try:
+        return base, choose(errors, base, groups)
+    except ValueError as error:
+        refuse(f"{error}; choose another --metric")
+
+
+def _numbers(values: Sequence[float | None]) -> list[float]:
+    """Read scores back: what is not known is null in JSON."""
+    return [float("nan") if value is None else value for value in values]
+
+
+def _show_choice(
+    axes: Sequence[Axis], points: Sequence[Values], choice: Choice, column: str, flights: int
+) -> None:
+    console = console_of()
+    grid_ = table_of(
+        *(axis.key.rsplit(".", 1)[-1] for axis in axes), f"mean {HEADINGS[column]}", left=0
+    )
+    for number in np.argsort(choice.means, kind="stable")[:SHOWN].tolist():
+        grid_.add_row(*map(_cell, points[number]), _cell(float(choice.means[number])))
+    console.print(grid_)
+    console.print(
+        f"{counted(len(points), 'point')} on {counted(flights, 'flight')}, "
+        f"in {choice.folds} folds by aircraft and day; "
+        f"the same point wins without {choice.stable} of the {choice.folds}"
+    )
+    if choice.over_base is not None:
+        console.print(
+            "against the settings that the flights came with, each flight judging only what the "
+            f"others chose: {choice.over_base.text}",
+        )
+    if choice.over_second is not None:
+        console.print(
+            f"the winner against the second, on the flights that chose both: "
+            f"{choice.over_second.text}",
+        )
+
+
+def _table_of(swept: Sequence[FlightResult], base: FloatArray, choice: Choice) -> pd.DataFrame:
+    return pd.DataFrame(
+        {
+            "recording": [result.place for result in swept],
+            "aircraft": [result.vehicle for result in swept],
+            "began": [result.began for result in swept],
+            "as it came": base,
+            "as others chose": choice.judged,
+        }
     )

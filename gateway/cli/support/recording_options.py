@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import msgspec
 import typer
@@ -18,13 +19,25 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from gateway.cli.support.options import ask, folder_of, is_running, read_settings
+from gateway.cli.support.options import (
+    ask,
+    folder_of,
+    is_running,
+    read_options,
+    read_settings,
+)
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.reasons import reason_of
-from gateway.recordings.files import FlightError, Position, SettingsChoice
+from gateway.recordings.files import FileKind, FlightError, Position, SettingsChoice, kind_of
 from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
+
+if TYPE_CHECKING:
+    from gateway.analysis.flight import Flight
+    from gateway.config import GatewaySettings
+    from gateway.recordings.fuse import FusionSettings
+    from gateway.recordings.reading import ReadOptions
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
 SmoothOption = Annotated[
@@ -150,9 +163,6 @@ def refusing() -> Iterator[None]:
         refuse(str(error))
 
 
-if TYPE_CHECKING:
-    pass
-
 Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""
 
@@ -198,3 +208,88 @@ def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
         return files
     ending = ".tlog" if wanted == "tlogs" else ".csv"
     return [file for file in files if file.suffix == ending] or files
+
+
+FlightArgument = Annotated[
+    Path | None,
+    typer.Argument(
+        help="A recording by its name, or any flight log; "
+        "by default the built-in simulated flight.",
+        show_default=False,
+    ),
+]
+ReferenceOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--reference",
+        help="A mavgate CSV on the flight's clock, with whose states the estimates are compared.",
+    ),
+]
+SystemOption = Annotated[
+    int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
+]
+
+STORIES: Final = {
+    FileKind.TABLE: "Recorded by mavgate.",
+    FileKind.CSV: "Recorded by another program; its samples count as calibrated.",
+    FileKind.OTHER: "Recorded by another program; its samples count as calibrated.",
+    FileKind.TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Loading:
+    """How to read a command's flights."""
+
+    settings: GatewaySettings
+    choice: SettingsChoice = "recorded"
+    columns: Path | None = None
+    system: int | None = None
+    reference: Path | None = None
+
+
+def fusion_of(settings: GatewaySettings) -> FusionSettings:
+    """Return the part of the settings that fuses a flight."""
+    from gateway.recordings.fuse import FusionSettings
+
+    return FusionSettings(estimation=settings.estimation)
+
+
+def load_flight(path: Path | None, loading: Loading) -> Flight:
+    """Read a recording, or the simulated flight; a file without one ends the command."""
+    # Imported here: they import all stages, for which commands that fuse nothing must not wait.
+    from gateway.analysis.flight import flight_of_files, judged_by
+    from gateway.analysis.simulated import simulated_flight
+    from gateway.recordings.reading import is_table, open_rows
+
+    settings = loading.settings
+    if path is None:
+        return simulated_flight(settings.simulator, fusion_of(settings))
+    with refusing():
+        parts = files_of([path], folder_of(settings), "tables")
+    files = [*parts, loading.reference] if loading.reference is not None else parts
+    with progress_of(files) as advance, refusing():
+        options = _read_options(loading, advance)
+        story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
+        try:
+            flight, table, _ = flight_of_files(
+                parts, options, name=path.name, story=story, checked=True
+            )
+        except ValueError as error:
+            raise FlightError(str(error)) from error
+        print_remarks(table.remarks)
+        if loading.reference is None:
+            return flight
+        return judged_by(
+            flight, open_rows(loading.reference, options).blocks, loading.reference.name
+        )
+
+
+def _read_options(loading: Loading, advance: Callable[[int], None]) -> ReadOptions:
+    return read_options(
+        loading.settings,
+        choice=loading.choice,
+        columns=read_column_map(loading.columns),
+        system_id=loading.system,
+        progress=advance,
+    )

@@ -7,7 +7,7 @@ import pytest
 import typer
 
 from gateway.aircraft import AircraftSettings
-from gateway.cli.support.loading import STORIES, Loading, load_flight
+from gateway.cli.support.recording_options import STORIES, Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
-from gateway.cli.support.loading import Loading, load_flight
+from gateway.cli.support.recording_options import Loading, load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
