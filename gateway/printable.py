@@ -1,6 +1,7 @@
-"""Sanitise text from recordings and the network before a terminal or a log shows it."""
+"""Texts for people: sanitised texts of others, errors and states in words."""
 
 import logging
+import os
 from typing import Final
 
 _CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
@@ -72,3 +73,32 @@ class PrintableFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the whole record, a traceback included, without control characters."""
         return printable(super().format(record))
+
+
+FEW_BYTES: Final = 200
+"""The end of a frame, or what an adapter still held."""
+
+
+def reason_of(error: Exception) -> str:
+    """Return the text of an error, the operating system's if there is one."""
+    if hasattr(error, "library"):
+        # Of TLS, whose numbers are not the operating system's.
+        reason = getattr(error, "reason", None)
+        return reason.replace("_", " ").lower() if reason else "no certificate and key in PEM"
+    number = getattr(error, "errno", None) or 0
+    return (
+        os.strerror(number)
+        if number > 0
+        else getattr(error, "strerror", None) or str(error) or type(error).__name__
+    )
+
+
+def receiver_state(connected: bool, bytes_received: int, frames: int) -> str:
+    """Describe the receiver's port: a wrong device or speed is open, too, and sends no frames."""
+    if not connected:
+        return "not connected"
+    if frames:
+        return "connected"
+    if bytes_received < FEW_BYTES:
+        return "connected, silent"
+    return "connected, sends no frames: is it the receiver, at the speed serial.baud?"

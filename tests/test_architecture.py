@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parent.parent / "gateway"
 FOUNDATION = {"records", "units", "settings", "compiled", "geometry"}
 STAGES = {"wire", "sensing", "estimation", "vehicle", "simulator"}
 JOINED = {"aircraft", "pipeline"}
-EDGES = {"hub", "live", "clock", "printable", "reasons"}
+EDGES = {"hub", "live", "clock", "printable"}
 
 MAY_IMPORT: dict[str, set[str]] = {
     "records": set(),
@@ -30,14 +30,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     "vehicle": FOUNDATION | {"sensing"},
     "clock": set(),
     "printable": set(),
-    "reasons": set(),
-    "hub": FOUNDATION | {"wire", "reasons", "recordings"},
+    "hub": FOUNDATION | {"wire", "printable", "recordings"},
     "simulator": FOUNDATION | {"wire"},
     "aircraft": FOUNDATION | {"sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
-    "status": FOUNDATION | {"hub"},
-    "aircraft_status": FOUNDATION | {"vehicle", "aircraft", "status"},
-    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "reasons"},
+    "status": FOUNDATION | {"hub", "vehicle", "aircraft"},
+    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output"},
     "batch": FOUNDATION
     | STAGES
@@ -48,11 +46,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "fleet": FOUNDATION | STAGES | {"output"} | EDGES,
     "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
-    "live": FOUNDATION
-    | STAGES
-    | JOINED
-    | {"status", "aircraft_status", "config", "recordings", "output"}
-    | EDGES,
+    "live": FOUNDATION | STAGES | JOINED | {"status", "config", "recordings", "output"} | EDGES,
     "extensions": set(),
     "player": FOUNDATION | STAGES | JOINED | {"recordings", "config"} | EDGES,
     "cli": FOUNDATION
@@ -64,7 +58,7 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 """The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
 
-PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "aircraft_status", "hub"}
+PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "hub"}
 IMPURE_PARTS = {
     "hub/hub.py",
     "hub/router.py",

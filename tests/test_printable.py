@@ -1,4 +1,4 @@
-"""Text from the network on a terminal, in JSON output and in a log."""
+"""Text from the network on a terminal, in JSON output and in a log; states in words."""
 
 import io
 import json
@@ -10,7 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.support.terminal import console_of
-from gateway.printable import LONGEST, PrintableFormatter, printable, printable_json
+from gateway.printable import (
+    LONGEST,
+    PrintableFormatter,
+    printable,
+    printable_json,
+    receiver_state,
+)
 
 RIGHT_TO_LEFT = "\u202e"
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
@@ -77,3 +83,20 @@ def test_log_line_is_escaped_and_its_length_bounded() -> None:
 
 def test_line_feed_in_a_logged_text_cannot_imitate_a_log_line() -> None:
     assert log_line("x\n2026-01-01 INFO all is well") == "from x\n    2026-01-01 INFO all is well"
+
+
+@pytest.mark.parametrize(
+    ("connected", "received", "frames", "text"),
+    [
+        (False, 0, 0, "not connected"),
+        (True, 0, 0, "connected, silent"),
+        (True, 5000, 90, "connected"),
+        (True, 5000, 0, "serial.baud"),
+    ],
+)
+def test_port_without_frames_is_described(
+    connected: bool, received: int, frames: int, text: str
+) -> None:
+    state = receiver_state(connected, received, frames)
+    assert text in state
+    assert (state == "connected") == (frames > 0)

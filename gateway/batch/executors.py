@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol, TypeVar
 from gateway import __version__
 from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
 from gateway.extensions import load_extensions
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 
 WAITING: Final = 2
 """Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""

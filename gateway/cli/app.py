@@ -21,8 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
 from gateway.live.log_limit import LogLimit
-from gateway.printable import PrintableFormatter, printable
-from gateway.reasons import reason_of
+from gateway.printable import PrintableFormatter, printable, reason_of
 
 RECORDINGS: Final = "Recordings"
 GATEWAY: Final = "A running gateway"

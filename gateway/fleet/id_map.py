@@ -14,7 +14,7 @@ import msgspec
 from gateway.hub.endpoint import SITE_NAME
 from gateway.live.kept_files import begin_worker, done_by
 from gateway.output import write_new
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 
 log = logging.getLogger(__name__)
 

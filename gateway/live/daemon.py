@@ -12,7 +12,6 @@ from typing import Final
 import msgspec
 
 from gateway.aircraft import Action, Aircraft, AircraftSettings, SettingsChanged
-from gateway.aircraft_status import status_of
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import (
     ConfigError,
@@ -33,7 +32,7 @@ from gateway.live.serial_port import SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
@@ -49,7 +48,7 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.status import Snapshot
+from gateway.status import Snapshot, status_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
 from gateway.vehicle.requests import (

@@ -18,7 +18,7 @@ from typing import Annotated, Final, ParamSpec, TypeVar
 import msgspec
 
 from gateway.output import PRIVATE, write_new
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.vehicle.plan import StoredPlan, decode_plan, encode_plan
 
 Parameters = ParamSpec("Parameters")

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from gateway.reasons import receiver_state
+from gateway.printable import receiver_state
 from gateway.units import counted
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Final
 from gateway.hub.endpoint import names_loopback
 from gateway.hub.stats import ListenerStats
 from gateway.hub.transports.stream import accept_each
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 
 log = logging.getLogger(__name__)
 

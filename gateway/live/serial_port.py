@@ -23,7 +23,7 @@ import serial
 from msgspec.structs import replace
 from serial.tools import list_ports
 
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
 from gateway.wire.framing import Frame, FrameDecoder

@@ -26,8 +26,7 @@ from gateway.analysis.case import make_case
 from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
 from gateway.analysis.metrics import euler_rad
 from gateway.panel.state.vehicle import FlightHistory, VehicleState
-from gateway.printable import printable
-from gateway.reasons import reason_of
+from gateway.printable import printable, reason_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import open_flights
 from gateway.recordings.play import Track

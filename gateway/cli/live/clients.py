@@ -20,7 +20,7 @@ from gateway.cli.support.terminal import (
     refuse,
     table_of,
 )
-from gateway.reasons import receiver_state
+from gateway.printable import receiver_state
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 

@@ -38,7 +38,7 @@ from gateway.live.serial_port import (
     fitting_ports,
     list_serial_ports,
 )
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4

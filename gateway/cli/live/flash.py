@@ -37,7 +37,7 @@ from gateway.live.serial_port import (
     list_serial_ports,
 )
 from gateway.output import write_new
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.settings import Field, fields_of
 
 FIELDS: Final = {field.name: field for field in fields_of(BoardSettings)}

@@ -27,7 +27,7 @@ from gateway.cli.support.options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of, refuse
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.recordings.files import FileKind, FlightError, Position, SettingsChoice, kind_of
 from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.index import RecordingError, find_recording

@@ -14,7 +14,7 @@ from gateway.hub.limits import TokenBucket
 from gateway.hub.routing_table import Origin
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import START_V2, Event, MavFrame, SplitFault

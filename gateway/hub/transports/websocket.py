@@ -21,7 +21,7 @@ from gateway.hub.transports.ws_protocol import (
     WsProtocol,
     caller_context,
 )
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import Event, MavFrame, SplitFault, SplitFaultKind
 

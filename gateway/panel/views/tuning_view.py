@@ -19,8 +19,7 @@ from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_val
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext
 from gateway.panel.widgets import DataTable, LiveChart, StripChart, heading
-from gateway.printable import printable
-from gateway.reasons import reason_of
+from gateway.printable import printable, reason_of
 from gateway.units import counted
 
 

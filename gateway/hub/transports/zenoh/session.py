@@ -42,7 +42,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import msgspec
 
 from gateway.hub.send_queue import BULK_IDS
-from gateway.reasons import reason_of
+from gateway.printable import reason_of
 
 if TYPE_CHECKING:
     import zenoh
