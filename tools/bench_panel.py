@@ -14,7 +14,6 @@ import json
 import os
 import re
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
@@ -33,8 +32,9 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.panel.panel_server import make_parts
 from gateway.panel.panel_settings import PanelSettings
+from tests.kit.process import Process
+from tests.ports import free_port
 from tools.bench_latency import GATEWAY, Line, Nodes, cpu_seconds
-from tools.bench_pauses import free_ports
 
 CHROMIUM = "/usr/bin/chromium"
 ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
@@ -48,7 +48,6 @@ RATE_HZ = 25
 VIEWERS = (1, 5)
 GATEWAY_HZ = 200
 TURNS = 3
-START_S = 180.0
 SETTLE_MS = 3000
 MINUTES = (10, 20, 40, 60, 80, 120)
 """After so many the memory of the hours is looked at; the path is full after 67."""
@@ -108,27 +107,6 @@ class Vehicle(threading.Thread):
         yield mavlink.MAVLink_vfr_hud_message(14.0, 14.0, 90, 0, 500.0, sent_s)
 
 
-@contextlib.contextmanager
-def running(*arguments: str, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """Run a command that prints the panel's link, until the end of the block."""
-    log = folder / f"{time.monotonic_ns()}.log"
-    with log.open("w") as output:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "gateway.cli", *arguments],
-            stdout=output, stderr=output, env=os.environ | {"XDG_RUNTIME_DIR": str(folder)},
-        )  # fmt: skip
-    try:
-        until = time.monotonic() + START_S
-        while not (link := re.search(r"panel: (http://\S+)", log.read_text())):
-            if time.monotonic() > until or process.poll() is not None:
-                raise SystemExit(log.read_text())
-            time.sleep(0.1)
-        yield process, link[1]
-    finally:
-        process.terminate()
-        process.wait(20)
-
-
 def memory_mb(pid: int) -> float:
     """Return how much memory a process holds."""
     text = Path(f"/proc/{pid}/status").read_text()
@@ -146,13 +124,12 @@ def open_pages(browser: Browser, link: str, count: int) -> list[Page]:
 
 def measure_page(browser: Browser, folder: Path, seconds: float) -> list[dict[str, float]]:
     """Measure delay, CPU and memory with one viewer and with several."""
-    (port,) = free_ports(1)
-    config = folder / "panel.toml"
-    config.write_text("[panel]\nmap_styles = []\n")
+    port = free_port()
     found = []
     connect = f"udp-listen:127.0.0.1:{port}"
-    options = ("panel", "--connect", connect, "--port", "0", "--config", str(config))
-    with running(*options, folder=folder) as (process, link):
+    options = ("panel", "--connect", connect, "--port", "0")
+    with Process(folder, *options, config="[panel]\nmap_styles = []\n") as panel:
+        process, link = panel.process, panel.link()
         vehicle = Vehicle(port)
         vehicle.start()
         for count in VIEWERS:
@@ -216,7 +193,8 @@ def measure_gateway(browser: Browser, folder: Path, seconds: float) -> dict[str,
         for _ in range(TURNS):
             turn(SETTLE_MS / 1000)
             late["without"] += turn(seconds)
-            with running("panel", "--config", str(config), folder=folder) as (_, link):
+            with Process(folder, "panel", config=config.read_text()) as panel:
+                link = panel.link()
                 for key, path in (("read", "web/icon.svg"), ("drawn", "")):
                     page = browser.new_page()
                     page.goto(link + path)

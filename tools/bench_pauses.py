@@ -12,7 +12,6 @@ are all alike.
 import argparse
 import asyncio
 import os
-import socket
 import subprocess
 import sys
 import tempfile
@@ -32,21 +31,13 @@ from gateway.compiled.entry_point import load_entry_points
 from gateway.config import GatewaySettings
 from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
+from tests.ports import free_ports
 from tools.turns import LONG_US, TurnWatch, even_turns
 
 GOAL_MS = LONG_US / 1e3
 ROTATE_MB = 1.0
 """The smallest there is: some files a minute."""
 LOOK_S = 0.1
-
-
-def free_ports(count: int) -> list[int]:
-    """Find ports that nobody uses, by TCP nor by UDP."""
-    socks = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [sock.getsockname()[1] for sock in socks]
-    for sock in socks:
-        sock.close()
-    return ports
 
 
 def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySettings:

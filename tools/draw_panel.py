@@ -3,15 +3,16 @@
 The first show the panel on the simulated flight, the last a flight as one file.
 """
 
-import re
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 from typing import Literal
 
 from playwright.sync_api import Page, ViewportSize, sync_playwright
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tests.kit.process import Process
 
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 CHROMIUM = "/usr/bin/chromium"
@@ -77,29 +78,18 @@ def main() -> None:
     """Start the demo, draw, end it."""
     draw_flight_page()
     with tempfile.TemporaryDirectory() as folder:
-        config, log = Path(folder, "gateway.toml"), Path(folder, "log")
-        config.write_text(CONFIG.format(folder=folder))
-        command = [sys.executable, "-m", "gateway.cli", "demo", "--plain", "--config", str(config)]
-        with log.open("w") as output:
-            demo = subprocess.Popen(command, stdout=output, stderr=output)
-        try:
-            until = time.monotonic() + START_S
-            while not (link := re.search(r"panel: (http://\S+)", log.read_text())):
-                if time.monotonic() > until:
-                    sys.exit(log.read_text())
-                time.sleep(0.2)
+        config = CONFIG.format(folder=folder)
+        with Process(Path(folder), "demo", "--plain", config=config) as demo:
+            link = demo.link()
             with sync_playwright() as playwright:
                 browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
                 for view, scheme in SHOTS:
                     page = browser.new_page(viewport=SIZE, color_scheme=scheme)
                     page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
-                    page.goto(link[1])
+                    page.goto(link)
                     draw(page, view)
                     page.close()
                 browser.close()
-        finally:
-            demo.terminate()
-            demo.wait(20)
 
 
 if __name__ == "__main__":

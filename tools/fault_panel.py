@@ -31,8 +31,9 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.panel.access import COOKIE, hash_password
-from tools.bench_panel import Vehicle, memory_mb, running
-from tools.bench_pauses import free_ports
+from tests.kit.process import Process
+from tests.ports import free_port
+from tools.bench_panel import Vehicle, memory_mb
 
 MEMORY_MB = 50.0
 ANSWER_S = 1.0
@@ -347,15 +348,15 @@ def main() -> None:
         folder = Path(name)
         (folder / "recordings").mkdir()
         (folder / "recordings" / "large_01.tlog").write_bytes(os.urandom(40_000_000))
-        config = folder / "panel.toml"
         hashes = {"operator": hash_password(OPERATOR), "viewer": hash_password(VIEWER)}
-        config.write_text(CONFIG.format(folder=folder, **hashes))
-        (port,) = free_ports(1)
-        command = ("panel", "--connect", f"udp-listen:127.0.0.1:{port}", "--config", str(config))
-        with running(*command, folder=folder) as (process, link):
+        port, config = free_port(), CONFIG.format(folder=folder, **hashes)
+        command = ("panel", "--connect", f"udp-listen:127.0.0.1:{port}")
+        with Process(folder, *command, config=config) as panel:
             vehicle = Vehicle(port)
             vehicle.start()
-            found = asyncio.run(measure(process.pid, link, options.seconds, options.only))
+            found = asyncio.run(
+                measure(panel.process.pid, panel.link(), options.seconds, options.only)
+            )
             vehicle.end()
     show(found)
     if options.json:

@@ -34,6 +34,7 @@ from gateway.live.pty_port import PtyPort
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from tests.kit.process import Process
 
 MAX_GAP_S = 7.0
 MAX_UNEXPLAINED_S = 2.0
@@ -175,22 +176,14 @@ class Gateway:
         self.has_disk = self._mount()
         self.clock = folder / "clock_off"
         self.receiver = Receiver(folder / "receiver")
-        config = folder / "gateway.toml"
-        config.write_text(
-            CONFIG.format(port=folder / "receiver", client=client_port, recordings=self.disk)
-        )
         environment = os.environ | {"XDG_RUNTIME_DIR": str(folder)}
         library = self._clock_library()
         if library is not None:
             environment |= {"LD_PRELOAD": str(library), "CLOCK_OFF_FILE": str(self.clock)}
         self.has_clock = library is not None
-        with (folder / "mavgate.log").open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-m", "gateway.cli", "run", "--plain", "--config", str(config)],
-                env=environment,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-            )
+        config = CONFIG.format(port=folder / "receiver", client=client_port, recordings=self.disk)
+        self._running = Process(folder, "run", "--plain", config=config, env=environment)
+        self.process = self._running.process
 
     def _mount(self) -> bool:
         if os.geteuid() != 0:
@@ -234,8 +227,7 @@ class Gateway:
     def close(self) -> None:
         """End it."""
         self.process.send_signal(signal.SIGCONT)
-        self.process.terminate()
-        self.process.wait(30.0)
+        self._running.end()
         self.receiver.pull()
         if self.has_disk:
             subprocess.run(["umount", "--lazy", str(self.disk)], check=False)
@@ -274,6 +266,8 @@ async def soak(options: argparse.Namespace) -> int:
                 progress.update(task, completed=elapsed_s)
                 await asyncio.sleep(1.0)
         for running in tasks:
+            if running.done():
+                running.result()
             running.cancel()
         listener.finish()
     finally:

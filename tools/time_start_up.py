@@ -45,9 +45,10 @@ from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.station import Station
 from tests.end_to_end.test_ground_stations import CONFIG
+from tests.kit.process import START_LIMIT_S
 from tests.vehicle.test_start_up import qgroundcontrol
 
 REPEATS = 5
@@ -119,7 +120,7 @@ def time_run(folder: Path) -> None:
             if not wanted:
                 break
     finally:
-        gateway.stop()
+        gateway.end()
         client.sock.close()
         os.close(master)
         os.close(slave)
@@ -136,7 +137,7 @@ def time_gateway(folder: Path) -> None:
         connect(socket.SOCK_STREAM, gateway.listen_port, 2).close()
         print(f"mavgate status: CPU {cpu_of(*mavgate, 'status'):.2f} s")
     finally:
-        gateway.stop()
+        gateway.end()
     time_run(folder)
 
 
@@ -290,7 +291,7 @@ def time_radio(folder: Path) -> None:
         )
         asked_s = timed(lambda: qgroundcontrol(station))
     finally:
-        gateway.stop()
+        gateway.end()
         radio.close()
         station.close()
     packed, plain = len(files["parameters"]), len(lzma.decompress(files["parameters"]))
@@ -321,7 +322,7 @@ def main() -> None:
             time_stations(gateway.listen_port)
             time_mavproxy(gateway.port, Path(folder))
         finally:
-            gateway.stop()
+            gateway.end()
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
 """Fixtures that start the gateway and clients, and end them whatever happens."""
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.processes import Client, Gateway, MavProxy
 
 
 @pytest.fixture
@@ -19,9 +20,7 @@ def start_gateway(tmp_path: Path) -> Iterator[Callable[..., Gateway]]:
 
     yield start
     for gateway in started:
-        if gateway.process.poll() is None:
-            gateway.process.kill()
-            gateway.process.wait(START_LIMIT_S)
+        gateway.end(signal.SIGKILL)
 
 
 @pytest.fixture

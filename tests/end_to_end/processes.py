@@ -4,7 +4,6 @@ import fcntl
 import os
 import re
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -15,10 +14,8 @@ from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_ports
-
-START_LIMIT_S = 60.0
-"""A start takes a second, on a busy machine some more."""
 
 SO_RCVBUFFORCE = 33
 """Of Linux, for root alone: beyond the limit that others have."""
@@ -34,16 +31,8 @@ gps_first_fix_s = 0.5
 """
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Wait for a condition."""
-    deadline_s = time.monotonic() + START_LIMIT_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
-class Gateway:
-    """A running `mavgate` process, in a session of its own on a terminal if there is one."""
+class Gateway(Process):
+    """A gateway with ports to clients, in a session of its own on a terminal if there is one."""
 
     def __init__(
         self,
@@ -54,26 +43,16 @@ class Gateway:
         terminal: int | None = None,
     ) -> None:
         self.port, self.listen_port = free_ports(2)
-        self.log = folder / "mavgate.log"
-        file = folder / "gateway.toml"
-        file.write_text(config.format(port=self.port, listen=self.listen_port))
         if command == "demo" and "--panel" not in options:
             options = ("--no-panel", *options)
-        arguments = ["-m", "gateway.cli", command, "--plain", "--config", str(file), *options]
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, *arguments],
-                stdin=subprocess.DEVNULL if terminal is None else terminal,
-                start_new_session=terminal is not None,
-                preexec_fn=None if terminal is None else _take_terminal,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                env=os.environ | {"COLUMNS": "200"},
-            )
-
-    def stop(self) -> int:
-        self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(START_LIMIT_S)
+        super().__init__(
+            *(folder, command, "--plain", *options),
+            config=config.format(port=self.port, listen=self.listen_port),
+            stdin=subprocess.DEVNULL if terminal is None else terminal,
+            start_new_session=terminal is not None,
+            preexec_fn=None if terminal is None else _take_terminal,
+            env=os.environ | {"COLUMNS": "200"},
+        )
 
 
 def _take_terminal() -> None:

@@ -10,7 +10,8 @@ from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.processes import Client, Gateway, MavProxy
+from tests.kit.process import START_LIMIT_S
 
 HOME = SimulatorSettings()
 NEAR_DEG = 0.004
@@ -38,7 +39,7 @@ def test_every_message_arrives_and_stopping_is_clean(
     assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
     assert place.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
     assert place.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
-    assert gateway.stop() == 0
+    assert gateway.end() == 0
     assert "Traceback" not in gateway.log.read_text()
 
 

@@ -20,8 +20,9 @@ from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
 from mavsdk.asyncio.plugins.mission_raw import MissionRawAsync
 from mavsdk.asyncio.plugins.param import ParamAsync
 
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy, until
+from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.test_ground_stations import WAYPOINTS, answered
+from tests.kit.process import START_LIMIT_S, wait_for
 from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -179,7 +180,7 @@ def test_clocks_that_are_wrong_by_years(
     client.sock.close()
     for site, system_id in fleet.ids().items():
         assert abs(time_s[system_id] - now_s - OFF_S.get(site, 0)) < YEAR_S / 365
-    until(lambda: set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES))
+    wait_for(lambda: set(json.loads(fleet.ask("recordings", "--json"))) == set(SITES))
     logs: dict[str, list[bytes]] = {}
 
     def fetched(site: str) -> bool:
@@ -190,8 +191,8 @@ def test_clocks_that_are_wrong_by_years(
         return sum(map(len, logs[site])) > 10_000
 
     for site in OFF_S:
-        until(partial(fetched, site))
-    assert [gateway.stop() for gateway in fleet.sites.values()] == [0, 0, 0]
+        wait_for(partial(fetched, site))
+    assert [gateway.end() for gateway in fleet.sites.values()] == [0, 0, 0]
     for site, off_s in OFF_S.items():
         # A second part begins where GPS reports another time than the clock, as in a late start.
         first_s = int.from_bytes(logs[site][0][:8], "big") / 1e6

@@ -26,8 +26,9 @@ from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Gateway, MavProxy
+from tests.end_to_end.processes import Gateway, MavProxy
 from tests.end_to_end.station import Station
+from tests.kit.process import START_LIMIT_S
 from tests.vehicle.test_start_up import qgroundcontrol
 
 HOME = SimulatorSettings()
@@ -75,7 +76,7 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
     """One gateway for all of them: each start takes seconds, and none leaves it changed."""
     running = Gateway(tmp_path_factory.mktemp("gateway"), "demo", config=CONFIG)
     yield running
-    running.stop()
+    running.end()
 
 
 @pytest.fixture

@@ -15,9 +15,10 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.live.control_socket import request
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway, MavProxy
+from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.test_demo import NEAR_DEG
 from tests.kit.cli import invoke
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 from tests.recordings.frames import START_US, make_tlog
 
@@ -174,7 +175,7 @@ folder = "FOLDER"
 """
     gateway = start_gateway("demo", "--record", config=config.replace("FOLDER", str(tmp_path)))
     connect(gateway.port).until(lambda seen: "HIGHRES_IMU" in seen)
-    assert gateway.stop() == 0
+    assert gateway.end() == 0
     path, *_ = sorted(tmp_path.glob("*.tlog"))
     batch = TlogScanner(strict=True).feed(path.read_bytes(), final=True)
     assert batch.damage == ()
@@ -231,7 +232,7 @@ async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
     # StatusText to end, it writes what it still holds; the closed input wakes its keyboard thread.
     recorder.process.terminate()
     recorder.process.communicate(timeout=START_LIMIT_S)
-    gateway.stop()
+    gateway.end()
     playing = play(str(tmp_path / "mav.tlog"), "--loop")
     configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
     async with Mavsdk(configuration) as mavsdk:

@@ -24,8 +24,9 @@ from pymavlink.dialects.v20 import all as mavlink
 from websockets.sync.client import connect as follow
 
 from gateway.wire.mavlink_json import template
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+from tests.end_to_end.processes import Client, Gateway
 from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 from tests.wire.test_mavlink_json import as_pymavlink_reads
 
@@ -86,7 +87,7 @@ def apis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Apis]:
             yield Apis(station, listen, f"127.0.0.1:{web}", place)
     finally:
         station.sock.close()
-        gateway.stop()
+        gateway.end()
 
 
 def requests() -> list[dict[str, Any]]:

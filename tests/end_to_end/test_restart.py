@@ -13,8 +13,9 @@ from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
-from tests.end_to_end.processes import START_LIMIT_S, Client
+from tests.end_to_end.processes import Client
 from tests.end_to_end.station import Station
+from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 from tests.vehicle.services.test_missions import (
     MISSION,

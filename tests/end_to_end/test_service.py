@@ -14,7 +14,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import ControlError, request, socket_path
-from tests.end_to_end.processes import CONFIG, START_LIMIT_S, Client, Gateway, until
+from tests.end_to_end.processes import CONFIG, Client, Gateway
+from tests.kit.process import START_LIMIT_S, wait_for
 from tests.ports import free_port, free_ports
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -52,7 +53,7 @@ class Systemd:
     def is_alive(self) -> None:
         """Wait for two signs of life, and for nothing else."""
         wanted = self.signs_of_life + 2
-        until(lambda: self.signs_of_life >= wanted)
+        wait_for(lambda: self.signs_of_life >= wanted)
         assert self._notified.empty()
 
     def close(self) -> None:
@@ -108,12 +109,12 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert f'remote="127.0.0.1:{extra}"' in text
     settings.write_text("[hub]\nendpoints = 7\n")
     gateway.process.send_signal(signal.SIGHUP)
-    until(lambda: "settings not reloaded" in gateway.log.read_text())
+    wait_for(lambda: "settings not reloaded" in gateway.log.read_text())
     follow(10)
     steps = {(after - before) % 256 for before, after in itertools.pairwise(numbers)}
     assert steps == {1}
     systemd.is_alive()
-    assert gateway.stop() == 0
+    assert gateway.end() == 0
     assert systemd.notified() == b"STOPPING=1"
 
 
@@ -124,7 +125,7 @@ def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
     config = f'{CONFIG}\n[recording]\nfolder = "{tmp_path}"\n'
     gateway = start_gateway("demo", "--record", config=config, terminal=terminal)
     os.close(terminal)
-    until(lambda: any(path.stat().st_size > 0 for path in tmp_path.glob("*.csv")))
+    wait_for(lambda: any(path.stat().st_size > 0 for path in tmp_path.glob("*.csv")))
     os.close(master)
     assert gateway.process.wait(START_LIMIT_S) == 0, gateway.log.read_text()
     assert "the simulated receiver has ended" not in gateway.log.read_text()
@@ -138,7 +139,7 @@ def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
             return True
         return False
 
-    until(is_gone)
+    wait_for(is_gone)
 
 
 def test_a_reload_changes_the_signing(

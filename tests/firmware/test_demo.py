@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.end_to_end.processes import START_LIMIT_S, Client, Gateway
+from tests.end_to_end.processes import Client, Gateway
+from tests.kit.process import START_LIMIT_S
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -30,5 +31,5 @@ def test_a_ground_station_sees_the_vehicle(gateway: Gateway) -> None:
     # It stands on the runway.
     assert abs(attitude.q2) < 0.1
     assert abs(attitude.q3) < 0.1
-    assert gateway.stop() == 0
+    assert gateway.end() == 0
     assert "Traceback" not in gateway.log.read_text()

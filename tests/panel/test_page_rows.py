@@ -15,15 +15,8 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import to_euler
 from gateway.live.control_socket import request
 from gateway.recordings.tlog import encode_record
-from tests.panel.browsing import (
-    START_LIMIT_MS,
-    WAIT_MS,
-    Process,
-    needs_chromium,
-    open_page,
-    show,
-    wait_for,
-)
+from tests.kit.process import wait_for
+from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
 from tests.panel.scripted_vehicle import ScriptedVehicle
 from tests.panel.test_flight_page import frames
 from tests.panel.test_map_tiles import write_pmtiles

@@ -16,6 +16,7 @@ from gateway.estimation.select import ESTIMATORS
 from gateway.live.control_socket import request
 from gateway.panel.estimator_trial import LEAST_S
 from gateway.units import US_PER_S
+from tests.kit.process import wait_for
 from tests.panel.bench_receiver import RATE_HZ, BenchReceiver
 from tests.panel.browsing import (
     CONFIG,
@@ -26,7 +27,6 @@ from tests.panel.browsing import (
     needs_chromium,
     open_page,
     show,
-    wait_for,
 )
 
 pytestmark = [
