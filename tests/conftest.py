@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import hypothesis
 import numpy as np
@@ -42,6 +43,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     all_of = Counter(item.path for item in items)
     items.sort(key=lambda item: (-slow[item.path], -all_of[item.path]))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
+    """Give each file to one worker, so that its gateway or its browser is started once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    # By the order above, not by the number of tests.
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
 
 
 class ManualClock:

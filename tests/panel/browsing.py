@@ -19,7 +19,8 @@ ARGUMENTS = [
 START_LIMIT_MS = 60_000
 WAIT_MS = 60_000
 """What is on the page by then, or not: a busy machine is slow, and nothing here sleeps."""
-DESKTOP = {"width": 1440, "height": 900}
+DESKTOP = {"width": 1080, "height": 680}
+"""Small: the processor draws every pixel."""
 
 CONFIG = """
 aircraft_folder = "{folder}/aircraft"
@@ -31,6 +32,8 @@ mode = "manual"
 [simulator]
 vehicles = 2
 gps_first_fix_s = 0.5
+imu_rate_hz = 25
+baro_rate_hz = 5
 [panel]
 port = 0
 tiles_folder = "{folder}/tiles"

@@ -7,17 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from gateway.live.control_socket import request
 from gateway.panel.access import hash_password
 from tests.panel.browsing import (
     CONFIG,
+    DESKTOP,
     START_LIMIT_MS,
     WAIT_MS,
     Process,
     needs_chromium,
-    open_page,
     show,
 )
 
@@ -48,41 +48,37 @@ def write_certificate(certificate: Path, key: Path) -> None:
     )
 
 
-@pytest.fixture
-def processes() -> Iterator[list[Process]]:
-    started: list[Process] = []
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    made = tmp_path_factory.mktemp("life")
+    write_certificate(made / "panel.pem", made / "panel.key")
+    return made
+
+
+@pytest.fixture(scope="module")
+def gateways(folder: Path) -> Iterator[list[Process]]:
+    """A gateway, and those that a test starts after it."""
+    started = [Process(folder, "demo", "--plain", "--no-panel")]
     yield started
     for process in started:
         process.end()
 
 
-def test_page_finds_a_gateway_that_was_killed_and_started_again(
-    browser: Browser, tmp_path: Path, processes: list[Process]
-) -> None:
-    processes.append(Process(tmp_path, "demo", "--plain", "--no-panel"))
-    processes[0].until("receiver on")
-    processes.append(Process(tmp_path, "panel"))
-    page = open_page(browser, processes[1].link())
-    chips = page.locator(".chips")
-    expect(chips.get_by_text("link", exact=True)).to_be_visible()
-    processes[0].end(signal.SIGKILL)
-    expect(chips.get_by_text(re.compile(r"silent for \d+ s"))).to_be_visible()
-    processes.append(Process(tmp_path, "demo", "--plain", "--no-panel"))
-    expect(chips.get_by_text("link", exact=True)).to_be_visible(timeout=START_LIMIT_MS)
-    before = page.evaluate("mavgate.state.time_us")
-    page.wait_for_function(f"mavgate.state.time_us > {before}")
-    page.close()
+@pytest.fixture(scope="module")
+def page(browser: Browser, folder: Path, gateways: list[Process]) -> Iterator[Page]:
+    """The page of a viewer, over TLS, of a panel that is a process of its own."""
+    gateways[0].until("receiver on")
+    panel = Process(folder, "panel", config=LOCKED)
+    opened = browser.new_page(viewport=DESKTOP, ignore_https_errors=True)  # type: ignore[arg-type]
+    opened.set_default_timeout(WAIT_MS)
+    opened.goto(panel.link())
+    yield opened
+    opened.close()
+    panel.end()
 
 
-def test_viewer_looks_over_tls_and_does_not_touch(
-    browser: Browser, tmp_path: Path, processes: list[Process]
-) -> None:
-    write_certificate(tmp_path / "panel.pem", tmp_path / "panel.key")
-    processes.append(Process(tmp_path, "demo", "--plain", config=LOCKED))
-    link = processes[0].link()
-    assert link.startswith("https://")
-    page = browser.new_page(viewport={"width": 1440, "height": 900}, ignore_https_errors=True)
-    page.goto(link)
+def test_viewer_looks_over_tls_and_does_not_touch(page: Page, folder: Path) -> None:
+    assert page.url.startswith("https://")
     page.get_by_label("Password").fill("wrong")
     page.get_by_text("Open the panel").click()
     expect(page.get_by_role("alert")).to_contain_text("not the password")
@@ -95,14 +91,32 @@ def test_viewer_looks_over_tls_and_does_not_touch(
     expect(recorder).to_have_text("idle")
     expect(page.get_by_label("Start recording")).to_have_count(0)
     show(page, "map")
+    expect(page.get_by_label("Upload a PMTiles file")).to_have_count(0)
     page.locator("section[data-view='map'] .map-canvas").click(position={"x": 300, "y": 300})
     expect(page.get_by_text("Mark this place")).to_have_count(0)
-    # What a page hides can be asked for all the same.
-    status = page.evaluate(
-        "fetch('/recordings/forged', {method: 'PUT', body: 'x'}).then((answer) => answer.status)"
-    )
-    assert status == 403
-    socket = tmp_path / "mavgate" / "run.sock"
+    show(page, "link")
+    expect(page.locator("section[data-view='link'] [data-role='receiver']")).to_be_visible()
+    expect(page.get_by_label("Serial port")).to_have_count(0)
+    # A request that a page hides can be sent all the same.
+    for path in ("/recordings/forged", "/maps/forged"):
+        status = page.evaluate(
+            "(path) => fetch(path, {method: 'PUT', body: 'x'}).then((answer) => answer.status)",
+            path,
+        )
+        assert status == 403
+    socket = folder / "mavgate" / "run.sock"
     aircraft = request(socket, "status", timeout_s=WAIT_MS / 1000)["aircraft"]
     assert [one["mark"] for one in aircraft] == [None, None]
-    page.close()
+
+
+def test_page_finds_a_gateway_that_was_killed_and_started_again(
+    page: Page, folder: Path, gateways: list[Process]
+) -> None:
+    chips = page.locator(".chips")
+    expect(chips.get_by_text("link", exact=True)).to_be_visible()
+    gateways[0].end(signal.SIGKILL)
+    expect(chips.get_by_text(re.compile(r"silent for \d+ s"))).to_be_visible()
+    gateways.append(Process(folder, "demo", "--plain", "--no-panel"))
+    expect(chips.get_by_text("link", exact=True)).to_be_visible(timeout=START_LIMIT_MS)
+    before = page.evaluate("mavgate.state.time_us")
+    page.wait_for_function(f"mavgate.state.time_us > {before}")

@@ -32,9 +32,7 @@ def folder(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("kind", "begin"), [("kml", b"<?xml"), ("gpx", b"<?xml"), ("page", b"<!doctype html>")]
-)
+@pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
 async def test_export_is_made_and_fetched_under_an_address_of_its_own(
     folder: Path, kind: str, begin: bytes
 ) -> None:
