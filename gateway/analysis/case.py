@@ -21,6 +21,7 @@ from gateway.analysis.metrics import errors_over_time, rms
 from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.recordings.fuse import FusionSettings, with_estimator
+from gateway.recordings.summary import ground_distance_m
 from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
 
@@ -95,7 +96,7 @@ def summarise(case: Case) -> dict[str, float]:
         "IMU samples a second": flight.rate_hz,
         "usable GPS fixes": float(len(fixes)),
         "longest time without a fix, s": float(gap_s.max()) if len(gap_s) else float("nan"),
-        "distance flown, m": _distance_m(case),
+        "distance flown, m": ground_distance_m(track.time_us, track.lat_deg, track.lon_deg),
         "greatest height above the start, m": _climbed_m(track.alt_amsl_m[flight.scored]),
         "greatest ground speed, m/s": _greatest(speed[flight.scored]),
         "shaking above the low-pass, m/s² RMS": rms(shaking),
@@ -137,13 +138,6 @@ def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, o
         elif of_a != of_b:
             found.append((f"{prefix}{field.name}", of_a, of_b))
     return found
-
-
-def _distance_m(case: Case) -> float:
-    """Distance over ground, from the fused speed."""
-    speed = np.hypot(case.track.vel_n_mps[:, 0], case.track.vel_n_mps[:, 1])
-    dt_s = np.diff(case.flight.time_s, append=case.flight.time_s[-1])
-    return float(np.nansum(speed * dt_s))
 
 
 def _climbed_m(alt_m: FloatArray) -> float:

@@ -161,6 +161,15 @@ class GroundDistance:
         self._last = (lat_deg, lon_deg)
 
 
+def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
+    """Return the distance over ground along positions; unknown ones are NaN."""
+    way, known = GroundDistance(), np.isfinite(lat_deg)
+    columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
+    for at_us, lat, lon in zip(*columns, strict=True):
+        way.add(at_us, lat, lon)
+    return way.distance_m
+
+
 @dataclass(slots=True)
 class TimesSpan:
     """Sum up how long records last; a clock that leaps by days adds nothing."""
