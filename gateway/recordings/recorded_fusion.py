@@ -90,6 +90,8 @@ from gateway.records import (
 from gateway.sensing.chain import IntArray
 from gateway.vehicle.requests import INFO, StatusText
 
+PIECE: Final = 200
+"""Rows that are fused at once for a playback: some milliseconds, in which it sends nothing."""
 LONGEST_GAP_US: Final = 1_000_000
 """In a longer gap the pipeline's timers are not run one by one."""
 
@@ -343,9 +345,9 @@ class RecordedFusion:
         zero_us = header.unix_us_at_zero or 0
         settings = PipelineSettings(self.aircraft, {}, zero_us, states)
         replay, stamper = Replay(Pipeline(settings), follow=self._follow), Stamper(zero_us)
-        for block in self._table.blocks:
-            fusion.block(block)
-            lines = (e for e in block.events(header.vehicle_id) if isinstance(e, Line))
+        for piece in (piece for block in self._table.blocks for piece in block.pieces(PIECE)):
+            fusion.block(piece)
+            lines = (e for e in piece.events(header.vehicle_id) if isinstance(e, Line))
             for now_us, action in (sent for line in lines for sent in replay.take(line)):
                 if not isinstance(action, Outgoing) or action.message_id in UNRECORDED:
                     continue

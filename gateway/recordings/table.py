@@ -172,6 +172,13 @@ class TableBlock:
             if comment is not None:
                 yield comment
 
+    def pieces(self, rows: int) -> "Iterator[TableBlock]":
+        """Cut the block into smaller ones of so many rows."""
+        for begin in range(0, max(len(self), 1), rows):
+            end = begin + rows if begin + rows < len(self) else len(self) + 1
+            comments = ((row - begin, c) for row, c in self.comments if begin <= row < end)
+            yield TableBlock(self.cells[begin:end], tuple(comments))
+
 
 def block_of(events: Iterable[TableEvent]) -> TableBlock:
     """Lay rows out as columns, and keep the lines between them."""

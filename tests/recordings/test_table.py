@@ -11,6 +11,7 @@ from gateway.recordings.table import (
     TableHeader,
     TableMark,
     TableReader,
+    block_of,
     encode_head,
     encode_line,
     encode_mark,
@@ -143,3 +144,13 @@ def test_a_file_of_something_else_gives_faults_only() -> None:
 def test_column_names_are_settled() -> None:
     assert COLUMNS[0] == "time_us"
     assert COLUMNS[-1] == "nav_flags"
+
+
+@pytest.mark.parametrize("size", [1, 7, 20, 1000])
+@pytest.mark.parametrize("count", [0, 20])
+def test_pieces_of_a_block_hold_all_events_in_order(size: int, count: int) -> None:
+    rows, mark = make_rows(1, count)[:20], TableMark(5, "here")
+    events = [mark, *rows[:7], mark, mark, *rows[7:], mark]
+    pieces = [*block_of(events).pieces(size)]
+    assert max(map(len, pieces)) <= size
+    assert repr([event for piece in pieces for event in piece.events(3)]) == repr(events)
