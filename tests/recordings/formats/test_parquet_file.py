@@ -73,9 +73,6 @@ def test_the_commands_take_it(table: Path, tmp_path: Path) -> None:
         for name in ("kind", "size"):
             each.pop(name)
     assert described[0] == described[1]
-    run("convert", columns, "-o", tmp_path / "a.tlog")
-    run("convert", table, "-o", tmp_path / "b.tlog")
-    assert (tmp_path / "a.tlog").read_bytes() == (tmp_path / "b.tlog").read_bytes()
 
 
 def test_one_message_is_one_typed_table(tmp_path: Path) -> None:
