@@ -44,8 +44,6 @@ NOISE_MPS: Final = 0.2
 """Noise of a GPS velocity in a pair."""
 TRACK_NOISE_MPS: Final = 0.6
 """The same of a velocity derived from two positions."""
-HARDEST_MPS2: Final = 100.0
-"""A larger acceleration of GPS is an error; one such pair would outweigh all others."""
 CONTRADICTION_SIGMA: Final = 4.0
 CONTRADICTION_MPS2: Final = 4.0
 """Differences beyond both contradict the other pairs; a turn by 25 deg causes the second one."""
@@ -99,8 +97,6 @@ def add_velocity(
     down = (vel[2] - v[2]) / dt
     force = ((force_i[0] - f[0]) / dt, (force_i[1] - f[1]) / dt, (force_i[2] - f[2]) / dt)
     begin_pair(s, valid_s, vel, force_i)
-    if math.hypot(down, math.hypot(north, east)) > HARDEST_MPS2:
-        return 0.0
     late_sq = p.gps_jitter_sq * (north * north + east * east)
     # Over one second the noise that successive differences share averages out.
     weight = dt / (2.0 * (noise_mps * noise_mps + late_sq))

@@ -50,9 +50,6 @@ SPEED_SHARES: Final = (0.4, 0.4, 0.8)
 SLOW_MPS: Final = 0.05
 SLOW_S: Final = 4.0
 """Slow error of GPS velocities where the receiver reports none, and its correlation time."""
-POOR_MPS: Final = 0.5
-"""A reported accuracy beyond this is due to reflections, which affect all fixes of some seconds."""
-REFLECTION_S: Final = 10.0
 LEAST_S: Final = 0.05
 """Fixes closer together count as that far apart."""
 LEAST_LAG_S: Final = 0.1
@@ -63,8 +60,6 @@ MOST_GLITCH: Final = (5.0, 30.0)
 GLITCH_S: Final = 10.0
 GLITCH_FADE_S: Final = 1.0
 LAG_S: Final = 0.2
-EXCESS_S: Final = 1.0
-"""Velocity noise beyond the assumed one lasts for this time: the receiver's own filter."""
 
 
 @compiled
@@ -180,13 +175,10 @@ def velocity_variance(
         # Without a compass the heading depends on these velocities alone.
         white = max(white, assumed * s.fix_excess)
     white *= max(1.0, p.gps_correlation_s / since_s)
-    if accuracy > POOR_MPS:
-        reflected = SPEED_SHARES[k] ** 2 * (accuracy * accuracy - POOR_MPS * POOR_MPS)
-        white += max(1.0, REFLECTION_S / since_s) * reflected
     late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
     level_sq = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
     excess = (s.fix_excess - 1.0) * (assumed + p.gps_jitter_sq * level_sq)
-    return max(white + late, excess * max(1.0, EXCESS_S / since_s))
+    return max(white + late, excess)
 
 
 @compiled

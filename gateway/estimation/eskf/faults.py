@@ -61,8 +61,6 @@ STEP_SHARE: Final = 0.01
 """Share of the newest interval in the usual one: an average over a hundred samples."""
 LONGEST_GAP_S: Final = 60.0
 """Capped: a longer gap adds no information and would destabilise the covariance."""
-STEADY_S: Final = 1.0
-"""Motion that began and ended in a longer gap is not visible at its ends."""
 RATE_TAU_S: Final = 0.3
 """Correlation time of the angular rate, between a hand's and that of a fixed wing."""
 TURNING_S: Final = 5.0
@@ -70,12 +68,7 @@ TURNING_S: Final = 5.0
 UNSEEN_MPS2: Final = 3.0
 """Standard deviation of the acceleration in a gap."""
 WANDER_RADPS: Final = 0.05
-HAND_WANDER_RADPS: Final = 0.3
-"""Change of the rate in a long gap, with GPS, and without: a hand moves more than an aircraft."""
-REST_WANDER_RADPS: Final = 0.02
-"""The same of a rest that may have been disturbed."""
-AIDED_LOST_RAD: Final = 0.75
-"""With GPS velocities an attitude with a larger standard deviation is lost in a gap."""
+"""Change of the rate in a gap."""
 
 
 @compiled
@@ -289,9 +282,9 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     rested = s.at_rest == 1
     close_gap(s)
     if rested and is_still(s, p, gyro, accel):
-        add_gap_variance(s, (REST_WANDER_RADPS * dt) ** 2, 0.0)
+        add_gap_variance(s, (WANDER_RADPS * dt) ** 2, 0.0)
         return
-    if rested and dt > STEADY_S:
+    if rested:
         lose_attitude(s, p)
         return
     mean, about, steady = steady_turn(s)
@@ -299,9 +292,8 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     share = 2.0 * end_share_s(dt) / dt
     rate = rate_of(s, part_way(steady, part_way(before, gyro, 0.5), share))
     turning = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
-    wander = (WANDER_RADPS if s.aided == 1 else HAND_WANDER_RADPS) + turning
     turned_var = unseen_turn_var(s, before, gyro, steady, dt)
-    turned_var += (wander * max(dt - STEADY_S, 0.0)) ** 2
+    turned_var += ((WANDER_RADPS + turning) * dt) ** 2
     turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
     write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
@@ -315,8 +307,7 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         add_gap_variance(s, turned_var, flown_s)
     else:
         add_gap_variance(s, turned_var, 0.0)
-    most = AIDED_LOST_RAD if s.aided == 1 else LOST_LEVEL_RAD
-    if s.lost == 0 and turned_var > most * most:
+    if s.lost == 0 and turned_var > LOST_LEVEL_RAD * LOST_LEVEL_RAD:
         lose_attitude(s, p)
 
 

@@ -1,9 +1,8 @@
 """Rest: quiet sensors with a constant mean, and no speed. The mean rate is then the bias.
 
-An idling engine shakes the gyroscope, so only its mean has to be quiet. A rate beyond the usual
-bias is the bias of an uncalibrated gyroscope if it turns nothing: not the force, which is constant
-and that of gravity, and not the magnetic field; without a compass, if it has not ended after two
-full circles.
+A rate beyond the usual bias is the bias of an uncalibrated gyroscope if it turns nothing: not the
+force, which is constant and that of gravity, and not the magnetic field; without a compass, if it
+has not ended after two full circles.
 """
 
 import math
@@ -26,10 +25,6 @@ MEAN_S: Final = 0.5
 """Time constant of the means."""
 DRIFT_S: Final = 10.0
 """Time constant by which the means of a rest may drift, as in a sensor that warms up."""
-SHAKEN: Final = 5.0
-"""An idling engine shakes the gyroscope by this multiple of the rest limit."""
-STEADY: Final = 0.15
-"""Its mean stays within this share of the rest limit then."""
 REST_RATE_RADPS: Final = 0.5 * RAD_PER_DEG
 REST_FORCE_MPS2: Final = 0.35
 """Changes of the means that end a rest: 2 deg of tilt."""
@@ -63,18 +58,15 @@ def begin_means(s: State, gyro: Vec3, accel: Vec3) -> None:
 def detect_rest(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     """Update the means, and decide whether the aircraft is at rest."""
     share = min(1.0, dt / MEAN_S)
-    gyro_sq = accel_sq = mean_sq = largest = 0.0
+    gyro_sq = accel_sq = largest = 0.0
     for k in range(3):
         s.imu_mean[k] += share * (gyro[k] - s.imu_mean[k])
         s.gyro_mean[k] += share * (s.imu_mean[k] - s.gyro_mean[k])
         s.imu_mean[3 + k] += share * (accel[k] - s.imu_mean[3 + k])
         gyro_sq += (gyro[k] - s.imu_mean[k]) ** 2
-        mean_sq += (s.imu_mean[k] - s.gyro_mean[k]) ** 2
         accel_sq += (accel[k] - s.imu_mean[3 + k]) ** 2
         largest = max(largest, abs(s.imu_mean[k]))
-    limit_sq = p.rest_gyro_radps**2
-    shaken = gyro_sq < SHAKEN**2 * limit_sq and mean_sq < STEADY**2 * limit_sq
-    quiet = (gyro_sq < limit_sq or shaken) and accel_sq < p.rest_accel_mps2**2
+    quiet = gyro_sq < p.rest_gyro_radps**2 and accel_sq < p.rest_accel_mps2**2
     moving = is_moving(s, p)
     quiet = quiet and largest < p.bias_limit_radps and not moving
     likely = is_likely_bias(s, quiet, dt)
