@@ -21,6 +21,7 @@ from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
 from gateway.wire.mavlink_splitter import with_sequence
+from tests.kit.mavlink import STATION, Sender
 from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
@@ -32,7 +33,7 @@ LIMIT_S = 60
 
 def recording(step_us: int = 1) -> list[TlogRecord]:
     """Vehicle 3 sends its parameters, and station 255 arms it."""
-    vehicle, station = mavlink.MAVLink(None, 3, 1), mavlink.MAVLink(None, 255, 190)
+    vehicle, station = Sender(3), Sender(255, STATION)
     said: list[tuple[Any, Any]] = [(vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
     said += [
         (vehicle, mavlink.MAVLink_param_value_message(f"P{i}".encode(), i, 9, PARAMETERS, i))
@@ -42,8 +43,7 @@ def recording(step_us: int = 1) -> list[TlogRecord]:
     said += [(station, arm), (vehicle, mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3))]
     records = []
     for i, (who, message) in enumerate(said):
-        records.append(TlogRecord(START_US + i * step_us, bytes(message.pack(who))))
-        who.seq = (who.seq + 1) % 256
+        records.append(TlogRecord(START_US + i * step_us, who.pack(message)))
     return records
 
 

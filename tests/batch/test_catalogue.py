@@ -31,6 +31,7 @@ from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S
 from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight
 from tests.kit.cli import invoke
+from tests.kit.mavlink import packed
 
 pytestmark = pytest.mark.io
 
@@ -54,7 +55,7 @@ def write_tlog(path: Path) -> Path:
     records = []
 
     def send(time_s: float, system: int, message: mavlink.MAVLink_message) -> None:
-        frame = bytes(message.pack(mavlink.MAVLink(None, system, 1)))
+        frame = packed(message, system)
         records.append(TlogRecord(1_780_000_000_000_000 + round(time_s * 1e6), frame))
 
     for second in range(600):

@@ -18,6 +18,7 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.test_demo import NEAR_DEG
 from tests.kit.cli import invoke
+from tests.kit.mavlink import Sender
 from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
 from tests.recordings.frames import START_US, make_tlog
@@ -30,8 +31,7 @@ SECONDS = 60
 
 def make_flight() -> list[TlogRecord]:
     """Make what a foreign vehicle (system 3) sends while it flies north."""
-    mav = mavlink.MAVLink(None, 3, 1)
-    records = []
+    sender, records = Sender(3), []
     for i in range(SECONDS * 10):
         lat, lon = round(LAT_DEG * 1e7) + 10 * i, round(LON_DEG * 1e7)
         messages = [
@@ -47,9 +47,8 @@ def make_flight() -> list[TlogRecord]:
                     lat, lon, 430_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
                 ),
             ]
-        for message in messages:
-            records.append(TlogRecord(START_US + 100_000 * i, bytes(message.pack(mav))))
-            mav.seq = (mav.seq + 1) % 256
+        time_us = START_US + 100_000 * i
+        records += [TlogRecord(time_us, sender.pack(message)) for message in messages]
     return records
 
 

@@ -20,6 +20,7 @@ from gateway.vehicle.recorded_vehicle import RecordedVehicle
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.conftest import ManualClock
 from tests.end_to_end.test_recording import Flight, Recording
+from tests.kit.mavlink import packed
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -130,7 +131,7 @@ async def test_tlog_and_playback_show_the_same_flight(folder: Path) -> None:
 
 def asked(vehicle: RecordedVehicle, request: Any) -> list[bytes]:
     """Ask a played vehicle as a ground station does; frames without the acknowledgement."""
-    frame = bytes(request.pack(mavlink.MAVLink(None, 255, 190)))
+    frame = packed(request, 255, 190)
     actions = vehicle.handle(Incoming(1, frame, trusted=True), 0)
     now_us = 0
     while (due_us := vehicle.next_due_us()) is not None:

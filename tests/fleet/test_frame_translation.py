@@ -11,19 +11,15 @@ from gateway.fleet.id_map import IdMap
 from gateway.vehicle.requests import EPOCH_2015_US
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import frame_of, target_of
+from tests.kit import mavlink as kit
 from tests.kit.mavlink import frames_in
 
 KEY = bytes(range(32))
 
 
 def packed(message: Any, system_id: int, *, v1: bool = False, key: bytes | None = None) -> bytes:
-    link = mavlink.MAVLink(None, system_id, 1)
-    if key is not None:
-        link.signing.secret_key = key
-        link.signing.link_id = 3
-        link.signing.timestamp = 123_456
-        link.signing.sign_outgoing = True
-    return bytes(message.pack(link, force_mavlink1=v1))
+    signing = None if key is None else (key, 3, 123_456)
+    return kit.packed(message, system_id, version=1 if v1 else 2, signing=signing)
 
 
 def read(frame: bytes, key: bytes | None = None) -> Any:

@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.frame_translation import MAX_STREAMS, WINDOW_TICKS, Rejection, SiteSignatures
 from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, TICKS_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from tests.kit.mavlink import packed
 
 KEY = bytes(range(32))
 NOW_TICKS = 1_000_000_000
@@ -17,12 +18,8 @@ MINUTE_TICKS = 60 * 100_000
 
 
 def signed(timestamp: int, *, link: int = 1, system: int = 1, key: bytes = KEY) -> MavFrame:
-    writer = mavlink.MAVLink(None, system, 1)
-    writer.signing.secret_key = key
-    writer.signing.link_id = link
-    writer.signing.timestamp = timestamp
-    writer.signing.sign_outgoing = True
-    return frame_of(bytes(mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0).pack(writer)))
+    message = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
+    return frame_of(packed(message, system, signing=(key, link, timestamp)))
 
 
 @pytest.fixture
@@ -32,9 +29,8 @@ def site() -> SiteSignatures:
 
 def test_unsigned_frame_is_rejected(site: SiteSignatures) -> None:
     message: Any = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
-    for force_v1 in (False, True):
-        frame = bytes(message.pack(mavlink.MAVLink(None, 1, 1), force_mavlink1=force_v1))
-        assert site.check(frame_of(frame), NOW_US) is Rejection.UNSIGNED
+    for version in (1, 2):
+        assert site.check(frame_of(packed(message, version=version)), NOW_US) is Rejection.UNSIGNED
 
 
 def test_frame_of_another_passphrase_is_rejected_and_begins_no_stream(site: SiteSignatures) -> None:

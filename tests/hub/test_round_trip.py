@@ -5,12 +5,13 @@ from pymavlink.dialects.v20 import common as dialect
 from gateway.hub.round_trip import LONGEST_US, PROBE_COMPONENT, RoundTrip
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from tests.kit.mavlink import packed
 
 SYSTEM = 7
 
 
 def pack(message: dialect.MAVLink_message) -> MavFrame:
-    return frame_of(bytes(message.pack(dialect.MAVLink(None, 255, 190))))
+    return frame_of(packed(message, 255, 190))
 
 
 def pong(time_us: int, system: int = SYSTEM) -> MavFrame:

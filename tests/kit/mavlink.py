@@ -13,6 +13,42 @@ KEY = bytes(32)
 """Signing key of a signed sender."""
 
 
+def packed(
+    message: Any,
+    system: int = 1,
+    component: int = 1,
+    *,
+    sequence: int = 0,
+    version: int = 2,
+    signing: tuple[bytes, int, int] | None = None,
+) -> bytes:
+    """Encode one message.
+
+    Parameters
+    ----------
+    message : MAVLink_message
+        Of any dialect.
+    system, component : int
+        Ids of its sender.
+    sequence : int, optional
+        Its number.
+    version : int, optional
+        Of MAVLink.
+    signing : (bytes, int, int), optional
+        Key, link and timestamp of its signature.
+
+    Returns
+    -------
+    bytes
+    """
+    link = dialect.MAVLink(None, system, component)
+    link.seq = sequence
+    if signing is not None:
+        link.signing.secret_key, link.signing.link_id, link.signing.timestamp = signing
+        link.signing.sign_outgoing = True
+    return bytes(message.pack(link, force_mavlink1=version == 1))
+
+
 class Sender:
     """A MAVLink system that numbers its frames.
 
@@ -81,10 +117,8 @@ def frames_in(data: bytes) -> list[bytes]:
 
 def numbered(system: int, sequence: int, message: Any = None) -> MavFrame:
     """Return a frame of a system with a sequence number; by default a heartbeat."""
-    link = dialect.MAVLink(None, system, 1)
-    link.seq = sequence
     message = message or dialect.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
-    return frame_of(bytes(message.pack(link)))
+    return frame_of(packed(message, system, sequence=sequence))
 
 
 def raw_frame(message_id: int, data: bytes) -> MavFrame:

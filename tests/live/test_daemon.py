@@ -22,6 +22,7 @@ from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
 from gateway.vehicle.requests import EPOCH_2015_US, Request, SaveSettings, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import MavFrame
+from tests.kit.mavlink import packed
 
 PING = mavlink.MAVLink_ping_message(0, 1, 0, 0)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)
@@ -73,9 +74,7 @@ def recorded(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
 
 
 def frame(message: mavlink.MAVLink_message, sequence: int = 0) -> bytes:
-    mav = mavlink.MAVLink(None, 255, 190)
-    mav.seq = sequence
-    return bytes(message.pack(mav))
+    return packed(message, 255, 190, sequence=sequence)
 
 
 def test_of_an_untrusted_client_only_requests_with_an_effect_are_recorded(

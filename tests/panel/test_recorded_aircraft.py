@@ -1,7 +1,6 @@
 """What is known of a recording before it is played."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +12,10 @@ from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S
+from tests.kit.mavlink import packed
 from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
-
-
-def packed(message: Any, system_id: int) -> bytes:
-    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)))
 
 
 def flown(system_id: int, second: int, alt_m: int) -> bytes:

@@ -19,6 +19,7 @@ from gateway.panel.uplink import (
     CommandFailedError,
     Uplink,
 )
+from tests.kit.mavlink import packed
 from tests.panel.messages import decoded
 
 pytestmark = pytest.mark.io
@@ -28,7 +29,7 @@ PLAYED = 249
 
 def beat(system_id: int) -> bytes:
     message = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_FIXED_WING, 0, 0, 0, 4, 3)
-    return bytes(message.pack(mavlink.MAVLink(None, srcSystem=system_id, srcComponent=1)))
+    return packed(message, system_id)
 
 
 @pytest.fixture

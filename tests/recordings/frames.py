@@ -3,6 +3,7 @@
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.tlog import TlogRecord, encode_record
+from tests.kit.mavlink import Sender
 
 START_US = 1_760_000_000_000_000
 STEP_US = 20_000
@@ -10,16 +11,14 @@ STEP_US = 20_000
 
 def make_frames(count: int, system_id: int = 1) -> list[bytes]:
     """Pack a row of messages of changing kind and size."""
-    mav = mavlink.MAVLink(None, system_id, 1)
-    frames = []
+    sender, frames = Sender(system_id), []
     for i in range(count):
         message = (
             mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3),
             mavlink.MAVLink_attitude_quaternion_message(20 * i, 1.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
             mavlink.MAVLink_statustext_message(6, f"number {i}".encode()),
         )[i % 3]
-        frames.append(bytes(message.pack(mav)))
-        mav.seq = (mav.seq + 1) % 256
+        frames.append(sender.pack(message))
     return frames
 
 

@@ -7,6 +7,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.play import Track
 from gateway.recordings.tlog import TlogScanner, encode_record
+from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US
 from tests.recordings.test_track import make_track, play_all
 
@@ -46,7 +47,7 @@ COMMANDS: list[tuple[tuple[int, int], Any]] = [
 
 
 def tlog_of(said: list[tuple[tuple[int, int], Any]]) -> bytes:
-    frames = [bytes(message.pack(mavlink.MAVLink(None, *who))) for who, message in said]
+    frames = [packed(message, *who) for who, message in said]
     return b"".join(encode_record(START_US + i, frame) for i, frame in enumerate(frames))
 
 

@@ -8,6 +8,7 @@ from gateway.recordings.columns import RowBuilder, row_to_line
 from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableMark, TableReader, encode_head, encode_mark
 from gateway.recordings.tlog import TlogRecord, TlogScanner
+from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US, make_tlog
 from tests.recordings.samples import make_baro, make_fused
 
@@ -75,7 +76,7 @@ def test_a_cut_record_that_others_follow_is_damage() -> None:
     """Also where the file ends before its length would be over."""
     flight = make_flight(20, 1)
     message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251)
-    frame = bytes(message.pack(mavlink.MAVLink(None, 1, 1)))
+    frame = packed(message)
     cut = make_tlog([TlogRecord(flight[-1].time_us, frame)])[:100]
     info = sum_up(make_tlog(flight[:-1]) + cut + make_tlog(flight[-1:]))
     assert (info.records, info.damaged_bytes, info.unfinished_bytes) == (40, len(cut), 0)

@@ -7,16 +7,15 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.wire.mavlink_signing import FrameSigner, sign
 from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.mavlink import packed
 
 KEY = bytes(range(32))
 STAMP = 30_000_000_000_000
 
 
 def attitude(sequence: int, *, version: int = 2) -> bytes:
-    mav = mavlink.MAVLink(None, 1, 1)
-    mav.seq = sequence
     message = mavlink.MAVLink_attitude_message(5, 0.1, 0, 0, 0, 0, 0)
-    return bytes(message.pack(mav, force_mavlink1=version == 1))
+    return packed(message, sequence=sequence, version=version)
 
 
 def strict() -> Any:

@@ -28,6 +28,7 @@ from gateway.recordings.reading import RecordedTable
 from gateway.recordings.table import TableMark, block_of
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags
+from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US
 from tests.recordings.test_replay import fly, make_flight, read
 
@@ -200,8 +201,7 @@ SAID: list[tuple[tuple[int, int], Any]] = [
 
 def records() -> list[TlogRecord]:
     return [
-        TlogRecord(START_US + i * SECOND_US, bytes(m.pack(mavlink.MAVLink(None, *who))))
-        for i, (who, m) in enumerate(SAID)
+        TlogRecord(START_US + i * SECOND_US, packed(m, *who)) for i, (who, m) in enumerate(SAID)
     ]
 
 

@@ -20,6 +20,7 @@ from gateway.records import (
     NavFlags,
     NavState,
 )
+from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US
 
 G = 9.80665
@@ -136,7 +137,7 @@ def test_no_fix_is_reported_as_none() -> None:
 
 def test_other_systems_and_components_are_left_out() -> None:
     assert read([(0, raw(0))], component_id=191) == []
-    frame = bytes(raw(0).pack(mavlink.MAVLink(None, 1, 1)))
+    frame = packed(raw(0))
     assert rows_of(AutopilotReader(system_id=2), [(START_US, frame)], 100) == []
 
 

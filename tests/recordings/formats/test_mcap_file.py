@@ -20,6 +20,7 @@ from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
+from tests.kit.mavlink import packed
 from tests.recordings.formats import flown
 from tests.recordings.frames import START_US, make_tlog
 
@@ -120,10 +121,6 @@ def test_the_state_is_in_degrees(shown: list[Message]) -> None:
     assert all(0 <= s["heading_deg"] < 360 for _, s in states)
 
 
-def pack(message: Any, system: int, component: int) -> bytes:
-    return bytes(message.pack(mavlink.MAVLink(None, system, component)))
-
-
 def test_every_message_of_a_tlog_is_in_it(tmp_path: Path) -> None:
     one, station = "/mavlink/3/1/", "/mavlink/255/190/"
     battery = mavlink.MAVLink_battery_status_message(0, 0, 0, 99, [4000] * 10, -1, -1, -1, 50)
@@ -139,7 +136,7 @@ def test_every_message_of_a_tlog_is_in_it(tmp_path: Path) -> None:
         (one, mavlink.MAVLink_param_value_message(b"RATE", 1.5, 9, 3, 0)),
     ]
     senders = {one: (3, 1), station: (255, 190)}
-    said = [(pack(m, *senders[sender]), sender + m.msgname) for sender, m in messages]
+    said = [(packed(m, *senders[sender]), sender + m.msgname) for sender, m in messages]
     records = [TlogRecord(START_US + k * 1000, frame) for k, (frame, _) in enumerate(said)]
     path = tmp_path / "a.tlog"
     path.write_bytes(make_tlog(records))
