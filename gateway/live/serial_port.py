@@ -33,9 +33,10 @@ log = logging.getLogger(__name__)
 FIRST_RETRY_S: Final = 0.25
 LONGEST_RETRY_S: Final = 1.0
 """A port that returns and is lost again within the delay would be missed."""
-READ_SIZE: Final = 256
-"""Six samples of the IMU, which are handled as one batch. A backlog, of which the kernel keeps 4096
-bytes, takes several turns of the loop, so that clients wait for a fraction of a millisecond."""
+READ_SIZE: Final = 48
+"""A sample of the IMU has 42. A backlog, of which the kernel keeps 4096 bytes, takes several turns
+of the loop, so that clients are not kept waiting, and the hub sends faster than samples come: with
+256 bytes its queue does not drain, and telemetry that has waited too long is dropped."""
 BITS_PER_BYTE: Final = 10
 """On the line, start and stop bit included."""
 
