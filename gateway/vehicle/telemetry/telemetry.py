@@ -255,7 +255,12 @@ class Telemetry:
         if sample.mag_b_ut is not None:
             self._mag_b_ut = sample.mag_b_ut
             self._updated |= messages.MAG_UPDATED
-        if self._reference_alt_m != self._reference_alt_m and messages.has_position(state):
+        # Not NaN: the latitude first, which is not known for long without GPS.
+        if (
+            self._reference_alt_m != self._reference_alt_m
+            and state.lat_deg == state.lat_deg
+            and messages.has_position(state)
+        ):
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
         time_us = state.time_us
