@@ -53,17 +53,9 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
 
 
 class VectorFilter:
-    """One filter on three axes, in transposed direct form II.
+    """One filter on three axes, in transposed direct form II, designed for a sample rate in Hz."""
 
-    Parameters
-    ----------
-    design : callable
-        Coefficients for a sample rate in Hz.
-    rate_hz : float
-        Sample rate to begin with.
-    """
-
-    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float) -> None:
+    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float = 100.0) -> None:
         self._design = design
         self._coefficients = design(rate_hz)
         self.state: list[float] | None = None

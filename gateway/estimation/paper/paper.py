@@ -108,8 +108,7 @@ class PaperSettings(Settings, frozen=True):
         ),
     ] = 0.9997
     alpha_yaw: Annotated[
-        float,
-        setting("The same in yaw, against the magnetometer.", ge=0.0, le=1.0),
+        float, setting("The same in yaw, against the magnetometer.", ge=0.0, le=1.0)
     ] = 0.999
     alpha_accel: Annotated[
         float,
@@ -154,36 +153,24 @@ class PaperState(msgspec.Struct):
     vel_n_mps: Vec3 = UNKNOWN_VEC3
     fix_time_us: int | None = None
     fix_from: Vec3 = UNKNOWN_VEC3
-    """The last fix as it came."""
     fix_location: Vec3 = UNKNOWN_VEC3
-    """The same moved on by its latency."""
+    """The last fix, as received above, moved on by its latency here."""
     fix_vel_n_mps: Vec3 = UNKNOWN_VEC3
     gains: list[tuple[int, Vec3]] = []
     """Times of recent samples, and the integral of the acceleration there, m/s."""
 
 
 class PaperEstimator:
-    """The paper's fusion behind the interface of all estimators.
-
-    Parameters
-    ----------
-    settings : PaperSettings
-        Filters and weights.
-    reference : ReferenceSettings
-        GPS latency and declination.
-    """
+    """The paper's fusion behind the interface of all estimators."""
 
     def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
         self._settings, self._reference = settings, reference
         self._earth = EarthField(reference)
         s = settings
         self._lowpass = VectorFilter(
-            lambda hz: design_lowpass(s.accel_filter, s.accel_cutoff_hz, hz, s.chebyshev_ripple_db),
-            PaperState().rate_hz,
+            lambda hz: design_lowpass(s.accel_filter, s.accel_cutoff_hz, hz, s.chebyshev_ripple_db)
         )
-        self._highpass = VectorFilter(
-            lambda hz: design_highpass(s.gyro_highpass_hz, hz), PaperState().rate_hz
-        )
+        self._highpass = VectorFilter(lambda hz: design_highpass(s.gyro_highpass_hz, hz))
         self.reset()
 
     def reset(self) -> None:
@@ -193,9 +180,13 @@ class PaperEstimator:
 
     def _use(self, state: PaperState) -> None:
         self._s = state
-        self._lowpass.retune(state.rate_hz)
-        self._highpass.retune(state.rate_hz)
+        self._retune(state.rate_hz)
         self._lowpass.state, self._highpass.state = state.filters
+
+    def _retune(self, rate_hz: float) -> None:
+        self._s.rate_hz = rate_hz
+        self._lowpass.retune(rate_hz)
+        self._highpass.retune(rate_hz)
 
     def snapshot(self) -> bytes:
         """Return the whole state."""
@@ -219,14 +210,12 @@ class PaperEstimator:
             if not sound:
                 return self._nav(sample.time_us, sound)
             s.time_us, s.gyro_mean, s.accel_mean = sample.time_us, gyro, accel
-            s.q_nb = from_euler(*_tilt(accel), 0.0)
-            s.rate_b_radps = gyro
+            s.q_nb, s.rate_b_radps = from_euler(*_tilt(accel), 0.0), gyro
         dt_s = (sample.time_us - s.time_us) / US_PER_S
         if abs(dt_s) > GAP_S:
             if dt_s < 0.0:
                 s.fix_time_us = s.mag_time_us = None
-            self._lowpass.retune(s.rate_hz)
-            self._highpass.retune(s.rate_hz)
+            self._retune(s.rate_hz)
             s.time_us, dt_s = sample.time_us, 0.0
         if dt_s > 0.0:
             s.time_us = sample.time_us
@@ -242,14 +231,11 @@ class PaperEstimator:
         if not is_usable(fix, self._reference):
             return
         s = self._s
-        alt_m = fix.alt_amsl_m if math.isfinite(fix.alt_amsl_m) else s.fix_from[2]
-        if not math.isfinite(alt_m):
-            alt_m = 0.0
+        alt_m = next(filter(math.isfinite, (fix.alt_amsl_m, s.fix_from[2])), 0.0)
         location = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, alt_m)
         self._earth.update(*location, fix.utc_us)
-        vel = fix.vel_n_mps
-        if not all(map(math.isfinite, vel)):
-            vel = self._bearing_velocity(location, fix.time_us)
+        known = all(map(math.isfinite, fix.vel_n_mps))
+        vel = fix.vel_n_mps if known else self._bearing_velocity(location, fix.time_us)
         s.fix_from, s.fix_time_us = location, fix.time_us
         latency_s = self._reference.gps_latency_s
         gained = self._gained_since(fix.time_us - round(latency_s * US_PER_S))
@@ -310,17 +296,14 @@ class PaperEstimator:
         s.mean_step_s += min(1.0, dt_s / REST_S) * (dt_s - s.mean_step_s)
         rate_hz = 1.0 / s.mean_step_s if s.mean_step_s > 0.0 else s.rate_hz
         if abs(rate_hz / s.rate_hz - 1.0) > RATE_CHANGE:
-            s.rate_hz = rate_hz
-            self._lowpass.retune(rate_hz)
-            self._highpass.retune(rate_hz)
+            self._retune(rate_hz)
 
     def _follow_rest(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
         """Measure the gyroscope bias at rest."""
         s, share = self._s, min(1.0, dt_s / REST_S)
         s.gyro_mean, s.accel_mean = _mix(share, s.gyro_mean, gyro), _mix(share, s.accel_mean, accel)
-        age_s = math.inf
-        if s.time_us is not None and s.fix_time_us is not None:
-            age_s = (s.time_us - s.fix_time_us) / US_PER_S
+        fixed_us, now_us = s.fix_time_us, s.time_us or 0
+        age_s = math.inf if fixed_us is None else (now_us - fixed_us) / US_PER_S
         quiet = (
             math.dist(gyro, s.gyro_mean) < REST[0]
             and math.dist(accel, s.accel_mean) < REST[1]
@@ -352,11 +335,8 @@ class PaperEstimator:
         s.vel_n_mps = _mix(1.0 - settings.alpha_accel, s.vel_n_mps, s.fix_vel_n_mps)
         # The longitude may wrap between the two.
         fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
-        lat, lon, alt = _mix(
-            1.0 - settings.beta_velocity,
-            s.location,
-            (s.fix_location[0], fix_lon, s.fix_location[2]),
-        )
+        fix = (s.fix_location[0], fix_lon, s.fix_location[2])
+        lat, lon, alt = _mix(1.0 - settings.beta_velocity, s.location, fix)
         s.location = (lat, wrap_180(lon), alt)
 
     def _nav(self, time_us: int, sound: bool) -> NavState:
