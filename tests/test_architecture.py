@@ -56,7 +56,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"extensions", "panel", "fleet", "flashing", "batch", "output"}
     | EDGES,
 }
-"""The law: a room may import itself and these; `gateway` itself (the version) is free to all."""
+"""The law: a package may import itself and these; `gateway` itself (the version) is free to all."""
 
 PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "hub"}
 IMPURE_PARTS = {
@@ -81,7 +81,7 @@ IMPURE_MODULES = {
     "random", "secrets", "select", "selectors", "serial", "shutil", "signal", "socket",
     "subprocess", "sys", "tempfile", "termios", "threading", "time", "tty",
 }  # fmt: skip
-"""I/O, threads, clocks, logs and unseeded chance: none of them in a pure room."""
+"""I/O, threads, clocks, logs and unseeded chance: none of them in a pure package."""
 
 MAX_FUNCTION_LINES = 40
 
@@ -93,7 +93,7 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
-def room_of(path: Path) -> str:
+def package_of(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
@@ -118,22 +118,22 @@ def names_of(paths: Iterable[Path]) -> list[str]:
 def test_imports_follow_the_flow() -> None:
     wrong: dict[str, set[str]] = {}
     for path in SOURCES:
-        room = room_of(path)
-        rooms = {
+        package = package_of(path)
+        imported = {
             parts[1]
             for module in imported_modules(tree_of(path))
             if (parts := module.split("."))[0] == "gateway" and len(parts) > 1
-        } - {"__version__", room}
-        if room != "__init__" and (beyond := rooms - MAY_IMPORT[room]):
+        } - {"__version__", package}
+        if package != "__init__" and (beyond := imported - MAY_IMPORT[package]):
             wrong[str(path.relative_to(ROOT))] = beyond
     assert wrong == {}
 
 
-def test_pure_rooms_do_no_io() -> None:
+def test_pure_packages_do_no_io() -> None:
     wrong: dict[str, set[str]] = {}
     for path in SOURCES:
         name = path.relative_to(ROOT)
-        is_pure = room_of(path) in PURE or str(name.parent) in PURE_FOLDERS
+        is_pure = package_of(path) in PURE or str(name.parent) in PURE_FOLDERS
         if not is_pure and str(name) not in PURE_FILES:
             continue
         if {str(name), str(name.parent)} & IMPURE_PARTS:
@@ -175,7 +175,7 @@ def test_short_functions() -> None:
 def test_no_stage_knows_an_edge() -> None:
     """Only the root, the command line and the settings file (for the edges' keys) do."""
     knowing = {
-        room_of(path)
+        package_of(path)
         for path in SOURCES
         for module in imported_modules(tree_of(path))
         if module.startswith(("gateway.live", "gateway.hub.transports"))

@@ -52,7 +52,7 @@ class Tracker:
         self.seq = [0, 0]
 
     def frame(self, time_us: int, payload: payloads.Payload, node: int = 0) -> bytes:
-        """Encode a payload; a node's first behind another, without which it is not believed."""
+        """Encode a payload; a node's first after another, without which it is not accepted."""
         first = b"" if self.seq[node] else self._frame(time_us, QUALITY, node)
         return first + self._frame(time_us, payload, node)
 
@@ -105,7 +105,7 @@ def test_a_single_frame_makes_no_aircraft(pipeline: Pipeline) -> None:
     assert sorted(pipeline.aircraft) == [1, 7]
 
 
-def test_an_aircraft_goes_after_a_long_silence_and_comes_back_as_it_was(pipeline: Pipeline) -> None:
+def test_aircraft_is_removed_after_a_timeout_and_returns_unchanged(pipeline: Pipeline) -> None:
     tracker = Tracker()
     pipeline.feed(tracker.frame(0, LEVEL), 5_000)
     pipeline.mark(Location(-7.0, 110.0, 0.0), 1, 5_000)

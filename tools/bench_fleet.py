@@ -84,9 +84,9 @@ session = open_session(session_config(sys.argv[1], ""))
 ways, tokens = [], []
 for name in sys.argv[2].split(","):
     drop = zenoh.CongestionControl.DROP
-    outlet = session.declare_publisher(out_key(name, 1), congestion_control=drop)
+    publisher = session.declare_publisher(out_key(name, 1), congestion_control=drop)
     tokens.append(session.liveliness().declare_token(presence_key(name, session.zid())))
-    ways.append(outlet.put)
+    ways.append(publisher.put)
 load(ways, int(sys.argv[3]), float(sys.argv[4]))
 """
 )

@@ -279,7 +279,9 @@ class TestNonsense:
         assert NavFlags.GPS_REJECTED in states[900].flags
         assert NavFlags.GPS_REJECTED not in states[-1].flags
 
-    def test_a_lasting_new_place_is_believed_in_the_end(self, estimator: KernelEstimator) -> None:
+    def test_lasting_jump_of_the_fixes_is_accepted_in_the_end(
+        self, estimator: KernelEstimator
+    ) -> None:
         items: Items = []
         for sample in still(0, 60.0):
             t = sample.time_us

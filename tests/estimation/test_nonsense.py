@@ -1,4 +1,4 @@
-"""Sensors that tell nonsense: whatever comes, the states stay finite and within reason."""
+"""Nonsense from sensors: whatever comes, the states stay finite and within reason."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -64,7 +64,7 @@ def part(flight: Flight, begin_s: float, length_s: float) -> SampleLog:
 
 
 def at_rest(length_s: float, speed_mps: float) -> SampleLog:
-    """Lie still below a receiver that tells the same over and over."""
+    """Rest below a receiver that repeats the same fix."""
     imu_us = np.arange(0, round(length_s * 1e6), 10_000)
     gps_us = np.arange(0, round(length_s * 1e6), 200_000)
     imu, gps = (
@@ -107,7 +107,7 @@ def swapped_field(log: SampleLog, rng: np.random.Generator) -> None:
 
 
 def fixes_off_africa(log: SampleLog, rng: np.random.Generator) -> None:
-    """Some receivers tell the place 0, 0 while they know none."""
+    """Some receivers send the position 0, 0 without a fix."""
     log.gps[rng.random(len(log.gps)) < 0.05, GPS_LAT : GPS_LON + 1] = 0.0
 
 
@@ -191,8 +191,8 @@ def test_a_compass_that_is_mounted_wrongly_is_done_without(
     late = replace(flight, counts=log.imu_time_us > 120_000_000)
     out = run(flight, name, log)
     flags = out[late.counts, NAV_FLAGS].astype(int)
-    told = NavFlags.MAG_DISTURBED | NavFlags.MAG_MISPLACED
-    assert ((flags & int(told)) == int(told)).all()
+    reported = NavFlags.MAG_DISTURBED | NavFlags.MAG_MISPLACED
+    assert ((flags & int(reported)) == int(reported)).all()
     assert (flags & int(NavFlags.HEADING_VALID) != 0).mean() > 0.9
     scores = attitude_scores(late, out[:, :4])
     assert scores["heading"] < 4.0
@@ -202,7 +202,7 @@ def test_a_compass_that_is_mounted_wrongly_is_done_without(
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("leap_s", [100, 86_400])
 @pytest.mark.parametrize("since_s", [4.0, 60.0], ids=["at rest", "in flight"])
-def test_a_clock_that_leaps_ahead_is_a_silence(
+def test_jump_of_the_clock_is_an_outage(
     flight: Flight, name: str, leap_s: int, since_s: float
 ) -> None:
     """Its end may find the aircraft anywhere, but the filter sane."""
@@ -236,8 +236,8 @@ def test_blows_beyond_the_range_of_the_accelerometer_are_got_over(
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_place_that_nothing_flies_to_tells_no_velocity(flight: Flight, name: str) -> None:
-    """All fixes come to lie there, so that they are believed in the end."""
+def test_impossible_jump_of_the_fixes_yields_no_velocity(flight: Flight, name: str) -> None:
+    """All later fixes are there, so they are accepted in the end."""
     log = part(flight, 30.0, 60.0)
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
@@ -255,7 +255,7 @@ def test_zeros_that_the_fixes_refute_are_no_velocity(flight: Flight, name: str) 
     assert max(scores["heading"], scores["inclination"]) < 3.5
 
 
-def test_what_stands_may_tell_zeros(rng: np.random.Generator) -> None:
+def test_zeros_at_rest_are_accepted(rng: np.random.Generator) -> None:
     s = new_record(State)
     clear_times(s)
     zero, refuted = (0.0, 0.0, 0.0), []
@@ -273,9 +273,7 @@ def test_what_stands_may_tell_zeros(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("has_velocity", [True, False])
-def test_a_fix_that_is_told_again_and_again_counts_once(
-    flight: Flight, name: str, has_velocity: bool
-) -> None:
+def test_repeated_fix_is_used_once(flight: Flight, name: str, has_velocity: bool) -> None:
     """As in a log that holds each fix until the next one."""
     log = part(flight, 30.0, 60.0)
     if not has_velocity:
@@ -288,7 +286,7 @@ def test_a_fix_that_is_told_again_and_again_counts_once(
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 def test_a_receiver_that_is_stuck_in_flight_is_none(flight: Flight, name: str) -> None:
-    """Its last words, over and over, move the place no more than if it told nothing."""
+    """Its last fix, repeated, changes the position no more than an outage."""
     log = part(flight, 30.0, 60.0)
     stuck = (log.gps_time_us > 60e6) & (log.gps_time_us < 66e6)
     none = replace(log, gps_time_us=log.gps_time_us[~stuck], gps=log.gps[~stuck])
@@ -298,7 +296,7 @@ def test_a_receiver_that_is_stuck_in_flight_is_none(flight: Flight, name: str) -
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("speed_mps", [0.0, np.nan])
-def test_a_receiver_that_repeats_itself_at_rest_is_believed(name: str, speed_mps: float) -> None:
+def test_repeated_fixes_at_rest_are_accepted(name: str, speed_mps: float) -> None:
     """Some hold their place while they stand."""
     log = at_rest(20.0, speed_mps)
     out = make_estimator(EstimationSettings(estimator=name)).run(log)

@@ -102,8 +102,8 @@ def test_smoothing_halves_the_error_of_outages(flight: Flight) -> None:
     assert outage_score(flight, run_smoothed, 10.0) < 0.5 * outage_score(flight, run_eskf, 10.0)
     std = slice(NAV_ATTITUDE_STD, NAV_ATTITUDE_STD + 3)
     use = flight.counts
-    told = np.sqrt(smoothed[use, std] ** 2 - AXES_RAD**2)
-    assert (told <= 1.05 * filtered[use, std]).mean() > 0.95
+    expected = np.sqrt(smoothed[use, std] ** 2 - AXES_RAD**2)
+    assert (expected <= 1.05 * filtered[use, std]).mean() > 0.95
     np.testing.assert_allclose(np.linalg.norm(smoothed[:, :4], axis=1), 1.0, atol=1e-9)
     same = smoothed[use, NAV_FLAGS] == filtered[use, NAV_FLAGS]
     assert same.mean() > 0.95
@@ -138,7 +138,7 @@ def test_smoothing_reduces_the_error_without_gps(flight: Flight) -> None:
     assert after["inclination"] < before["inclination"]
     assert share_scores(alone, smoothed)["tilt_2s"] > 0.8
     assert after["heading"] < before["heading"]
-    # Without a fix the declination is not known, and hindsight does not tell it.
+    # Without a fix the declination is not known, and smoothing does not estimate it.
     assert (smoothed[flight.counts, NAV_ATTITUDE_STD + 2] > NO_DECLINATION_RAD).all()
 
 

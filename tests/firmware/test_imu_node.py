@@ -210,7 +210,7 @@ def test_a_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -
     assert not any(ImuFlags.MAG_NEW in p.flags for p in stale)
 
 
-def test_an_imu_without_its_interrupt_is_asked_at_times_and_told(bench: MakeBench) -> None:
+def test_imu_without_its_interrupt_is_polled_and_reported(bench: MakeBench) -> None:
     rig = bench()
     chip = rig.imu_node().imu
     rig.run(0.8)

@@ -42,7 +42,7 @@ SETTINGS = BoardSettings(
 )
 
 
-def sealed(block: bytes) -> bytes:
+def with_crc(block: bytes) -> bytes:
     return block + crc16(block).to_bytes(2, "little")
 
 
@@ -51,14 +51,14 @@ def image_with(block: bytes) -> bytes:
 
 
 def test_block_is_found_and_every_field_decoded() -> None:
-    found = find_block(image_with(sealed(BLOCK)))
+    found = find_block(image_with(with_crc(BLOCK)))
     assert (found.offset, found.program) == (104, Program.IMU)
     assert (found.clock_mhz, found.firmware_version) == (16, (1, 2))
     assert found.settings == SETTINGS
 
 
 def test_patch_changes_the_block_alone_and_reads_back() -> None:
-    image = image_with(sealed(BLOCK))
+    image = image_with(with_crc(BLOCK))
     others = (
         BoardSettings(),
         BoardSettings(vehicle_id=31, radio_channel=125, radio_address=0xFFFFFFFF),
@@ -73,7 +73,7 @@ def test_patch_changes_the_block_alone_and_reads_back() -> None:
 
 
 def test_any_damaged_byte_is_detected() -> None:
-    block = sealed(BLOCK)
+    block = with_crc(BLOCK)
     for place in range(SIZE):
         damaged = bytearray(block)
         damaged[place] ^= 0x10
@@ -87,10 +87,10 @@ def test_any_damaged_byte_is_detected() -> None:
         (b"", "no settings block"),
         (b"\xff" * 32768, "no settings block"),
         (MAGIC, "damaged"),
-        (sealed(BLOCK[:7] + b"\x02" + BLOCK[8:]), "version 2"),
-        (sealed(BLOCK[:8] + b"\x09" + BLOCK[9:]), "out of range"),
-        (sealed(BLOCK[:12] + b"\x20" + BLOCK[13:]), "out of range"),
-        (sealed(BLOCK[:18] + b"\x04" + BLOCK[19:]), "out of range"),
+        (with_crc(BLOCK[:7] + b"\x02" + BLOCK[8:]), "version 2"),
+        (with_crc(BLOCK[:8] + b"\x09" + BLOCK[9:]), "out of range"),
+        (with_crc(BLOCK[:12] + b"\x20" + BLOCK[13:]), "out of range"),
+        (with_crc(BLOCK[:18] + b"\x04" + BLOCK[19:]), "out of range"),
     ],
     ids=["empty", "erased", "cut", "version", "program", "vehicle", "power"],
 )
@@ -100,7 +100,7 @@ def test_unusable_block_is_refused_with_the_reason(image: bytes, message: str) -
 
 
 def test_the_magic_word_elsewhere_does_not_hide_the_block() -> None:
-    image = b"see mavgate.example " + image_with(sealed(BLOCK))
+    image = b"see mavgate.example " + image_with(with_crc(BLOCK))
     assert find_block(image).settings == SETTINGS
 
 

@@ -23,7 +23,7 @@ def test_found_by_address() -> None:
     assert table.find(("10.0.0.2", 1000)) is None
 
 
-def test_silence_ends_it() -> None:
+def test_timeout_ends_it() -> None:
     table = table_of(1000)
     assert table.expire(30 * S - 1) == []
     assert [presence.client_id for presence in table.expire(30 * S)] == [0]

@@ -244,7 +244,7 @@ class TestSerial:
         assert rig.incoming[0].frame == said
         assert hub.clients()[0].bytes_garbage == 5
 
-    async def test_a_radio_that_tells_of_a_full_buffer_is_sent_less(
+    async def test_radio_that_reports_a_full_buffer_is_sent_less(
         self, rig: Any, line: tuple[int, str]
     ) -> None:
         near, device = line

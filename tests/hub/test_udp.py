@@ -270,7 +270,7 @@ async def test_a_name_moves_to_another_address(rig: Any, monkeypatch: pytest.Mon
         ports.append(new.port)
 
 
-async def test_an_answer_and_a_wish_concern_one_client(rig: Any) -> None:
+async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> None:
     first, second = rig.station(), rig.station()
     hub = rig.hub(f"udp:127.0.0.1:{first.port}", f"udp:127.0.0.1:{second.port}")
     await rig.until_open(hub)

@@ -205,7 +205,7 @@ async def test_only_its_owner_root_and_a_services_group_are_answered(
     assert answered == is_answered
 
 
-async def test_the_kernel_tells_who_asks(
+async def test_the_kernel_names_the_user_who_asks(
     server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[int, tuple[int, ...]]] = []
@@ -264,7 +264,7 @@ async def test_a_command_finds_the_gateway_that_is_meant(
         server.close()
 
 
-async def test_a_service_that_may_not_be_asked_tells_how(
+async def test_error_without_access_to_a_service_names_its_group(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))

@@ -147,7 +147,7 @@ async def test_the_thread_for_look_ups_is_there_before_the_first(daemon: Daemon)
 
 
 @pytest.mark.parametrize("estimator", ["eskf"])
-async def test_a_reload_tells_of_what_needs_a_new_start(
+async def test_reload_reports_settings_that_need_a_restart(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, estimator: str
 ) -> None:
     now = daemon._settings

@@ -239,7 +239,7 @@ async def test_a_failing_disk_stops_recording_until_it_recovers(
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
-async def test_a_folder_that_vanishes_is_made_anew(bench: Bench) -> None:
+async def test_folder_that_vanishes_is_made_again(bench: Bench) -> None:
     await bench.turn()
     bench.send(FRAMES[:5])
     await bench.turn()

@@ -39,7 +39,7 @@ def test_a_tlog_of_any_size_is_shifted_in_small_steps(tlog: Path) -> None:
     assert list(tlog.parent.iterdir()) == [tlog]
 
 
-def test_a_table_tells_its_true_place_in_time(tmp_path: Path) -> None:
+def test_table_contains_its_corrected_time(tmp_path: Path) -> None:
     path = tmp_path / "a_01_v1.csv"
     header = TableHeader(unix_us_at_zero=7)
     rest = "1,2\n" * STEP + encode_header(header) + "# header: {\n5"

@@ -9,7 +9,7 @@ from typer.testing import Result
 from gateway.flashing import boards
 from gateway.flashing.boards import find_block
 from gateway.live.serial_port import Port
-from tests.flashing.test_settings_block import BLOCK, image_with, sealed
+from tests.flashing.test_settings_block import BLOCK, image_with, with_crc
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -21,7 +21,7 @@ def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "images"
     folder.mkdir()
     image = IntelHex()
-    image.puts(0, image_with(sealed(BLOCK)))
+    image.puts(0, image_with(with_crc(BLOCK)))
     for mhz in (16, 8):
         image.write_hex_file(str(folder / f"imu_{mhz}mhz.hex"))
     monkeypatch.setattr(boards, "IMAGES", folder)

@@ -77,7 +77,7 @@ def test_no_transient_at_start_or_retune(kind: str) -> None:
             assert f.step((0.3, -0.2, -9.81)) == pytest.approx((0.3, -0.2, -9.81), abs=1e-9)
 
 
-def test_highpass_forgets_a_constant_at_once() -> None:
+def test_highpass_removes_a_constant_at_once() -> None:
     f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
     assert f.step((0.5, 0.5, 0.5)) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
     assert f.step((1.5, 0.5, 0.5))[0] == pytest.approx(1.0, abs=0.01)

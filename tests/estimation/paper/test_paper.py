@@ -112,7 +112,7 @@ def test_latency_moves_the_fix_forward() -> None:
     assert state.alt_amsl_m == pytest.approx(499.0)
 
 
-def test_velocity_from_the_bearing_where_the_receiver_tells_none() -> None:
+def test_velocity_is_that_of_the_track_if_the_receiver_sends_none() -> None:
     estimator = make(alpha_accel=0.0)
     run(estimator, [imu(0)])
     unknown = (math.nan, math.nan, math.nan)
@@ -293,7 +293,7 @@ def test_says_when_it_dead_reckons_and_when_that_ends() -> None:
     assert NavFlags.POSITION_VALID not in run(estimator, [imu(40_000_000)]).flags
 
 
-def test_reset_forgets() -> None:
+def test_reset_restores_the_initial_state() -> None:
     estimator = make()
     run(estimator, [imu(0, tilted(1.0, 0.0))])
     estimator.update_gps(fix(0))
