@@ -36,8 +36,8 @@ ANGLE_DEG: Final = 3.0
 MEASURED: Final = "another one, as measured"
 GUIDE: Final = {
     CalibrationStep.MOUNTING: "When: first of all, and when the board was turned. Any other angle "
-    "is measured by `mavgate calibrate mounting`, and some degrees by Level. Good: raising the "
-    "nose raises the pitch, and lowering the right wing raises the roll.",
+    "is measured by the command mavgate calibrate mounting, some degrees by Level. Good: raising "
+    "the nose raises the pitch, and lowering the right wing raises the roll.",
     CalibrationStep.GYRO: "When: before the first flight, and when the temperature has changed by "
     "more than 10 °C. Good: a rate at rest below 0.1 °/s.",
     CalibrationStep.ACCEL: "When: once for each board. Good: an error of gravity over the six "
@@ -201,7 +201,8 @@ class _CalibrationView:
             "Choose how the board lies in the aircraft, seen from above. Its x arrow is printed "
             "next to the chips; both the IMU and the compass are set."
         ).classes("now")
-        picture = ui.element("img").classes("mounting-picture")
+        with ui.element("div").classes("mounting").props("tabindex=0"):
+            picture = ui.element("img").classes("mounting-picture")
         picture.props["src"] = "/web/mounting.svg"
         picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
         self._mounted = self._orientation()

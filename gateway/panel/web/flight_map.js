@@ -9,7 +9,8 @@ const CIRCLE_95 = 2.4477 / Math.SQRT2; // of the root of both axes' variances, a
 const MAX_DOTS = 2000;
 const MAX_TOWNS = 60;
 const LINE_GAP = 90; // least pixels between two lines of the grid
-const GRID_ZOOM = 9; // the coarse map shows less than the grid when it is looked at more closely
+const GRID_ZOOM = 9; // from here on the grid is drawn over the coarse map
+const NEAR_ZOOM = 14; // from here on the coarse map, accurate to kilometres, shows nothing
 const AIRCRAFT = {
   plane: "M16 2c1.4 0 2 2 2 5v5l12 6v3l-12-3v7l4 3v2l-6-1.6L10 30v-2l4-3v-7L2 21v-3l12-6V7c0-3 .6-5 2-5z",
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
@@ -202,6 +203,7 @@ export default {
       if (this.offline || !this.tiles) this.style = now.length - 1;
     });
     this.$watch("offline", () => this.set_base());
+    map.on("zoomend", () => this.set_base());
     this.set_style();
     this.paint();
     this.stop_theme = mavgate.watch_theme(() => this.paint());
@@ -252,7 +254,8 @@ export default {
     },
     // Show the coarse map where there are no tiles, unless the grid was chosen.
     async set_base() {
-      const wanted = () => this.base && this.style >= 0 && (this.offline || !this.styles.length);
+      const has_none = () => this.base && this.style >= 0 && (this.offline || !this.styles.length);
+      const wanted = () => has_none() && this.map.getZoom() < NEAR_ZOOM;
       if (wanted() && !this.world) {
         const { coasts, borders, towns } = await load_base_map(this.base);
         if (this.world || !this.map) return;
@@ -265,7 +268,7 @@ export default {
         this.paint();
       }
       this.toggle(this.world, wanted(), () => {});
-      this.grid.least_zoom = wanted() ? GRID_ZOOM : 0;
+      this.grid.least_zoom = has_none() ? GRID_ZOOM : 0;
       this.grid.draw();
     },
     paint() {
