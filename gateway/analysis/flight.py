@@ -256,23 +256,8 @@ def flight_of_files(
 ) -> tuple[Flight, RecordedTable, AircraftSettings]:
     """Read the parts of a recording as one flight; also return its table and its settings.
 
-    Parameters
-    ----------
-    files : sequence of Path
-        Its parts.
-    options : ReadOptions
-        How they are read.
-    name, story : str
-        See `Flight`.
-    checked : bool
-        Whether a remark is added where the motion contradicts the latency of a recording.
-
-    Raises
-    ------
-    FlightError, OSError
-        If a file cannot be read.
-    ValueError
-        If there are fewer than two IMU samples.
+    With `checked` a remark is added where the motion contradicts the latency of a recording.
+    FlightError or OSError if a file cannot be read, ValueError for fewer than two IMU samples.
     """
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)

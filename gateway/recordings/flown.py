@@ -2,20 +2,17 @@
 
 import logging
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from gateway.aircraft import AircraftSettings
-from gateway.geometry.atmosphere import pressure_altitude_m
-from gateway.recordings.columns import TableRow
+from gateway.recordings.columns import FloatArray
 from gateway.recordings.files import FlightError
+from gateway.recordings.fuse import Samples, samples_of
 from gateway.recordings.reading import ReadOptions, joined_tables, open_rows
 from gateway.recordings.recorded_fusion import aircraft_for
-from gateway.records import ImuCalibrated
-from gateway.sensing.chain import SensorChain
+from gateway.records import BaroSample
 from gateway.simulator.recorded import RecordedFlight
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
@@ -37,50 +34,37 @@ def open_flown(files: list[Path], options: ReadOptions) -> RecordedFlight:
     """
     table = joined_tables([open_rows(file, options) for file in files])
     aircraft = aircraft_for(files, table, options)
-    cells = _cells(table.plain_rows, aircraft)
+    cells = _cells(samples_of(table.blocks, aircraft.calibration))
     for remark in table.remarks:
         log.warning(remark)
     latency_s = aircraft.estimation.reference.gps_latency_s
-    columns = np.array(cells, float).reshape(-1, len(COLUMNS))
     try:
-        return RecordedFlight.from_columns(dict(zip(COLUMNS, columns.T, strict=True)), latency_s)
+        return RecordedFlight.from_columns(dict(zip(COLUMNS, cells.T, strict=True)), latency_s)
     except ValueError as error:
         raise FlightError(f"{files[0]}: {error}") from error
 
 
-def _cells(rows: Iterable[TableRow], aircraft: AircraftSettings) -> list[list[float]]:
-    """Return rows in the order of `COLUMNS`; records between two samples are in the later one."""
-    chain = SensorChain(aircraft.calibration)
-    found: list[list[float]] = []
-    cells = [math.nan] * len(COLUMNS)
-    for row in rows:
-        if row.baro is not None:
-            cells[BARO] = pressure_altitude_m(row.baro.pressure_pa)
-        if (fix := row.gps) is not None and fix.fix_ok:
-            place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
-            north_mps, east_mps, down_mps = fix.vel_n_mps
-            if math.isnan(down_mps):
-                # A receiver sends a whole velocity or none; speed and course are of a level one.
-                down_mps = 0.0
-            velocity = (north_mps, east_mps, down_mps)
-            cells[GPS:] = (fix.time_us / US_PER_S, *place, fix.alt_amsl_m, *velocity)
-        imu = _imu(row, chain)
-        if imu is None or (found and row.time_us / US_PER_S <= found[-1][0]):
-            continue
-        cells[0] = row.time_us / US_PER_S
-        cells[IMU] = [*imu[0], *imu[1], *(imu[2] or (math.nan,) * 3)]
-        found.append(cells)
-        cells = [math.nan] * len(COLUMNS)
-    return found
+def _cells(samples: Samples) -> FloatArray:
+    """Return samples in the order of `COLUMNS`; records between two of them are in the later one.
 
-
-def _imu(
-    row: TableRow, chain: SensorChain
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...] | None] | None:
-    sample: ImuCalibrated | None = row.imu
-    if sample is not None:
-        return sample.accel_b_mps2, sample.gyro_b_radps, sample.mag_b_ut
-    if row.raw is None:
-        return None
-    made = chain.imu(row.raw)
-    return made.accel_b_mps2, made.gyro_b_radps, made.mag_b_ut
+    A sample that is not later than those before is left out.
+    """
+    imu = samples.imu
+    newest_us = np.maximum.accumulate(imu.time_us)
+    kept = np.flatnonzero(np.diff(newest_us, prepend=newest_us[:1] - 1) > 0)
+    cells = np.full((len(kept), len(COLUMNS)), np.nan)
+    cells[:, 0] = imu.time_us[kept] / US_PER_S
+    cells[:, IMU] = np.column_stack([imu.accel_b_mps2, imu.gyro_b_radps, imu.mag_b_ut])[kept]
+    for before, record in samples.aiding:
+        row = int(np.searchsorted(kept, before))
+        if row == len(kept):
+            break
+        if isinstance(record, BaroSample):
+            cells[row, BARO] = record.alt_pressure_m
+        elif record.fix_ok:
+            place = (record.lat_dege7 * DEG_PER_DEGE7, record.lon_dege7 * DEG_PER_DEGE7)
+            # A receiver sends a whole velocity or none; speed and course are of a level one.
+            north_mps, east_mps, down_mps = record.vel_n_mps
+            velocity = (north_mps, east_mps, 0.0 if math.isnan(down_mps) else down_mps)
+            cells[row, GPS:] = (record.time_us / US_PER_S, *place, record.alt_amsl_m, *velocity)
+    return cells

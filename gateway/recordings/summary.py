@@ -454,27 +454,9 @@ def _first_us(file: Path, row: TableRow) -> int:
 
 
 def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOptions]) -> FileInfo:
-    """Summarise a recording.
+    """Summarise a tlog, a table, or a file that can be read as one; FlightError if it is none.
 
-    Parameters
-    ----------
-    file : Path
-        A tlog, a table, or a file that can be read as one.
-    progress : callable or None
-        Called with the number of further bytes read.
-    options : callable
-        Returns how other programs' files are read; called for these alone.
-
-    Returns
-    -------
-    FileInfo
-
-    Raises
-    ------
-    FlightError
-        If it is none of these.
-    OSError
-        If it cannot be read.
+    `options` is called for other programs' files alone.
     """
     kind, size = kind_of(file), file.stat().st_size
     if kind is FileKind.TLOG:
