@@ -28,14 +28,14 @@ test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
-	.venv/bin/pytest -q -n 3 --dist loadfile --no-loadscope-reorder --durations 20
+	.venv/bin/pytest -q -n 3 --durations 20
 
 # Before Python 3.12 tracing makes the tests take 2.7 times the processor time, from then on little more:
 # so it is apart from `make test`, and without the slow tests, most of which start other processes.
 coverage: export PYTHONDONTWRITEBYTECODE =
 coverage: .venv/.dev kernels
 	COVERAGE_CORE=$$(.venv/bin/python -c 'import sys; print("sysmon" if sys.version_info >= (3, 12) else "ctrace")') \
-		.venv/bin/pytest -q -n 2 --dist loadfile -m "not slow" --cov=gateway --cov-report=
+		.venv/bin/pytest -q -n 2 -m "not slow" --cov=gateway --cov-report=
 	@.venv/bin/python -m tools.coverage_by_package
 
 lint: .venv/.dev
