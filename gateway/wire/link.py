@@ -62,12 +62,15 @@ class SequenceCounter:
         self.lost = 0
         self.duplicates = 0
         self.reordered = 0
+        self.has_begun_again = False
+        """Whether the numbers have gone back since the last reset."""
         self._last: int | None = None
         self._seen = 0
 
     def reset(self) -> None:
         """Begin a new sequence after a restart of the sender; the counts stay."""
         self._last = None
+        self.has_begun_again = False
 
     def count(self, seq: int) -> Arrival:
         """Count one sequence number, modulo 65536."""
@@ -82,6 +85,7 @@ class SequenceCounter:
             return Arrival.NEW
         behind = -ahead % SEQUENCE_MODULUS
         if behind >= LATE_WINDOW:
+            self.has_begun_again = True
             return self._begin(seq)
         if self._seen >> behind & 1:
             self.duplicates += 1
@@ -222,8 +226,10 @@ def _hear_node(
 ) -> RawRecord | None:
     """Count a payload of a node, and return its record if it is new."""
     header, clock = frame.header, node.clock
-    stamp_us, restarts = header.node_time_us, clock.restarts
+    stamp_us, restarts, resumptions = header.node_time_us, clock.restarts, clock.resumptions
     time_us = clock.observe(stamp_us, heard_us)
+    if clock.resumptions != resumptions and node.sequence.has_begun_again:
+        clock.restarts += 1
     if clock.restarts != restarts:
         node.sequence.reset()
         node.last_stamp_us = None

@@ -14,6 +14,7 @@ sum of distances to the points.
 | stamp is late by more, but goes on from the last one   | the same, for DRAIN_US at most: the    |
 |                                                        | local computer stood still, and reads  |
 |                                                        | what its buffers kept                  |
+| stamp is late for longer, but goes on from the last    | its clock was halted: starts again     |
 | stamp disagrees by more                                | the remote restarted: starts again     |
 | packet seems to come before it was sent                | waits for a second one that agrees     |
 
@@ -48,8 +49,8 @@ RESTART_JUMP_US: Final = 1_500_000
 MAX_STALL_US: Final = 60_000_000
 """How long the local computer may have stood still, in which the remote clock went on."""
 DRAIN_US: Final = 3_000_000
-"""Until then the buffers have been read; stamps that are still so late are those of a remote that
-restarted, or whose clock stood still."""
+"""Until then the buffers have been read; stamps that are still so late are those of a remote whose
+clock was halted, or which restarted and is beyond its last stamp again."""
 AHEAD_US: Final = 50_000
 """More than the line can err by between two packets. Either the line was learned in a queue, and
 the next packets say the same, or a single stamp is wrong and must not move all that follow."""
@@ -65,6 +66,8 @@ class ClockTracker:
 
     def __init__(self) -> None:
         self.restarts = 0
+        self.resumptions = 0
+        """How often the remote clock went on after it had been halted."""
         self._reset()
 
     def _reset(self) -> None:
@@ -107,7 +110,8 @@ class ClockTracker:
         elif late_us > RESTART_JUMP_US:
             self._suspect_us = None
             if self._is_stale(arrival_us):
-                self._restart()
+                self._reset()
+                self.resumptions += 1
                 remote_us, local_us = remote_u32, arrival_us
         elif self._is_unconfirmed(arrival_us - remote_us):
             return arrival_us

@@ -178,6 +178,26 @@ def test_node_restart_costs_nothing_but_its_clock() -> None:
     assert (node.lost, node.restarts) == (0, 1)
 
 
+@pytest.mark.parametrize(("next_seq", "restarts"), [(200, 0), (0, 1)], ids=["halted", "restarted"])
+def test_halted_clock_is_a_restart_only_if_the_sequence_starts_again(
+    next_seq: int, restarts: int
+) -> None:
+    line, link = Line(), Link()
+    for i in range(200):
+        link.feed(line.frame(i * 10_000, IMU), 100_000_000 + i * 10_000)
+    line.seq = next_seq
+    late_us = 104_000_000
+    records = [
+        record
+        for i in range(200, 1200)
+        for record in link.feed(line.frame(i * 10_000, IMU), late_us + i * 10_000)
+    ]
+    assert records[-1].time_us == late_us + 1199 * 10_000
+    assert all(a.time_us < b.time_us for a, b in pairwise(records))
+    (node,) = link.report(0, connected=True, port="").nodes
+    assert (node.lost, node.restarts) == (0, restarts)
+
+
 @pytest.mark.parametrize("rate_hz", [50, 200, 1000])
 @pytest.mark.parametrize("queue_us", [300, 5_000, 40_000])
 def test_samples_come_a_little_closer_after_a_queue(rate_hz: int, queue_us: int) -> None:
