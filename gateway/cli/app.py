@@ -144,13 +144,7 @@ COMMANDS: Final[dict[str, CommandEntry]] = {
 
 
 def load_command(name: str) -> Any:
-    """Import the file of a command and create it.
-
-    Parameters
-    ----------
-    name : str
-        One of `COMMANDS`.
-    """
+    """Import the file of a command and create it."""
     part = typer.Typer(rich_markup_mode="rich")
     # With a callback it is a group, however few commands the file has.
     part.callback()(lambda: None)
@@ -163,13 +157,7 @@ def load_command(name: str) -> Any:
 
 
 def tidied(command: Any) -> Any:
-    """Return a command whose help flows at any width, and names a type only where one is typed.
-
-    Parameters
-    ----------
-    command : typer.core.TyperCommand or TyperGroup
-        Changed in place, with all commands below it.
-    """
+    """Return a command whose help flows at any width, and names a type only where one is typed."""
     if command.help:
         paragraphs = command.help.split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)

@@ -129,19 +129,7 @@ def recorded_line(
     columns: Path | None = None,
     report: Callable[[str], None] = log.info,
 ) -> tuple[Iterator[TimedFrame], dict[int, AircraftSettings]]:
-    """Send a recording as its nodes would have, with its calibrated values unchanged.
-
-    Parameters
-    ----------
-    settings : GatewaySettings
-        Of the gateway that it is sent to.
-    name : Path
-        Name of a recording, or a file.
-    columns : Path, optional
-        Column map of another program's CSV.
-    report : callable
-        Called with a text at every end.
-    """
+    """Send a recording as its nodes would have, with its calibrated values unchanged."""
     from gateway.recordings.flown import open_flown
     from gateway.recordings.fuse import with_reference
     from gateway.simulator.recorded import in_rounds, replay
@@ -178,18 +166,7 @@ AT_ONCE: Final = 16
 
 
 def made_ahead(frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
-    """Let a background process make frames, so that the event loop that plays them need not.
-
-    Parameters
-    ----------
-    frames : iterator of TimedFrame
-        Used in that process alone, which ends with this one.
-
-    Returns
-    -------
-    iterator of TimedFrame
-        The same frames.
-    """
+    """Let a background process make frames, so that the event loop that plays them need not."""
     return _take(begin_copy(_make, frames))
 
 
@@ -221,25 +198,7 @@ class BenchError(RuntimeError):
 
 
 def firmware_line(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
-    """Fly the simulated aircraft with the firmware on simulated chips.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        Of which the first aircraft flies.
-    start_unix_us : int
-        UTC at the start.
-
-    Returns
-    -------
-    iterator of TimedFrame
-        The receiver's frames, endless.
-
-    Raises
-    ------
-    BenchError
-        If this is no checkout, or a compiler or the chip simulator is missing.
-    """
+    """Fly the simulated aircraft with the firmware on simulated chips, or raise `BenchError`."""
     if not (CHECKOUT / "firmware" / "rig").is_dir():
         raise BenchError("--firmware needs a checkout of the project, not an installed package")
     if str(CHECKOUT) not in sys.path:

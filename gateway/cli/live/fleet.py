@@ -93,21 +93,7 @@ class PiecePace:
 
 
 class RecordingFetch:
-    """Fetch files of one site into a folder.
-
-    Parameters
-    ----------
-    site : str
-        Its name.
-    folder : Path
-        Where to; made if it is not there.
-    ask : callable
-        See `Ask`; raises `ControlError` for what is refused.
-    force : bool
-        Replace files that differ.
-    wait : callable
-        Waits some seconds.
-    """
+    """Fetch files of one site into a folder."""
 
     def __init__(
         self,
@@ -126,29 +112,7 @@ class RecordingFetch:
         self._pace = PiecePace()
 
     def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
-        """Fetch one file, or the rest of it.
-
-        Parameters
-        ----------
-        name : str
-            As the site lists it.
-        size : int
-            As the site lists it; what has been written since is left for the next time.
-        advance : callable
-            Called with the bytes that are there more.
-
-        Returns
-        -------
-        bool
-            Whether anything had to be fetched.
-
-        Raises
-        ------
-        FetchError
-            If it cannot be fetched.
-        OSError
-            If the disk fails.
-        """
+        """Fetch one file, or the rest of it; return whether anything had to be fetched."""
         if not is_file_name(name):
             raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
         target, part = self._folder / name, self._folder / f".{name}.part"

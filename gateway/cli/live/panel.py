@@ -145,13 +145,7 @@ class OneLineFormatter(PrintableFormatter):
 
 
 class PanelProcess:
-    """The panel as a child process of the gateway; restarted when it dies.
-
-    Parameters
-    ----------
-    config : Path or None
-        The gateway's settings file.
-    """
+    """The panel as a child process of the gateway; restarted when it dies."""
 
     def __init__(self, config: Path | None) -> None:
         self.link = ""
@@ -174,13 +168,7 @@ class PanelProcess:
         )
 
     def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:
-        """Connect it to the gateway, and keep it running; needs a running event loop.
-
-        Parameters
-        ----------
-        control_socket : callable
-            Waits for the gateway's control socket and returns its path.
-        """
+        """Connect it to the gateway, and keep it running; needs a running event loop."""
         self._task = asyncio.get_running_loop().create_task(self._keep(control_socket))
 
     async def close(self) -> None:

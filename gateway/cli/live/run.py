@@ -99,15 +99,6 @@ async def serve(
 
     SIGHUP reports the end of the terminal, which ends the daemon as well; without a terminal, as
     in a service, it reloads the settings.
-
-    Parameters
-    ----------
-    daemon_of : callable
-        Builds the daemon; called inside the event loop.
-    plain : bool
-        Log lines even on a terminal.
-    panel : PanelProcess, optional
-        The page in a browser, to be started and ended with the daemon.
     """
     stopped = asyncio.Event()
     on_end_signals(stopped.set)

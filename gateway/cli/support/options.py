@@ -110,19 +110,7 @@ def ask(
     of: str = "run",
     wait_s: float | None = None,
 ) -> Any:
-    """Send a request to the running gateway (or player); end the command if that fails.
-
-    Parameters
-    ----------
-    verb : str
-        See docs/control.md.
-    params : dict, optional
-        Its parameters.
-    of : str
-        `run` for the gateway, `play` for a player.
-    wait_s : float, optional
-        Longest wait, where it is not that of `request`.
-    """
+    """Send a request to the running gateway (or player); end the command if that fails."""
     try:
         return request(socket_of(of), verb, params, timeout_s=wait_s)
     except ControlError as error:

@@ -175,22 +175,7 @@ def recordings_folder(config: Path | None) -> Path:
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
-    """Replace names of recordings by their files; paths stay unchanged.
-
-    Parameters
-    ----------
-    names : iterable of Path
-        Files, or names of recordings; `last` is the newest.
-    folder : Path
-        Where the recordings are.
-    wanted : str
-        Which of a recording's files.
-
-    Raises
-    ------
-    FlightError
-        If there is neither such a file nor such a recording.
-    """
+    """Replace names of recordings by their files; paths stay unchanged."""
     return [file for name in names for file in _files_of(name, folder, wanted)]
 
 

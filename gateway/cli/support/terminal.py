@@ -82,13 +82,7 @@ DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
 
 
 def refuse(text: str) -> NoReturn:
-    """End the command with an error.
-
-    Parameters
-    ----------
-    text : str
-        What was wrong, where, and what to do; one or more lines.
-    """
+    """End the command with an error."""
     console = console_of(stderr=True)
     console.print(text, style="red")
     raise typer.Exit(2)
