@@ -13,6 +13,8 @@ import argparse
 import math
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
+from inspect import getsourcelines
 from pathlib import Path
 from statistics import fmean
 from typing import Final, NamedTuple
@@ -59,23 +61,45 @@ class Mechanism(NamedTuple):
     module: str
     name: str
     replacement: object
+    parts: tuple[str, ...]
+    """Its modules, or functions as `module.function`, to count their lines."""
 
 
-MECHANISMS: Final = (
-    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING),
-    Mechanism("steps of the gyroscope bias", "predict", "unexpected_bias_density", NO_NUMBER),
-    Mechanism("rest", "rest", "keeps_means", FALSE),
-    Mechanism("integrity check of the attitude", "integrity", "differs_from_alignment", FALSE),
-    Mechanism("heading from motion", "integrity", "FOUND_HEADING_RAD", 0.0),
-    Mechanism("norm and dip of the field", "magnetometer", "field_weight", FULL_WEIGHT),
-    Mechanism("restart of the alignment", "alignment", "contradiction", NO_NUMBER),
-    Mechanism("hard iron by the model's dip", "fixes", "raise_hard_iron_by_dip", NOTHING),
-    Mechanism("time of validity of a fix", "fixes", "look_back", at_present),
-    Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING),
-    Mechanism("GPS glitches", "delayed", "note_glitch", NOTHING),
-    Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO),
-)
 FILTER: Final = "gateway.estimation.eskf"
+VALIDITY: Final = ("delayed.store_integrals", "delayed.look_back", "delayed.past_state")
+SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hanging")
+MECHANISMS: Final = (
+    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("vibration",)),
+    Mechanism(
+        "steps of the gyroscope bias", "predict", "unexpected_bias_density", NO_NUMBER,
+        ("predict.unexpected_bias_density", "predict.follow_bias_steps"),
+    ),
+    Mechanism("rest", "rest", "keeps_means", FALSE, ("rest",)),
+    Mechanism(
+        "integrity check of the attitude", "integrity", "differs_from_alignment", FALSE,
+        ("integrity.differs_from_alignment", "integrity.discard_calibration"),
+    ),
+    Mechanism(
+        "restart of the alignment", "alignment", "contradiction", NO_NUMBER,
+        ("alignment.contradiction",),
+    ),
+    Mechanism(
+        "heading from motion", "integrity", "FOUND_HEADING_RAD", 0.0,
+        ("alignment.heading_of_pairs", "alignment.along", "alignment.explained"),
+    ),
+    Mechanism(
+        "norm and dip of the field", "magnetometer", "field_weight", FULL_WEIGHT,
+        ("magnetometer.field_weight", "magnetometer.learn_field"),
+    ),
+    Mechanism(
+        "hard iron by the model's dip", "fixes", "raise_hard_iron_by_dip", NOTHING,
+        ("magnetometer.raise_hard_iron_by_dip",),
+    ),
+    Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
+    Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING, ("latency",)),
+    Mechanism("GPS glitches", "delayed", "note_glitch", NOTHING, ("delayed.note_glitch",)),
+    Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO, SENSORS),
+)  # fmt: skip
 FULL: Final = "full filter"
 FLIGHTS: Final = (
     *("arduplane", "quad106", "phantom", "mocap", "car_", "walk"),
@@ -118,6 +142,16 @@ def share_within(board: Board, name: str) -> str:
     return f"{100 * fmean(share for share in shares if math.isfinite(share)):.1f} %"
 
 
+def lines_of(parts: Sequence[str]) -> int:
+    """Return the number of source lines of modules and functions of the filter."""
+    total = 0
+    for part in parts:
+        module, _, function = part.partition(".")
+        found = import_module(f"{FILTER}.{module}")
+        total += len(getsourcelines(getattr(found, function) if function else found)[0])
+    return total
+
+
 def main() -> None:
     """Score the full filter, then each variant, and print the table."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -129,19 +163,20 @@ def main() -> None:
         raise SystemExit(f"{options.data} contains none of the flights {', '.join(FLIGHTS)}")
     boards: tuple[Board, Board] = {}, {}
     add_scores(*boards, FULL, flights)
-    table = Table("disabled mechanism", box=None, pad_edge=False)
+    table = Table("disabled mechanism", "lines", box=None, pad_edge=False)
     for board, kind in zip(boards, ("recorded", "disturbed"), strict=True):
         for title in (f"{len(board)} {kind}: worse", "better", "ratio", "within 2 sigma"):
             table.add_column(title, justify="right")
     table.add_column()
-    table.add_row("none", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
-    for number, (title, module, name, replacement) in enumerate(MECHANISMS, 1):
+    table.add_row("none", "", *(c for b in boards for c in ("", "", "1", share_within(b, FULL))))
+    for number, (title, module, name, replacement, parts) in enumerate(MECHANISMS, 1):
         target = f"{FILTER}.{module}.{name}"
         with patch(target, replacement), compiled_again([begin_state, run]):
             add_scores(*boards, title, flights)
         cells = [c for b in boards for c in (*comparison(b, title), share_within(b, title))]
-        differs = any(int(cells[k]) for k in (0, 1, 4, 5))
-        table.add_row(title, *cells, "" if differs else "no measurable difference")
+        equal = not any(int(cells[k]) for k in (0, 1, 4, 5))
+        mark = "no measurable difference" if equal else ""
+        table.add_row(title, str(lines_of(parts)), *cells, mark)
         print(f"{number} of {len(MECHANISMS)}: without {title}: {'  '.join(cells)}", flush=True)
     Console(width=170).print(table)
 
