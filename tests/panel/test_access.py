@@ -245,6 +245,15 @@ async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
     assert fitting.text == f"operator {MAX_BODY}"
 
 
+@pytest.mark.parametrize("path", ["/recordings/x", "/maps/x"])
+async def test_uploads_have_a_limit_of_their_own(path: str) -> None:
+    async with client_of(guarded(PanelSettings(upload_limit_mb=2))) as client:
+        fitting = await client.put(path, content=bytes(2_000_000))
+        too_large = await client.put(path, content=bytes(2_000_001))
+    assert fitting.text == "operator 2000000"
+    assert too_large.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
+
+
 async def test_nothing_is_shown_without_the_password(locked: httpx.AsyncClient) -> None:
     assert (await locked.get("/")).headers["location"] == "/login"
     assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED

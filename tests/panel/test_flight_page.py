@@ -123,7 +123,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.io
 @pytest.mark.slow
 @needs_chromium
-@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1024, "dark"), (1920, "light")])
+@pytest.mark.parametrize(("width", "scheme"), [(390, "light"), (1920, "dark")])
 def test_page_opens_offline_and_moves(
     browser: Browser, page_file: Path, width: int, scheme: Any
 ) -> None:

@@ -94,7 +94,9 @@ def test_no_name_or_text_of_others_runs_as_a_script(page: Page) -> None:
     for view in VIEWS:
         show(page, view)
         page.locator(f"section[data-view='{view}'] > *").first.wait_for()
-        page.wait_for_timeout(600)
+        # Two messages of each kind have come and were drawn.
+        page.evaluate("window.begun_us = mavgate.now_us")
+        page.wait_for_function("mavgate.now_us > window.begun_us + 4e5")
         assert page.evaluate("typeof q") == "undefined"
     show(page, "tuning")
     names = page.locator(".parameter .name")
