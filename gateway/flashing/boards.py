@@ -140,13 +140,7 @@ def find_block(image: bytes) -> SettingsBlock:
 
 
 def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
-    """Return the offset and the new bytes of an image's settings block.
-
-    Raises
-    ------
-    SettingsBlockError
-        As `find_block`.
-    """
+    """Return offset and new bytes of an image's settings block; raises as `find_block`."""
     block = find_block(image)
     return block.offset, _encode(block, settings)
 
@@ -223,13 +217,7 @@ BOOTLOADERS: Final = (
 
 
 def image_path(program: Program, clock_mhz: int) -> Path:
-    """Return the file of a ready-made image.
-
-    Raises
-    ------
-    FlashError
-        If it has not been built.
-    """
+    """Return the file of a ready-made image; raises FlashError if it has not been built."""
     path = IMAGES / f"{program.name.lower()}_{clock_mhz}mhz.hex"
     if not path.exists():
         raise FlashError(
@@ -267,10 +255,7 @@ def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:
 def reserved(device: str) -> Iterator[None]:
     """Keep a port for this program, which a running gateway respects, and avrdude does not.
 
-    Raises
-    ------
-    FlashError
-        If it cannot be opened, or another program has it.
+    Raises FlashError if it cannot be opened, or another program has it.
     """
     try:
         file = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -291,10 +276,7 @@ def reserved(device: str) -> Iterator[None]:
 def find_bootloader(device: str) -> Bootloader | None:
     """Reset a board and ask its bootloader, at one speed after the other; None if none answers.
 
-    Raises
-    ------
-    FlashError
-        If the port cannot be opened.
+    Raises FlashError if the port cannot be opened.
     """
     try:
         return next((loader for loader in BOOTLOADERS if _answers(device, loader.baud)), None)
@@ -332,13 +314,7 @@ def require_bootloader(device: str) -> Bootloader:
 
 
 def write_flash(device: str, bootloader: Bootloader, image: bytes) -> None:
-    """Write an Intel HEX file to a board and verify it; avrdude shows the progress.
-
-    Raises
-    ------
-    FlashError
-        If avrdude is not installed or fails.
-    """
+    """Write an Intel HEX file and verify it; raises FlashError if avrdude is missing or fails."""
     with tempfile.NamedTemporaryFile(suffix=".hex") as file:
         file.write(image)
         file.flush()

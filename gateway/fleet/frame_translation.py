@@ -78,15 +78,7 @@ class _Window:
 
 
 class SiteSignatures:
-    """Check and renew the signatures of one site.
-
-    Parameters
-    ----------
-    key : bytes
-        32 bytes, derived from the site's passphrase.
-    unix_us_at_zero : int
-        Unix time, in microseconds, when the gateway clock was zero.
-    """
+    """Check and renew the signatures of one site."""
 
     def __init__(self, key: bytes, unix_us_at_zero: int) -> None:
         self._key = key
@@ -94,15 +86,7 @@ class SiteSignatures:
         self._windows: dict[tuple[int, int, int], _Window] = {}
 
     def check(self, frame: MavFrame, now_us: int) -> Rejection | None:
-        """Return why a frame of the site is rejected; None if it is accepted.
-
-        Parameters
-        ----------
-        frame : MavFrame
-            As it was published.
-        now_us : int
-            Gateway time.
-        """
+        """Return why a frame of the site is rejected; None if it is accepted."""
         if not frame.signed:
             return Rejection.UNSIGNED
         if not self.is_genuine(frame):
@@ -124,15 +108,7 @@ class SiteSignatures:
         return hmac.compare_digest(wanted, frame.data[-HASH_BYTES:])
 
     def renewed(self, body: bytes, former: MavFrame) -> bytes:
-        """Sign a changed frame with the link and the timestamp of the former one.
-
-        Parameters
-        ----------
-        body : bytes
-            The changed frame up to its checksum.
-        former : MavFrame
-            The frame before the change.
-        """
+        """Sign a changed frame with the link and the timestamp of the former one."""
         signed = body + former.data[-SIGNATURE_SIZE:-HASH_BYTES]
         return signed + signature_hash(self._key, signed)
 
@@ -222,19 +198,7 @@ class _CannotPassError(Exception):
 
 
 class FrameTranslation:
-    """The frames of one site.
-
-    Parameters
-    ----------
-    site : str
-        Its name.
-    ids : IdMap
-        Shared by all sites.
-    signatures : SiteSignatures, optional
-        Of the site's passphrase; all its frames must be signed then.
-    loops : LoopDetection, optional
-        Shared by all sites.
-    """
+    """The frames of one site."""
 
     def __init__(
         self,
@@ -260,19 +224,7 @@ class FrameTranslation:
     def from_site(self, frame: MavFrame, now_us: int, *, is_own: bool = False) -> MavFrame | None:
         """Return a frame of the site with the ids of this side; None if it is dropped.
 
-        Parameters
-        ----------
-        frame : MavFrame
-            As it was published.
-        now_us : int
-            Gateway time.
-        is_own : bool, optional
-            Whether the site's gateway made it, so that it has not been here before; any other frame
-            may have come to the site from the ground stations here.
-
-        Returns
-        -------
-        MavFrame or None
+        `is_own` if the site's gateway made it, so that it cannot have been here before.
         """
         if self._signatures is not None and (rejection := self._signatures.check(frame, now_us)):
             self._count(rejection)
@@ -361,28 +313,7 @@ def rewrite(
     rename: Callable[[int], int],
     signatures: SiteSignatures | None,
 ) -> MavFrame:
-    """Return a frame in which systems have other ids; the same object if nothing changes.
-
-    Parameters
-    ----------
-    frame : MavFrame
-        A complete frame.
-    sender : int
-        System id of its new sender.
-    rename : callable
-        Turns the id of an addressed or named system into the other one; 0 stays 0.
-    signatures : SiteSignatures or None
-        Renews the signature of a changed frame.
-
-    Returns
-    -------
-    MavFrame
-
-    Raises
-    ------
-    _CannotPassError
-        If it cannot be changed.
-    """
+    """Return a frame with other ids, itself if nothing changes; raises _CannotPassError."""
     data, message_id = frame.data, frame.message_id
     target = rename(frame.target[0])
     names = changes_of_names(frame, rename)
@@ -409,20 +340,7 @@ def rewrite(
 
 
 def changes_of_names(frame: MavFrame, rename: Callable[[int], int]) -> list[Change]:
-    """Return the changes of a payload that names systems which get other ids.
-
-    Parameters
-    ----------
-    frame : MavFrame
-        A complete frame.
-    rename : callable
-        Turns the id of a system into its other one.
-
-    Returns
-    -------
-    list of (int, bytes)
-        Offset in the payload, and the new bytes there.
-    """
+    """Return the changes of a payload that names systems whose ids `rename` changes."""
     message_id = frame.message_id
     if message_id not in NAMING:
         return []

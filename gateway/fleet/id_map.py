@@ -44,13 +44,6 @@ class IdMap:
     A vehicle keeps the id that it has at its site if that is free here, else it gets the lowest
     free one. No site gets more than `per_site`, nor more than are left for the others. Where none
     is left, `make_room` finds a vehicle that is no longer received.
-
-    Parameters
-    ----------
-    known : mapping
-        Ids assigned before, by vehicle; `LEFT_OUT` for excluded ones.
-    per_site : int
-        Most ids of one site.
     """
 
     def __init__(self, known: Mapping[Vehicle, int] | None = None, per_site: int = LAST_ID) -> None:
@@ -92,18 +85,6 @@ class IdMap:
 
         The former vehicle is of the same site, or of a site that has more ids. A vehicle that is
         received keeps its id: ground stations would command another vehicle by it.
-
-        Parameters
-        ----------
-        heard_us : mapping
-            Time of the newest frame of each vehicle; none for one that was never received.
-        silent_since_us : int
-            A vehicle without a frame since then may lose its id.
-
-        Returns
-        -------
-        Handover or None
-            The change, if there was one.
         """
         shares = self._shares()
         silent = [each for each in self._ids if heard_us.get(each, 0) < silent_since_us]
@@ -127,13 +108,7 @@ class IdMap:
         return self._vehicles.get(own_id)
 
     def set_by_hand(self, site: str, system_id: int, own_id: int) -> None:
-        """Assign an id to a vehicle; its former holder gets another, if one is free.
-
-        Raises
-        ------
-        ValueError
-            If the id is not `FIRST_ID` to `LAST_ID`.
-        """
+        """Assign an id; its former holder gets another, if one is free. Raises ValueError."""
         if not FIRST_ID <= own_id <= LAST_ID:
             raise ValueError(f"id {own_id} is not {FIRST_ID} to {LAST_ID}")
         holder = self._vehicles.get(own_id)
@@ -183,17 +158,7 @@ class IdMap:
 class IdsFile:
     """The file of the ids, `{"SITE/SYSTEM": id, …}`; 0 for an excluded vehicle.
 
-    Parameters
-    ----------
-    file : Path
-        Its path; created with the first id.
-    per_site : int
-        Most ids of one site.
-
-    Raises
-    ------
-    ValueError
-        If the file is malformed.
+    Raises ValueError if it is malformed.
     """
 
     def __init__(self, file: Path, per_site: int = LAST_ID) -> None:
@@ -205,13 +170,7 @@ class IdsFile:
         self._trouble = ""
 
     async def keep(self) -> str:
-        """Write changed ids, and wait until they are on the disk.
-
-        Returns
-        -------
-        str
-            Why they could not be written, also logged; empty if they were. The next call retries.
-        """
+        """Write changed ids to the disk; return why not, which is logged and retried."""
         version = self.ids.version
         if version != self._kept:
             reason = await done_by(self._worker, self._write, self._text())

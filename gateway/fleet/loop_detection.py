@@ -73,19 +73,7 @@ class LoopDetection:
             self._sent.put(changed.data, now_us + 2 * SPAN_US)
 
     def is_returned(self, frame: MavFrame, vehicle: Vehicle, *, has_id: bool, now_us: int) -> bool:
-        """Return whether a frame of a site has been here before.
-
-        Parameters
-        ----------
-        frame : MavFrame
-            As it was published.
-        vehicle : Vehicle
-            Its sender, by its key and its header.
-        has_id : bool
-            Whether that vehicle has an id here.
-        now_us : int
-            Gateway time.
-        """
+        """Return whether a frame of a site has been here before."""
         known = self._given.get(frame.data)
         if known is None or known.vehicle == vehicle or now_us - known.time_us > 2 * SPAN_US:
             self._runs.pop(vehicle, None)

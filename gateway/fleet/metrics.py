@@ -36,18 +36,7 @@ VEHICLE: Final = ("site", "system", "id")
 
 
 def fleet_families(status: Mapping[str, Any]) -> Iterator[Metric]:
-    """Describe a fleet.
-
-    Parameters
-    ----------
-    status : mapping
-        From `FleetServer.status`.
-
-    Yields
-    ------
-    Metric
-        Names begin with `mavgate_fleet_`.
-    """
+    """Describe a fleet."""
     linked = float(status["is_linked"])
     yield gauge("fleet_linked", "1 while there is a router.", (), [((), linked)])
     for key, text in (

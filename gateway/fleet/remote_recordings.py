@@ -52,13 +52,7 @@ class DigestParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RemoteRecordings:
-    """The verbs `fleet.recordings`, `fleet.piece` and `fleet.digest`.
-
-    Parameters
-    ----------
-    session : FleetSession
-        Session over which sites are queried.
-    """
+    """The verbs `fleet.recordings`, `fleet.piece` and `fleet.digest`."""
 
     def __init__(self, session: FleetSession) -> None:
         self._session = session

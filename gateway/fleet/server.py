@@ -243,13 +243,7 @@ class FleetServer:
         return self._session.locator
 
     async def start(self) -> None:
-        """Open everything; a router that does not answer yet is retried.
-
-        Raises
-        ------
-        ControlError
-            If the control socket cannot be created.
-        """
+        """Open everything, and retry the router; raises ControlError without a control socket."""
         if self._session.warning:
             log.warning("%s", self._session.warning)
         await self._control.start()

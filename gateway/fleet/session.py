@@ -81,22 +81,8 @@ class QueryRefusedError(Exception):
 class FleetSession:
     """A session that subscribes to sites.
 
-    Parameters
-    ----------
-    settings : FleetSettings
-        Which sites, the router, and Zenoh's own file.
-    events : SessionEvents
-        Callbacks.
-    now_us : callable
-        The gateway clock.
-
-    Raises
-    ------
-    ValueError
-        If a pattern, Zenoh's file or the locator is malformed, or it would listen beyond loopback
-        without authentication.
-    ModuleNotFoundError
-        If Zenoh is not installed.
+    Raises ValueError if a setting is malformed or it would listen beyond loopback without
+    authentication, ModuleNotFoundError if Zenoh is not installed.
     """
 
     def __init__(
@@ -197,30 +183,10 @@ class FleetSession:
     async def query(
         self, key: str, payload: bytes, timeout_s: float, decode: Callable[[str, bytes], Decoded]
     ) -> dict[str, Decoded]:
-        """Query the sites of a key at the lowest priority, off the loop.
+        """Query the sites of a key at the lowest priority; return the first answer of each.
 
-        Parameters
-        ----------
-        key : str
-            Key of one site or, with a pattern, of several.
-        payload : bytes
-            The query.
-        timeout_s : float
-            Longest wait.
-        decode : callable
-            Decodes the answer of a site, on a thread.
-
-        Returns
-        -------
-        dict of str
-            The first answer of each site, decoded; none above `MAX_ANSWER`.
-
-        Raises
-        ------
-        NoAnswerError
-            If there is none.
-        QueryRefusedError
-            If the only answers are refusals.
+        Answers are decoded on a thread, and none is above `MAX_ANSWER`. Raises NoAnswerError if
+        there is none, QueryRefusedError if all are refusals.
         """
         if self._session is None:
             raise NoAnswerError(f"{self.locator}: no session")
@@ -275,28 +241,14 @@ def _declare_key(
 
 
 def key_pattern(site: str) -> str:
-    """Return a pattern of sites as Zenoh writes it in one part of a key.
-
-    Raises
-    ------
-    ValueError
-        If it is malformed.
-    """
+    """Return a pattern of sites as Zenoh writes it in a key; raises ValueError."""
     if not PATTERN.fullmatch(site) or "**" in site:
         raise ValueError(f"site {site!r}: letters, digits, . _ - and single * only")
     return site if site == "*" else site.replace("*", "$*")
 
 
 def missing_authentication(locator: str, config: "zenoh.Config") -> str:
-    """Return why a router that listens here would admit everyone; empty if it does not.
-
-    Parameters
-    ----------
-    locator : str
-        Where it listens.
-    config : zenoh.Config
-        Its configuration.
-    """
+    """Return why a router that listens here would admit everyone; empty if it does not."""
     protocol, _, rest = locator.partition("/")
     host = rest.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
     if protocol == LOCAL or is_loopback(host):

@@ -81,16 +81,7 @@ class GpsSamples:
 
 
 class GpsSampler:
-    """Run the receiver along a trajectory.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-    trajectory : SensorMotion
-    rng : numpy.random.Generator
-    start_unix_us : int
-        UTC at the start of the simulation.
-    """
+    """Run the receiver along a trajectory."""
 
     def __init__(
         self,
@@ -112,18 +103,7 @@ class GpsSampler:
         self._sky = Wander(sky, 1.0, WANDER_S, interval_s)
 
     def take(self, until_s: float) -> GpsSamples:
-        """Run up to a time.
-
-        Parameters
-        ----------
-        until_s : float
-            True time; every message of a fix that was valid before it comes out, though some
-            arrive after it.
-
-        Returns
-        -------
-        GpsSamples
-        """
+        """Run until every fix that is valid before a true time has come out; some arrive later."""
         end_epoch = math.ceil((self._start_unix_us + until_s * 1e6) / EPOCH_US)
         unix_us = np.arange(self._epoch, max(end_epoch, self._epoch)) * EPOCH_US
         self._epoch = max(end_epoch, self._epoch)

@@ -78,17 +78,7 @@ class Sent:
 
 
 class Node(ABC):
-    """A source of payloads.
-
-    Parameters
-    ----------
-    node_id : NodeId
-    clock : DeviceClock
-    sensors : int
-        Bits of the sensors on it.
-    rate_hz : int
-        What it reports as its sample rate.
-    """
+    """A source of payloads."""
 
     def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
         self.node_id = node_id

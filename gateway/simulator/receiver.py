@@ -120,15 +120,7 @@ class _RadioPath:
 
 
 class SimulatedReceiver:
-    """The receiver on the ground.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        Radio, line and clocks.
-    nodes : sequence of Node
-        In the order of their pipes; more than six share them.
-    """
+    """The receiver on the ground."""
 
     def __init__(self, settings: SimulatorSettings, nodes: Sequence[Node]) -> None:
         self._settings = settings
@@ -141,17 +133,7 @@ class SimulatedReceiver:
         self._line_free_s = 0.0
 
     def frames(self, until_s: float = math.inf) -> Iterator[TimedFrame]:
-        """Yield the serial frames in the order of time; call it once.
-
-        Parameters
-        ----------
-        until_s : float
-            True time at which the receiver is switched off.
-
-        Yields
-        ------
-        TimedFrame
-        """
+        """Yield the serial frames in the order of time; call it once."""
         frames = self._clean_frames(until_s)
         if self._settings.corrupt_bytes > 0.0:
             rng = generator(self._settings, 0, Chance.LINE)
@@ -243,20 +225,7 @@ def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) ->
 def damage(
     frames: Iterator[TimedFrame], share: float, rng: np.random.Generator
 ) -> Iterator[TimedFrame]:
-    """Change a share of the bytes to any other value.
-
-    Parameters
-    ----------
-    frames : iterator of TimedFrame
-    share : float
-        Probability that a byte is hit, 0 to 1.
-    rng : numpy.random.Generator
-
-    Yields
-    ------
-    TimedFrame
-        With the number of its damaged bytes.
-    """
+    """Change a share of the bytes to any other value."""
     for frame in frames:
         data = np.frombuffer(frame.data, dtype=np.uint8)
         hit = rng.random(len(data)) < share

@@ -182,20 +182,7 @@ class RecordedNode(Node):
 def in_rounds(
     frames: Iterator[TimedFrame], duration_s: float, on_round: Callable[[int], None]
 ) -> Iterator[TimedFrame]:
-    """Pass on the frames of an endless replay, and report the end of each round.
-
-    Parameters
-    ----------
-    frames : iterator of TimedFrame
-    duration_s : float
-        Of the recorded flight.
-    on_round : callable
-        Called with the number of the round that begins, from 2, before its first frame.
-
-    Yields
-    ------
-    TimedFrame
-    """
+    """Pass on the frames of an endless replay; report each round, from 2, before its first."""
     number, end_s = 1, duration_s
     for frame in frames:
         if frame.time_s >= end_s:
@@ -211,22 +198,9 @@ def replay(
     *,
     endless: bool = False,
 ) -> SimulatedReceiver:
-    """Set up the receiver and one aircraft that flies a recording.
+    """Set up the receiver and one aircraft that flies a recording, which has no UTC of its start.
 
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        Vehicle id, radio, line and clocks; its flight and sensors do not matter here.
-    flight : RecordedFlight
-    start_unix_us : int
-        UTC of the first row, which recordings do not contain.
-    endless : bool
-        Restart whenever the recording has ended; the nodes' clocks and sequence numbers continue.
-
-    Returns
-    -------
-    SimulatedReceiver
-        Its `frames(flight.duration_s)` end with the recording.
+    If endless it begins again whenever it has ended, while the nodes' clocks and numbers go on.
     """
     imu_clock = DeviceClock(IMU_BOOT_US, settings.clock_skew_ppm)
     inertial = _imu_payloads(flight, imu_clock, endless=endless)

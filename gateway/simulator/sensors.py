@@ -55,15 +55,8 @@ class White:
 class Wander:
     """First-order Gauss-Markov noise on three axes: `x' = retain * x + step`.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    sigma : float
-        Standard deviation in the long run.
-    correlation_s : float
-        Time after which 37 % of a value is left.
-    interval_s : float
-        Time between values.
+    Its standard deviation is `sigma` in the long run, and after `correlation_s` 37 % of a value is
+    left.
     """
 
     def __init__(

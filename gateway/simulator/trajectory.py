@@ -142,20 +142,7 @@ class SensorMotion(Protocol):
 
 
 class Trajectory:
-    """One planned flight, repeated for ever.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        Home, runway, wind and gusts.
-    rng : numpy.random.Generator
-        Source of gusts and unrest.
-
-    Raises
-    ------
-    ValueError
-        If no plan brings the aircraft home in this wind.
-    """
+    """One planned flight, repeated for ever; ValueError if no plan ends at home in this wind."""
 
     def __init__(self, settings: SimulatorSettings, rng: np.random.Generator) -> None:
         self._settings = settings
@@ -396,13 +383,7 @@ PITCH_RADPS: Final = 0.47
 
 
 class Workbench:
-    """The motion of an aircraft that a person holds.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-        Home, where it stays.
-    """
+    """The motion of an aircraft that a person holds."""
 
     def __init__(self, settings: SimulatorSettings) -> None:
         self._settings = settings
