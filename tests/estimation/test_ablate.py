@@ -23,7 +23,7 @@ def names_used_in(module: ModuleType) -> set[str]:
 
 @pytest.mark.parametrize("mechanism", MECHANISMS, ids=lambda mechanism: mechanism.title)
 def test_mechanism_is_used_in_its_module_and_its_replacement_fits(mechanism: Mechanism) -> None:
-    _, module_name, name, replacement = mechanism
+    _, module_name, name, replacement, _ = mechanism
     module = import_module(f"{FILTER}.{module_name}")
     original = getattr(module, name)
     assert name in names_used_in(module)
