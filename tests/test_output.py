@@ -120,13 +120,13 @@ def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path, overwrite: bool) ->
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"1")]
 
 
-def test_a_file_of_the_user_next_to_it_is_left_alone(tmp_path: Path) -> None:
+def test_existing_file_with_the_temporary_name_is_unchanged(tmp_path: Path) -> None:
     (tmp_path / "a.partial").write_bytes(b"mine")
     write_new(tmp_path / "a", [b"1"])
     assert (tmp_path / "a.partial").read_bytes() == b"mine"
 
 
-def test_a_folder_that_holds_something_is_asked_about(tmp_path: Path) -> None:
+def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
     check_folder(tmp_path / "new")
     check_folder(tmp_path)
     (tmp_path / "a").touch()

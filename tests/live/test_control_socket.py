@@ -205,7 +205,7 @@ async def test_only_its_owner_root_and_a_services_group_are_answered(
     assert answered == is_answered
 
 
-async def test_the_kernel_names_the_user_who_asks(
+async def test_user_and_groups_of_a_request_are_those_of_the_process(
     server: ControlServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[int, tuple[int, ...]]] = []

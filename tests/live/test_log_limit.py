@@ -20,7 +20,7 @@ def line(text: str, lineno: int = 1, error: Exception | None = None) -> logging.
     return logging.LogRecord("here", logging.INFO, "place.py", lineno, "%s", (text,), info)
 
 
-def test_a_burst_passes_and_then_one_line_a_second(limit: LogLimit, clock: ManualClock) -> None:
+def test_burst_passes_then_one_line_per_second(limit: LogLimit, clock: ManualClock) -> None:
     passed = []
     for n in range(5000):
         passed.append(limit.filter(line(f"n {n}")))

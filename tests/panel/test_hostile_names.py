@@ -1,8 +1,6 @@
 """Names and texts that try to become scripts, fed through every view of a real page."""
 
 import contextlib
-import socket
-import threading
 from collections.abc import Iterator
 
 import pytest
@@ -10,8 +8,8 @@ from playwright.sync_api import Browser, Page
 from pymavlink.dialects.v20 import all as mavlink
 
 from tests.panel.browsing import WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.scripted_vehicle import SendingVehicle
 from tests.panel.test_recording_files import flight
-from tests.ports import free_port
 
 pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 
@@ -31,26 +29,11 @@ VIEWS = (
 )  # fmt: skip
 
 
-class HostileVehicle(threading.Thread):
+class HostileVehicle(SendingVehicle):
     """Sends parameters, texts and named values whose names are scripts."""
 
     def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.port = free_port()
-        self._ended = threading.Event()
-
-    def run(self) -> None:
-        mav = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-            sock.connect(("127.0.0.1", self.port))
-            while not self._ended.wait(0.2):
-                for message in self._messages():
-                    with contextlib.suppress(ConnectionRefusedError):
-                        sock.send(message.pack(mav))
-
-    def end(self) -> None:
-        self._ended.set()
-        self.join()
+        super().__init__(0.2)
 
     def _messages(self) -> Iterator[mavlink.MAVLink_message]:
         yield mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3)

@@ -146,7 +146,7 @@ def test_rest() -> None:
         (SIDES * [[0.93], [1.0], [1.0], [1.0], [1.0], [1.0]] - [[0], [3], [0], [0], [0], [0]], ""),
     ],
 )
-def test_an_accelerometer_that_no_sensor_can_be_is_refused(poses: np.ndarray, reason: str) -> None:
+def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: str) -> None:
     with pytest.raises(CalibrationError, match=f"{reason}.*still"):
         solve_accelerometer(poses)
 
@@ -164,7 +164,7 @@ def test_an_accelerometer_that_no_sensor_can_be_is_refused(poses: np.ndarray, re
         ),
     ],
 )
-def test_a_field_that_is_not_the_earths_is_refused(field: np.ndarray, reason: str) -> None:
+def test_field_outside_the_range_of_the_earth_is_refused(field: np.ndarray, reason: str) -> None:
     with pytest.raises(CalibrationError, match=f"{reason}.*steel"):
         solve_magnetometer(field)
 

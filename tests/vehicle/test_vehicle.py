@@ -88,7 +88,7 @@ def test_messages_are_not_due_all_at_once() -> None:
     assert len({name for each in reported for name in each}) > 12
 
 
-def test_a_rate_of_zero_sends_nothing() -> None:
+def test_rate_of_zero_disables_a_message() -> None:
     vehicle = make(rates=RateSettings(attitude_hz=0.0, gps_raw_int_hz=0.0, sys_status_hz=0.0))
     found = set(names(fly(vehicle, 0, 2)))
     assert not found & {"ATTITUDE", "GPS_RAW_INT", "SYS_STATUS"}

@@ -110,7 +110,7 @@ def test_one_stamp_ahead_moves_nothing(ahead_us: int) -> None:
     assert observed == [2_000_000 + step * 10_000 for step in range(300)]
 
 
-def test_a_clock_learned_in_a_queue_is_corrected_by_two_packets() -> None:
+def test_offset_measured_with_queued_packets_is_corrected_by_two_packets() -> None:
     tracker = ClockTracker()
     for step in range(10):
         tracker.observe(step * 10_000, 2_000_000 + 400_000 + step * 10_000)

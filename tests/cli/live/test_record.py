@@ -62,7 +62,7 @@ async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
     assert [path.name for path in gateway.recorder.folder.iterdir()] == [CATALOGUE_NAME]
 
 
-async def test_a_start_that_records_nothing_has_an_exit_code_of_its_own(gateway: Bench) -> None:
+async def test_start_without_a_recording_has_a_distinct_exit_code(gateway: Bench) -> None:
     gateway.recorder.folder.write_text("a file in its place")
     assert "blocked" in await run("start", code=1)
     assert "exists" in await run("status")

@@ -184,7 +184,7 @@ def fixes_of(messages: list[tuple[int, Message]]) -> list[GpsFix]:
 
 
 @pytest.mark.parametrize(("age_us", "is_known"), [(500_000, True), (500_001, False)])
-def test_a_climb_of_long_ago_is_unknown(age_us: int, is_known: bool) -> None:
+def test_climb_rate_is_unknown_once_it_is_outdated(age_us: int, is_known: bool) -> None:
     (fix,) = fixes_of([(0, position(0, -150)), (age_us, gps(age_us))])
     assert math.isfinite(fix.vel_n_mps[2]) == is_known
 
