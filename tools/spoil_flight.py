@@ -243,9 +243,10 @@ def field_jump(flight: Flight) -> Spoilt:
     return with_imu(flight, imu, begin_s + CURRENT_S)
 
 
-def gps_jump(flight: Flight) -> Spoilt:
-    """Shift position and velocity of the fixes of some seconds in the middle of the flight."""
-    gps, begin_s = flight.log.gps.copy(), middle_s(flight)
+def gps_jump(flight: Flight, begin_s: float | None = None) -> Spoilt:
+    """Shift position and velocity of the fixes of some seconds, by default in the middle."""
+    gps = flight.log.gps.copy()
+    begin_s = middle_s(flight) if begin_s is None else begin_s
     time_s = flight.log.gps_time_us * 1e-6
     wrong = (time_s > begin_s) & (time_s <= begin_s + GLITCH_S)
     gps[wrong, GPS_LAT] += math.degrees(GLITCH_M / SEMI_MAJOR_M)
@@ -253,11 +254,11 @@ def gps_jump(flight: Flight) -> Spoilt:
     return Spoilt(replace(flight, log=replace(flight.log, gps=gps)), begin_s + GLITCH_S)
 
 
-def wrong_latency(flight: Flight) -> Spoilt:
-    """Set the latency of the fixes too long; manoeuvres show it."""
+def wrong_latency(flight: Flight, known_s: float | None = None) -> Spoilt:
+    """Set the latency of the fixes too long; manoeuvres show it, by default until the middle."""
     latency_s = flight.reference.gps_latency_s + LATENCY_S
     spoilt = replace(flight, reference=replace_struct(flight.reference, gps_latency_s=latency_s))
-    return Spoilt(spoilt, middle_s(flight))
+    return Spoilt(spoilt, middle_s(flight) if known_s is None else known_s)
 
 
 SPOILS: dict[str, Callable[[Flight], Spoilt]] = {
