@@ -16,7 +16,6 @@ from gateway.hub.endpoint import parse_endpoint, stays_here
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlServer, socket_path
-from gateway.live.control_verbs import PlayerVerbs
 from gateway.live.player_edge import PlayerEdge
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
@@ -105,8 +104,7 @@ class PlayerDaemon:
         self.edge = PlayerEdge(
             self._player, self._send, self._now_us, files=files, on_end=self.ended.set
         )
-        self._control = ControlServer(socket_path("play"))
-        PlayerVerbs(self.edge).register(self._control)
+        self._control = ControlServer(socket_path("play"), self.edge.verbs())
 
     async def start(self) -> None:
         """Open everything and start; raises ControlError if another player runs."""

@@ -149,7 +149,7 @@ async def test_every_parameter_arrives_and_none_looks_lost(
     station.frames.clear()
     station.send(mavlink.MAVLink_param_request_list_message(3, 1))
     await station.until(PARAMETERS)
-    daemon.edge.seek(0.0)
+    daemon.edge.seek("0")
     daemon.edge.resume()
     await station.until(PARAMETERS + 2)
     daemon.close()

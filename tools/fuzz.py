@@ -30,8 +30,8 @@ from typer.testing import CliRunner
 
 from gateway.aircraft import AircraftSettings
 from gateway.config import ConfigError, GatewaySettings, load
-from gateway.live.control_socket import ControlError, ControlServer, NoParams
-from gateway.live.control_verbs import AircraftVerbs, Named, Text, To
+from gateway.live.control_socket import ControlServer, Verbs
+from gateway.live.control_verbs import mark_verbs
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import COLUMNS, TableRow
 from gateway.recordings.formats.ulog import TOPICS
@@ -164,28 +164,22 @@ JSON: Final = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner),
     max_leaves=8,
 )
-VERBS: Final = ("mark", "verbs", "name", "text", "to", "none", "record.list", "")
-KEYS: Final = ("lat_deg", "lon_deg", "alt_amsl_m", "vehicle_id", "name", "text", "to", "url")
+VERBS: Final = ("mark", "verbs", "text", "to", "none", "record.list", "")
+KEYS: Final = ("lat_deg", "lon_deg", "alt_amsl_m", "vehicle_id", "number", "text", "to", "url")
 
 
 def _control() -> ControlServer:
-    server = ControlServer(Path("unused.sock"))
-
     def mark(place: Location | None, vehicle_id: int | None) -> None:
         _vehicles().mark(place, vehicle_id, 0)
 
-    def moment(params: To) -> str:
-        try:
-            return str(parse_moment(params.to))
-        except ValueError as error:
-            raise ControlError(str(error)) from error
+    def echo(text: str, number: int = 1) -> str:
+        return text * number
 
-    AircraftVerbs(mark).register(server)
-    server.register("name", Named, lambda params: params.name)
-    server.register("text", Text, lambda params: params.text)
-    server.register("to", To, moment)
-    server.register("none", NoParams, lambda _: None)
-    return server
+    def moment(to: str) -> str:
+        return str(parse_moment(to))
+
+    verbs: Verbs = {"text": echo, "to": moment, "none": lambda: None}
+    return ControlServer(Path("unused.sock"), mark_verbs(mark), verbs)
 
 
 def _run(awaitable: Any) -> Any:

@@ -17,7 +17,7 @@ from gateway.fleet.session import (
 from gateway.hub.endpoint import SITE_NAME
 from gateway.hub.transports.zenoh.session import recordings_key
 from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
-from gateway.live.control_socket import ControlError, ControlServer
+from gateway.live.control_socket import ControlError, Verbs
 
 log = logging.getLogger(__name__)
 
@@ -28,48 +28,22 @@ DIGEST_TIMEOUT_S: Final = 300.0
 """Gigabytes on a slow card."""
 
 
-class SitePattern(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names of sites; without a pattern all that the fleet shows."""
-
-    site: str = ""
-
-
-class PieceParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Bytes of a file of a site's recording."""
-
-    site: str
-    file: str
-    offset: int
-    size: int
-
-
-class DigestParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The first `size` bytes of a file of a site's recording."""
-
-    site: str
-    file: str
-    size: int
-
-
 class RemoteRecordings:
     """The verbs `fleet.recordings`, `fleet.piece` and `fleet.digest`."""
 
     def __init__(self, session: FleetSession) -> None:
         self._session = session
 
-    def register(self, server: ControlServer) -> None:
-        """Register the verbs at a control socket."""
-        server.register("fleet.recordings", SitePattern, self._list)
-        server.register("fleet.piece", PieceParams, self._piece)
-        server.register("fleet.digest", DigestParams, self._digest)
+    def verbs(self) -> Verbs:
+        """Return the handlers."""
+        return {
+            "fleet.recordings": self._list,
+            "fleet.piece": self._piece,
+            "fleet.digest": self._digest,
+        }
 
-    async def _list(self, params: SitePattern) -> dict[str, list[RemoteRecording]]:
-        patterns = self._session.patterns
-        try:
-            if params.site:
-                patterns = [key_pattern(params.site)]
-        except ValueError as error:
-            raise ControlError(str(error)) from error
+    async def _list(self, site: str = "") -> dict[str, list[RemoteRecording]]:
+        patterns = [key_pattern(site)] if site else self._session.patterns
         query = RecordingQuery()
         asked = (self._query(each, query, LIST_TIMEOUT_S, _list_from) for each in patterns)
         found: dict[str, list[RemoteRecording]] = {}
@@ -77,13 +51,13 @@ class RemoteRecordings:
             found |= {site: listed for site, listed in answers.items() if listed is not None}
         return found
 
-    async def _piece(self, params: PieceParams) -> dict[str, bytes | None]:
-        query = RecordingQuery(params.file, params.offset, params.size)
-        return {"data": await self._ask_one(params.site, query, PIECE_TIMEOUT_S)}
+    async def _piece(self, site: str, file: str, offset: int, size: int) -> dict[str, bytes | None]:
+        query = RecordingQuery(file, offset, size)
+        return {"data": await self._ask_one(site, query, PIECE_TIMEOUT_S)}
 
-    async def _digest(self, params: DigestParams) -> dict[str, str | None]:
-        query = RecordingQuery(params.file, size=params.size, digest=True)
-        answer = await self._ask_one(params.site, query, DIGEST_TIMEOUT_S)
+    async def _digest(self, site: str, file: str, size: int) -> dict[str, str | None]:
+        query = RecordingQuery(file, size=size, digest=True)
+        answer = await self._ask_one(site, query, DIGEST_TIMEOUT_S)
         return {"sha256": None if answer is None else answer.decode("ascii", "replace")}
 
     async def _ask_one(self, site: str, query: RecordingQuery, timeout_s: float) -> bytes | None:

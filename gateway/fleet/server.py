@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
@@ -26,12 +25,7 @@ from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.base import Client
 from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers, in_key
-from gateway.live.control_socket import (
-    ControlError,
-    ControlServer,
-    NoParams,
-    socket_path,
-)
+from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
 from gateway.vehicle.requests import key_from_passphrase
@@ -176,15 +170,6 @@ ABANDONED_US: Final = 3600 * US_PER_S
 """After so long without a frame a vehicle may lose its id, and a site is removed."""
 
 
-class IdParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A vehicle of a site, and its id here."""
-
-    site: str
-    system_id: int
-    own_id: int
-    """0 to exclude it."""
-
-
 class FleetServer:
     """Sites, their vehicles, and the ground stations here.
 
@@ -227,10 +212,9 @@ class FleetServer:
         self._sites: dict[str, SiteClient] = {}
         self._bad_names = 0
         self._task: asyncio.Task[None] | None = None
-        self._control = ControlServer(socket_path("fleet"))
-        self._control.register("fleet.status", NoParams, lambda _: self.status())
-        self._control.register("fleet.id", IdParams, self._set_id)
-        RemoteRecordings(self._session).register(self._control)
+        own: Verbs = {"fleet.status": self.status, "fleet.id": self._set_id}
+        recordings = RemoteRecordings(self._session)
+        self._control = ControlServer(socket_path("fleet"), own, recordings.verbs())
 
     @property
     def control_socket(self) -> Path:
@@ -287,16 +271,13 @@ class FleetServer:
         about_hub = hub_families(hub.counters(), hub.listeners(), clients, self._now_us())
         return text_of(chain(fleet_families(status), about_hub))
 
-    async def _set_id(self, params: IdParams) -> list[str]:
-        if not SITE_NAME.fullmatch(params.site):
-            raise ControlError(f"site {params.site!r}: only letters, digits, . _ and - are allowed")
-        try:
-            if params.own_id == LEFT_OUT:
-                self._ids.leave_out(params.site, params.system_id)
-            else:
-                self._ids.set_by_hand(params.site, params.system_id, params.own_id)
-        except ValueError as error:
-            raise ControlError(str(error)) from error
+    async def _set_id(self, site: str, system_id: int, own_id: int) -> list[str]:
+        if not SITE_NAME.fullmatch(site):
+            raise ControlError(f"site {site!r}: only letters, digits, . _ and - are allowed")
+        if own_id == LEFT_OUT:
+            self._ids.leave_out(site, system_id)
+        else:
+            self._ids.set_by_hand(site, system_id, own_id)
         if reason := await self._ids_file.keep():
             raise ControlError(
                 f"the id is used from now on, but not saved: {self._ids_file.file}: {reason}; "

@@ -1,9 +1,8 @@
 """The control socket, by which the command line and the panel talk to a running gateway.
 
 A Unix socket that only the user (and root) can open; a system service's, its group too. Each
-request and each reply is one line of JSON; docs/control.md describes every verb. Each verb has a
-registered handler and a parameter type, which is checked before the handler is called. A command
-uses the named socket, the only one of its user, or the system service's.
+request and each reply is one line of JSON; docs/control.md describes every verb. A command uses the
+named socket, the only one of its user, or the system service's.
 """
 
 from __future__ import annotations
@@ -13,9 +12,10 @@ import os
 import pwd
 import socket
 import struct
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -54,10 +54,6 @@ class ControlError(Exception):
     """A request that was refused, or no gateway to send it to; the text says why."""
 
 
-class NoParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The parameters of a verb that has none."""
-
-
 class _Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     verb: str
     params: dict[str, Any] = {}
@@ -69,8 +65,13 @@ class _Answer(msgspec.Struct, frozen=True):
     error: str = ""
 
 
-Params = TypeVar("Params", bound=msgspec.Struct)
-Handler = Callable[[Any], Awaitable[object] | object]
+Handler = Callable[..., Awaitable[object] | object]
+Verbs = Mapping[str, Handler]
+"""Handlers by verb, which is words joined by dots.
+
+A handler takes the verb's parameters by their names and annotated types. It returns, or awaits,
+JSON, a msgspec structure or a dataclass; it refuses by ControlError, ValueError or OSError.
+"""
 
 
 class ControlServer:
@@ -80,30 +81,22 @@ class ControlServer:
     ----------
     path : Path
         Where the socket is created; if another gateway listens there, with the next number.
+    *tables : Verbs
+        The verbs, in addition to `verbs`, which lists them.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *tables: Verbs) -> None:
         self.path = path
         self._for_group = "RUNTIME_DIRECTORY" in os.environ
-        self._verbs: dict[str, tuple[type[msgspec.Struct], Handler]] = {}
         self._socket: socket.socket | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
         self._writers: set[asyncio.StreamWriter] = set()
-        self.register("verbs", NoParams, lambda _: sorted(self._verbs))
-
-    def register(
-        self,
-        verb: str,
-        params: type[Params],
-        handler: Callable[[Params], Awaitable[object] | object],
-    ) -> None:
-        """Register a verb: words joined by dots, its parameters' structure, and its handler.
-
-        The handler returns, or awaits, what is JSON or a msgspec structure or dataclass, and raises
-        ControlError to refuse.
-        """
-        self._verbs[verb] = (params, handler)
+        self._verbs = {
+            verb: (_parameters_of(handler), handler)
+            for table in ({"verbs": self._list}, *tables)
+            for verb, handler in table.items()
+        }
 
     async def start(self) -> None:
         """Create the socket and listen.
@@ -143,10 +136,10 @@ class ControlServer:
         try:
             request = msgspec.json.decode(line, type=_Request)
             kind, handler = self._find(request.verb)
-            result = handler(msgspec.convert(request.params, kind))
+            result = handler(**msgspec.structs.asdict(msgspec.convert(request.params, kind)))
             if isinstance(result, Awaitable):
                 result = await result
-        except (ControlError, msgspec.DecodeError, UnicodeDecodeError) as error:
+        except (ControlError, msgspec.DecodeError, ValueError, OSError) as error:
             return _Answer(ok=False, error=str(error))
         except RecursionError:
             return _Answer(ok=False, error="the request is nested too deeply")
@@ -154,9 +147,11 @@ class ControlServer:
 
     def _find(self, verb: str) -> tuple[type[msgspec.Struct], Handler]:
         if verb not in self._verbs:
-            known = ", ".join(sorted(self._verbs))
-            raise ControlError(f"no such verb: {verb}; there are {known}")
+            raise ControlError(f"no such verb: {verb}; there are {', '.join(self._list())}")
         return self._verbs[verb]
+
+    def _list(self) -> list[str]:
+        return sorted(self._verbs)
 
     def _bound(self) -> socket.socket:
         sock = socket.socket(socket.AF_UNIX)
@@ -178,16 +173,14 @@ class ControlServer:
         import asyncio
 
         connection.setblocking(False)
-        task = asyncio.get_running_loop().create_task(self._admit(connection))
+        task = asyncio.get_running_loop().create_task(self._serve(connection))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _admit(self, connection: socket.socket) -> None:
+    async def _serve(self, connection: socket.socket) -> None:
         import asyncio
 
-        await self._serve(*await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE))
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        reader, writer = await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)
         # One that was accepted just before the end is served only after it.
         is_refused = self._is_closed or len(self._writers) >= MAX_CONNECTIONS
         if is_refused or not self._is_allowed(writer):
@@ -210,6 +203,17 @@ class ControlServer:
         user, groups = peer_of(writer)
         is_member = self._for_group and os.getgid() in groups
         return user in (0, os.getuid()) or is_member
+
+
+def _parameters_of(handler: Handler) -> type[msgspec.Struct]:
+    """Make the structure that checks a request from a handler's parameters."""
+    fields: list[Any] = [
+        (each.name, each.annotation)
+        if each.default is each.empty
+        else (each.name, each.annotation, each.default)
+        for each in signature(handler, eval_str=True).parameters.values()
+    ]
+    return msgspec.defstruct("Parameters", fields, frozen=True, forbid_unknown_fields=True)
 
 
 def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
@@ -255,18 +259,10 @@ def check_length(path: Path) -> None:
 
 
 def socket_path(name: str) -> Path:
-    """Return where a kind of gateway creates its socket.
+    """Return where the socket of `run`, `play` or `fleet` is created.
 
-    Parameters
-    ----------
-    name : str
-        `run` for the gateway, `play` for a player.
-
-    Returns
-    -------
-    Path
-        In the folder that systemd created for a service, in the user's runtime folder, or in the
-        state folder if there is none.
+    It is in the folder that systemd created for a service, in the user's runtime folder, or in the
+    state folder if there is none.
     """
     if service := os.environ.get("RUNTIME_DIRECTORY"):
         return Path(service.split(":")[0]) / f"{name}.sock"
@@ -278,28 +274,9 @@ def socket_path(name: str) -> Path:
 def request(
     path: Path, verb: str, params: dict[str, Any] | None = None, *, timeout_s: float | None = None
 ) -> Any:
-    """Send a request to a running gateway, and wait for its reply.
+    """Send a request to the gateway at a socket, and return its result, decoded from JSON.
 
-    Parameters
-    ----------
-    path : Path
-        See `find_socket`.
-    verb : str
-        What to do.
-    params : dict, optional
-        Its parameters.
-    timeout_s : float, optional
-        Longest wait; `REQUEST_TIMEOUT_S` by default.
-
-    Returns
-    -------
-    object
-        The result, decoded from JSON.
-
-    Raises
-    ------
-    ControlError
-        If no gateway listens, or the request is refused.
+    Raises ControlError if no gateway listens, none answers in time, or the request is refused.
     """
     check_length(path)
     line = msgspec.json.encode({"verb": verb, "params": params or {}}) + b"\n"
@@ -331,22 +308,9 @@ ACCEPTS: Final = "00010000"
 
 
 def find_socket(name: str) -> Path:
-    """Find the gateway or player that a command is for.
+    """Find the socket of the user's own `run`, `play` or `fleet`, or else of the system service.
 
-    Parameters
-    ----------
-    name : str
-        `run` for the gateway, `play` for a player.
-
-    Returns
-    -------
-    Path
-        The user's own if one runs, otherwise the system service's.
-
-    Raises
-    ------
-    ControlError
-        If none runs, several do, or the running one denies access.
+    Raises ControlError if none runs, several do, or the running one denies access.
     """
     own = live_sockets(name)
     if len(own) > 1:

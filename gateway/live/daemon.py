@@ -22,7 +22,13 @@ from gateway.config import (
 )
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
-from gateway.live.control_verbs import AircraftVerbs, HubVerbs, ImuTap, RecorderVerbs, SerialVerbs
+from gateway.live.control_verbs import (
+    ImuTap,
+    RecorderVerbs,
+    SerialVerbs,
+    client_verbs,
+    mark_verbs,
+)
 from gateway.live.kept_files import PlaceFiles, StampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
@@ -146,17 +152,19 @@ class Daemon:
         )
 
     def _make_control(self) -> ControlServer:
-        control = ControlServer(socket_path("run"))
-        RecorderVerbs(self._recorder).register(control)
-        AircraftVerbs(self._mark).register(control)
-        SerialVerbs(self._serial, is_simulated=self._receiver is not None).register(control)
-        HubVerbs(self._hub, self.snapshot, self._reload_or_refuse).register(control)
         self._imu = ImuTap(
             lambda vehicle_id: self._pipeline.find(vehicle_id).settings.calibration,
             self._calibrate,
         )
-        self._imu.register(control)
-        return control
+        return ControlServer(
+            socket_path("run"),
+            {"status": self.snapshot, "reload": self._reload_or_refuse},
+            RecorderVerbs(self._recorder).verbs(),
+            mark_verbs(self._mark),
+            SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
+            client_verbs(self._hub),
+            self._imu.verbs(),
+        )
 
     def start(self) -> None:
         """Open everything; needs a running event loop. What is missing is retried."""

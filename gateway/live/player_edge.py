@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from gateway.live.control_socket import Verbs
+from gateway.recordings.moment import parse_moment, place_in
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player, PlayState, check_speed
 from gateway.units import US_PER_S
 
@@ -37,7 +39,7 @@ class PlayerEdge:
     Parameters
     ----------
     player : Player
-        Decides what is due when.
+        Decides which frames are due when.
     emit : callable
         Called with each batch of frames.
     now_us : callable
@@ -65,6 +67,18 @@ class PlayerEdge:
         self._wanted_us: int | None = None
         self._timer: asyncio.TimerHandle | asyncio.Handle | None = None
 
+    def verbs(self) -> Verbs:
+        """Return the handlers of the control socket; each returns the state."""
+        return {
+            "seek": self.seek,
+            "play.pause": self.pause,
+            "play.resume": self.resume,
+            "play.step": self.step,
+            "play.speed": self.set_speed,
+            "play.loop": self.set_loop,
+            "play.status": self.status,
+        }
+
     def start(self) -> None:
         """Start; needs a running event loop."""
         self._turn()
@@ -75,41 +89,38 @@ class PlayerEdge:
             self._timer.cancel()
             self._timer = None
 
-    def pause(self) -> None:
+    def pause(self) -> PlayerStatus:
         """Pause."""
         self._player.pause(self._clock())
-        self._turn()
+        return self._turned()
 
-    def resume(self) -> None:
+    def resume(self) -> PlayerStatus:
         """Resume."""
         self._player.resume(self._clock())
-        self._turn()
+        return self._turned()
 
-    def step(self, count: int = 1) -> None:
+    def step(self, count: int = 1) -> PlayerStatus:
         """Pause, and play the next frames."""
         self._emit(self._player.step(self._clock(), count))
-        self._turn()
+        return self._turned()
 
-    def set_speed(self, speed: float) -> None:
-        """Change the speed; raises ValueError if it is out of range."""
-        self._player.set_speed(check_speed(speed), self._clock())
-        self._turn()
+    def set_speed(self, speed: float | None) -> PlayerStatus:
+        """Change the speed, None for the fastest; raises ValueError if it is out of range."""
+        speed = AS_FAST_AS_POSSIBLE if speed is None else check_speed(speed)
+        self._player.set_speed(speed, self._clock())
+        return self._turned()
 
-    def set_loop(self, loop: bool) -> None:
+    def set_loop(self, on: bool) -> PlayerStatus:
         """Set whether to restart at the end."""
-        self._player.loop = loop
+        self._player.loop = on
+        return self.status()
 
-    def seek(self, offset_s: float, *, relative: bool = False) -> None:
-        """Move to an offset from the start of the range, or from here."""
-        player = self._player
+    def seek(self, to: str) -> PlayerStatus:
+        """Move to a moment, as soon as it is ready; see `parse_moment`, also for its error."""
+        player, moment = self._player, parse_moment(to)
         here_us = player.position_us if self._wanted_us is None else self._wanted_us
-        base_us = here_us if relative else player.begin_us
-        self.seek_time(base_us + round(offset_s * US_PER_S))
-
-    def seek_time(self, time_us: int) -> None:
-        """Move to a recorded civil time in µs since 1970, as soon as it is ready."""
-        self._wanted_us = time_us
-        self._turn()
+        self._wanted_us = place_in(moment, here_us if moment.relative else player.begin_us)
+        return self._turned()
 
     def status(self) -> PlayerStatus:
         """Return the present state."""
@@ -125,6 +136,10 @@ class PlayerEdge:
             sent=player.sent,
             files=self._files,
         )
+
+    def _turned(self) -> PlayerStatus:
+        self._turn()
+        return self.status()
 
     def _turn(self) -> None:
         """Emit the frames due and wait for the next; the work for a seek is done in between."""

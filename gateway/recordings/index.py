@@ -31,7 +31,7 @@ class Recording:
     """When it was last written, in s since 1970."""
 
 
-class RecordingError(Exception):
+class RecordingError(ValueError):
     """The request cannot be carried out; the text says why."""
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from gateway.cli.live import fleet as fleet_command
 from gateway.cli.live.fleet import FetchError, PiecePace, RecordingFetch
-from gateway.fleet.remote_recordings import RemoteRecordings, SitePattern
+from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.hub.transports.zenoh import site_queries
 from gateway.hub.transports.zenoh.site_queries import (
     MAX_PIECE,
@@ -180,7 +180,7 @@ async def test_malformed_list_of_one_site_hides_no_others() -> None:
         return {site: decode(site, data) for site, data in answers.items()}
 
     session = MagicMock(patterns=["*"], query=query)
-    found = await RemoteRecordings(session)._list(SitePattern())
+    found = await RemoteRecordings(session)._list()
     assert found == {"sound": [RemoteRecording("one", [], 1.5)]}
 
 

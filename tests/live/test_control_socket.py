@@ -17,7 +17,6 @@ from gateway.live.control_socket import (
     MAX_LINE,
     ControlError,
     ControlServer,
-    NoParams,
     find_socket,
     request,
     socket_path,
@@ -29,22 +28,15 @@ LIMIT_S = 60.0
 """After which a connection that nobody closes makes its test fail."""
 
 
-class Seek(msgspec.Struct, forbid_unknown_fields=True):
-    offset_s: float
-
-
 @pytest.fixture
 async def server(tmp_path: Path) -> AsyncIterator[ControlServer]:
-    made = ControlServer(tmp_path / "mavgate" / "run.sock")
+    async def seek(offset_s: float) -> dict[str, float]:
+        return {"position_s": offset_s}
 
-    async def seek(params: Seek) -> dict[str, float]:
-        return {"position_s": params.offset_s}
-
-    def refuse(_: NoParams) -> None:
+    def refuse() -> None:
         raise ControlError("not now")
 
-    made.register("seek", Seek, seek)
-    made.register("refuse", NoParams, refuse)
+    made = ControlServer(tmp_path / "mavgate" / "run.sock", {"seek": seek, "refuse": refuse})
     await made.start()
     yield made
     made.close()
@@ -129,10 +121,10 @@ async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Pat
     server = ControlServer(tmp_path / "run.sock")
     accepted, ended, serve = asyncio.Event(), asyncio.Event(), server._serve
 
-    async def serve_late(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def serve_late(connection: socket.socket) -> None:
         accepted.set()
         await ended.wait()
-        await serve(reader, writer)
+        await serve(connection)
 
     server._serve = serve_late  # type: ignore[method-assign]
     await server.start()

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from gateway.live.control_socket import ControlServer
-from gateway.live.control_verbs import AircraftVerbs, PlayerVerbs, RecorderVerbs
+from gateway.live.control_verbs import RecorderVerbs, mark_verbs
 from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
@@ -36,8 +36,7 @@ async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
 
 
 async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) -> None:
-    server = ControlServer(tmp_path / "s")
-    RecorderVerbs(bench.recorder).register(server)
+    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
     started = (await ask(server, "record.start"))["result"]
     assert (started["state"], started["part"]) == ("recording", 1)
     bench.send(make_frames(9))
@@ -62,8 +61,7 @@ async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) 
 async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server = ControlServer(tmp_path / "s")
-    RecorderVerbs(bench.recorder).register(server)
+    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
     looked: list[threading.Thread] = []
 
     def look(_folder: Path) -> list[Recording]:
@@ -83,8 +81,7 @@ async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None
             raise ValueError("no such aircraft; heard so far: 1")
         marked.append((place, vehicle_id))
 
-    server = ControlServer(tmp_path / "s")
-    AircraftVerbs(mark).register(server)
+    server = ControlServer(tmp_path / "s", mark_verbs(mark))
     assert (await ask(server, "mark", lat_deg=-7.5, lon_deg=110.0, alt_amsl_m=90.0))["ok"]
     assert (await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=3))["ok"]
     assert (await ask(server, "mark"))["result"] == "mark cleared"
@@ -103,8 +100,7 @@ async def test_a_player_is_steered(clock: ManualClock, tmp_path: Path) -> None:
     path.write_bytes(make_tlog(make_records(500)))
     played = Played(path, clock)
     played.edge.start()
-    server = ControlServer(tmp_path / "s")
-    PlayerVerbs(played.edge).register(server)
+    server = ControlServer(tmp_path / "s", played.edge.verbs())
 
     async def state(verb: str, **params: object) -> dict[str, Any]:
         answer = await ask(server, verb, **params)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gateway.cli.live import calibrate
-from gateway.live.control_socket import ControlServer, NoParams, socket_path
-from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuParams, ImuTap, raw_of, values_of
+from gateway.live.control_socket import ControlServer, Verbs, socket_path
+from gateway.live.control_verbs import IDLE_US, MAX_SAMPLES, ImuTap, raw_of, values_of
 from gateway.records import FusedSample
 from gateway.sensing.calibration import NodeCalibration
 from tests.kit.cli import invoke
@@ -36,15 +36,15 @@ def test_samples_are_collected_only_while_they_are_asked_for() -> None:
     tap = ImuTap(lambda _: NodeCalibration(), lambda *_: None)
     for sample in samples(10):
         tap.add(sample)
-    assert tap._take(ImuParams(3)) == []
+    assert tap._take(3) == []
     for sample in samples(MAX_SAMPLES + 50):
         tap.add(sample)
-    found = tap._take(ImuParams(3))
+    found = tap._take(3)
     assert len(found) == MAX_SAMPLES
     assert values_of(raw_of(found[0], 3)) == found[0]
     for sample in samples(3 + IDLE_US // STEP_US):
         tap.add(sample)
-    assert tap._take(ImuParams(3)) == []
+    assert tap._take(3) == []
 
 
 @pytest.mark.io
@@ -56,22 +56,19 @@ async def test_calibrate_uses_the_samples_of_the_running_gateway(
     monkeypatch.setattr(calibrate, "POLL_S", 0.0)
     kept = [NodeCalibration(mag_hard_iron_ut=(1.0, 2.0, 3.0))]
     tap = ImuTap(lambda _: kept[-1], lambda _, calibration: kept.append(calibration))
-    server = ControlServer(socket_path("run"))
-    tap.register(server)
-    take, now = tap._take, 0
+    now = 0
 
-    def taken(params: ImuParams) -> object:
+    def taken(vehicle_id: int) -> object:
         nonlocal now
         for sample in samples(100, now):
             tap.add(sample)
         now += 100 * STEP_US
-        return take(params)
+        return tap._take(vehicle_id)
 
-    server.register("imu.samples", ImuParams, taken)
     board = {"sensors_present": 7, "chips": ["MPU6500", "QMC5883L", "BMP280"]}
-    server.register(
-        "status", NoParams, lambda _: {"aircraft": [{"vehicle_id": 3, "boards": [board]}]}
-    )
+    status = {"aircraft": [{"vehicle_id": 3, "boards": [board]}]}
+    verbs: Verbs = {"imu.samples": taken, "status": lambda: status}
+    server = ControlServer(socket_path("run"), tap.verbs(), verbs)
     await server.start()
     try:
         words = ["calibrate", "gyro", "--vehicle", "3"]

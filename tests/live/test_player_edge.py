@@ -67,11 +67,11 @@ async def test_orders(tlog: Path, clock: ManualClock) -> None:
     played.edge.pause()
     played.edge.step(2)
     assert played.frames == FRAMES[:3]
-    played.edge.seek(10 * STEP_US / 1e6)
+    played.edge.seek("0.2")
     assert played.edge.status().position_s == pytest.approx(10 * STEP_US / 1e6)
-    played.edge.seek(-0.1, relative=True)
+    played.edge.seek("-0.1")
     assert played.edge.status().position_s == pytest.approx(5 * STEP_US / 1e6)
-    played.edge.seek_time(START_US + 7 * STEP_US)
+    played.edge.seek("2025-10-09T08:53:20.14Z")
     assert played.edge.status().time_us == START_US + 7 * STEP_US
     played.frames.clear()
     played.edge.resume()

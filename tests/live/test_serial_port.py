@@ -370,8 +370,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
     first, second = adapters.plug(), adapters.plug()
     settings = SerialSettings(port=first)
     port = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
-    server = ControlServer(tmp_path / "s")
-    SerialVerbs(port, is_simulated=False).register(server)
+    server = ControlServer(tmp_path / "s", SerialVerbs(port, is_simulated=False).verbs())
     port.start()
     status = (await ask(server, "serial.status"))["result"]
     assert (status["state"], status["device"], len(status["ports"])) == ("open", first, 2)
@@ -398,8 +397,7 @@ async def test_port_of_a_simulated_receiver_is_not_changed(
     listener: Listener, tmp_path: Path
 ) -> None:
     port = SerialPort(SerialSettings(), listener.on_bytes, print, print, lambda: 42)
-    server = ControlServer(tmp_path / "s")
-    SerialVerbs(port, is_simulated=True).register(server)
+    server = ControlServer(tmp_path / "s", SerialVerbs(port, is_simulated=True).verbs())
     assert (await ask(server, "serial.status"))["result"]["is_fixed"]
     for verb, params in (("serial.connect", {"port": "auto"}), ("serial.disconnect", {})):
         assert "simulated" in (await ask(server, verb, **params))["error"]

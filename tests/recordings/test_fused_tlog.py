@@ -93,11 +93,11 @@ async def test_the_old_place_plays_on_until_a_seek_is_ready(
 
     edge = PlayerEdge(Player([Track(tlog)], clock()), emit, clock)
     edge.start()
-    edge.seek(10.0)
+    edge.seek("10")
     assert edge.status().state == "seeking"
     assert edge.status().duration_s == pytest.approx((END_US - START_US) / 1e6)
     clock.advance(STEP_US / 1e6)
-    edge.seek(5.0, relative=True)
+    edge.seek("+5")
     assert frames == [record.frame for record in RECORDS[:2]]
     for _ in range(2 * len(RECORDS)):
         await asyncio.sleep(0)

@@ -243,9 +243,9 @@ def steer(daemon: PlayerDaemon, key: str) -> None:
         case "l":
             edge.set_loop(not edge.status().loop)
         case "home":
-            edge.seek(0.0)
+            edge.seek("0")
         case _ if key in LEAPS_S:
-            edge.seek(LEAPS_S[key], relative=True)
+            edge.seek(f"{LEAPS_S[key]:+g}")
 
 
 def _next_speed(speed: float | None, *, faster: bool) -> float:

@@ -16,7 +16,7 @@ from rich.console import Console
 from gateway.cli.live import clients
 from gateway.config import load
 from gateway.hub.stats import HubCounters, ListenerStats
-from gateway.live.control_socket import ControlError, ControlServer, NoParams, socket_path
+from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.records import (
     LinkReport,
     LoggedRequest,
@@ -95,46 +95,39 @@ SNAPSHOT = Snapshot(
 )
 
 
-class Url(msgspec.Struct):
-    url: str
-
-
-class Name(msgspec.Struct):
-    name: str
-
-
-class Place(msgspec.Struct):
-    lat_deg: float | None
-    lon_deg: float | None
-    alt_amsl_m: float | None
-    vehicle_id: int | None
-
-
 class Gateway:
     """A control socket in a loop of its own, as the command would meet it."""
 
     def __init__(self) -> None:
         self.asked: list[object] = []
         self.loop = asyncio.new_event_loop()
-        self.server = ControlServer(socket_path("run"))
-        self.server.register("status", NoParams, lambda _: SNAPSHOT)
-        self.server.register("clients.list", NoParams, lambda _: SNAPSHOT.clients)
-        self.server.register("clients.add", Url, self._add)
-        self.server.register("clients.remove", Name, self._remove)
-        self.server.register("reload", NoParams, lambda _: "settings of the hub applied")
-        self.server.register("mark", Place, self._mark)
+        verbs = {
+            "status": lambda: SNAPSHOT,
+            "clients.list": lambda: SNAPSHOT.clients,
+            "clients.add": self._add,
+            "clients.remove": self._remove,
+            "reload": lambda: "settings of the hub applied",
+            "mark": self._mark,
+        }
+        self.server = ControlServer(socket_path("run"), verbs)
         self.thread = threading.Thread(target=self.loop.run_forever)
 
-    def _add(self, params: Url) -> list[str]:
-        self.asked.append(params)
-        return ["udp:127.0.0.1:14550", params.url]
+    def _add(self, url: str) -> list[str]:
+        self.asked.append(url)
+        return ["udp:127.0.0.1:14550", url]
 
-    def _mark(self, params: Place) -> str:
-        self.asked.append(params)
+    def _mark(
+        self,
+        lat_deg: float | None,
+        lon_deg: float | None,
+        alt_amsl_m: float | None,
+        vehicle_id: int | None,
+    ) -> str:
+        self.asked.append((lat_deg, lon_deg, alt_amsl_m, vehicle_id))
         return "marked"
 
-    def _remove(self, params: Name) -> list[str]:
-        raise ControlError(f"no endpoint is called {params.name!r}")
+    def _remove(self, name: str) -> list[str]:
+        raise ControlError(f"no endpoint is called {name!r}")
 
 
 @pytest.fixture
@@ -192,7 +185,7 @@ def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
     assert "3722.0" in run("clients", "list").output
     assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
     assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
-    assert gateway.asked == [Url("udp:10.0.0.8:14550")]
+    assert gateway.asked == ["udp:10.0.0.8:14550"]
     reported = "observers: Address already in use; trying again until it works"
     assert reported in run("clients", "add", CLOSED.endpoint).output
     refused = run("clients", "remove", "phone")
@@ -229,7 +222,7 @@ def test_piped_tables_and_texts_are_never_wrapped(
 
 def test_mark_takes_places_of_the_south_and_west(gateway: Gateway) -> None:
     assert run("mark", "-7.76", "-110.4", "--alt", "-3").output == "marked\n"
-    assert gateway.asked == [Place(-7.76, -110.4, -3.0, None)]
+    assert gateway.asked == [(-7.76, -110.4, -3.0, None)]
     assert run("mark", "--hight", "3").exit_code == 2
 
 

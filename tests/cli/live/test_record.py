@@ -28,8 +28,7 @@ async def gateway(
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     bench = Bench(tmp_path / "elsewhere", clock, mode="manual")
     bench.recorder.start()
-    server = ControlServer(socket_path("run"))
-    RecorderVerbs(bench.recorder).register(server)
+    server = ControlServer(socket_path("run"), RecorderVerbs(bench.recorder).verbs())
     await server.start()
     yield bench
     server.close()
