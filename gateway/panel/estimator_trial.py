@@ -74,11 +74,11 @@ def settings_of(parameters: Mapping[str, float]) -> FusionSettings:
     """Convert MAVLink parameters back to the settings of filters and estimators."""
     table = ParameterTable({"estimation": EstimationSettings()})
     for name, value in parameters.items():
-        index = table.index.get(name)
-        if index is None:
+        parameter = table.parameters.get(name)
+        if parameter is None:
             continue
         try:
-            table.change(table.parameters[index], value)
+            table.change(parameter, value)
         except ValueError:
             # Out of range, as from another version: use the default.
             continue

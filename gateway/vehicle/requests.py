@@ -22,10 +22,10 @@ import hashlib
 import hmac
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import msgspec
 from pymavlink.dialects.v20 import all as mavlink
@@ -143,14 +143,93 @@ Action = (
 Answer = Reply | Action
 
 
+class Service:
+    """One group of requests; by default it changes nothing and sends nothing by itself."""
+
+    types: ClassVar[tuple[str, ...]] = ()
+    """Names of the messages that it handles."""
+
+    def changes_state(self, _request: Request) -> bool:
+        """Return whether only a trusted client may send this request."""
+        return False
+
+    def handle(self, _request: Request, _now_us: int) -> list[Answer]:
+        """Answer a request."""
+        return []
+
+    def refuse(self, _request: Request) -> list[Answer]:
+        """Answer a client that may not send this request."""
+        return []
+
+    def poll(self, _now_us: int) -> list[Answer]:
+        """Return what is due by time."""
+        return []
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to do."""
+        return None
+
+    def remove_client(self, client_id: int) -> None:
+        """Discard what was kept for a client that has gone."""
+
+
+BATCH: Final = 10
+BATCH_INTERVAL_US: Final = 10_000
+"""Between batches of this many answers, for all transfers together."""
+
+
+class Transfers:
+    """Lists and files on the way to clients: a few answers at a time, each transfer in turn.
+
+    That bounds the load of the gateway, and overflows neither a receive buffer nor a slow link.
+    """
+
+    def __init__(self) -> None:
+        self._answers: dict[int, Iterator[Answer]] = {}
+        """What is left of each transfer; whose turn it is comes first."""
+        self._due_us = 0
+
+    def __contains__(self, key: int) -> bool:
+        """Return whether a transfer is under way."""
+        return key in self._answers
+
+    def __len__(self) -> int:
+        """Return how many transfers are under way."""
+        return len(self._answers)
+
+    def start(self, key: int, answers: Iterator[Answer]) -> None:
+        """Start a transfer, or start it again."""
+        self._answers[key] = answers
+
+    def stop(self, key: int) -> None:
+        """End a transfer, if it is under way."""
+        self._answers.pop(key, None)
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Return the next answers if they are due."""
+        found: list[Answer] = []
+        if not self._answers or now_us < self._due_us:
+            return found
+        while self._answers and len(found) < BATCH:
+            key = next(iter(self._answers))
+            answers = self._answers.pop(key)
+            if (answer := next(answers, None)) is not None:
+                found.append(answer)
+                self._answers[key] = answers
+        self._due_us = now_us + BATCH_INTERVAL_US
+        return found
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to do."""
+        return self._due_us if self._answers else None
+
+
 TICKS_PER_S: Final = 100_000
 RESERVE_TICKS: Final = 5 * TICKS_PER_S
 MAX_KEYS: Final = 16
 MAX_STREAMS: Final = 256
 """Only holders of the key make streams, so untrusted clients never reach this."""
 
-Stream = tuple[int, int, int]
-"""Link, system, component."""
 KeptTimestamps = dict[str, dict[str, int]]
 """By the id of the key, then by the stream as `link.system.component`."""
 
@@ -166,19 +245,16 @@ class SigningTimestamps:
     Parameters
     ----------
     kept : mapping, optional
-        What `to_keep` returned in an earlier run.
+        The result of `to_keep` in an earlier run.
     """
 
     def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
-        self._newest = {
-            key_id: {_stream(text): timestamp for text, timestamp in streams.items()}
-            for key_id, streams in (kept or {}).items()
-        }
-        self._kept = {key_id: dict(streams) for key_id, streams in self._newest.items()}
+        self._newest = _copied(kept or {})
+        self._kept = _copied(self._newest)
         self.is_due = False
         """Whether `to_keep` has something that must be written."""
 
-    def newest(self, key_id: str, stream: Stream) -> int | None:
+    def newest(self, key_id: str, stream: str) -> int | None:
         """Return the newest timestamp of a stream under a key; None if it is new."""
         return self._newest.get(key_id, {}).get(stream)
 
@@ -186,7 +262,7 @@ class SigningTimestamps:
         """Return whether one more stream can be followed under a key."""
         return len(self._newest.get(key_id, {})) < MAX_STREAMS
 
-    def add(self, key_id: str, stream: Stream, timestamp: int) -> None:
+    def add(self, key_id: str, stream: str, timestamp: int) -> None:
         """Add an accepted timestamp."""
         streams = self._newest.pop(key_id, {})
         # The key that was used last comes last.
@@ -202,23 +278,15 @@ class SigningTimestamps:
     def to_keep(self) -> KeptTimestamps:
         """Return what to write now, so that no frame accepted so far is accepted again."""
         self.is_due = False
-        return _texts(self._kept)
+        return _copied(self._kept)
 
     def exact(self) -> KeptTimestamps:
         """Return the timestamps without the reserve, for a clean shutdown."""
-        return _texts(self._newest)
+        return _copied(self._newest)
 
 
-def _texts(found: Mapping[str, Mapping[Stream, int]]) -> KeptTimestamps:
-    return {
-        key_id: {".".join(map(str, stream)): timestamp for stream, timestamp in streams.items()}
-        for key_id, streams in found.items()
-    }
-
-
-def _stream(text: str) -> Stream:
-    link, system, component = (int(part) for part in text.split("."))
-    return link, system, component
+def _copied(found: Mapping[str, Mapping[str, int]]) -> KeptTimestamps:
+    return {key_id: dict(streams) for key_id, streams in found.items()}
 
 
 SIGNATURE_BYTES: Final = 13
@@ -287,7 +355,7 @@ class Verifier:
         wanted = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
         if not hmac.compare_digest(signature, wanted):
             return False
-        stream = (frame[-SIGNATURE_BYTES], frame[5], frame[6])
+        stream = f"{frame[-SIGNATURE_BYTES]}.{frame[5]}.{frame[6]}"
         timestamp = int.from_bytes(frame[-12:-6], "little")
         newest = self._book.newest(self._key_id, stream)
         if newest is None:

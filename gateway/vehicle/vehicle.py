@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -36,6 +36,7 @@ from gateway.vehicle.requests import (
     Request,
     RequestLog,
     RequestReader,
+    Service,
     SettingsChange,
     SigningClock,
     SigningTimestamps,
@@ -71,27 +72,6 @@ HOME_SECTION: Final = "home"
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
 """A refusal is announced to all at most this often: enough as a warning, without a flood."""
-
-
-class Service(Protocol):
-    """A service that answers one group of messages."""
-
-    @property
-    def types(self) -> tuple[str, ...]:
-        """Names of the messages it handles."""
-        ...
-
-    def changes_state(self, request: Request) -> bool:
-        """Return whether only a trusted client may send this request."""
-        ...
-
-    def handle(self, request: Request, now_us: int) -> list[Answer]:
-        """Answer."""
-        ...
-
-    def refuse(self, request: Request) -> list[Answer]:
-        """Answer a client that may not send this request."""
-        ...
 
 
 class Vehicle:
@@ -157,7 +137,7 @@ class Vehicle:
             self.system_id, ParameterTable(sections), {HOME_SECTION: self.plan}
         )
         self._metadata = Metadata(self._parameters.table)
-        self._ftp = FtpService({**self._metadata.files(), PACKED_PATH: self._parameters.packed})
+        self._ftp = FtpService({**self._metadata.files, PACKED_PATH: self._parameters.packed})
         self._calibrator = Calibrator(
             self.system_id, lambda: self.in_flight, lambda: self.telemetry.state
         )
@@ -189,17 +169,7 @@ class Vehicle:
 
     def _route(self, commands: CommandService) -> None:
         """Register which service handles which message, and which are polled."""
-        services: tuple[Service, ...] = (
-            commands,
-            self._intervals,
-            self._parameters,
-            self.plan.missions,
-            self._ftp,
-            QueryService(self._build, self._explain),
-            self._control,
-        )
-        self._services = {kind: service for service in services for kind in service.types}
-        self._timed = (
+        self._timed: tuple[Service, ...] = (
             self._intervals,
             self._parameters,
             self.plan.missions,
@@ -208,6 +178,8 @@ class Vehicle:
             self._recording,
             self._control,
         )
+        services = (commands, QueryService(self._build, self._explain), *self._timed)
+        self._services = {kind: service for service in services for kind in service.types}
 
     @property
     def faults(self) -> Counter[str]:
@@ -315,7 +287,7 @@ class Vehicle:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION,
         )
         known = [message for number in asked for message in self._build(number, 0)]
-        known += [each.message for each in self._parameters.values() if isinstance(each, Reply)]
+        known += self._parameters.values()
         known += self.plan.missions.download()
         return [encoder.encode(message, RECORDED_ONLY) for message in known]
 
@@ -336,12 +308,8 @@ class Vehicle:
 
     def remove_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
-        self._intervals.remove_client(client_id)
-        self._parameters.remove_client(client_id)
-        self.plan.missions.remove_client(client_id)
-        self._ftp.remove_client(client_id)
-        self._control.remove_client(client_id)
-        self._recording.remove_client(client_id)
+        for service in self._timed:
+            service.remove_client(client_id)
 
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; the armed bit may follow it."""

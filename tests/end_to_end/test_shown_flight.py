@@ -126,7 +126,7 @@ async def test_tlog_and_playback_show_the_same_flight(folder: Path) -> None:
     assert played.track == recorded.track
     assert played.home == recorded.home
     assert played.version == recorded.version
-    assert vehicle._metadata is metadata
+    assert vehicle.metadata is metadata
 
 
 def asked(vehicle: RecordedVehicle, request: Any) -> list[bytes]:

@@ -47,6 +47,7 @@ from gateway.vehicle.requests import (
     CalibrationKind,
     CalibrationMeasured,
     Reply,
+    Service,
     StatusText,
 )
 from gateway.vehicle.services.commands import (
@@ -123,7 +124,7 @@ class _Run:
         return found
 
 
-class Calibrator:
+class Calibrator(Service):
     """At most one calibration at a time.
 
     Parameters
@@ -154,7 +155,7 @@ class Calibrator:
 
     def start(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_CALIBRATION; all zero cancels."""
-        asked = (whole(command.params[0]), whole(command.params[1]), whole(command.extra[0]))
+        asked = (whole(command.params[0]), whole(command.params[1]), whole(command.params[4]))
         run = {
             (1, 0, 0): _Run(CalibrationKind.GYRO, command, now_us),
             (0, 1, 0): _Run(CalibrationKind.MAG, command, now_us),
@@ -163,8 +164,7 @@ class Calibrator:
             (0, 0, 4): _Run(CalibrationKind.ACCEL, command, now_us, simple=True),
         }.get(asked)
         if run is None:
-            values = (*command.params, *command.extra, command.height_m)
-            nothing = not any(whole(value) for value in values)
+            nothing = not any(whole(value) for value in command.params)
             return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
         return self._begin(run)
 
@@ -227,7 +227,7 @@ class Calibrator:
             return calibrate_accelerometer_level(samples, IN_BODY_AXES)
         if run.yaw_rad is None:
             return calibrate_accelerometer(run.poses, IN_BODY_AXES)
-        lat_deg, lon_deg = run.command.lat_deg, run.command.lon_deg
+        lat_deg, lon_deg, _ = run.command.location
         state = self._state()
         if (
             not (lat_deg or lon_deg)

@@ -24,7 +24,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
 from gateway.vehicle.plan import DEGE7, GLOBAL_FRAMES
-from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request
+from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request, Service
 from gateway.vehicle.services.intervals import IntervalService
 
 ACCEPTED: Final[int] = mavlink.MAV_RESULT_ACCEPTED
@@ -35,6 +35,7 @@ IN_PROGRESS: Final[int] = mavlink.MAV_RESULT_IN_PROGRESS
 FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
 
 NO_PROGRESS: Final = 255
+REQUEST_MESSAGE: Final = mavlink.MAV_CMD_REQUEST_MESSAGE
 RESPOND_TO_ALL: Final = 2
 """Last parameter of MAV_CMD_REQUEST_MESSAGE."""
 
@@ -54,39 +55,30 @@ SHORTHANDS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """COMMAND_LONG or COMMAND_INT, in one form."""
+    """COMMAND_LONG, COMMAND_INT or SET_MODE, in one form."""
 
     request: Request
     number: int
-    params: tuple[float, float, float, float]
-    lat_deg: float
-    """Parameter 5 of a COMMAND_LONG, x of a COMMAND_INT in degrees."""
-    lon_deg: float
-    height_m: float
-    """Parameter 7."""
-    frame: int
+    params: tuple[float, ...]
+    """All seven; the fifth and sixth of a COMMAND_INT are its x and y."""
+    frame: int = mavlink.MAV_FRAME_GLOBAL
+
+    @property
+    def location(self) -> tuple[float, float, float]:
+        """Latitude and longitude in deg, and height in m in its frame."""
+        is_scaled = self.request.message.get_type() == "COMMAND_INT" and self.frame in GLOBAL_FRAMES
+        scale = DEGE7 if is_scaled else 1.0
+        x, y, z = self.params[4:]
+        return x / scale, y / scale, z
 
     def ack(self, result: int, progress: int = NO_PROGRESS) -> Reply:
         """Acknowledge it."""
-        done = progress if result == IN_PROGRESS else 0
-        return self.request.reply(
+        request, done = self.request, progress if result == IN_PROGRESS else 0
+        return request.reply(
             mavlink.MAVLink_command_ack_message(
-                self.number,
-                result,
-                done,
-                0,
-                self.request.system_id,
-                self.request.component_id,
+                self.number, result, done, 0, request.system_id, request.component_id
             )
         )
-
-    @property
-    def extra(self) -> tuple[float, float]:
-        """Parameters 5 and 6, if they are not a position."""
-        message = self.request.message
-        if message.get_type() == "COMMAND_INT":
-            return (float(message.x), float(message.y))
-        return (message.param5, message.param6)
 
 
 Outcome = tuple[int, list[Answer]]
@@ -95,20 +87,19 @@ Outcome = tuple[int, list[Answer]]
 Handler = Callable[[Command, int], Outcome]
 Explain = Callable[[str, int], list[Answer]]
 """Announces a text to all at a time: why something was refused."""
+Build = Callable[[int, int], list[Any]]
+"""Builds the messages of an id at a time; an empty list if there is nothing yet."""
 
 
 def read_command(request: Request) -> Command:
-    """Read a command from either message."""
-    message = request.message
-    params = (message.param1, message.param2, message.param3, message.param4)
-    if message.get_type() == "COMMAND_LONG":
-        place = (message.param5, message.param6, message.param7)
-        frame = int(mavlink.MAV_FRAME_GLOBAL)
-    else:
-        scale = DEGE7 if message.frame in GLOBAL_FRAMES else 1.0
-        place = (message.x / scale, message.y / scale, message.z)
-        frame = int(message.frame)
-    return Command(request, message.command, params, *place, frame)
+    """Read a command from any of its messages."""
+    m = request.message
+    if m.get_type() == "SET_MODE":
+        return Command(request, mavlink.MAV_CMD_DO_SET_MODE, (0.0,) * 7)
+    first = (m.param1, m.param2, m.param3, m.param4)
+    if m.get_type() == "COMMAND_INT":
+        return Command(request, m.command, (*first, m.x, m.y, m.z), m.frame)
+    return Command(request, m.command, (*first, m.param5, m.param6, m.param7))
 
 
 def whole(value: float) -> int:
@@ -116,44 +107,44 @@ def whole(value: float) -> int:
     return round(value) if math.isfinite(value) else 0
 
 
-class CommandService:
-    """Dispatch commands by number; one without a handler is UNSUPPORTED."""
+def requested_message(command: Command) -> int:
+    """Return the id of the message that a command requests."""
+    return SHORTHANDS.get(command.number) or whole(command.params[0])
+
+
+class CommandService(Service):
+    """Dispatch commands by number; one without a handler is UNSUPPORTED.
+
+    Parameters
+    ----------
+    intervals : IntervalService
+        For the rates of single clients.
+    build, knows : callable
+        Build a message, and whether a message of that id is ever sent.
+    explain : callable
+        Announces to all why something was refused.
+    """
 
     types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
 
     def __init__(
         self,
         intervals: IntervalService,
-        build: Callable[[int, int], list[Any]],
+        build: Build,
         knows: Callable[[int], bool],
         explain: Explain,
     ) -> None:
-        """Start with the commands that need no other service.
-
-        Parameters
-        ----------
-        intervals : IntervalService
-            For the rates of single clients.
-        build : callable
-            Builds the messages of an id at a time; an empty list if there is nothing yet.
-        knows : callable
-            Whether a message of that id is ever sent.
-        explain : callable
-            Announces to all why something was refused.
-        """
         self._intervals = intervals
         self._build = build
         self._knows = knows
         self._explain = explain
         self._handlers: dict[int, Handler] = {
-            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
-            **{number: self._fixed(message_id) for number, message_id in SHORTHANDS.items()},
+            **dict.fromkeys((REQUEST_MESSAGE, *SHORTHANDS), self._request_message),
+            **dict.fromkeys(REFUSALS, self._decline),
         }
         self._changing: set[int] = set(REFUSALS)
-        for number in REFUSALS:
-            self._handlers[number] = self._decline
 
     def register(self, number: int, handler: Handler, *, changes_state: bool = True) -> None:
         """Let another service carry out a command."""
@@ -163,73 +154,52 @@ class CommandService:
 
     def changes_state(self, request: Request) -> bool:
         """Return whether the command would change anything."""
-        message = request.message
-        return message.get_type() == "SET_MODE" or message.command in self._changing
+        return read_command(request).number in self._changing
 
     def refuse(self, request: Request) -> list[Answer]:
         """Acknowledge as denied."""
-        return [self._read(request).ack(DENIED)]
+        return [read_command(request).ack(DENIED)]
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Carry out a command and acknowledge it."""
-        command = self._read(request)
+        command = read_command(request)
         handler = self._handlers.get(command.number)
         if handler is None:
             return [command.ack(UNSUPPORTED)]
         result, answers = handler(command, now_us)
         return [command.ack(result), *answers]
 
-    def _read(self, request: Request) -> Command:
-        if request.message.get_type() != "SET_MODE":
-            return read_command(request)
-        number = mavlink.MAV_CMD_DO_SET_MODE
-        return Command(request, number, (0.0,) * 4, 0.0, 0.0, 0.0, mavlink.MAV_FRAME_GLOBAL)
-
     def _decline(self, command: Command, now_us: int) -> Outcome:
         return DENIED, self._explain(REFUSALS[command.number], now_us)
 
     def _request_message(self, command: Command, now_us: int) -> Outcome:
-        message_id = whole(command.params[0])
+        message_id, request = requested_message(command), command.request
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-            return self._report_interval(command, whole(command.params[1]))
+            return self._report_interval(request, whole(command.params[1]))
         if not self._knows(message_id):
             return UNSUPPORTED, []
-        messages = self._build(message_id, now_us)
         # The answer to an untrusted client must not load the links of others.
-        everybody = whole(command.height_m) == RESPOND_TO_ALL and command.request.may_change
-        answers: list[Answer] = [
-            Reply(m, None if everybody else command.request.client_id) for m in messages
-        ]
+        to_all = command.number == REQUEST_MESSAGE and whole(command.params[6]) == RESPOND_TO_ALL
+        client_id = None if to_all and request.may_change else request.client_id
+        answers: list[Answer] = [Reply(m, client_id) for m in self._build(message_id, now_us)]
         return (ACCEPTED, answers) if answers else (NOT_NOW, [])
 
-    def _fixed(self, message_id: int) -> Handler:
-        def handler(command: Command, now_us: int) -> Outcome:
-            messages = self._build(message_id, now_us)
-            answers: list[Answer] = [command.request.reply(m) for m in messages]
-            return (ACCEPTED, answers) if answers else (NOT_NOW, [])
-
-        return handler
-
     def _set_interval(self, command: Command, _now_us: int) -> Outcome:
-        message_id = whole(command.params[0])
-        interval_us = command.params[1]
+        message_id, interval_us = whole(command.params[0]), command.params[1]
         if not math.isfinite(interval_us):
             return DENIED, []
         if not self._knows(message_id):
             return UNSUPPORTED, []
-        try:
-            return ACCEPTED, self._intervals.set_interval(command.request, message_id, interval_us)
-        except ValueError:
-            return DENIED, []
+        answers = self._intervals.set_interval(command.request, message_id, round(interval_us))
+        return (DENIED, []) if answers is None else (ACCEPTED, answers)
 
     def _get_interval(self, command: Command, _now_us: int) -> Outcome:
-        return self._report_interval(command, whole(command.params[0]))
+        return self._report_interval(command.request, whole(command.params[0]))
 
-    def _report_interval(self, command: Command, message_id: int) -> Outcome:
-        client_id = command.request.client_id
-        interval_us = self._intervals.interval_us(client_id, message_id)
+    def _report_interval(self, request: Request, message_id: int) -> Outcome:
+        interval_us = self._intervals.interval_us(request.client_id, message_id)
         answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
-        return ACCEPTED, [command.request.reply(answer)]
+        return ACCEPTED, [request.reply(answer)]
 
 
 RECORDER_TIMEOUT_US: Final = 10 * US_PER_S
@@ -237,7 +207,7 @@ MAX_WAITING: Final = 16
 """Ground stations that may wait for the recorder."""
 
 
-class RecordingService:
+class RecordingService(Service):
     """Start and stop the recording.
 
     Parameters
@@ -306,35 +276,57 @@ class RecordingService:
 
 
 NS_PER_US: Final = 1000
-PARAM_EXT_TYPE_UINT8: Final = mavlink.MAV_PARAM_EXT_TYPE_UINT8
 
 SIGNING_SETUP: Final = (
     "Signing is not set up by MAVLink: set vehicle.signing_passphrase in the settings file "
     "and run mavgate reload"
 )
 
-Build = Callable[[int, int], list[Any]]
+SINGLE: Final = {
+    "AUTOPILOT_VERSION_REQUEST": mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+    "SET_GPS_GLOBAL_ORIGIN": mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
+}
+"""Older requests of one message. The origin is the first home; the answer has the one in use."""
 
 
-class QueryService:
+def _no_extended_parameter(_request: Any) -> Any:
+    return mavlink.MAVLink_param_ext_value_message(b"", b"", mavlink.MAV_PARAM_EXT_TYPE_UINT8, 0, 0)
+
+
+def _extended_parameter_refused(request: Any) -> Any:
+    name = request.param_id.encode("ascii", "replace")[:16]
+    failed = mavlink.PARAM_ACK_FAILED
+    return mavlink.MAVLink_param_ext_ack_message(name, b"", request.param_type, failed)
+
+
+NOTHING: Final[dict[str, Callable[[Any], Any]]] = {
+    "LOG_REQUEST_LIST": lambda _: mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0),
+    "LOG_REQUEST_DATA": lambda m: mavlink.MAVLink_log_data_message(m.id, m.ofs, 0, [0] * 90),
+    "TERRAIN_CHECK": lambda m: mavlink.MAVLink_terrain_report_message(
+        m.lat, m.lon, spacing=0, terrain_height=0.0, current_height=0.0, pending=0, loaded=0
+    ),
+    "PARAM_EXT_REQUEST_LIST": _no_extended_parameter,
+    "PARAM_EXT_REQUEST_READ": _no_extended_parameter,
+    "PARAM_EXT_SET": _extended_parameter_refused,
+}
+"""Answers that there are no logs, no terrain data and no extended parameters."""
+
+
+class QueryService(Service):
     """Answer requests that need no state.
 
-    A ground station that gets no answer repeats its request for seconds, so what does not exist
-    here is answered too: by an empty list, or by "not available".
+    A ground station that gets no answer repeats its request for seconds, so a request of something
+    that does not exist here is answered too.
 
     Parameters
     ----------
     build : callable
-        Builds the messages of an id at a time, for requests of a single message.
+        Builds a message, for requests of a single message.
     explain : callable
         Announces to all why something was refused.
     """
 
-    types = (
-        "PING", "TIMESYNC", "LOG_REQUEST_LIST", "LOG_REQUEST_DATA", "PARAM_EXT_REQUEST_LIST",
-        "PARAM_EXT_REQUEST_READ", "PARAM_EXT_SET", "TERRAIN_CHECK", "AUTOPILOT_VERSION_REQUEST",
-        "SET_GPS_GLOBAL_ORIGIN", "SETUP_SIGNING",
-    )  # fmt: skip
+    types = ("PING", "TIMESYNC", "SETUP_SIGNING", *SINGLE, *NOTHING)
 
     def __init__(self, build: Build, explain: Explain) -> None:
         self._build = build
@@ -345,71 +337,26 @@ class QueryService:
         return request.message.get_type() in ("SETUP_SIGNING", "PARAM_EXT_SET")
 
     def refuse(self, request: Request) -> list[Answer]:
-        """Return no answer: these messages have none of their own."""
-        return [_no_parameter(request)] if request.message.get_type() == "PARAM_EXT_SET" else []
+        """Refuse to set a parameter; the other messages have no answer of their own."""
+        is_parameter = request.message.get_type() == "PARAM_EXT_SET"
+        return [request.reply(_extended_parameter_refused(request.message))] if is_parameter else []
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer a request at once."""
         message = request.message
-        match message.get_type():
-            case "PING":
-                is_request = (message.target_system, message.target_component) == (0, 0)
-                return [_pong(request)] if is_request else []
-            case "TIMESYNC":
-                if message.tc1 != 0:
-                    return []
-                answer = mavlink.MAVLink_timesync_message(now_us * NS_PER_US, message.ts1)
-                return [request.reply(answer)]
-            case "AUTOPILOT_VERSION_REQUEST":
-                return self._send(request, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, now_us)
-            case "SET_GPS_GLOBAL_ORIGIN":
-                # The origin is the first home; the answer has the one in use.
-                return self._send(request, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, now_us)
-            case "SETUP_SIGNING":
-                return self._explain(SIGNING_SETUP, now_us)
-        return [_nothing(request)]
-
-    def _send(self, request: Request, message_id: int, now_us: int) -> list[Answer]:
-        return [request.reply(message) for message in self._build(message_id, now_us)]
-
-
-def _pong(request: Request) -> Answer:
-    message = request.message
-    return request.reply(
-        mavlink.MAVLink_ping_message(
-            message.time_usec, message.seq, request.system_id, request.component_id
-        )
-    )
-
-
-def _nothing(request: Request) -> Answer:
-    """Answer that there are no logs, no extended parameters and no terrain data."""
-    message = request.message
-    match message.get_type():
-        case "LOG_REQUEST_LIST":
-            return request.reply(mavlink.MAVLink_log_entry_message(0, 0, 0, 0, 0))
-        case "LOG_REQUEST_DATA":
-            answer = mavlink.MAVLink_log_data_message(message.id, message.ofs, 0, [0] * 90)
-            return request.reply(answer)
-        case "TERRAIN_CHECK":
-            answer = mavlink.MAVLink_terrain_report_message(
-                message.lat, message.lon, spacing=0, terrain_height=0.0, current_height=0.0,
-                pending=0, loaded=0,
-            )  # fmt: skip
-            return request.reply(answer)
-        case "PARAM_EXT_SET":
-            return _no_parameter(request)
-    none = mavlink.MAVLink_param_ext_value_message(b"", b"", PARAM_EXT_TYPE_UINT8, 0, 0)
-    return request.reply(none)
-
-
-def _no_parameter(request: Request) -> Answer:
-    message = request.message
-    return request.reply(
-        mavlink.MAVLink_param_ext_ack_message(
-            message.param_id.encode("ascii", "replace")[:16],
-            b"",
-            message.param_type,
-            mavlink.PARAM_ACK_FAILED,
-        )
-    )
+        kind = message.get_type()
+        if kind == "SETUP_SIGNING":
+            return self._explain(SIGNING_SETUP, now_us)
+        if kind in SINGLE:
+            found = self._build(SINGLE[kind], now_us)
+        elif kind in NOTHING:
+            found = [NOTHING[kind](message)]
+        elif kind == "TIMESYNC":
+            sync = mavlink.MAVLink_timesync_message(now_us * NS_PER_US, message.ts1)
+            found = [] if message.tc1 else [sync]
+        else:
+            sender = (request.system_id, request.component_id)
+            pong = mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender)
+            # One with a target is an answer.
+            found = [] if message.target_system or message.target_component else [pong]
+        return [request.reply(answer) for answer in found]

@@ -12,14 +12,14 @@ References
 import binascii
 import re
 import struct
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.requests import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request, Service, Transfers
 
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251
@@ -29,20 +29,18 @@ MAX_SESSIONS_OF_ONE: Final = 4
 """A client reads one file after the other; its oldest session gives way, and nobody else's."""
 MAX_ANSWERS: Final = 512
 """Clients whose last answer is kept."""
-BURST: Final = 10
-BURST_INTERVAL_US: Final = 10_000
-"""Between batches of this many packets, for all clients together."""
 MIN_BURST_DATA: Final = 64
 """A burst of single bytes would cost both sides sixty times as much."""
 
-ACK: Final = 128
 _SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
 """The part before the path in a URI of the component metadata."""
+
+ACK: Final = 128
 NAK: Final = 129
 
 
 class Opcode(IntEnum):
-    """The requests of the protocol."""
+    """The requests that only read; those from 6 to 13 write."""
 
     NONE = 0
     TERMINATE_SESSION = 1
@@ -50,36 +48,16 @@ class Opcode(IntEnum):
     LIST_DIRECTORY = 3
     OPEN_FILE_RO = 4
     READ_FILE = 5
-    CREATE_FILE = 6
-    WRITE_FILE = 7
-    REMOVE_FILE = 8
-    CREATE_DIRECTORY = 9
-    REMOVE_DIRECTORY = 10
-    OPEN_FILE_WO = 11
-    TRUNCATE_FILE = 12
-    RENAME = 13
     CALC_FILE_CRC32 = 14
     BURST_READ_FILE = 15
 
 
-WRITING: Final = frozenset(
-    {
-        Opcode.CREATE_FILE,
-        Opcode.WRITE_FILE,
-        Opcode.REMOVE_FILE,
-        Opcode.CREATE_DIRECTORY,
-        Opcode.REMOVE_DIRECTORY,
-        Opcode.OPEN_FILE_WO,
-        Opcode.TRUNCATE_FILE,
-        Opcode.RENAME,
-    }
-)
+WRITING: Final = range(mavlink.MAV_FTP_OPCODE_CREATEFILE, mavlink.MAV_FTP_OPCODE_RENAME + 1)
 
 
 class FtpError(IntEnum):
     """Why a request is refused."""
 
-    INVALID_DATA_SIZE = 3
     INVALID_SESSION = 4
     NO_SESSIONS = 5
     EOF = 6
@@ -94,8 +72,7 @@ class _RefusedError(Exception):
         self.error = error
 
 
-@dataclass(frozen=True, slots=True)
-class Packet:
+class Packet(NamedTuple):
     """The payload of FILE_TRANSFER_PROTOCOL."""
 
     sequence: int
@@ -109,61 +86,49 @@ class Packet:
 
     def encode(self) -> bytes:
         """Lay it out, padded to the payload's full length."""
-        head = HEADER.pack(
-            self.sequence,
-            self.session,
-            self.opcode,
-            self.size,
-            self.request_opcode,
-            self.burst_complete,
-            self.offset,
-        )
-        return (head + self.data).ljust(PAYLOAD_BYTES, b"\0")
+        *head, data = self
+        return (HEADER.pack(*head) + data).ljust(PAYLOAD_BYTES, b"\0")
+
+    def answer(self, opcode: int, session: int, data: bytes) -> "Packet":
+        """Return the answer to this request."""
+        sequence = (self.sequence + 1) & 0xFFFF
+        return Packet(sequence, session, opcode, len(data), self.opcode, 0, self.offset, data)
 
 
 def decode_packet(payload: bytes) -> Packet:
     """Read a payload."""
-    *head, offset = HEADER.unpack_from(payload)
-    size = min(head[3], MAX_DATA)
-    data = payload[HEADER.size : HEADER.size + size]
-    return Packet(head[0], head[1], head[2], head[3], head[4], head[5], offset, data)
+    data_size = min(payload[4], MAX_DATA)
+    fields = (*HEADER.unpack_from(payload), payload[HEADER.size : HEADER.size + data_size])
+    return Packet._make(fields)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Session:
     client_id: int
     may_change: bool
     content: bytes
 
 
-@dataclass(slots=True)
-class _Burst:
-    request: Request
-    packet: Packet
-    """The next packet's sequence and offset, and the size that the client requested."""
+File = bytes | Callable[[Request, str], bytes]
 
 
-FileMaker = Callable[[Request, str], bytes]
-
-
-class FtpService:
-    """Files of one vehicle, generated each time they are opened.
+class FtpService(Service):
+    """Files of one vehicle.
 
     Parameters
     ----------
-    files : mapping of str to callable
-        Absolute paths, and the functions that generate their content from the request and the
-        query of its path, such as `start=50&count=10`.
+    files : mapping of str to bytes or callable
+        Absolute paths, and their content, or the functions that generate it from the request and
+        the query of its path, such as `start=50&count=10`.
     """
 
     types = ("FILE_TRANSFER_PROTOCOL",)
 
-    def __init__(self, files: Mapping[str, FileMaker]) -> None:
+    def __init__(self, files: Mapping[str, File]) -> None:
         self._files = dict(files)
         self._sessions: dict[int, _Session] = {}
-        self._bursts: dict[int, _Burst] = {}
-        """By session; whose turn it is comes first."""
-        self._due_us = 0
+        self._bursts = Transfers()
+        """By session."""
         self._last: dict[int, tuple[Packet, Reply]] = {}
         self._handlers: dict[int, Callable[[Request, Packet], bytes]] = {
             Opcode.NONE: lambda *_: b"",
@@ -174,14 +139,6 @@ class FtpService:
             Opcode.CALC_FILE_CRC32: self._crc32,
         }
 
-    def changes_state(self, _request: Request) -> bool:
-        """Return False: files can only be read."""
-        return False
-
-    def refuse(self, _request: Request) -> list[Answer]:
-        """Return no answer; never called."""
-        return []
-
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one request; a repeated request gets the same answer again."""
         packet = decode_packet(bytes(request.message.payload))
@@ -190,27 +147,23 @@ class FtpService:
             return [known[1]]
         try:
             if packet.opcode == Opcode.BURST_READ_FILE:
-                return self._begin_burst(request, packet, now_us)
-            answer = _answer(packet, ACK, *self._carry_out(request, packet))
+                content = self._content_from(request, packet)
+                self._bursts.start(packet.session, _burst(request, packet, content))
+                return self._bursts.poll(now_us)
+            answer = packet.answer(ACK, *self._carry_out(request, packet))
         except _RefusedError as refused:
-            answer = _answer(packet, NAK, packet.session, bytes([refused.error]))
+            answer = packet.answer(NAK, packet.session, bytes([refused.error]))
         reply = _reply(request, answer)
         self._keep_answer(request.client_id, packet, reply)
         return [reply]
 
     def poll(self, now_us: int) -> list[Answer]:
-        """Send the next packets of the bursts, in turn."""
-        if not self._bursts or now_us < self._due_us:
-            return []
-        answers: list[Answer] = []
-        while self._bursts and len(answers) < BURST:
-            answers.append(self._continue_burst(next(iter(self._bursts))))
-        self._due_us = now_us + BURST_INTERVAL_US
-        return answers
+        """Send the next packets of the bursts."""
+        return self._bursts.poll(now_us)
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to send."""
-        return self._due_us if self._bursts else None
+        return self._bursts.next_due_us()
 
     def remove_client(self, client_id: int) -> None:
         """Close the sessions of a client that has gone."""
@@ -220,7 +173,7 @@ class FtpService:
 
     def _drop(self, number: int) -> None:
         self._sessions.pop(number)
-        self._bursts.pop(number, None)
+        self._bursts.stop(number)
 
     def _carry_out(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         """Carry out a request; return the session and the data of the answer."""
@@ -238,7 +191,7 @@ class FtpService:
 
         The server chooses the number [1]_, but MAVProxy ignores answers with another than its own.
         """
-        content = self._content(request, packet)
+        content = self._generate(*_path(packet), request)
         self._make_room(request)
         number = packet.session
         if number in self._sessions or number >= MAX_SESSIONS:
@@ -260,7 +213,7 @@ class FtpService:
         self._drop(oldest)
 
     def _terminate(self, request: Request, packet: Packet) -> bytes:
-        self._session(request, packet)
+        self._content(request, packet)
         self._drop(packet.session)
         return b""
 
@@ -276,7 +229,7 @@ class FtpService:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
         data = b""
         for path in found[packet.offset :]:
-            size = len(self._files[path](request, ""))
+            size = len(self._generate(path, "", request))
             entry = f"F{path.removeprefix(folder)}\t{size}\0".encode()
             if len(data) + len(entry) > MAX_DATA:
                 break
@@ -286,58 +239,44 @@ class FtpService:
         return data
 
     def _read(self, request: Request, packet: Packet) -> bytes:
-        content = self._session(request, packet).content
-        if packet.offset >= len(content):
-            raise _RefusedError(FtpError.EOF)
-        size = min(packet.size or MAX_DATA, MAX_DATA)
-        return content[packet.offset : packet.offset + size]
+        return self._content_from(request, packet)[: min(packet.size or MAX_DATA, MAX_DATA)]
 
     def _crc32(self, request: Request, packet: Packet) -> bytes:
-        return struct.pack("<I", crc32(self._content(request, packet)))
+        return struct.pack("<I", crc32(self._generate(*_path(packet), request)))
 
-    def _begin_burst(self, request: Request, packet: Packet, now_us: int) -> list[Answer]:
-        content = self._session(request, packet).content
-        if packet.offset >= len(content):
-            raise _RefusedError(FtpError.EOF)
-        first = replace(packet, sequence=(packet.sequence + 1) & 0xFFFF)
-        self._bursts[packet.session] = _Burst(request, first)
-        return self.poll(now_us)
-
-    def _continue_burst(self, number: int) -> Reply:
-        """Build the next packet of a burst, which then queues behind the others."""
-        burst = self._bursts.pop(number)
-        content, packet = self._sessions[number].content, burst.packet
-        size = min(max(packet.size or MAX_DATA, MIN_BURST_DATA), MAX_DATA)
-        data = content[packet.offset : packet.offset + size]
-        end = packet.offset + len(data)
-        last = end >= len(content)
-        if not last:
-            burst.packet = replace(packet, sequence=(packet.sequence + 1) & 0xFFFF, offset=end)
-            self._bursts[number] = burst
-        return _reply(
-            burst.request,
-            Packet(
-                packet.sequence, number, ACK, len(data), packet.opcode, last, packet.offset, data
-            ),
-        )
-
-    def _session(self, request: Request, packet: Packet) -> _Session:
+    def _content(self, request: Request, packet: Packet) -> bytes:
+        """Return the file of the client's session."""
         session = self._sessions.get(packet.session)
         if session is None or session.client_id != request.client_id:
             raise _RefusedError(FtpError.INVALID_SESSION)
-        return session
+        return session.content
 
-    def _content(self, request: Request, packet: Packet) -> bytes:
-        path, query = _path(packet)
-        make = self._files.get(path)
-        if make is None:
+    def _content_from(self, request: Request, packet: Packet) -> bytes:
+        """Return the rest of the file from the requested offset."""
+        rest = self._content(request, packet)[packet.offset :]
+        if not rest:
+            raise _RefusedError(FtpError.EOF)
+        return rest
+
+    def _generate(self, path: str, query: str, request: Request) -> bytes:
+        file = self._files.get(path)
+        if file is None:
             raise _RefusedError(FtpError.FILE_NOT_FOUND)
-        return make(request, query)
+        return file if isinstance(file, bytes) else file(request, query)
 
     def _keep_answer(self, client_id: int, packet: Packet, reply: Reply) -> None:
         if client_id not in self._last and len(self._last) >= MAX_ANSWERS:
             self._last.pop(next(iter(self._last)))
         self._last[client_id] = (packet, reply)
+
+
+def _burst(request: Request, packet: Packet, content: bytes) -> Iterator[Reply]:
+    """Build the packets of a burst that sends what remains of the content."""
+    size = min(max(packet.size or MAX_DATA, MIN_BURST_DATA), MAX_DATA)
+    for number, start in enumerate(range(0, len(content), size)):
+        asked = packet._replace(sequence=packet.sequence + number, offset=packet.offset + start)
+        answer = asked.answer(ACK, packet.session, content[start : start + size])
+        yield _reply(request, answer._replace(burst_complete=start + size >= len(content)))
 
 
 def crc32(content: bytes) -> int:
@@ -354,11 +293,6 @@ def _path(packet: Packet) -> tuple[str, str]:
     text = packet.data.split(b"\0", 1)[0].decode("utf-8", "replace")
     path, _, query = _SCHEME.sub("", text.strip()).partition("?")
     return "/" + "/".join(part for part in path.split("/") if part not in ("", ".")), query
-
-
-def _answer(packet: Packet, opcode: int, session: int, data: bytes) -> Packet:
-    sequence = (packet.sequence + 1) & 0xFFFF
-    return Packet(sequence, session, opcode, len(data), packet.opcode, 0, packet.offset, data)
 
 
 def _reply(request: Request, packet: Packet) -> Reply:

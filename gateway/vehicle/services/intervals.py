@@ -11,7 +11,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
-from gateway.vehicle.requests import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request, Service
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
 
@@ -52,7 +52,7 @@ DATA_STREAMS: Final[dict[int, tuple[int, ...]]] = {
 ALL_GROUPS: Final = tuple(message for group in DATA_STREAMS.values() for message in group)
 
 
-class IntervalService:
+class IntervalService(Service):
     """Which client gets which message how often."""
 
     types = ("REQUEST_DATA_STREAM",)
@@ -62,14 +62,6 @@ class IntervalService:
         self._telemetry = telemetry
         self._requested: dict[tuple[int, int], int] = {}
         self._fast: dict[tuple[int, int], Stream] = {}
-
-    def changes_state(self, _request: Request) -> bool:
-        """Return False: a client's own rates change nothing for others."""
-        return False
-
-    def refuse(self, _request: Request) -> list[Answer]:
-        """Return no answer: the message has none."""
-        return []
 
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
         """Thin a group of messages by REQUEST_DATA_STREAM, which has no answer.
@@ -90,34 +82,20 @@ class IntervalService:
             answers += self._take(request.client_id, message_id, DEFAULT if faster else wanted_us)
         return answers
 
-    def set_interval(self, request: Request, message_id: int, interval_us: float) -> list[Answer]:
-        """Apply one client's requested rate.
+    def set_interval(
+        self, request: Request, message_id: int, requested_us: int
+    ) -> list[Answer] | None:
+        """Apply one client's requested interval, as in MAV_CMD_SET_MESSAGE_INTERVAL.
 
-        Parameters
-        ----------
-        request : Request
-            The client's request.
-        message_id : int
-        interval_us : float
-            As in MAV_CMD_SET_MESSAGE_INTERVAL: 0 for the settings' rate, -1 for none.
-
-        Returns
-        -------
-        list of Answer
-            What the hub is to do.
-
-        Raises
-        ------
-        ValueError
-            If the message is never streamed, or the rate cannot be granted.
+        None if the message is never streamed, or the rate cannot be granted.
         """
         stream = self._telemetry.streams.get(message_id)
         if stream is None:
-            raise ValueError("this message is not streamed")
-        requested_us = round(interval_us)
+            return None
         if message_id == HEARTBEAT and requested_us != DEFAULT:
+            # A vehicle without heartbeats disappears from ground stations.
             if not 0 < requested_us <= KEEPS_CLIENTS_US:
-                raise ValueError("a vehicle without heartbeats disappears from ground stations")
+                return None
             requested_us = DEFAULT
         if requested_us < 0:
             requested_us = NONE
@@ -125,7 +103,7 @@ class IntervalService:
             carried = message_id in CARRIED_MESSAGES
             requested_us = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, requested_us)
         if _is_faster(requested_us, stream.interval_us) and not request.may_change:
-            raise ValueError("more than the settings' rate is not for every client")
+            return None
         return self._take(request.client_id, message_id, requested_us)
 
     def interval_us(self, client_id: int, message_id: int) -> int:

@@ -57,7 +57,7 @@ from gateway.vehicle.plan import (
     write_float_item,
     write_item,
 )
-from gateway.vehicle.requests import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request, Service
 
 REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S
@@ -104,7 +104,7 @@ class _Upload:
     """How often the last item is still to be asked for, once all came."""
 
 
-class MissionService:
+class MissionService(Service):
     """The stored items of one vehicle."""
 
     types = (

@@ -27,7 +27,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import ControlStatus
-from gateway.vehicle.requests import Answer, Reply, Request
+from gateway.vehicle.requests import Answer, Reply, Request, Service
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -55,14 +55,14 @@ LEGACY_TAKEN: Final = 3
 
 @dataclass(slots=True)
 class _Operator:
-    client_id: int
-    system_id: int
-    component_id: int
-    heard_us: int
+    request: Request
+    """Its newest request of control."""
+    received_us: int
+    """When its newest message was received."""
     allows_takeover: bool
 
 
-class OperatorControl:
+class OperatorControl(Service):
     """The ground station that controls one vehicle.
 
     Parameters
@@ -89,20 +89,12 @@ class OperatorControl:
         """Return why another station may not change things."""
         if self._operator is None:
             return "no station is in control"
-        return f"system {self._operator.system_id} is in control"
+        return f"system {self._operator.request.system_id} is in control"
 
     def on_request(self, request: Request, now_us: int) -> None:
         """Note that a station is alive."""
         if self._operator is not None and self._is_operator(request):
-            self._operator.heard_us = now_us
-
-    def changes_state(self, _request: Request) -> bool:
-        """Return False: untrusted clients are denied by the acknowledgement itself."""
-        return False
-
-    def refuse(self, _request: Request) -> list[Answer]:
-        """Return nothing; never called."""
-        return []
+            self._operator.received_us = now_us
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer CHANGE_OPERATOR_CONTROL, the older request, which has no takeover."""
@@ -127,28 +119,25 @@ class OperatorControl:
 
     def command(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_REQUEST_OPERATOR_CONTROL."""
-        request, (action, takeover, timeout_s, system_id) = command.request, command.params
+        request, (action, takeover, timeout_s, system_id) = command.request, command.params[:4]
         if not request.may_change or whole(system_id) not in (0, request.system_id):
             return DENIED, []
         if whole(action) == 0:
             return self._release(request, now_us)
         result, answers = self._request(request, now_us, allows_takeover=whole(takeover) == 1)
-        operator = self._operator
-        if result == FAILED and operator is not None:
+        if result == FAILED and self._operator is not None:
+            operator, params = self._operator.request, (1.0, takeover, timeout_s, request.system_id)
             notice = mavlink.MAVLink_command_long_message(
                 operator.system_id,
                 operator.component_id,
                 REQUEST_OPERATOR_CONTROL,
                 0,
-                1.0,
-                takeover,
-                timeout_s,
-                float(request.system_id),
-                0.0,
-                0.0,
-                0.0,
+                *params,
+                0,
+                0,
+                0,
             )
-            answers = [*answers, Reply(notice, operator.client_id)]
+            answers = [*answers, operator.reply(notice)]
         return result, answers
 
     def poll(self, now_us: int) -> list[Answer]:
@@ -156,8 +145,10 @@ class OperatorControl:
         if not self.exclusive or now_us < self._due_us:
             return []
         operator = self._operator
-        if operator is not None and now_us - operator.heard_us > TIMEOUT_US:
-            return self._change(None, f"System {operator.system_id} lost control: timeout", now_us)
+        if operator is not None and now_us - operator.received_us > TIMEOUT_US:
+            return self._change(
+                None, f"System {operator.request.system_id} lost control: timeout", now_us
+            )
         self._due_us = now_us + INTERVAL_US
         return [Reply(self.status())]
 
@@ -167,7 +158,7 @@ class OperatorControl:
 
     def remove_client(self, client_id: int) -> None:
         """Release the control of a station whose link has closed."""
-        if self._operator is not None and self._operator.client_id == client_id:
+        if self._operator is not None and self._operator.request.client_id == client_id:
             self._operator = None
             self._due_us = 0
 
@@ -177,10 +168,11 @@ class OperatorControl:
         if operator is None:
             return ControlStatus(SYSTEM_MANAGER | TAKEOVER_ALLOWED, 0, b"")
         takeover = TAKEOVER_ALLOWED if operator.allows_takeover else 0
-        return ControlStatus(SYSTEM_MANAGER | takeover, operator.system_id, b"")
+        return ControlStatus(SYSTEM_MANAGER | takeover, operator.request.system_id, b"")
 
     def _is_operator(self, request: Request) -> bool:
-        return self._operator is not None and self._operator.system_id == request.system_id
+        operator = self._operator
+        return operator is not None and operator.request.system_id == request.system_id
 
     def _request(self, request: Request, now_us: int, *, allows_takeover: bool) -> Outcome:
         if not self.exclusive:
@@ -191,11 +183,8 @@ class OperatorControl:
             return FAILED, self._explain(
                 f"System {request.system_id} requests control; {self.denial()}", now_us
             )
-        fresh = _Operator(
-            request.client_id, request.system_id, request.component_id, now_us, allows_takeover
-        )
         text = "" if is_own else f"System {request.system_id} is in control"
-        return ACCEPTED, self._change(fresh, text, now_us)
+        return ACCEPTED, self._change(_Operator(request, now_us, allows_takeover), text, now_us)
 
     def _release(self, request: Request, now_us: int) -> Outcome:
         if not self.exclusive:

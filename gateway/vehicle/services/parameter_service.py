@@ -1,20 +1,28 @@
 """The parameter protocol: list, read, set.
 
-The list goes to the client that requested it, a few at a time, so that it does not overflow the
-client's receive buffer or a slow link, and to several clients in turn, to bound the gateway's load.
-A change goes to every client that has requested parameters before, so that its table stays up to
-date, and to no other: QGroundControl takes the first PARAM_VALUE that it receives for the beginning
-of the list, and reads the list before it has the metadata.
+The list goes to the client that requested it. A change goes to every client that has requested
+parameters before, so that its table stays up to date, and to no other: QGroundControl takes the
+first PARAM_VALUE that it receives for the beginning of the list, and reads the list before it has
+the metadata.
 """
 
 from collections.abc import Mapping
-from typing import Any, Final, Protocol
+from itertools import islice
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
 from gateway.settings import Settings
-from gateway.vehicle.requests import Answer, Reply, Request, SaveSettings, SettingsChange
+from gateway.vehicle.requests import (
+    Answer,
+    Reply,
+    Request,
+    SaveSettings,
+    Service,
+    SettingsChange,
+    Transfers,
+)
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     IN_PROGRESS,
@@ -30,9 +38,6 @@ from gateway.vehicle.services.parameters import (
     packed_parameters,
 )
 
-BATCH: Final = 10
-BATCH_INTERVAL_US: Final = 10_000
-"""Between batches of this many, for all clients together."""
 MAX_LISTENERS: Final = 512
 """Clients that may request lists and be sent changes."""
 BY_NAME: Final = -1
@@ -46,10 +51,78 @@ RESET_CALIBRATION: Final = 3
 CALIBRATION: Final = "calibration"
 """The section that holds the sensors' errors."""
 
-REAL32: Final = mavlink.MAV_PARAM_TYPE_REAL32
 UNKNOWN: Final = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
 BAD_VALUE: Final = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
 FORBIDDEN: Final = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
+
+Entry = TypeVar("Entry")
+
+
+class ReadOnlyParameters(Service, Generic[Entry]):
+    """List and read the parameters of a vehicle; refuse to set them."""
+
+    types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
+
+    def __init__(self) -> None:
+        self._lists = Transfers()
+        """By client."""
+
+    def entries(self) -> Mapping[str, Entry]:
+        """Return the parameters by name, in their order."""
+        raise NotImplementedError
+
+    def value(self, entry: Entry, client_id: int) -> Answer:
+        """Return the PARAM_VALUE of a parameter."""
+        raise NotImplementedError
+
+    def changes_state(self, request: Request) -> bool:
+        """Return whether the request is to set one."""
+        return bool(request.message.get_type() == "PARAM_SET")
+
+    def refuse(self, request: Request) -> list[Answer]:
+        """Return the unchanged value."""
+        return self._reject(request, FORBIDDEN)
+
+    def handle(self, request: Request, now_us: int) -> list[Answer]:
+        """Answer a request to list or to read."""
+        if request.message.get_type() == "PARAM_REQUEST_READ":
+            return self._read(request)
+        entries, client_id = self.entries(), request.client_id
+        if not entries:
+            return [_error(request, UNKNOWN)]
+        if client_id in self._lists or len(self._lists) < MAX_LISTENERS:
+            values = (self.value(entry, client_id) for entry in entries.values())
+            self._lists.start(client_id, values)
+        return self._lists.poll(now_us)
+
+    def poll(self, now_us: int) -> list[Answer]:
+        """Send the next few parameters of the requested lists."""
+        return self._lists.poll(now_us)
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to send."""
+        return self._lists.next_due_us()
+
+    def remove_client(self, client_id: int) -> None:
+        """Stop the list for a client that has gone."""
+        self._lists.stop(client_id)
+
+    def _read(self, request: Request) -> list[Answer]:
+        index, entries = request.message.param_index, self.entries()
+        entry = entries.get(request.message.param_id)
+        if index != BY_NAME:
+            entry = next(islice(entries.values(), index, None), None) if index >= 0 else None
+        if entry is None:
+            return [_error(request, UNKNOWN)]
+        return [self.value(entry, request.client_id)]
+
+    def _reject(self, request: Request, error: int) -> list[Answer]:
+        """Refuse to set a parameter, and report its value."""
+        entry = self.entries().get(request.message.param_id)
+        if entry is None:
+            return [_error(request, UNKNOWN)]
+        # The error first: a client that sees only the old value would retry.
+        return [_error(request, error), self.value(entry, request.client_id)]
 
 
 class OwnSection(Protocol):
@@ -64,7 +137,7 @@ class OwnSection(Protocol):
         ...
 
 
-class ParameterService:
+class ParameterService(ReadOnlyParameters[Parameter]):
     """Parameters of one vehicle.
 
     Parameters
@@ -77,64 +150,41 @@ class ParameterService:
         Sections of the table that are not settings. They have no defaults.
     """
 
-    types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
-
     def __init__(
         self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection]
     ) -> None:
+        super().__init__()
         self.table = table
         self._own = own
         self._vehicle_id = vehicle_id
-        self._lists: dict[int, int] = {}
-        """The next parameter of each list that is under way; whose turn it is comes first."""
-        self._due_us = 0
         self._listeners: dict[int, None] = {}
         """Clients that have requested parameters, and are sent changes."""
 
-    def changes_state(self, request: Request) -> bool:
-        """Return whether the request is to set one."""
-        return bool(request.message.get_type() == "PARAM_SET")
+    def entries(self) -> Mapping[str, Parameter]:
+        """Return the parameters by name, in their order."""
+        return self.table.parameters
 
-    def refuse(self, request: Request) -> list[Answer]:
-        """Return the unchanged value."""
-        parameter = self._named(request.message.param_id)
-        if parameter is None:
-            return [self._error(request, UNKNOWN)]
-        return [self._error(request, FORBIDDEN), request.reply(self._value(parameter))]
+    def value(self, entry: Parameter, client_id: int | None) -> Reply:
+        """Return the PARAM_VALUE of a parameter."""
+        message = mavlink.MAVLink_param_value_message(
+            entry.name.encode(),
+            self.table.number(entry),
+            mavlink.MAV_PARAM_TYPE_REAL32,
+            len(self.table.parameters),
+            entry.index,
+        )
+        return Reply(message, client_id)
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Answer one request."""
-        kind = request.message.get_type()
         self.listen(request.client_id)
-        if kind == "PARAM_SET":
+        if self.changes_state(request):
             return self._set(request, now_us)
-        if kind == "PARAM_REQUEST_READ":
-            return self._read(request)
-        if request.client_id in self._lists or len(self._lists) < MAX_LISTENERS:
-            self._lists[request.client_id] = 0
-        return self.poll(now_us)
-
-    def poll(self, now_us: int) -> list[Answer]:
-        """Send the next few parameters of the requested lists, in turn."""
-        if not self._lists or now_us < self._due_us:
-            return []
-        answers: list[Answer] = []
-        while self._lists and len(answers) < BATCH:
-            client_id = next(iter(self._lists))
-            index = self._lists.pop(client_id)
-            answers.append(Reply(self._value(self.table.parameters[index]), client_id))
-            if index + 1 < len(self.table.parameters):
-                self._lists[client_id] = index + 1
-        self._due_us = now_us + BATCH_INTERVAL_US
-        return answers
-
-    def next_due_us(self) -> int | None:
-        """Return when `poll` has something to send."""
-        return self._due_us if self._lists else None
+        return super().handle(request, now_us)
 
     def remove_client(self, client_id: int) -> None:
         """Stop the list and the changes for a client that has gone."""
-        self._lists.pop(client_id, None)
+        super().remove_client(client_id)
         self._listeners.pop(client_id, None)
 
     def listen(self, client_id: int) -> None:
@@ -162,19 +212,14 @@ class ParameterService:
                 answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
         return ACCEPTED, answers + self._changed_since(before)
 
-    def values(self) -> list[Answer]:
-        """Return every parameter, for all clients."""
-        return [Reply(self._value(parameter)) for parameter in self.table.parameters]
+    def values(self) -> list[Any]:
+        """Return the PARAM_VALUE messages of all parameters."""
+        return [self.value(entry, None).message for entry in self.table.parameters.values()]
 
     def packed(self, request: Request, query: str) -> bytes:
         """Return the file of ArduPilot's parameters; who reads it is sent changes from then on."""
         self.listen(request.client_id)
         return packed_parameters(self.table, query)
-
-    def _changed(self, parameter: Parameter) -> list[Answer]:
-        """Send the value of a parameter to the clients that listen; record it if none does."""
-        value = self._value(parameter)
-        return [Reply(value, client_id) for client_id in self._listeners or (RECORDED_ONLY,)]
 
     def take(self, section: str, settings: Any) -> list[Answer]:
         """Apply a section that was changed elsewhere, and send what differs."""
@@ -182,73 +227,50 @@ class ParameterService:
         self.table.sections[section] = settings
         return self._changed_since(before)
 
-    def _numbers(self) -> list[float]:
-        return [self.table.number(parameter) for parameter in self.table.parameters]
+    def _numbers(self) -> dict[str, float]:
+        return {name: self.table.number(each) for name, each in self.table.parameters.items()}
 
-    def _changed_since(self, before: list[float]) -> list[Answer]:
-        changed = zip(self.table.parameters, before, self._numbers(), strict=True)
-        return [
-            answer
-            for parameter, old, new in changed
-            if old != new
-            for answer in self._changed(parameter)
+    def _changed_since(self, before: Mapping[str, float]) -> list[Answer]:
+        """Send the values that differ from these."""
+        now = self._numbers()
+        changed = [
+            each for name, each in self.table.parameters.items() if before[name] != now[name]
         ]
+        return [answer for each in changed for answer in self._changed(each)]
+
+    def _changed(self, parameter: Parameter) -> list[Answer]:
+        """Send the value of a parameter to the clients that listen; record it if none does."""
+        clients = self._listeners or (RECORDED_ONLY,)
+        return [self.value(parameter, client_id) for client_id in clients]
 
     def _set(self, request: Request, now_us: int) -> list[Answer]:
         message = request.message
-        parameter = self._named(message.param_id)
+        parameter = self.table.parameters.get(message.param_id)
         if parameter is None:
-            return [self._error(request, UNKNOWN)]
+            return [_error(request, UNKNOWN)]
+        section, path = parameter.section, ".".join(parameter.path)
         number = decode_value(message.param_value, message.param_type)
-        before = self.table.sections[parameter.section]
+        before = self.table.sections[section]
         try:
             settings = self.table.change(parameter, number)
-            answers = self._carry_out(parameter, settings, now_us)
+            own = self._own.get(section)
+            answers: list[Answer] = [SettingsChange(self._vehicle_id, section, settings, path)]
+            if own is not None:
+                answers = own.change(settings, path, now_us)
         except ValueError:
-            self.table.sections[parameter.section] = before
-            # The error first: a client that sees only the old value would retry.
-            return [self._error(request, BAD_VALUE), request.reply(self._value(parameter))]
+            self.table.sections[section] = before
+            return self._reject(request, BAD_VALUE)
         return [*answers, *self._changed(parameter)]
 
-    def _carry_out(self, parameter: Parameter, settings: Settings, now_us: int) -> list[Answer]:
-        path = ".".join(parameter.path)
-        own = self._own.get(parameter.section)
-        if own is not None:
-            return own.change(settings, path, now_us)
-        return [SettingsChange(self._vehicle_id, parameter.section, settings, path)]
 
-    def _read(self, request: Request) -> list[Answer]:
-        index = request.message.param_index
-        if index == BY_NAME:
-            parameter = self._named(request.message.param_id)
-        else:
-            known = 0 <= index < len(self.table.parameters)
-            parameter = self.table.parameters[index] if known else None
-        if parameter is None:
-            return [self._error(request, UNKNOWN)]
-        return [request.reply(self._value(parameter))]
-
-    def _named(self, name: str) -> Parameter | None:
-        index = self.table.index.get(name)
-        return None if index is None else self.table.parameters[index]
-
-    def _value(self, parameter: Parameter) -> Any:
-        return mavlink.MAVLink_param_value_message(
-            parameter.name.encode(),
-            self.table.number(parameter),
-            REAL32,
-            len(self.table.parameters),
-            self.table.index[parameter.name],
+def _error(request: Request, error: int) -> Reply:
+    message = request.message
+    return request.reply(
+        mavlink.MAVLink_param_error_message(
+            request.system_id,
+            request.component_id,
+            getattr(message, "param_id", "").encode("ascii", "replace")[:16],
+            getattr(message, "param_index", BY_NAME),
+            error,
         )
-
-    def _error(self, request: Request, error: int) -> Reply:
-        message = request.message
-        return request.reply(
-            mavlink.MAVLink_param_error_message(
-                request.system_id,
-                request.component_id,
-                message.param_id.encode("ascii", "replace")[:16],
-                getattr(message, "param_index", BY_NAME),
-                error,
-            )
-        )
+    )

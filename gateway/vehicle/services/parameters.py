@@ -24,10 +24,11 @@ import lzma
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import takewhile
+from types import MappingProxyType
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -97,22 +98,7 @@ def without_unit(key: str) -> str:
 
 @cache
 def parameter_name(section: str, key: str, axis: str = "") -> str:
-    """Name the parameter of one setting.
-
-    Parameters
-    ----------
-    section : str
-        The section that holds it, the innermost one.
-    key : str
-        The setting; its unit is left out by the caller, unless two keys differ in it alone.
-    axis : str, optional
-        X, Y or Z of a vector; ROLL, PIT or YAW of a rotation.
-
-    Returns
-    -------
-    str
-        At most 16 characters of A to Z, 0 to 9 and underscore.
-    """
+    """Name the parameter of a key of the innermost section that holds it."""
     words = key.split("_")
     # A key that repeats its section need not do so in the name.
     if words[0] != section:
@@ -160,19 +146,9 @@ INTEGER_CODES: Final = {
 
 
 def decode_value(value: float, kind: int) -> float:
-    """Undo the byte-wise encoding of a parameter's value.
+    """Undo the byte-wise encoding of the value of a message, whose MAV_PARAM_TYPE is `kind`.
 
-    Parameters
-    ----------
-    value : float
-        The float of the message.
-    kind : int
-        MAV_PARAM_TYPE.
-
-    Returns
-    -------
-    float
-        The shortest decimal that is the same 32-bit float: 0.1, not 0.10000000149.
+    The result is the shortest decimal that is the same 32-bit float: 0.1, not 0.10000000149.
     """
     code = INTEGER_CODES.get(kind)
     if code is not None:
@@ -193,6 +169,8 @@ class Parameter:
     """Component of a vector; of a rotation: roll, pitch or yaw."""
     field: Field
     """The setting; of a rotation with its angles in place of its matrix."""
+    index: int = 0
+    """Its number among the parameters of its table."""
 
     def to_number(self, value: Any) -> float:
         """Convert the setting's value to the parameter's."""
@@ -201,11 +179,7 @@ class Parameter:
         return float(value if self.axis is None else value[self.axis])
 
     def from_number(self, number: float, old: Any) -> Any:
-        """Convert a parameter's value to the setting's.
-
-        Raises ValueError if the number is not finite or out of range; the error gives the
-        range.
-        """
+        """Convert a parameter's value to the setting's; ValueError gives the allowed ones."""
         if not math.isfinite(number):
             raise ValueError("not a number")
         value: Any = number
@@ -237,18 +211,13 @@ class ParameterTable:
     ----------
     sections : mapping of str to Settings
         The trees of settings that may be changed live, by key.
-
-    Raises
-    ------
-    ValueError
-        If two settings would share a name.
     """
 
     def __init__(self, sections: Mapping[str, Settings]) -> None:
         self.sections = dict(sections)
         self.kinds = tuple((key, type(tree)) for key, tree in sections.items())
         self.parameters = parameters_of(self.kinds)
-        self.index = {p.name: n for n, p in enumerate(self.parameters)}
+        """By name, in their order."""
         # As they were set: a matrix alone would give others, where the pitch is a right angle or
         # only some of the three have been set yet.
         self._angles: dict[tuple[str, ...], tuple[Matrix3, Vec3]] = {}
@@ -258,10 +227,7 @@ class ParameterTable:
         return parameter.to_number(self._value(parameter))
 
     def change(self, parameter: Parameter, number: float) -> Settings:
-        """Write a parameter.
-
-        Raises ValueError if the value is not allowed; nothing changes then.
-        """
+        """Write a parameter, or raise ValueError and change nothing if it is not allowed."""
         value = parameter.from_number(number, self._value(parameter))
         if parameter.field.is_rotation:
             angles, value = value, matrix_from_euler_deg(value)
@@ -272,7 +238,7 @@ class ParameterTable:
 
     def reset(self, section: str) -> Settings:
         """Set every parameter of a tree to its default; other settings stay as they are."""
-        for parameter in self.parameters:
+        for parameter in self.parameters.values():
             if parameter.section == section:
                 self.change(parameter, parameter.to_number(parameter.field.default))
         return self.sections[section]
@@ -295,17 +261,8 @@ def packed_parameters(table: ParameterTable, query: str) -> bytes:
     in the lower, and the number of others less one in the upper four bits; the other characters;
     the value; the default, if the flag is set. The padding at block boundaries in [1]_ is left
     out: it protects against values that change between two reads, and a file here is fixed when it
-    is opened.
-
-    Parameters
-    ----------
-    table : ParameterTable
-    query : str
-        `start`, `count` and `withdefaults`, each optional, as `start=50&count=10`.
-
-    Returns
-    -------
-    bytes
+    is opened. The query has `start`, `count` and `withdefaults`, each optional, as
+    `start=50&count=10`.
 
     References
     ----------
@@ -315,7 +272,7 @@ def packed_parameters(table: ParameterTable, query: str) -> bytes:
     start = _number(wanted.get("start"), 0)
     count = _number(wanted.get("count"), len(table.parameters))
     with_defaults = _number(wanted.get("withdefaults"), 0) != 0
-    chosen = table.parameters[start : start + count]
+    chosen = list(table.parameters.values())[start : start + count]
     magic = PACKED_WITH_DEFAULTS if with_defaults else PACKED
     packed = struct.pack("<HHH", magic, len(chosen), len(table.parameters))
     last = ""
@@ -337,18 +294,18 @@ def _number(text: str | None, missing: int) -> int:
 
 
 @cache
-def parameters_of(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[Parameter, ...]:
-    """List the parameters of some classes of settings, in the order of their names.
+def parameters_of(kinds: tuple[tuple[str, type[Settings]], ...]) -> Mapping[str, Parameter]:
+    """List the parameters of some classes of settings by name, in the order of their names.
 
-    They are worked out once, which takes some milliseconds, and shared by all vehicles.
-
-    Raises ValueError if two settings would share a name.
+    They are computed once, which takes some milliseconds, and shared by all vehicles. ValueError
+    if two settings would share a name.
     """
     found = [parameter for key, kind in kinds for parameter in _walk(key, kind)]
     names = Counter(parameter.name for parameter in found)
     if twice := sorted(name for name, count in names.items() if count > 1):
         raise ValueError(f"parameter names used twice: {', '.join(twice)}")
-    return tuple(sorted(found, key=lambda parameter: parameter.name))
+    found.sort(key=lambda parameter: parameter.name)
+    return MappingProxyType({p.name: replace(p, index=n) for n, p in enumerate(found)})
 
 
 def _walk(section: str, kind: type[Settings], path: tuple[str, ...] = ()) -> Iterator[Parameter]:
@@ -360,19 +317,22 @@ def _walk(section: str, kind: type[Settings], path: tuple[str, ...] = ()) -> Ite
             yield from _walk(section, field.section, inner)
             continue
         group = path[-1] if path else section
-        default = field.default
         bare = without_unit(field.name)
         key = bare if bare_keys[bare] == 1 else field.name
-        if field.choices or isinstance(default, bool | int | float):
+        if field.choices or isinstance(field.default, bool | int | float):
             yield Parameter(parameter_name(group, key), section, inner, None, field)
-        elif field.is_rotation:
-            for axis, (letters, _, _) in enumerate(ANGLES):
-                name = parameter_name(group, key, letters)
-                yield Parameter(name, section, inner, axis, _angle_field(field, axis))
-        elif _is_vector(default):
-            for axis, letter in enumerate(AXES):
-                name = parameter_name(group, key, letter)
-                yield Parameter(name, section, inner, axis, field)
+        for axis, letters in enumerate(_axes(field)):
+            described = _angle_field(field, axis) if field.is_rotation else field
+            yield Parameter(parameter_name(group, key, letters), section, inner, axis, described)
+
+
+def _axes(field: Field) -> tuple[str, ...]:
+    """Name the components of a rotation or a vector; a setting of any other type has none."""
+    if field.is_rotation:
+        return tuple(letters for letters, _, _ in ANGLES)
+    value = field.default
+    is_vector = isinstance(value, tuple) and len(value) == len(AXES)
+    return AXES if is_vector and all(isinstance(item, float) for item in value) else ()
 
 
 def _angle_field(field: Field, axis: int) -> Field:
@@ -387,14 +347,6 @@ def _angle_field(field: Field, axis: int) -> Field:
         "roll; a board that lies face up with its x arrow to the nose has a roll of 180",
         unit="deg",
         bounds=(-limit, limit),
-    )
-
-
-def _is_vector(value: Any) -> bool:
-    return (
-        isinstance(value, tuple)
-        and len(value) == len(AXES)
-        and all(isinstance(item, float) for item in value)
     )
 
 
@@ -419,36 +371,24 @@ class Metadata:
     """The metadata files of one vehicle."""
 
     def __init__(self, table: ParameterTable) -> None:
-        self._general, self._parameters = _files(table.kinds)
-        self._names = {parameter.name for parameter in table.parameters}
+        self.files = _files(table.kinds)
+        """By their FTP paths."""
+        self._names = table.parameters.keys()
 
-    def describes(self, names: Iterable[str]) -> bool:
+    def describes(self, names: Collection[str]) -> bool:
         """Return whether parameters, of which there are some, are those of this version."""
-        found = set(names)
-        return bool(found) and found <= self._names
-
-    def files(self) -> dict[str, Callable[..., bytes]]:
-        """Return the files by their FTP paths."""
-        return {GENERAL_PATH: lambda *_: self._general, PARAMETER_PATH: lambda *_: self._parameters}
-
-    def general(self) -> bytes:
-        """Return the file that lists the others."""
-        return self._general
-
-    def parameters(self) -> bytes:
-        """Return the parameters' file."""
-        return self._parameters
+        return bool(names) and set(names) <= self._names
 
     def announcement(self, now_us: int) -> Any:
         """Encode COMPONENT_METADATA."""
         uri = f"mftp://{GENERAL_PATH}".encode()
-        return ComponentMetadata(boot_ms(now_us), crc32(self._general), uri)
+        return ComponentMetadata(boot_ms(now_us), crc32(self.files[GENERAL_PATH]), uri)
 
 
 @cache
-def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[bytes, bytes]:
+def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> Mapping[str, bytes]:
     """Write the two files, once for all vehicles."""
-    described = [_describe(parameter) for parameter in parameters_of(kinds)]
+    described = [_describe(parameter) for parameter in parameters_of(kinds).values()]
     # CRC32 is the check that every decoder of xz supports; embedded ones lack the default, CRC64.
     parameters = lzma.compress(
         _json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32
@@ -466,7 +406,7 @@ def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> tuple[bytes, bytes]
             }
         ],
     }
-    return _json(general), parameters
+    return MappingProxyType({GENERAL_PATH: _json(general), PARAMETER_PATH: parameters})
 
 
 def _describe(parameter: Parameter) -> dict[str, Any]:

@@ -294,10 +294,11 @@ class PlanService:
         """Read the position of a command; None if it is invalid."""
         if command.frame not in GLOBAL_FRAMES:
             return None
-        if not is_on_earth(command.lat_deg, command.lon_deg):
+        lat_deg, lon_deg, height_m = command.location
+        if not is_on_earth(lat_deg, lon_deg):
             return None
-        height = height_amsl_m(command.height_m, command.frame, self._home_alt_m)
-        return Location(command.lat_deg, command.lon_deg, height)
+        height_m = height_amsl_m(height_m, command.frame, self._home_alt_m)
+        return Location(lat_deg, lon_deg, height_m)
 
     def _set_home(self, command: Command, now_us: int) -> Outcome:
         if whole(command.params[0]) == USE_CURRENT:

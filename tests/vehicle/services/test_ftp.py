@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32, decode_packet
-from gateway.vehicle.services.parameters import Metadata, ParameterTable
+from gateway.vehicle.services.parameters import PARAMETER_PATH, Metadata, ParameterTable
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.vehicle.ground_station import GroundStation
 from tests.vehicle.services.test_parameters import values
@@ -186,7 +186,7 @@ def test_parameter_metadata_of_the_gateway_is_small() -> None:
     """A radio of 57600 baud carries about 140 bytes of a file in 60 ms."""
     settings = AircraftSettings()
     table = ParameterTable({name: getattr(settings, name) for name in settings.__struct_fields__})
-    content = Metadata(table).parameters()
+    content = Metadata(table).files[PARAMETER_PATH]
     assert len(content) < 8_000 < 30_000 < len(lzma.decompress(content))
 
 
@@ -213,14 +213,7 @@ def test_files_that_are_not_there_are_refused_with_everything_echoed(ftp: Ftp) -
 @pytest.mark.parametrize(
     ("opcode", "error"),
     [
-        (Opcode.CREATE_FILE, FtpError.FILE_PROTECTED),
-        (Opcode.WRITE_FILE, FtpError.FILE_PROTECTED),
-        (Opcode.REMOVE_FILE, FtpError.FILE_PROTECTED),
-        (Opcode.CREATE_DIRECTORY, FtpError.FILE_PROTECTED),
-        (Opcode.REMOVE_DIRECTORY, FtpError.FILE_PROTECTED),
-        (Opcode.OPEN_FILE_WO, FtpError.FILE_PROTECTED),
-        (Opcode.TRUNCATE_FILE, FtpError.FILE_PROTECTED),
-        (Opcode.RENAME, FtpError.FILE_PROTECTED),
+        *((opcode, FtpError.FILE_PROTECTED) for opcode in range(6, 14)),
         (Opcode.READ_FILE, FtpError.INVALID_SESSION),
         (Opcode.BURST_READ_FILE, FtpError.INVALID_SESSION),
         (Opcode.TERMINATE_SESSION, FtpError.INVALID_SESSION),

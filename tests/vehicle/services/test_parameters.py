@@ -249,7 +249,7 @@ def test_defaults_do_not_change_settings_that_are_no_parameters() -> None:
 def test_a_second_vehicle_costs_no_second_walk_through_the_settings() -> None:
     first, second = (ParameterTable({"vehicle": VehicleSettings()}) for _ in range(2))
     assert first.parameters is second.parameters
-    first.change(first.parameters[first.index["RATE_ATT"]], 7.0)
+    first.change(first.parameters["RATE_ATT"], 7.0)
     assert second.sections == {"vehicle": VehicleSettings()}
 
 
@@ -278,9 +278,9 @@ def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
     }
     table = ParameterTable(sections)
     assert {"PAPER_ALPHA_ACC", "PAPER_BETA_VEL", "PAPER_ACC_CUTOFF", "REF_GPS_LATENCY"} <= set(
-        table.index
+        table.parameters
     )
-    for parameter in table.parameters:
+    for parameter in table.parameters.values():
         assert re.fullmatch(r"[A-Z][A-Z0-9_]{1,15}", parameter.name)
         assert table.number(parameter) == pytest.approx(
             parameter.to_number(parameter.field.default)
@@ -290,6 +290,6 @@ def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
 
 def test_an_angle_of_a_mounting_is_described_by_the_first_sentence_of_the_mounting() -> None:
     table = ParameterTable({"calibration": NodeCalibration()})
-    meaning = table.parameters[table.index["CAL_MNT_ROLL"]].field.meaning
+    meaning = table.parameters["CAL_MNT_ROLL"].field.meaning
     reported = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]
     assert f" of the {reported[0].lower()}{reported[1:]}. Yaw is turned first" in meaning
