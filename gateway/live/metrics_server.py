@@ -25,15 +25,10 @@ RETRY_S: Final = 5.0
 
 
 class MetricsServer:
-    """Answer HTTP with the present metrics, unless a page asks under a name of its own.
-
-    Parameters
-    ----------
-    text : callable
-        Returns the present metrics in pieces, as `metrics.text_of` writes them.
-    """
+    """Answer HTTP with the present metrics, unless a page asks under a name of its own."""
 
     def __init__(self, text: Callable[[], Iterator[str]]) -> None:
+        """Serve the pieces of text that a function returns."""
         self._text = text
         self._wanted = 0
         self._reason = ""
@@ -105,19 +100,17 @@ class MetricsServer:
         task.add_done_callback(self._tasks.discard)
 
     async def _serve(self, connection: socket.socket) -> None:
-        loop, request = asyncio.get_running_loop(), b""
-        with connection:
-            connection.setblocking(False)
-            try:
-                async with asyncio.timeout(REQUEST_LIMIT_S):
-                    while b"\r\n\r\n" not in request and len(request) < MAX_REQUEST_BYTES:
-                        data = await loop.sock_recv(connection, 4096)
-                        if not data:
-                            return
-                        request += data
-                    await loop.sock_sendall(connection, await self._respond(request))
-            except (OSError, TimeoutError) as error:
-                log.debug("metrics request failed: %s", error)
+        connection.setblocking(False)
+        reader, writer = await asyncio.open_connection(sock=connection, limit=MAX_REQUEST_BYTES)
+        try:
+            async with asyncio.timeout(REQUEST_LIMIT_S):
+                request = await reader.readuntil(b"\r\n\r\n")
+                writer.write(await self._respond(request))
+                await writer.drain()
+        except (OSError, EOFError, asyncio.LimitOverrunError) as error:
+            log.debug("metrics request failed: %s", error)
+        finally:
+            writer.close()
 
     async def _respond(self, request: bytes) -> bytes:
         method = request.partition(b" ")[0]

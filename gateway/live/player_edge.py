@@ -34,21 +34,7 @@ class PlayerStatus:
 
 
 class PlayerEdge:
-    """Play recordings on the event loop.
-
-    Parameters
-    ----------
-    player : Player
-        Decides which frames are due when.
-    emit : callable
-        Called with each batch of frames.
-    now_us : callable
-        The gateway clock.
-    files : sequence of str
-        Names to show.
-    on_end : callable, optional
-        Called when the end is reached.
-    """
+    """Play recordings on the event loop: batches of frames to `emit`; `on_end` at their end."""
 
     def __init__(
         self,

@@ -27,26 +27,10 @@ MAX_BATCH: Final = 4
 
 
 class PtyPort:
-    """Play timed frames on a pseudo-terminal; never blocks, never grows.
+    """Play timed frames on a pseudo-terminal; never blocks, never grows."""
 
-    Parameters
-    ----------
-    frames : iterator of TimedFrame
-        In the order of time; pulled one ahead.
-    speed : float
-        How much faster than true time; positive.
-
-    Raises
-    ------
-    ValueError
-        If the speed is not positive.
-    OSError
-        If the machine has no pseudo-terminal left.
-    """
-
-    def __init__(self, frames: Iterator[TimedFrame], speed: float = 1.0) -> None:
-        if not speed > 0.0:
-            raise ValueError(f"speed of {speed}; it must be positive")
+    def __init__(self, frames: Iterator[TimedFrame]) -> None:
+        """Open the terminal; raises OSError if the machine has none left."""
         self.written = 0
         """Frames written completely."""
         self.dropped = 0
@@ -54,7 +38,6 @@ class PtyPort:
         self.ended = asyncio.Event()
         """Set after the last frame, and by closing."""
         self._frames = frames
-        self._speed = speed
         # Here and not by `start`: the first frame takes as long as many of the others.
         self._next = next(frames, None)
         self._rest = b""
@@ -95,7 +78,7 @@ class PtyPort:
             if self._next is None:
                 self.ended.set()
                 return
-            due_s = self._start_s + self._next.time_s / self._speed
+            due_s = self._start_s + self._next.time_s
             late_s = loop.time() - due_s
             if late_s < 0.0:
                 self._timer = loop.call_at(due_s, self._advance)

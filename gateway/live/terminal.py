@@ -27,13 +27,7 @@ READ_BYTES: Final = 1024
 
 
 def on_parent_gone(end: Callable[[], None]) -> None:
-    """Call back on the running event loop when standard input ends.
-
-    Parameters
-    ----------
-    end : callable
-        Called once.
-    """
+    """Call back on the running event loop, once, when standard input ends."""
     loop, source = asyncio.get_running_loop(), sys.stdin.fileno()
 
     def read() -> None:
@@ -48,11 +42,6 @@ def on_end_signals(end: Callable[[], None]) -> None:
     """Call back on the running event loop on SIGINT, SIGTERM, and SIGHUP, with a terminal's end.
 
     SIGHUP stays ignored where it is at the start, as by `nohup`.
-
-    Parameters
-    ----------
-    end : callable
-        Called at each of them.
     """
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -65,15 +54,6 @@ def own_command(*words: str) -> list[str]:
 
     `-P` keeps the current folder off the child's module path: a `msgspec.py` among unpacked
     recordings would be imported instead of the library.
-
-    Parameters
-    ----------
-    *words : str
-        Command and options, as after `mavgate`.
-
-    Returns
-    -------
-    list of str
     """
     return [sys.executable, "-P", "-m", "gateway.cli", *words]
 
@@ -85,19 +65,12 @@ LAST_WORDS_S: Final = 1.0
 
 
 class DetachedStream(io.TextIOBase):
-    """A text stream whose `write` returns at once; a thread does the writing.
-
-    Parameters
-    ----------
-    stream : file object
-        The stream to write to; must have a file descriptor.
-    """
+    """A text stream whose `write` returns at once; a thread writes to another stream's file."""
 
     def __init__(self, stream: TextIO) -> None:
         stream.flush()
         self._stream = stream
         self._file = stream.fileno()
-        self._is_terminal = stream.isatty()
         self._waiting: queue.Queue[bytes | None] = queue.Queue(MAX_TEXTS)
         self._thread = threading.Thread(target=self._write_all, name="output", daemon=True)
         self._thread.start()
@@ -113,7 +86,7 @@ class DetachedStream(io.TextIOBase):
 
     def isatty(self) -> bool:
         """Return whether it is a terminal."""
-        return self._is_terminal
+        return self._stream.isatty()
 
     def writable(self) -> bool:
         """Return True."""
@@ -200,17 +173,10 @@ def keys_of(text: str) -> Iterator[str]:
 
 
 class Keyboard:
-    """The terminal of a command; without one, nothing happens.
-
-    Parameters
-    ----------
-    on_key : callable
-        Called with each key's name; see `keys_of`.
-    descriptor : int, optional
-        The terminal; standard input by default.
-    """
+    """The terminal of a command; without one, nothing happens."""
 
     def __init__(self, on_key: Callable[[str], None], descriptor: int | None = None) -> None:
+        """Call back with each key's name; the terminal is standard input by default."""
         self._on_key = on_key
         self._descriptor = descriptor
         self._before: list[Any] | None = None

@@ -15,11 +15,10 @@ from gateway.wire.framing import Fault, Frame, FrameDecoder, encode_frame
 
 pytestmark = pytest.mark.io
 
-SPEED = 20.0
 CONTENT_SIZE = 40
 
 
-def frames(count: int, rate_hz: float = 1000.0) -> Iterator[TimedFrame]:
+def frames(count: int, rate_hz: float = 20_000.0) -> Iterator[TimedFrame]:
     for k in range(count):
         yield TimedFrame(k / rate_hz, encode_frame(k.to_bytes(4, "big") * (CONTENT_SIZE // 4)))
 
@@ -63,8 +62,8 @@ class Reader:
 async def play() -> Iterator[Callable[..., PtyPort]]:  # type: ignore[misc]
     ports: list[PtyPort] = []
 
-    def make(source: Iterator[TimedFrame], speed: float = SPEED) -> PtyPort:
-        ports.append(PtyPort(source, speed))
+    def make(source: Iterator[TimedFrame]) -> PtyPort:
+        ports.append(PtyPort(source))
         return ports[-1]
 
     yield make
@@ -93,7 +92,7 @@ async def test_every_frame_arrives(play: Callable[..., PtyPort]) -> None:
 
 async def test_frames_keep_their_times(play: Callable[..., PtyPort]) -> None:
     loop = asyncio.get_running_loop()
-    port = play(frames(6, rate_hz=50.0), 1.0)
+    port = play(frames(6, rate_hz=50.0))
     reader = Reader(port.path)
     begin_s = loop.time()
     port.start()
@@ -158,7 +157,7 @@ async def test_closing_removes_the_terminal(play: Callable[..., PtyPort]) -> Non
 async def test_goes_on_after_a_standstill(
     play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    port = play(frames(1000, rate_hz=100.0), 1.0)
+    port = play(frames(1000, rate_hz=100.0))
     reader = Reader(port.path)
     port.start()
     await reader.until(3)
@@ -187,16 +186,10 @@ async def test_frames_that_are_made_too_slowly_are_not_all_dropped(
             yield frame
 
     monkeypatch.setattr(loop, "time", lambda: clock() + made_s[0])
-    port = play(slowly(), 1.0)
+    port = play(slowly())
     reader = Reader(port.path)
     port.start()
     await reader.until(300)
     reader.close()
     port.close()
     assert port.dropped < 10 * port.written
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan")])
-def test_speed_is_checked(speed: float) -> None:
-    with pytest.raises(ValueError, match="speed"):
-        PtyPort(frames(1), speed)
