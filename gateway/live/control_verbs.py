@@ -81,10 +81,7 @@ class RecorderVerbs:
 def mark_verbs(mark: Callable[[Location | None, int | None], None]) -> Verbs:
     """Return the handler of `mark`, which marks a location for one aircraft or all, or clears it.
 
-    Parameters
-    ----------
-    mark : callable
-        Called with the location, or None, and the aircraft, or None for all; raises ValueError.
+    `mark` is called with the location, or None, and the aircraft, or None for all.
     """
 
     def set_mark(
@@ -106,16 +103,7 @@ def mark_verbs(mark: Callable[[Location | None, int | None], None]) -> Verbs:
 
 
 class SerialVerbs:
-    """`serial.*`.
-
-    Parameters
-    ----------
-    port : SerialPort
-        The receiver's port. The one of its settings may be chosen even if this machine does not
-        list it.
-    is_simulated : bool
-        Whether the receiver is simulated; then its port stays open.
-    """
+    """`serial.*`; the port of a simulated receiver stays open."""
 
     def __init__(self, port: SerialPort, *, is_simulated: bool) -> None:
         self._port = port
@@ -140,6 +128,7 @@ class SerialVerbs:
         ports = await asyncio.to_thread(list_serial_ports)
         # No other path: opening some devices has effects, as that of a watchdog, which restarts
         # the machine.
+        # The one of the settings may be chosen even if this machine does not list it.
         known = {"auto", self._own, *(each.device for each in ports)}
         if port not in known:
             raise ControlError(
@@ -186,12 +175,8 @@ VehicleId = Annotated[int, msgspec.Meta(ge=1, le=255)]
 class ImuTap:
     """Collects the raw samples of one aircraft while a client asks for them.
 
-    Parameters
-    ----------
-    calibration : callable
-        Returns the calibration of an aircraft; raises LookupError for an unknown one.
-    calibrate : callable
-        Called with a vehicle id and its new calibration; raises ControlError if it is refused.
+    `calibration` returns that of an aircraft, and raises LookupError for an unknown one;
+    `calibrate` sets it, and raises ControlError if it is refused.
     """
 
     def __init__(

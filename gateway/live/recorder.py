@@ -61,14 +61,10 @@ class Recorder:
     Parameters
     ----------
     settings : RecordingSettings
-        What, where, when.
-    now_us : callable
-        The gateway clock.
-    unix_us : callable
-        The machine's civil time.
+    now_us, unix_us : callable
+        The gateway clock, and the machine's civil time.
     header_of : callable
-        Returns the head of a vehicle's table: version, settings, calibration. Session, part and
-        start are filled in here.
+        Returns the head of a vehicle's table; session, part and start are filled in here.
     announce : callable
         Called with whether it is a problem, and a text for the user.
     state_of : callable
@@ -114,14 +110,12 @@ class Recorder:
         """Folder of the recordings."""
 
     def start(self) -> None:
-        """Start; needs a running event loop.
-
-        A recording that is wanted already is opened at once: nothing runs yet that could be
-        delayed, and a table should begin with the estimator's first sample.
-        """
+        """Start; needs a running event loop."""
         clear_copies(self.folder)
         self._civil.hear_machine(self._machine_us(), self._clock())
         if self._session.wanted:
+            # Nothing runs yet that could be delayed, and a table should begin with the estimator's
+            # first sample.
             self._open_at_once()
         self._task = asyncio.get_running_loop().create_task(self._run())
 

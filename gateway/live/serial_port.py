@@ -127,24 +127,9 @@ def list_serial_ports() -> list[Port]:
 
 
 def fitting_ports(wanted: str, ports: list[Port]) -> list[str]:
-    """List the devices that the setting `port` may mean.
+    """List the devices that the setting `port` may mean, of the ports of this machine.
 
-    Parameters
-    ----------
-    wanted : str
-        A device, `usb:VID:PID[:SERIAL]` in hexadecimal, or `auto`.
-    ports : list of Port
-        The ports of this machine.
-
-    Returns
-    -------
-    list of str
-        One or more.
-
-    Raises
-    ------
-    PortNotFoundError
-        If nothing fits.
+    Raises PortNotFoundError if there is none.
     """
     if wanted == "auto":
         fitting = [port for port in ports if port.known]
@@ -164,13 +149,7 @@ def fitting_ports(wanted: str, ports: list[Port]) -> list[str]:
 
 
 def find_port(wanted: str, ports: list[Port]) -> str:
-    """Choose the only device that the setting `port` may mean; see `fitting_ports`.
-
-    Raises
-    ------
-    PortNotFoundError
-        If nothing fits, or several do.
-    """
+    """Return the only device of `fitting_ports`; raises PortNotFoundError if there are several."""
     fitting = fitting_ports(wanted, ports)
     if len(fitting) > 1:
         raise PortNotFoundError(
@@ -184,19 +163,7 @@ def _listed(ports: list[Port]) -> str:
 
 
 def why_not_open(error: Exception, ports: list[Port]) -> str:
-    """Return why a device cannot be opened, and under which name an adapter is found that is there.
-
-    Parameters
-    ----------
-    error : Exception
-        As pyserial raises it.
-    ports : list of Port
-        The ports of this machine.
-
-    Returns
-    -------
-    str
-    """
+    """Describe an error of pyserial, and name the adapters that this machine has instead."""
     number = getattr(error, "errno", None)
     if number == errno.EAGAIN:
         return "another program has it open"
@@ -208,10 +175,7 @@ def why_not_open(error: Exception, ports: list[Port]) -> str:
 
 
 def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
-    """Open the receiver's port, for this program alone.
-
-    Raises PortNotFoundError if there is none, or it cannot be opened.
-    """
+    """Open the receiver's port, for this program alone; raises PortNotFoundError."""
     try:
         return serial.Serial(device, baud, timeout=0, write_timeout=0, exclusive=True)
     except (OSError, ValueError) as error:
@@ -221,14 +185,8 @@ def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
 class ReceiverSearch:
     """Open several ports and find the one that sends the receiver's frames.
 
-    Parameters
-    ----------
-    devices : list of str
-    baud : int
-        Speed of the receiver's line.
-    on_end : callable
-        Called once with the open port and the bytes that were read last, or, if no port sends a
-        frame within `ASK_S`, with None, no bytes, and a text of what each did instead.
+    `on_end` is called once with the open port and the bytes that were read last, or, if no port
+    sends a frame within `ASK_S`, with None, no bytes, and a text that describes each.
     """
 
     def __init__(
@@ -297,10 +255,7 @@ class ReceiverSearch:
 async def find_receiver(settings: SerialSettings) -> str:
     """Return the device of the receiver, asking every port if several fit the settings.
 
-    Raises
-    ------
-    PortNotFoundError
-        If nothing fits, none of several is the receiver, or the only one cannot be opened.
+    Raises PortNotFoundError if nothing fits, none is the receiver, or the only one does not open.
     """
     ports = list_serial_ports()
     fitting = fitting_ports(settings.port, ports)
@@ -327,15 +282,8 @@ async def find_receiver(settings: SerialSettings) -> str:
 class SerialPort:
     """Keep one serial port open and pass on its bytes.
 
-    Parameters
-    ----------
-    settings : SerialSettings
-    on_bytes : callable
-        Called with every chunk and the gateway time of its reading.
-    on_open, on_lost : callable
-        Called with the device after each opening, before the first bytes, and after each loss.
-    now_us : callable
-        The gateway clock.
+    `on_bytes` is called with every chunk and the gateway time of its reading; `on_open` and
+    `on_lost` with the device, after each opening, before the first bytes, and after each loss.
     """
 
     def __init__(
