@@ -4,16 +4,14 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from contextlib import suppress
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Final, Protocol
 
 import msgspec
 import typer
-from rich import box
 from rich.progress import BarColumn, Progress, TextColumn
-from rich.table import Table
 
 from gateway.cli.support.options import (
     ConfigOption,
@@ -25,7 +23,7 @@ from gateway.cli.support.options import (
     read_settings,
 )
 from gateway.cli.support.recording_options import files_of, refusing
-from gateway.cli.support.terminal import console_of, refuse
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.live.control_verbs import raw_of
@@ -36,7 +34,7 @@ from gateway.live.serial_port import (
     find_receiver,
 )
 from gateway.recordings.reading import open_rows
-from gateway.records import GpsFix, ImuRaw, NodeStatus, RawRecord
+from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import (
     FIELD_SIDES,
     CalibrationError,
@@ -101,8 +99,8 @@ class Capture(Protocol):
         """Return samples of so many seconds, or until the compass was turned to most sides."""
 
 
-Solve = Callable[[Step, NodeCalibration], NodeCalibration]
-Save = Callable[[NodeCalibration], None]
+Poses = Callable[[Step], list[NodeSamples]]
+"""Returns the samples of each pose of a step; raises CalibrationError with advice."""
 
 
 def register(app: typer.Typer) -> None:
@@ -159,18 +157,20 @@ def calibrate(
             console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
 
     if log is not None:
-        samples = _read_log(log, settings, vehicle)
-        solve: Solve = lambda step, known: _log_step(step, samples, known, field_ut)  # noqa: E731
+        poses = _poses_of_log(_read_log(log, settings, vehicle))
     else:
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
-        capture = _capture_live(vehicle) if is_live else capture_from(serial, vehicle)
-        solve = lambda step, known: live_step(step, capture, known, field_ut)  # noqa: E731
-    _show(old, calibrate_each(chosen, solve, old, save))
+        poses = poses_from(_capture_live(vehicle) if is_live else capture_from(serial, vehicle))
+    _show(old, calibrate_each(chosen, poses, old, save, field_ut))
 
 
 def calibrate_each(
-    steps: list[Step], solve: Solve, calibration: NodeCalibration, save: Save
+    steps: list[Step],
+    poses: Poses,
+    calibration: NodeCalibration,
+    save: Callable[[NodeCalibration], None],
+    field_ut: float | None = None,
 ) -> NodeCalibration:
     """Run the steps; each is saved when it is done, so aborting loses only the present one.
 
@@ -180,7 +180,7 @@ def calibrate_each(
         if len(steps) > 1:
             console.print(f"\nStep {number + 1} of {len(steps)}: {step}")
         try:
-            calibration = solve(step, calibration)
+            calibration = _solve(step, poses(step), calibration, field_ut)
         except CalibrationError as error:
             console.print(f"{step}: {error}", style="red")
         except (KeyboardInterrupt, typer.Abort):
@@ -193,31 +193,55 @@ def calibrate_each(
     return calibration
 
 
-def live_step(
-    step: Step, capture: Capture, calibration: NodeCalibration, field_ut: float | None
+def _solve(
+    step: Step, poses: list[NodeSamples], calibration: NodeCalibration, field_ut: float | None
 ) -> NodeCalibration:
-    """Ask for the poses of a step, and solve it; raises CalibrationError with advice."""
     match step:
         case Step.GYRO:
-            _ask("Lay the aircraft down and do not touch it.")
-            return calibrate_gyro(capture(REST_S), calibration)
+            return calibrate_gyro(poses[0], calibration)
         case Step.ACCEL:
-            return calibrate_accelerometer(_six_sides(capture), calibration)
+            return calibrate_accelerometer(poses, calibration)
         case Step.MAG:
-            _ask(
-                "Away from steel, turn the aircraft slowly about all its axes, upside down too, "
-                "until most sides were seen."
-            )
-            samples = capture(MAG_S, turned=True)
-            return calibrate_magnetometer(samples, calibration, field_ut)
+            return calibrate_magnetometer(poses[0], calibration, field_ut)
         case Step.MOUNTING:
-            _ask("Set the aircraft level, as it flies.")
-            level = capture(POSE_S)
-            _ask("Raise the nose by 30 deg or more and hold it there.")
-            return calibrate_mounting(level, capture(POSE_S), calibration)
+            return calibrate_mounting(poses[0], poses[1], calibration)
         case Step.LEVEL:
-            _ask("Set the aircraft level, as it flies.")
-            return calibrate_level(capture(POSE_S), calibration)
+            return calibrate_level(poses[0], calibration)
+
+
+def poses_from(capture: Capture) -> Poses:
+    """Return the poses that a person is asked for."""
+
+    def poses(step: Step) -> list[NodeSamples]:
+        match step:
+            case Step.GYRO:
+                _ask("Lay the aircraft down and do not touch it.")
+                return [capture(REST_S)]
+            case Step.ACCEL:
+                return _six_sides(capture)
+            case Step.MAG:
+                _ask(
+                    "Away from steel, turn the aircraft slowly about all its axes, upside down "
+                    "too, until most sides were seen."
+                )
+                return [capture(MAG_S, turned=True)]
+        _ask("Set the aircraft level, as it flies.")
+        level = [capture(POSE_S)]
+        if step is Step.MOUNTING:
+            _ask("Raise the nose by 30 deg or more and hold it there.")
+            level.append(capture(POSE_S))
+        return level
+
+    return poses
+
+
+def _poses_of_log(samples: NodeSamples) -> Poses:
+    def poses(step: Step) -> list[NodeSamples]:
+        if step in (Step.MOUNTING, Step.LEVEL):
+            raise CalibrationError("a recording does not show which pose was level")
+        return [samples]
+
+    return poses
 
 
 def _six_sides(capture: Capture) -> list[NodeSamples]:
@@ -247,47 +271,22 @@ def _missing(samples: list[NodeSamples]) -> list[str]:
     return [name for number, name in enumerate(SIDES) if number not in seen]
 
 
-def _log_step(
-    step: Step, samples: NodeSamples, calibration: NodeCalibration, field_ut: float | None
-) -> NodeCalibration:
-    match step:
-        case Step.GYRO:
-            return calibrate_gyro(samples, calibration)
-        case Step.ACCEL:
-            return calibrate_accelerometer([samples], calibration)
-        case Step.MAG:
-            return calibrate_magnetometer(samples, calibration, field_ut)
-        case Step.MOUNTING | Step.LEVEL:
-            raise CalibrationError("a recording does not show which pose was level")
-
-
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
-    raws, moving, fix = list[ImuRaw](), list[bool](), _Fix()
+    raws, moving, moved_us = list[ImuRaw](), list[bool](), -MOVING_US
     with refusing():
         (path, *_) = files_of([path], folder_of(settings), "tables")
         table = open_rows(path, read_options(settings))
         for row in table.plain_rows:
-            if row.gps is not None and row.gps.node.vehicle_id == vehicle:
-                fix = _Fix(row.gps.time_us, _speed_mps(row.gps) > MOVING_MPS)
+            fix = row.gps
+            if fix is not None and fix.node.vehicle_id == vehicle:
+                moves = fix.fix_ok and math.hypot(*fix.vel_n_mps[:2]) > MOVING_MPS
+                moved_us = fix.time_us if moves else -MOVING_US
             if row.raw is not None and row.raw.node.vehicle_id == vehicle:
                 raws.append(row.raw)
-                moving.append(fix.moving and row.time_us - fix.time_us < MOVING_US)
+                moving.append(row.time_us - moved_us < MOVING_US)
     if not raws:
         refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")
     return node_samples(raws, moving)
-
-
-@dataclass(frozen=True, slots=True)
-class _Fix:
-    """Data of the newest fix."""
-
-    time_us: int = 0
-    moving: bool = False
-
-
-def _speed_mps(fix: GpsFix) -> float:
-    north, east, _ = fix.vel_n_mps
-    return math.hypot(north, east) if fix.fix_ok else 0.0
 
 
 def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
@@ -303,13 +302,37 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
         nonlocal shown
         collecting = _Collecting(vehicle, seconds, turned=turned)
-        samples = asyncio.run(_listen(serial, vehicle, collecting))
+        limit_s = collecting.limit_s + PATIENCE_S
+        with collecting.bar:
+            _, is_done = asyncio.run(listen(serial, collecting.add, limit_s))
+        if not is_done:
+            refuse(f"no samples of vehicle {vehicle}: is it on, and the port right?")
         if collecting.chips not in ((), shown):
             shown = collecting.chips
             _show_chips(shown)
-        return samples
+        return node_samples(collecting.raws)
 
     return capture
+
+
+async def listen(
+    serial: SerialSettings, take: Callable[[list[RawRecord]], bool], limit_s: float
+) -> tuple[LinkReport, bool]:
+    """Read the receiver until `take` has enough; return its report, and whether it was enough."""
+    clock, link, done = GatewayClock(), Link(), asyncio.Event()
+
+    def on_bytes(data: bytes, now_us: int) -> None:
+        if take(link.feed(data, now_us)):
+            done.set()
+
+    port = SerialPort(serial, on_bytes, lambda _: None, lambda _: None, clock)
+    port.start()
+    try:
+        with suppress(TimeoutError):
+            await asyncio.wait_for(done.wait(), limit_s)
+        return link.report(clock(), connected=port.connected, port=serial.port), done.is_set()
+    finally:
+        port.close()
 
 
 class _Collecting:
@@ -352,26 +375,6 @@ class _Collecting:
         return span_s > MAG_LIMIT_S or (span_s > seconds and sides >= MAG_SIDES)
 
 
-async def _listen(serial: SerialSettings, vehicle: int, collecting: _Collecting) -> NodeSamples:
-    """Read the receiver until the samples are enough."""
-    clock, link, done = GatewayClock(), Link(), asyncio.Event()
-
-    def on_bytes(data: bytes, now_us: int) -> None:
-        if collecting.add(link.feed(data, now_us)):
-            done.set()
-
-    port = SerialPort(serial, on_bytes, lambda _: None, lambda _: None, clock)
-    port.start()
-    try:
-        with collecting.bar:
-            await asyncio.wait_for(done.wait(), collecting.limit_s + PATIENCE_S)
-    except TimeoutError:
-        refuse(f"no samples of vehicle {vehicle}: is it on, and the port right?")
-    finally:
-        port.close()
-    return node_samples(collecting.raws)
-
-
 def _capture_live(vehicle: int) -> Capture:
     """Take the samples of the running gateway."""
     for aircraft in ask("status")["aircraft"]:
@@ -408,9 +411,7 @@ def _ask(text: str) -> None:
 
 def _show(old: NodeCalibration, new: NodeCalibration) -> None:
     """Print what changed."""
-    table = Table(box=box.SIMPLE_HEAD)
-    for column in ("setting", "before", "after"):
-        table.add_column(column)
+    table = table_of("setting", "before", "after", left=3)
     for name in new.__struct_fields__:
         before, after = getattr(old, name), getattr(new, name)
         if before != after:

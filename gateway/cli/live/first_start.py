@@ -11,22 +11,22 @@ from typing import Annotated, Final, NoReturn
 
 import typer
 from msgspec.structs import replace
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.cli.live.calibrate import (
-    Capture,
     Step,
     calibrate_each,
     capture_from,
-    live_step,
+    listen,
+    poses_from,
 )
 from gateway.cli.support.options import ConfigOption, read_aircraft, read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.clock import GatewayClock, unix_time_us
+from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
-from gateway.records import GpsFix, LinkReport, NodeStatus
+from gateway.records import GpsFix, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import SimulatedAircraft
@@ -34,13 +34,11 @@ from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Workbench
-from gateway.wire.link import Link
 from gateway.wire.payloads import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 
 LOOK_S: Final = 5.0
 """After opening: a bootloader takes up to 2 s, and every board reports once a second."""
 GPS_WAIT_S: Final = 60.0
-POLL_S: Final = 0.2
 NOISY_PERCENT: Final = 30
 LOSSY_PERCENT: Final = 5.0
 FEW_LOST: Final = 3
@@ -62,15 +60,10 @@ console = console_of()
 class Observed:
     """The records that were received within a time."""
 
-    report: LinkReport
     statuses: dict[tuple[int, int], NodeStatus] = field(default_factory=dict)
     """The newest report of each node, by vehicle and node id."""
     fixes: dict[int, GpsFix] = field(default_factory=dict)
     """The newest fix of each vehicle."""
-
-    def vehicles(self) -> list[int]:
-        """List the ids of the aircraft that were heard."""
-        return sorted({link.node.vehicle_id for link in self.report.nodes})
 
 
 def register(app: typer.Typer) -> None:
@@ -81,7 +74,8 @@ def register(app: typer.Typer) -> None:
 def setup(
     *,
     vehicle: Annotated[
-        int | None, typer.Option("--vehicle", min=1, max=31, help="Its id, if several are heard.")
+        int | None,
+        typer.Option("--vehicle", min=1, max=31, help="Its id, if several send."),
     ] = None,
     port: Annotated[
         str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
@@ -99,30 +93,28 @@ def setup(
     settings = read_settings(config)
     serial = settings.serial if port is None else replace(settings.serial, port=port)
     if not simulated:
-        _guide(settings, serial, vehicle, save=True)
+        _guide(settings, serial, vehicle)
         return
     with simulated_receiver(settings.simulator) as (path, bench):
-        serial = replace(serial, port=path)
-        _guide(settings, serial, vehicle, save=False, on_turn=bench.turn)
+        _guide(settings, replace(serial, port=path), vehicle, bench)
 
 
 def _guide(
     settings: GatewaySettings,
     serial: SerialSettings,
     vehicle: int | None,
-    *,
-    save: bool,
-    on_turn: Callable[[], None] = lambda: None,
+    bench: Workbench | None = None,
 ) -> None:
-    """Run the steps of the first start."""
+    """Run the steps of the first start; with a simulated aircraft nothing is saved."""
     logging.getLogger(SerialPort.__module__).setLevel(logging.WARNING)
     serial = _find(serial)
-    seen = asyncio.run(_observe(serial, lambda _: False, LOOK_S))
-    _check_receiver(seen, serial)
-    number = _choose(seen, vehicle)
-    _check_nodes(seen, number)
+    seen = Observed()
+    report = _observe(serial, seen, lambda: False, LOOK_S)
+    _check_receiver(report, serial)
+    number = _choose(report, vehicle)
+    _check_nodes(report, seen.statuses, number)
     _check_gps(serial, number)
-    _calibrate(settings, serial, number, save=save, on_turn=on_turn)
+    _calibrate(settings, serial, number, bench)
     _head("Done")
     console.print("Start the gateway with `mavgate run`, and a ground station on UDP port 14550.")
     console.print("A step that failed can be repeated: `mavgate calibrate gyro`, `level` or `mag`.")
@@ -143,8 +135,8 @@ def _find(serial: SerialSettings) -> SerialSettings:
     return replace(serial, port=device)
 
 
-def _check_receiver(seen: Observed, serial: SerialSettings) -> None:
-    report, receiver = seen.report, seen.report.receiver
+def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
+    receiver = report.receiver
     if receiver is None and not report.nodes:
         sent = "bytes that are no frames" if report.bytes_received else "nothing"
         _stop(
@@ -165,34 +157,37 @@ def _check_receiver(seen: Observed, serial: SerialSettings) -> None:
         )
 
 
-def _choose(seen: Observed, vehicle: int | None) -> int:
+def _choose(report: LinkReport, vehicle: int | None) -> int:
     _head("2 of 5: boards, sensors and radio")
-    heard = seen.vehicles()
-    if not heard:
+    received = sorted({link.node.vehicle_id for link in report.nodes})
+    if not received:
         _stop(
-            "no aircraft is heard",
+            "no aircraft is received",
             "Is it powered? A node whose LED flashes once every 2 s gets no answer: channel, rate "
             "and address must be the receiver's, compare them by `mavgate flash --show`",
             "Three flashes: its radio module does not answer: check its wiring and 3.3 V supply",
         )
-    if vehicle is not None and vehicle not in heard:
-        _stop(f"vehicle {vehicle} is not heard, but {', '.join(map(str, heard))}")
-    if vehicle is None and len(heard) > 1:
-        _stop(f"several aircraft are heard: {', '.join(map(str, heard))}; choose with --vehicle")
-    return heard[0] if vehicle is None else vehicle
+    listed = ", ".join(map(str, received))
+    if vehicle is not None and vehicle not in received:
+        _stop(f"nothing is received from vehicle {vehicle}, but from {listed}")
+    if vehicle is None and len(received) > 1:
+        _stop(f"several aircraft are received: {listed}; choose with --vehicle")
+    return received[0] if vehicle is None else vehicle
 
 
-def _check_nodes(seen: Observed, vehicle: int) -> None:
+def _check_nodes(
+    report: LinkReport, statuses: dict[tuple[int, int], NodeStatus], vehicle: int
+) -> None:
     """Print the boards of the aircraft, and what is wrong with them."""
     table = table_of(
         "node", "firmware", "sensors", "missing", "payloads/s", "lost %", "supply V", left=4
     )
     hints = []
-    for link in seen.report.nodes:
+    for link in report.nodes:
         if link.node.vehicle_id != vehicle:
             continue
         node = link.node.node_id
-        status = seen.statuses.get((vehicle, node))
+        status = statuses.get((vehicle, node))
         share = 100.0 * link.lost / max(link.received + link.lost, 1)
         if status is None:
             table.add_row(str(node), "no report", "", "", f"{link.rate_hz:.0f}", f"{share:.1f}", "")
@@ -200,8 +195,8 @@ def _check_nodes(seen: Observed, vehicle: int) -> None:
         failed = _sensors(status.sensors_failed)
         version = "{}.{}".format(*status.firmware_version)
         volts = f"{status.supply_mv / 1000:.2f}" if status.supply_mv else ""
-        found = ", ".join(status.chips)
-        found = found or _sensors(status.sensors_present & ~status.sensors_failed)
+        present = _sensors(status.sensors_present & ~status.sensors_failed)
+        found = ", ".join(status.chips) or present
         table.add_row(
             str(node), version, found, failed, f"{link.rate_hz:.0f}", f"{share:.1f}", volts
         )
@@ -227,11 +222,12 @@ def _sensors(bits: int) -> str:
 
 def _check_gps(serial: SerialSettings, vehicle: int) -> None:
     _head("3 of 5: GPS")
-    seen = asyncio.run(_observe(serial, lambda seen: _has_fix(seen, vehicle), GPS_WAIT_S))
+    seen = Observed()
+    _observe(serial, seen, lambda: vehicle in seen.fixes and seen.fixes[vehicle].fix_ok, GPS_WAIT_S)
     fix = seen.fixes.get(vehicle)
     if fix is None:
-        _hint("no GPS node is heard: position will be missing; see step 2")
-    elif not _has_fix(seen, vehicle):
+        _hint("no GPS node is received: position will be missing; see step 2")
+    elif not fix.fix_ok:
         _hint(
             f"no fix within {GPS_WAIT_S:.0f} s, {fix.satellites} satellites: go outdoors; a module "
             "that was never used takes up to 15 min the first time"
@@ -241,79 +237,53 @@ def _check_gps(serial: SerialSettings, vehicle: int) -> None:
         _good(text) if fix.satellites >= WEAK_SATELLITES else _hint(f"{text}: wait for more")
 
 
-def _has_fix(seen: Observed, vehicle: int) -> bool:
-    return vehicle in seen.fixes and seen.fixes[vehicle].fix_ok
-
-
 def _calibrate(
-    settings: GatewaySettings,
-    serial: SerialSettings,
-    vehicle: int,
-    *,
-    save: bool,
-    on_turn: Callable[[], None],
+    settings: GatewaySettings, serial: SerialSettings, vehicle: int, bench: Workbench | None
 ) -> None:
     _head("4 of 5: calibration of gyroscope, level and compass")
     aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
-    listen = capture_from(serial, vehicle)
+    from_receiver = capture_from(serial, vehicle)
 
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
-        if turned:
-            on_turn()
-        return listen(seconds, turned=turned)
+        if turned and bench is not None:
+            bench.turn()
+        return from_receiver(seconds, turned=turned)
 
     saved: list[Path] = []
 
-    def keep(calibration: NodeCalibration) -> None:
-        if save:
+    def save(calibration: NodeCalibration) -> None:
+        if bench is None:
             changed = replace(aircraft, calibration=calibration)
             saved.append(save_aircraft(settings, vehicle, changed))
 
-    source: Capture = capture
-    calibrate_each(
-        [*STEPS],
-        lambda step, known: live_step(step, source, known, None),
-        aircraft.calibration,
-        keep,
-    )
+    calibrate_each([*STEPS], poses_from(capture), aircraft.calibration, save)
     _head("5 of 5: saved")
     if saved:
         _good(str(saved[-1]))
     else:
-        _hint("nothing was saved" + ("" if save else ", since the receiver is simulated"))
+        _hint("nothing was saved" + (", since the receiver is simulated" if bench else ""))
 
 
-async def _observe(
-    serial: SerialSettings, is_done: Callable[[Observed], bool], limit_s: float
-) -> Observed:
+def _observe(
+    serial: SerialSettings, seen: Observed, is_done: Callable[[], bool], limit_s: float
+) -> LinkReport:
     """Read the receiver until something holds, at most for a time; shows progress."""
-    clock, link = GatewayClock(), Link()
-    seen = Observed(link.report(0, connected=False, port=serial.port))
 
-    def on_bytes(data: bytes, now_us: int) -> None:
-        for record in link.feed(data, now_us):
+    def take(records: list[RawRecord]) -> bool:
+        for record in records:
             if isinstance(record, NodeStatus):
                 seen.statuses[record.node.vehicle_id, record.node.node_id] = record
             elif isinstance(record, GpsFix):
                 seen.fixes[record.node.vehicle_id] = record
+        return is_done()
 
     bar = Progress(
-        TextColumn("listening"), BarColumn(), TextColumn("{task.completed:.0f} s"),
-        console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
+        TextColumn("listening"), BarColumn(), TimeElapsedColumn(),
+        console=console, transient=True, disable=not console.is_terminal,
     )  # fmt: skip
-    task = bar.add_task("", total=limit_s)
-    port = SerialPort(serial, on_bytes, lambda _: None, lambda _: None, clock)
-    port.start()
-    began_us = clock()
-    try:
-        with bar:
-            while (past_s := (clock() - began_us) / 1e6) < limit_s and not is_done(seen):
-                bar.update(task, completed=past_s, refresh=True)
-                await asyncio.sleep(POLL_S)
-        seen.report = link.report(clock(), connected=port.connected, port=serial.port)
-    finally:
-        port.close()
-    return seen
+    bar.add_task("", total=None)
+    with bar:
+        return asyncio.run(listen(serial, take, limit_s))[0]
 
 
 @contextmanager

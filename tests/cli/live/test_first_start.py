@@ -3,26 +3,37 @@
 import os
 import tty
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 from typer.testing import Result
 
 from gateway.cli.live import calibrate, first_start
+from gateway.clock import GatewayClock
 from gateway.config import load, load_aircraft
+from gateway.live.serial_port import SerialPort
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
 
 
+SPEED = 8.0
+"""The simulated receiver and the gateway clock run so many times faster than true time."""
+
+
+class FastClock(GatewayClock):
+    def __call__(self) -> int:
+        return round(SPEED * super().__call__())
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(first_start, "LOOK_S", 1.5)
+    monkeypatch.setattr(calibrate, "GatewayClock", FastClock)
+    monkeypatch.setattr(first_start, "PtyPort", partial(first_start.PtyPort, speed=SPEED))
+    monkeypatch.setattr(first_start, "LOOK_S", 2.5 / SPEED)
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
-    monkeypatch.setattr(calibrate, "REST_S", 4.0)
-    monkeypatch.setattr(calibrate, "POSE_S", 3.5)
-    monkeypatch.setattr(calibrate, "MAG_S", 5.0)
 
 
 def setup(*words: str) -> Result:
@@ -31,10 +42,7 @@ def setup(*words: str) -> Result:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(calibrate, "MAG_SIDES", 16)
+def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text(f'aircraft_folder = "{tmp_path}"\n')
     done = setup("--simulated", "--config", str(config))
@@ -62,7 +70,7 @@ def test_calibration_of_a_receiver_at_a_port_is_saved(
         wrong = setup("--port", path, "--vehicle", "4", "--config", str(config))
         done = setup("--port", path, "--config", str(config))
     assert wrong.exit_code == 2
-    assert "vehicle 4 is not heard, but 3" in wrong.output
+    assert "nothing is received from vehicle 4, but from 3" in wrong.output
     assert done.exit_code == 0, done.output
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
 
@@ -86,13 +94,13 @@ def test_port_that_is_no_receiver_is_named_with_what_to_do(
 ) -> None:
     master, path = terminal
     monkeypatch.setattr(first_start, "LOOK_S", 0.3)
-    before = first_start.SerialPort.start
+    before = SerialPort.start
 
-    def start(port: first_start.SerialPort) -> None:
+    def start(port: SerialPort) -> None:
         before(port)
         os.write(master, sent)
 
-    monkeypatch.setattr(first_start.SerialPort, "start", start)
+    monkeypatch.setattr(SerialPort, "start", start)
     done = setup("--port", path)
     assert done.exit_code == 2
     assert f"{path} {said}" in done.output
