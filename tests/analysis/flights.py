@@ -10,12 +10,12 @@ from gateway.analysis.flight import Flight
 from gateway.analysis.simulated import simulated_flight
 from gateway.simulator.simulator_settings import SimulatorSettings
 
-DURATION_S = 60.0
+DURATION_S = 40.0
 
 
 @cache
 def short_flight() -> Flight:
-    settings = SimulatorSettings(imu_rate_hz=50, gps_outages_s=((40.0, 3.0),))
+    settings = SimulatorSettings(imu_rate_hz=50, gps_outages_s=((28.0, 3.0),))
     return simulated_flight(settings, duration_s=DURATION_S)
 
 
