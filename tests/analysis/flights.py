@@ -14,9 +14,9 @@ DURATION_S = 40.0
 
 
 @cache
-def short_flight() -> Flight:
+def short_flight(duration_s: float = DURATION_S) -> Flight:
     settings = SimulatorSettings(imu_rate_hz=50, gps_outages_s=((28.0, 3.0),))
-    return simulated_flight(settings, duration_s=DURATION_S)
+    return simulated_flight(settings, duration_s=duration_s)
 
 
 @cache

@@ -267,8 +267,7 @@ def weights(case: Case) -> Section | None:
     if case.frame is None:
         return None
     thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
-    full = blend_table(case.flight, case.fusion, 0.0)
-    if not (_is_judged(thinned) and _is_judged(full)):
+    if not _is_judged(thinned) or not _is_judged(full := blend_table(case.flight, case.fusion, 0)):
         return None
     return Section(
         "Alpha and beta: Table I",

@@ -58,7 +58,8 @@ def test_several_processes_give_the_same_as_one() -> None:
 
 def test_withheld_fixes_find_the_latency() -> None:
     """Interpolated GPS would choose no compensation at all: it copies the late fixes."""
-    flight, fusion = short_flight(), short_case().fusion
+    # With the turns that begin after 40 s.
+    flight, fusion = short_flight(60.0), short_case().fusion
     contest = make_contest(flight, fusion, [LATENCY])
     latencies = (0.0, 0.08, 0.16, 0.24, 0.32)
     points: list[Values] = [(latency,) for latency in latencies]
