@@ -3,7 +3,6 @@
 import os
 import tty
 from collections.abc import Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -12,8 +11,10 @@ from typer.testing import Result
 from gateway.cli.live import calibrate, first_start
 from gateway.clock import GatewayClock
 from gateway.config import load, load_aircraft
+from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.simulator.timed_frame import TimedFrame
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -28,10 +29,14 @@ class FastClock(GatewayClock):
         return round(SPEED * super().__call__())
 
 
+def fast_port(frames: Iterator[TimedFrame]) -> PtyPort:
+    return PtyPort(TimedFrame(frame.time_s / SPEED, frame.data) for frame in frames)
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibrate, "GatewayClock", FastClock)
-    monkeypatch.setattr(first_start, "PtyPort", partial(first_start.PtyPort, speed=SPEED))
+    monkeypatch.setattr(first_start, "PtyPort", fast_port)
     monkeypatch.setattr(first_start, "LOOK_S", 2.5 / SPEED)
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
 
