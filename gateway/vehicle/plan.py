@@ -39,30 +39,8 @@ def is_on_earth(lat_deg: float, lon_deg: float) -> bool:
     return abs(lat_deg) <= MAX_LAT_DEG and abs(lon_deg) <= MAX_LON_DEG
 
 
-def describe_location_fault(location: "Location") -> str:
-    """Return what is wrong with the coordinates of a location that is not on earth."""
-    if not abs(location.lat_deg) <= MAX_LAT_DEG:
-        return f"latitude must be between -90 and 90, not {location.lat_deg}"
-    return f"longitude must be between -180 and 180, not {location.lon_deg}"
-
-
 def height_amsl_m(height_m: float, frame: int, home_alt_m: float) -> float:
-    """Convert a height in a MAV_FRAME to one above mean sea level.
-
-    Parameters
-    ----------
-    height_m : float
-        Height as sent; NaN if the client does not specify it.
-    frame : int
-        A MAV_FRAME of `GLOBAL_FRAMES`.
-    home_alt_m : float
-        Height of home above mean sea level, NaN while there is none.
-
-    Returns
-    -------
-    float
-        NaN if it cannot be known.
-    """
+    """Convert a height in a MAV_FRAME to one above mean sea level; NaN if it is not known."""
     relative = frame in RELATIVE_FRAMES
     height = height_m + home_alt_m if relative else height_m
     return height if math.isfinite(height) else math.nan
@@ -80,6 +58,14 @@ class Location:
     lat_deg: float
     lon_deg: float
     alt_amsl_m: float
+
+    def fault(self) -> str:
+        """Return what is wrong with the coordinates; an empty text for a location on the earth."""
+        if not abs(self.lat_deg) <= MAX_LAT_DEG:
+            return f"latitude must be between -90 and 90, not {self.lat_deg}"
+        if not abs(self.lon_deg) <= MAX_LON_DEG:
+            return f"longitude must be between -180 and 180, not {self.lon_deg}"
+        return ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,13 +126,7 @@ def location_of(fix: GpsFix) -> Location:
 
 
 def distance_and_bearing(here: Location, there: Location) -> tuple[float, float]:
-    """Measure distance and bearing between two locations.
-
-    Returns
-    -------
-    tuple of 2 floats
-        Distance along the ellipsoid in metres, and bearing at `here` in rad from north, -pi to pi.
-    """
+    """Return the distance along the ellipsoid in m, and the bearing at `here` in rad, -pi to pi."""
     found = Geodesic.WGS84.Inverse(here.lat_deg, here.lon_deg, there.lat_deg, there.lon_deg, WANTED)
     return (found["s12"], math.radians(found["azi1"]))
 
@@ -158,37 +138,24 @@ RALLY: Final[int] = mavlink.MAV_MISSION_TYPE_RALLY
 MAX_ITEMS: Final = {MISSION: 1000, FENCE: 500, RALLY: 100}
 """More than a flight needs, with little memory for each aircraft."""
 
-FENCE_COMMANDS: Final = frozenset(
-    {
-        mavlink.MAV_CMD_NAV_FENCE_RETURN_POINT,
-        mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_INCLUSION,
-        mavlink.MAV_CMD_NAV_FENCE_POLYGON_VERTEX_EXCLUSION,
-        mavlink.MAV_CMD_NAV_FENCE_CIRCLE_INCLUSION,
-        mavlink.MAV_CMD_NAV_FENCE_CIRCLE_EXCLUSION,
-    }
-)
-RALLY_COMMANDS: Final = frozenset({mavlink.MAV_CMD_NAV_RALLY_POINT})
 
+def _commands(*names: str) -> frozenset[int]:
+    return frozenset(getattr(mavlink, f"MAV_CMD_{name}") for name in names)
+
+
+FENCE_COMMANDS: Final = _commands(
+    *("NAV_FENCE_RETURN_POINT", "NAV_FENCE_CIRCLE_INCLUSION", "NAV_FENCE_CIRCLE_EXCLUSION"),
+    *("NAV_FENCE_POLYGON_VERTEX_INCLUSION", "NAV_FENCE_POLYGON_VERTEX_EXCLUSION"),
+)
+RALLY_COMMANDS: Final = _commands("NAV_RALLY_POINT")
 LOCATED_COMMANDS: Final = (
-    frozenset(
-        {
-            mavlink.MAV_CMD_NAV_WAYPOINT,
-            mavlink.MAV_CMD_NAV_LOITER_UNLIM,
-            mavlink.MAV_CMD_NAV_LOITER_TURNS,
-            mavlink.MAV_CMD_NAV_LOITER_TIME,
-            mavlink.MAV_CMD_NAV_LOITER_TO_ALT,
-            mavlink.MAV_CMD_NAV_LAND,
-            mavlink.MAV_CMD_NAV_TAKEOFF,
-            mavlink.MAV_CMD_NAV_VTOL_TAKEOFF,
-            mavlink.MAV_CMD_NAV_VTOL_LAND,
-            mavlink.MAV_CMD_NAV_SPLINE_WAYPOINT,
-            mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
-            mavlink.MAV_CMD_DO_SET_ROI,
-            mavlink.MAV_CMD_DO_LAND_START,
-        }
-    )
-    | FENCE_COMMANDS
+    FENCE_COMMANDS
     | RALLY_COMMANDS
+    | _commands(
+        *("NAV_WAYPOINT", "NAV_SPLINE_WAYPOINT", "NAV_LOITER_UNLIM", "NAV_LOITER_TURNS"),
+        *("NAV_LOITER_TIME", "NAV_LOITER_TO_ALT", "NAV_LAND", "NAV_TAKEOFF", "NAV_VTOL_TAKEOFF"),
+        *("NAV_VTOL_LAND", "DO_SET_ROI_LOCATION", "DO_SET_ROI", "DO_LAND_START"),
+    )
 )
 """Commands whose parameters 5 to 7 are a location, if their frame is a global one."""
 
@@ -229,51 +196,29 @@ def read_item(message: Any) -> Item:
     if message.get_type() == "MISSION_ITEM":
         scale = DEGE7 if message.frame in GLOBAL_FRAMES else 1.0
         x, y = (_integer(value * scale) for value in (x, y))
-    return Item(
-        message.frame,
-        message.command,
-        message.autocontinue,
-        (message.param1, message.param2, message.param3, message.param4),
-        x,
-        y,
-        message.z,
-    )
+    params = (message.param1, message.param2, message.param3, message.param4)
+    frame, command, autocontinue = message.frame, message.command, message.autocontinue
+    return Item(frame, command, autocontinue, params, x, y, message.z)
 
 
-def write_item(item: Item, sequence: int, kind: int, target: tuple[int, int], current: bool) -> Any:
-    """Encode an item as MISSION_ITEM_INT."""
-    return mavlink.MAVLink_mission_item_int_message(
-        *target,
-        sequence,
-        item.frame,
-        item.command,
-        int(current),
-        item.autocontinue,
-        *item.params,
-        item.x,
-        item.y,
-        item.z,
-        kind,
-    )
-
-
-def write_float_item(
-    item: Item, sequence: int, kind: int, target: tuple[int, int], current: bool
+def write_item(
+    item: Item,
+    sequence: int,
+    kind: int,
+    target: tuple[int, int],
+    is_current: bool,
+    as_floats: bool = False,
 ) -> Any:
-    """Encode an item as the older MISSION_ITEM, whose coordinates are floats in degrees."""
+    """Encode an item as MISSION_ITEM_INT, or the older MISSION_ITEM with floats in degrees."""
+    fields = (item.command, int(is_current), item.autocontinue, *item.params)
+    if not as_floats:
+        return mavlink.MAVLink_mission_item_int_message(
+            *target, sequence, item.frame, *fields, item.x, item.y, item.z, kind
+        )
     scale = DEGE7 if item.frame in GLOBAL_FRAMES else 1.0
+    frame = FLOAT_FRAMES.get(item.frame, item.frame)
     return mavlink.MAVLink_mission_item_message(
-        *target,
-        sequence,
-        FLOAT_FRAMES.get(item.frame, item.frame),
-        item.command,
-        int(current),
-        item.autocontinue,
-        *item.params,
-        item.x / scale,
-        item.y / scale,
-        item.z,
-        kind,
+        *target, sequence, frame, *fields, item.x / scale, item.y / scale, item.z, kind
     )
 
 
@@ -325,22 +270,9 @@ def encode_plan(plan: StoredPlan) -> str:
 
 
 def decode_plan(text: str) -> StoredPlan:
-    """Read a plan.
+    """Read a text of `encode_plan`.
 
-    Parameters
-    ----------
-    text : str
-        JSON of `encode_plan`.
-
-    Returns
-    -------
-    StoredPlan
-
-    Raises
-    ------
-    ValueError
-        If it is not such a text, or contains values that no ground station could have stored; the
-        error names the first.
+    ValueError names the first fault: also a value that no ground station could have stored.
     """
     try:
         plan = msgspec.convert(json.loads(text), StoredPlan)
@@ -354,8 +286,8 @@ def decode_plan(text: str) -> StoredPlan:
 
 def _faults(plan: StoredPlan) -> Iterator[str]:
     for name, location in (("home", plan.home), ("mark", plan.mark)):
-        if location is not None and not is_on_earth(location.lat_deg, location.lon_deg):
-            yield f"{name}: {describe_location_fault(location)}"
+        if location is not None and (fault := location.fault()):
+            yield f"{name}: {fault}"
     if plan.home is not None and not math.isfinite(plan.home.alt_amsl_m):
         yield "home: the height is not a number"
     for kind, name in KINDS.items():

@@ -128,7 +128,7 @@ class Vehicle:
             system_id, self.telemetry, self._announcements.say, stored or StoredPlan()
         )
         self._published_home = self.telemetry.home
-        home = self.plan.home.parameters()
+        home = self.plan.home_parameters()
         self._make_services({OWN_SECTION: settings, **(sections or {}), HOME_SECTION: home})
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
@@ -391,7 +391,7 @@ class Vehicle:
         actions: list[Action] = []
         if self.telemetry.home is not self._published_home:
             self._published_home = self.telemetry.home
-            home = self._parameters.take(HOME_SECTION, self.plan.home.parameters())
+            home = self._parameters.take(HOME_SECTION, self.plan.home_parameters())
             answers = [*answers, *home]
         for answer in answers:
             if isinstance(answer, Reply):

@@ -54,7 +54,6 @@ from gateway.vehicle.plan import (
     Item,
     check_item,
     read_item,
-    write_float_item,
     write_item,
 )
 from gateway.vehicle.requests import Answer, Reply, Request, Service
@@ -80,28 +79,34 @@ CHANGING: Final = frozenset(
 Sender = tuple[int, int, int]
 """Client, system and component: several programs may share one client of the hub."""
 
-Changed = Callable[[int, int], list[Answer]]
-"""Called with the mission type that was stored, cleared or advanced, and the time."""
+Changed = Callable[[int], list[Answer]]
+"""Called with the mission type that was stored, cleared or advanced."""
 
 
 @dataclass(slots=True)
 class _Upload:
+    """An upload, kept after its last item, as that may come again."""
+
     request: Request
     """The MISSION_COUNT that began it."""
     kind: int
     count: int
     due_us: int
+    progress_us: int
+    """When the first item that is missing was asked for first."""
     items: list[Item] = field(default_factory=list)
     wanted: int = 0
     """What is asked for: the first that is missing, or before it what the client goes on with."""
-    progress_us: int = 0
-    """When the first that is missing was asked for first."""
     repeats: int = 0
     """How often a request was repeated since: so many copies of that item may still come."""
     loses: bool = False
     """Whether any request had to be repeated."""
     checks: int = 0
     """How often the last item is still to be asked for, once all came."""
+
+    @property
+    def is_complete(self) -> bool:
+        return len(self.items) == self.count
 
 
 class MissionService(Service):
@@ -120,7 +125,6 @@ class MissionService(Service):
         self._forms: dict[Sender, bool] = {}
         """Whether a client has used the INT form; without an entry it is not known yet."""
         self._upload: _Upload | None = None
-        self._finished: _Upload | None = None
         self._handlers: dict[str, Callable[[Request, int], list[Answer]]] = {
             "MISSION_REQUEST_LIST": self._list,
             "MISSION_REQUEST_INT": self._send_item,
@@ -157,10 +161,10 @@ class MissionService(Service):
 
     def poll(self, now_us: int) -> list[Answer]:
         """Request a missing item again; finally cancel the upload."""
-        upload = self._waiting()
-        if upload is None or now_us < upload.due_us:
+        due_us, upload = self.next_due_us(), self._upload
+        if upload is None or due_us is None or now_us < due_us:
             return []
-        if upload is self._finished:
+        if upload.is_complete:
             upload.checks -= 1
         elif now_us - upload.progress_us >= GIVE_UP_US:
             self._upload = None
@@ -172,21 +176,21 @@ class MissionService(Service):
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to do."""
-        upload = self._waiting()
-        return None if upload is None else upload.due_us
-
-    def _waiting(self) -> _Upload | None:
-        """Return the upload for which a request is repeated when it is due."""
-        done = self._finished
-        return done if done is not None and done.checks else self._upload
+        upload = self._upload
+        if upload is None or (upload.is_complete and not upload.checks):
+            return None
+        return upload.due_us
 
     def remove_client(self, client_id: int) -> None:
         """Give up an upload whose client has gone."""
-        for upload in (self._upload, self._finished):
-            if upload is not None and upload.request.client_id == client_id:
-                self._upload = self._finished = None
-        for sender in [sender for sender in self._forms if sender[0] == client_id]:
-            del self._forms[sender]
+        if self._upload is not None and self._upload.request.client_id == client_id:
+            self._upload = None
+        self._forms = {key: form for key, form in self._forms.items() if key[0] != client_id}
+
+    def _upload_of(self, request: Request) -> _Upload | None:
+        """Return the present or last upload if it is of this client."""
+        upload = self._upload
+        return upload if upload and upload.request.client_id == request.client_id else None
 
     def _note_form(self, request: Request, *, uses_int: bool) -> None:
         sender = _sender(request)
@@ -194,12 +198,12 @@ class MissionService(Service):
             self._forms.pop(next(iter(self._forms)))
         self._forms[sender] = uses_int
 
-    def set_current(self, sequence: int, now_us: int) -> list[Answer] | None:
+    def set_current(self, sequence: int) -> list[Answer] | None:
         """Make an item the current one; None if there is no such item."""
         if not 0 <= sequence < len(self.items[MISSION]):
             return None
         self.current = sequence
-        return [Reply(self.mission_current()), *self._changed(MISSION, now_us)]
+        return [Reply(self.mission_current()), *self._changed(MISSION)]
 
     def mission_current(self) -> Any:
         """Encode MISSION_CURRENT; nothing is executed here, so the mission is not started."""
@@ -214,10 +218,13 @@ class MissionService(Service):
         for kind, items in self.items.items():
             found.append(mavlink.MAVLink_mission_count_message(0, 0, len(items), kind))
             found += [
-                write_item(item, number, kind, (0, 0), kind == MISSION and number == self.current)
+                write_item(item, number, kind, (0, 0), self._is_current(kind, number))
                 for number, item in enumerate(items)
             ]
         return found
+
+    def _is_current(self, kind: int, sequence: int) -> bool:
+        return kind == MISSION and sequence == self.current
 
     def _list(self, request: Request, _now_us: int) -> list[Answer]:
         kind = request.message.mission_type
@@ -235,28 +242,25 @@ class MissionService(Service):
         if sequence >= len(self.items[kind]):
             return [mission_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
         target = (request.system_id, request.component_id)
-        current = kind == MISSION and sequence == self.current
-        write = write_item if self._forms[_sender(request)] else write_float_item
-        item = write(self.items[kind][sequence], sequence, kind, target, current)
-        return [request.reply(item)]
+        item, is_current = self.items[kind][sequence], self._is_current(kind, sequence)
+        as_floats = not self._forms[_sender(request)]
+        return [request.reply(write_item(item, sequence, kind, target, is_current, as_floats))]
 
     def _begin(self, request: Request, now_us: int) -> list[Answer]:
         kind, count = request.message.mission_type, request.message.count
         begun = self._upload
-        is_own = begun is None or begun.request.client_id == request.client_id
-        if not is_own:
+        if begun and not begun.is_complete and not self._upload_of(request):
             return [mission_ack(request, mavlink.MAV_MISSION_DENIED)]
         if kind not in KINDS:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         if count > MAX_ITEMS[kind]:
             return [mission_ack(request, mavlink.MAV_MISSION_NO_SPACE)]
-        is_same = begun is not None and (begun.kind, begun.count) == (kind, count)
-        if begun is not None and is_same and not begun.items:
+        if begun and not begun.items and (begun.kind, begun.count) == (kind, count):
             return []
-        self._upload = self._finished = None
+        self._upload = None
         if count == 0:
-            return [mission_ack(request, ACCEPTED), *self._store(kind, (), now_us)]
-        self._upload = _Upload(request, kind, count, now_us, progress_us=now_us)
+            return [mission_ack(request, ACCEPTED), *self._store(kind, ())]
+        self._upload = _Upload(request, kind, count, now_us, now_us)
         return self._ask(self._upload, now_us)
 
     def _ask(self, upload: _Upload, now_us: int) -> list[Answer]:
@@ -270,14 +274,14 @@ class MissionService(Service):
         return [request.reply(wanted)]
 
     def _take_item(self, request: Request, now_us: int) -> list[Answer]:
-        message = request.message
-        upload = self._upload
-        if upload is None or upload.request.client_id != request.client_id:
-            return self._stray_item(request)
-        if message.seq < len(upload.items) and message.mission_type == upload.kind:
+        message, upload = request.message, self._upload_of(request)
+        if upload is None or upload.is_complete:
+            return self._stray_item(request, upload)
+        received = len(upload.items)
+        if message.seq < received and message.mission_type == upload.kind:
             was_wanted, upload.wanted = message.seq == upload.wanted, message.seq + 1
             return self._ask(upload, now_us) if was_wanted else []
-        if message.seq != len(upload.items) or message.mission_type != upload.kind:
+        if message.seq != received or message.mission_type != upload.kind:
             return self._ask(upload, now_us)
         item = read_item(message)
         result = check_item(item, upload.kind)
@@ -285,50 +289,43 @@ class MissionService(Service):
             self._upload = None
             return [mission_ack(request, result)]
         upload.items.append(item)
-        if len(upload.items) < upload.count:
-            upload.wanted, upload.progress_us, upload.repeats = len(upload.items), now_us, 0
+        if received + 1 < upload.count:
+            upload.wanted, upload.progress_us, upload.repeats = received + 1, now_us, 0
             return self._ask(upload, now_us)
-        self._upload, self._finished = None, upload
         upload.wanted, upload.due_us = message.seq, now_us + REPEAT_US
         upload.checks = CHECKS if upload.loses else 0
-        stored = self._store(upload.kind, tuple(upload.items), now_us)
-        return [mission_ack(request, ACCEPTED), *stored]
+        return [mission_ack(request, ACCEPTED), *self._store(upload.kind, tuple(upload.items))]
 
-    def _stray_item(self, request: Request) -> list[Answer]:
+    def _stray_item(self, request: Request, done: _Upload | None) -> list[Answer]:
         """Acknowledge a last item that comes again because the ACK was lost; deny what is new."""
-        done, message = self._finished, request.message
-        is_known = (
-            done is not None
-            and done.request.client_id == request.client_id
-            and message.mission_type == done.kind
-            and message.seq < done.count
-        )
-        if done is None or not is_known:
+        kind, sequence = request.message.mission_type, request.message.seq
+        if done is None or kind != done.kind or sequence >= done.count:
             return [mission_ack(request, mavlink.MAV_MISSION_ERROR)]
-        is_last = message.seq == done.count - 1
-        if is_last and done.repeats:
+        if sequence != done.count - 1:
+            return []
+        if done.repeats:
             done.repeats -= 1
             return []
-        return [mission_ack(request, ACCEPTED)] if is_last else []
+        return [mission_ack(request, ACCEPTED)]
 
-    def _store(self, kind: int, items: tuple[Item, ...], now_us: int) -> list[Answer]:
+    def _store(self, kind: int, items: tuple[Item, ...]) -> list[Answer]:
         self.items[kind] = items
         if kind == MISSION:
             self.current = 0
-        return self._changed(kind, now_us)
+        return self._changed(kind)
 
-    def _clear(self, request: Request, now_us: int) -> list[Answer]:
+    def _clear(self, request: Request, _now_us: int) -> list[Answer]:
         kind = request.message.mission_type
         if kind not in (*KINDS, ALL):
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
-        self._upload = self._finished = None
+        self._upload = None
         answers: list[Answer] = [mission_ack(request, ACCEPTED)]
         for each in KINDS if kind == ALL else (kind,):
-            answers += self._store(each, (), now_us)
+            answers += self._store(each, ())
         return answers
 
     def _set_current(self, request: Request, now_us: int) -> list[Answer]:
-        answers = self.set_current(request.message.seq, now_us)
+        answers = self.set_current(request.message.seq)
         if answers is None:
             return self._explain(f"No mission item {request.message.seq}", now_us)
         return answers
@@ -338,9 +335,8 @@ class MissionService(Service):
 
         What it accepts is a download, also if that comes late, after the begin of an upload.
         """
-        upload = self._upload
-        is_own = upload is not None and upload.request.client_id == request.client_id
-        if upload is None or not is_own or request.message.type == ACCEPTED:
+        upload = self._upload_of(request)
+        if upload is None or upload.is_complete or request.message.type == ACCEPTED:
             return []
         is_probed = _sender(request) not in self._forms and upload.repeats >= OLD_FORM_EVERY - 1
         if request.message.type == mavlink.MAV_MISSION_UNSUPPORTED and is_probed:

@@ -26,7 +26,6 @@ from gateway.vehicle.plan import (
     Item,
     Location,
     StoredPlan,
-    describe_location_fault,
     distance_and_bearing,
     height_amsl_m,
     is_3d,
@@ -51,9 +50,9 @@ from gateway.vehicle.telemetry.telemetry import Telemetry
 class Mark:
     """The marked location of one vehicle."""
 
-    def __init__(self) -> None:
-        self.location: Location | None = None
-        self.of: int | None = None
+    def __init__(self, location: Location | None = None, of: int | None = None) -> None:
+        self.location = location
+        self.of = of
         """Kind of the stored items that it follows; None if it was put by itself."""
 
     def put(self, location: Location | None) -> None:
@@ -61,8 +60,8 @@ class Mark:
 
         Raises ValueError if its coordinates are out of range; its height may be NaN.
         """
-        if location is not None and not is_on_earth(location.lat_deg, location.lon_deg):
-            raise ValueError(describe_location_fault(location))
+        if location is not None and (fault := location.fault()):
+            raise ValueError(fault)
         self.location, self.of = location, None
 
     def follow(self, kind: int, items: tuple[Item, ...], home_alt_m: float) -> None:
@@ -74,13 +73,6 @@ class Mark:
         elif self.of == kind:
             self.put(None)
 
-    def way(self, state: NavState) -> tuple[float, float] | None:
-        """Return the distance to the mark, m, and its bearing from north, rad; None if unknown."""
-        if self.location is None or not is_on_earth(state.lat_deg, state.lon_deg):
-            return None
-        here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        return distance_and_bearing(here, self.location)
-
     def nav_controller_output(self, state: NavState | None) -> Any:
         """Encode distance and bearing to the mark; None without a mark or a position.
 
@@ -88,10 +80,11 @@ class Mark:
         Desired roll and pitch and the crosstrack do not exist here and are NaN. The airspeed error
         is 0, since none is desired; clients print it as an integer, so NaN would fail.
         """
-        way = None if state is None else self.way(state)
-        if state is None or self.location is None or way is None:
+        mark = self.location
+        if state is None or mark is None or not is_on_earth(state.lat_deg, state.lon_deg):
             return None
-        distance_m, bearing_rad = way
+        here = Location(state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        distance_m, bearing_rad = distance_and_bearing(here, mark)
         bearing_deg = (encoding.compass_deg(bearing_rad) + 180) % 360 - 180
         return mavlink.MAVLink_nav_controller_output_message(
             nav_roll=NAN,
@@ -99,7 +92,7 @@ class Mark:
             nav_bearing=bearing_deg,
             target_bearing=bearing_deg,
             wp_dist=encoding.uint16(distance_m, unknown=0),
-            alt_error=self.location.alt_amsl_m - state.alt_amsl_m,
+            alt_error=mark.alt_amsl_m - state.alt_amsl_m,
             aspd_error=0.0,
             xtrack_error=NAN,
         )
@@ -108,84 +101,6 @@ class Mark:
 NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
 """Parameters of home, and the fields of `Location` that they set."""
 
-
-class HomeService:
-    """Set and clear home, and decide which home is kept over a restart.
-
-    A home that the GPS measured is measured again at every start, which may be at another field;
-    one that an operator set is kept. A command keeps it at once, a parameter when the parameters
-    are stored.
-    """
-
-    def __init__(self, telemetry: Telemetry) -> None:
-        self.kept: Location | None = None
-        self._telemetry = telemetry
-        self._entered: set[str] = set()
-        """Numbers that were set while there was no home."""
-
-    @property
-    def home(self) -> Home | None:
-        """The present home."""
-        return self._telemetry.home
-
-    def put(self, location: Location, now_us: int) -> list[Answer]:
-        """Set home for an operator, and send HOME_POSITION."""
-        self._entered.clear()
-        return [Reply(m) for m in self._telemetry.set_home(Home(location, now_us, "operator"))]
-
-    def restore(self, location: Location) -> None:
-        """Start with the home that was kept."""
-        self.kept = location
-        self._telemetry.set_home(Home(location, 0, "operator"))
-
-    def keep(self) -> None:
-        """Keep the present home over a restart if an operator set it; else keep none."""
-        home = self.home
-        self.kept = home.location if home is not None and home.source == "operator" else None
-
-    def parameters(self) -> HomeParameters:
-        """Return home as parameters."""
-        home = self.home
-        if home is None:
-            return HomeParameters()
-        numbers = {key: getattr(home.location, part) for key, part in NUMBERS.items()}
-        return HomeParameters(source=home.source, **numbers)
-
-    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Apply the change of one parameter.
-
-        Raises ValueError if there is no such home to name a source of.
-        """
-        value: Any = getattr(settings, key)
-        if key == "source":
-            return self._change_source(value, now_us)
-        part, home = NUMBERS[key], self.home
-        if home is not None:
-            if _same(value, getattr(home.location, part)):
-                # A parameter is less precise than home; a list that is written back must not round
-                # it.
-                return []
-            return self.put(replace(home.location, **{part: value}), now_us)
-        self._entered.add(key)
-        if self._entered < set(NUMBERS):
-            return []
-        return self.put(Location(*(getattr(settings, each) for each in NUMBERS)), now_us)
-
-    def _change_source(self, source: str, now_us: int) -> list[Answer]:
-        home = self.home
-        if source == "none":
-            self._entered.clear()
-            self._telemetry.clear_home()
-            return []
-        if home is None or (source, home.source) == ("gps", "operator"):
-            raise ValueError("there is no such home")
-        return [] if source == home.source else self.put(home.location, now_us)
-
-
-def _same(a: float, b: float) -> bool:
-    return bool(np.float32(a) == np.float32(b))
-
-
 Say = Callable[[StatusText, int], list[Any]]
 
 USE_CURRENT: Final = 1
@@ -193,7 +108,11 @@ USE_CURRENT: Final = 1
 
 
 class PlanService:
-    """Set home, set and clear the mark, and store them and the missions.
+    """Set home and the mark, and keep them and the missions over a restart.
+
+    A home that the GPS measured is measured again at every start, which may be at another field;
+    one that an operator set is kept. A command keeps it at once, a parameter when the parameters
+    are stored.
 
     Parameters
     ----------
@@ -209,17 +128,18 @@ class PlanService:
 
     def __init__(self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlan) -> None:
         self._vehicle_id = vehicle_id
-        self.mark = Mark()
-        self.mark.location, self.mark.of = stored.mark, stored.mark_of
-        self.home = HomeService(telemetry)
-        if stored.home is not None:
-            self.home.restore(stored.home)
-        self._announces_home = stored.home is not None
+        self._telemetry = telemetry
+        self._say = say
+        self.mark = Mark(stored.mark, stored.mark_of)
         self.missions = MissionService(self._on_items, self._explain)
         self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
         self.missions.current = stored.current
-        self._telemetry = telemetry
-        self._say = say
+        self._kept_home = stored.home
+        self._announces_home = stored.home is not None
+        self._entered: set[str] = set()
+        """Parameters of home that were set while there was none."""
+        if stored.home is not None:
+            telemetry.set_home(Home(stored.home, 0, "operator"))
         telemetry.add(
             mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
             lambda _: self.mark.nav_controller_output(telemetry.state),
@@ -238,13 +158,12 @@ class PlanService:
 
     def on_fix(self, fix: GpsFix, now_us: int) -> list[Answer]:
         """Announce once how far a kept home is: it may be that of another field."""
-        home = self.home.kept
+        home = self._kept_home
         if home is None or not self._announces_home or not is_3d(fix):
             return []
         self._announces_home = False
         distance_m, _ = distance_and_bearing(location_of(fix), home)
-        text = f"Stored home is used, {distance_m:.0f} m from here"
-        return self._explain(text, now_us)
+        return self._explain(f"Stored home is used, {distance_m:.0f} m from here", now_us)
 
     def put_mark(self, location: Location | None, now_us: int) -> list[Answer]:
         """Mark a location, or none, and announce it."""
@@ -254,19 +173,63 @@ class PlanService:
             text = f"Marked {location.lat_deg:.6f}, {location.lon_deg:.6f}"
         return [self._save(), *self._explain(text, now_us)]
 
+    def home_parameters(self) -> HomeParameters:
+        """Return home as parameters."""
+        home = self._telemetry.home
+        if home is None:
+            return HomeParameters()
+        numbers = {key: getattr(home.location, part) for key, part in NUMBERS.items()}
+        return HomeParameters(source=home.source, **numbers)
+
     def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Apply the change of a parameter of home; ValueError refuses it."""
-        return self.home.change(settings, key, now_us)
+        """Apply the change of a parameter of home.
+
+        Raises ValueError if there is no such home to name a source of.
+        """
+        value: Any = getattr(settings, key)
+        if key == "source":
+            return self._change_source(value, now_us)
+        part, home = NUMBERS[key], self._telemetry.home
+        if home is not None:
+            if _same(value, getattr(home.location, part)):
+                # A parameter is less precise than home; a list that is written back must not round
+                # it.
+                return []
+            return self._put_home(replace(home.location, **{part: value}), now_us)
+        self._entered.add(key)
+        if self._entered < set(NUMBERS):
+            return []
+        return self._put_home(Location(*(getattr(settings, each) for each in NUMBERS)), now_us)
 
     def store(self) -> list[Answer]:
         """Keep the home that was set by parameters."""
-        self.home.keep()
+        self._keep_home()
         return [self._save()]
+
+    def _change_source(self, source: str, now_us: int) -> list[Answer]:
+        home = self._telemetry.home
+        if source == "none":
+            self._entered.clear()
+            self._telemetry.clear_home()
+            return []
+        if home is None or (source, home.source) == ("gps", "operator"):
+            raise ValueError("there is no such home")
+        return [] if source == home.source else self._put_home(home.location, now_us)
+
+    def _put_home(self, location: Location, now_us: int) -> list[Answer]:
+        """Set home for an operator, and send HOME_POSITION."""
+        self._entered.clear()
+        return [Reply(m) for m in self._telemetry.set_home(Home(location, now_us, "operator"))]
+
+    def _keep_home(self) -> None:
+        """Keep the present home over a restart if an operator set it; else keep none."""
+        home = self._telemetry.home
+        self._kept_home = home.location if home and home.source == "operator" else None
 
     def _save(self) -> SavePlan:
         items = self.missions.items
         stored = StoredPlan(
-            home=self.home.kept,
+            home=self._kept_home,
             mark=self.mark.location,
             mark_of=self.mark.of,
             current=self.missions.current,
@@ -284,7 +247,7 @@ class PlanService:
     def _explain(self, text: str, now_us: int) -> list[Answer]:
         return [Reply(message) for message in self._say(StatusText(INFO, text), now_us)]
 
-    def _on_items(self, kind: int, _now_us: int) -> list[Answer]:
+    def _on_items(self, kind: int) -> list[Answer]:
         if kind != FENCE:
             first = self.missions.current if kind == MISSION else 0
             self.mark.follow(kind, self.missions.items[kind][first:], self._home_alt_m)
@@ -292,10 +255,8 @@ class PlanService:
 
     def _location(self, command: Command) -> Location | None:
         """Read the position of a command; None if it is invalid."""
-        if command.frame not in GLOBAL_FRAMES:
-            return None
         lat_deg, lon_deg, height_m = command.location
-        if not is_on_earth(lat_deg, lon_deg):
+        if command.frame not in GLOBAL_FRAMES or not is_on_earth(lat_deg, lon_deg):
             return None
         height_m = height_amsl_m(height_m, command.frame, self._home_alt_m)
         return Location(lat_deg, lon_deg, height_m)
@@ -310,8 +271,8 @@ class PlanService:
             location = self._location(command)
         if location is None or not math.isfinite(location.alt_amsl_m):
             return DENIED, []
-        announced = self.home.put(location, now_us)
-        self.home.keep()
+        announced = self._put_home(location, now_us)
+        self._keep_home()
         self.mark.put(location)
         said = self._explain("Home set by a ground station", now_us)
         return ACCEPTED, [*announced, *said, self._save()]
@@ -331,6 +292,10 @@ class PlanService:
     def _clear_roi(self, _command: Command, now_us: int) -> Outcome:
         return ACCEPTED, self.put_mark(None, now_us)
 
-    def _set_mission_current(self, command: Command, now_us: int) -> Outcome:
-        answers = self.missions.set_current(whole(command.params[0]), now_us)
+    def _set_mission_current(self, command: Command, _now_us: int) -> Outcome:
+        answers = self.missions.set_current(whole(command.params[0]))
         return (DENIED, []) if answers is None else (ACCEPTED, answers)
+
+
+def _same(a: float, b: float) -> bool:
+    return bool(np.float32(a) == np.float32(b))
