@@ -230,13 +230,17 @@ class Vehicle:
         """Take in a node's report about itself."""
         findings = self.health.on_node_status(status)
         found = self.telemetry.on_node_status(status)
-        return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
+        return self._finish(
+            self._replies(found + self._announcements.on_findings(findings, now_us))
+        )
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
         """Take in the state of the serial link and of all radio links."""
         findings = self.health.on_link(report)
         found = self._announcements.on_link(report, now_us)
-        return self._finish(self._replies(found + self._announcements.on_boards(findings, now_us)))
+        return self._finish(
+            self._replies(found + self._announcements.on_findings(findings, now_us))
+        )
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Answer one frame of a client; ignore one that is not for this vehicle."""

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
 from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, StatusText
-from gateway.vehicle.telemetry.health import Finding, Health
+from gateway.vehicle.telemetry.health import Finding, Health, status_text
 
 HOLD_US: Final = 5 * US_PER_S
 BUCKET: Final = 10
@@ -37,15 +37,7 @@ class _Topic:
 
 
 class Announcer:
-    """Texts about changes of state, limited in rate.
-
-    Parameters
-    ----------
-    bucket : int, optional
-        Most single events at once.
-    refill_us : int, optional
-        Time after which one more may be announced.
-    """
+    """Texts about changes of state, and at most `bucket` single events at once."""
 
     def __init__(self, bucket: int = BUCKET, refill_us: int = REFILL_US) -> None:
         self._topics: dict[str, _Topic] = {}
@@ -56,31 +48,12 @@ class Announcer:
         self._refilled_us = 0
         self._next_id = 0
 
-    def track(
-        self, topic: str, state: object, text: StatusText, now_us: int, *, initially: object = None
-    ) -> list[Any]:
-        """Note the present state of a topic, and announce it if it changed.
-
-        Parameters
-        ----------
-        topic : str
-            Name of the topic.
-        state : object
-            Any value; compared by equality.
-        text : StatusText
-            The text for this state.
-        now_us : int
-            Gateway clock.
-        initially : object, optional
-            The state in which a new topic begins, which is not announced.
-
-        Returns
-        -------
-        list of MAVLink_message
-        """
+    def track(self, finding: Finding, now_us: int) -> list[Any]:
+        """Note the present state of a topic, and announce it if it changed."""
+        topic, state, text = finding
         known = self._topics.get(topic)
         if known is None:
-            known = self._topics[topic] = _Topic(initially, initially, text)
+            known = self._topics[topic] = _Topic(False, False, text)
         known.state, known.text = state, text
         if state == known.announced:
             self._pending.pop(topic, None)
@@ -143,50 +116,24 @@ def chunks(text: StatusText, number: int = 1) -> list[Any]:
 
 
 FLAG_TEXTS: Final = (
-    (
-        NavFlags.ATTITUDE_VALID,
-        StatusText(INFO, "Attitude valid"),
-        StatusText(WARNING, "Attitude not valid"),
-    ),
-    (
-        NavFlags.HEADING_VALID,
-        StatusText(INFO, "Heading valid"),
-        StatusText(WARNING, "Heading not valid"),
-    ),
-    (
-        NavFlags.DEAD_RECKONING,
-        StatusText(WARNING, "Position is dead-reckoned"),
-        StatusText(INFO, "Position follows GPS again"),
-    ),
-    (
-        NavFlags.GPS_REJECTED,
-        StatusText(WARNING, "GPS fixes rejected"),
-        StatusText(INFO, "GPS accepted again"),
-    ),
+    (NavFlags.ATTITUDE_VALID, "Attitude valid", "Attitude not valid"),
+    (NavFlags.HEADING_VALID, "Heading valid", "Heading not valid"),
+    (NavFlags.DEAD_RECKONING, "Position is dead-reckoned", "Position follows GPS again"),
+    (NavFlags.GPS_REJECTED, "GPS fixes rejected", "GPS accepted again"),
     (
         NavFlags.MAG_MISPLACED,
-        StatusText(WARNING, "Compass axes wrong, not used: check CAL_MAG_MNT"),
-        StatusText(INFO, "Compass axes right again"),
+        "Compass axes wrong, not used: check CAL_MAG_MNT",
+        "Compass axes right again",
     ),
-    (
-        NavFlags.MAG_DISTURBED,
-        StatusText(WARNING, "Magnetic field disturbed"),
-        StatusText(INFO, "Magnetic field normal again"),
-    ),
-    (
-        NavFlags.SENSOR_FAULT,
-        StatusText(CRITICAL, "Sensor fault"),
-        StatusText(INFO, "Sensors OK again"),
-    ),
-    (
-        NavFlags.DEGRADED,
-        StatusText(WARNING, "Estimator degraded"),
-        StatusText(INFO, "Estimator OK again"),
-    ),
+    (NavFlags.MAG_DISTURBED, "Magnetic field disturbed", "Magnetic field normal again"),
+    (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
+    (NavFlags.DEGRADED, "Estimator degraded", "Estimator OK again"),
 )
 """A flag of the estimator, the text when it rises, and the text when it falls."""
-GPS_FIX: Final = StatusText(INFO, "GPS fix")
-GPS_LOST: Final = StatusText(WARNING, "GPS fix lost")
+GOOD_FLAGS: Final = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
+CRITICAL_FLAGS: Final = NavFlags.SENSOR_FAULT
+GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
+GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
 UNCALIBRATED_SENSORS: Final = (
     (ImuFlags.MAG_UNCALIBRATED, "Compass"),
     (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
@@ -216,11 +163,11 @@ class Announcements:
 
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Any]:
         """Announce changes of the sensors' and the estimator's flags."""
-        found: list[Any] = []
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
-        # The compass only once it has measured a field.
-        if changed and (sample.mag_b_ut is not None or changed & INERTIAL):
-            found = self._on_sample(sample, now_us)
+        if changed and sample.mag_b_ut is None:
+            # The compass only once it has measured a field.
+            changed &= INERTIAL
+        found = self._on_uncalibrated(changed, now_us) if changed else []
         if state.flags != self._flags:
             found += self._on_flags(state.flags, now_us)
         return found
@@ -230,33 +177,28 @@ class Announcements:
         found = []
         for flag, raised, fallen in FLAG_TEXTS:
             if changed & flag:
-                text = raised if flags & flag else fallen
-                found += self._announcer.track(
-                    str(flag.name), bool(flags & flag), text, now_us, initially=False
-                )
-        return found
+                is_raised, is_good = bool(flags & flag), bool(GOOD_FLAGS & flag)
+                severity = CRITICAL if CRITICAL_FLAGS & flag else WARNING
+                bad, good = (fallen, raised) if is_good else (raised, fallen)
+                text = status_text(is_raised != is_good, bad, good, severity)
+                found.append(Finding(str(flag.name), is_raised, text))
+        return self.on_findings(found, now_us)
 
-    def _on_sample(self, sample: ImuSample, now_us: int) -> list[Any]:
-        """Announce sensors that were never calibrated; the compass once it has measured a field."""
-        changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
-        if sample.mag_b_ut is None:
-            changed &= INERTIAL
+    def _on_uncalibrated(self, changed: int, now_us: int) -> list[Any]:
+        """Announce sensors that were never calibrated."""
         self._uncalibrated ^= changed
         found = []
         for flag, sensor in UNCALIBRATED_SENSORS:
-            shown = self._uncalibrated & flag
-            text = StatusText(INFO, f"{sensor} calibrated")
-            if shown:
-                text = StatusText(WARNING, f"{sensor} not calibrated")
             if changed & flag:
-                found += self._announcer.track(sensor, shown, text, now_us, initially=0)
-        return found
+                is_bad = bool(self._uncalibrated & flag)
+                text = status_text(is_bad, f"{sensor} not calibrated", f"{sensor} calibrated")
+                found.append(Finding(sensor, is_bad, text))
+        return self.on_findings(found, now_us)
 
     def on_fix(self, now_us: int) -> list[Any]:
         """Announce whether GPS fixes arrive."""
-        fixed = self._health.has_fix(now_us)
-        text = GPS_FIX if fixed else GPS_LOST
-        return self._announcer.track("GPS", fixed, text, now_us, initially=False)
+        finding = GPS_FIX if self._health.has_fix(now_us) else GPS_LOST
+        return self._announcer.track(finding, now_us)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
         """Announce once that the estimated latency of fixes differs from the setting.
@@ -268,34 +210,27 @@ class Announcements:
         if used_s == set_s or now_us - self._latency_since_us < LATENCY_SETTLED_US:
             return []
         text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
-        return self._announcer.track("latency", set_s, StatusText(NOTICE, text), now_us)
+        finding = Finding("latency", f"{set_s} s is wrong", StatusText(NOTICE, text))
+        return self._announcer.track(finding, now_us)
 
-    def on_boards(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
-        """Announce changes in the state of the boards."""
-        found = []
-        for one in findings:
-            found += self._announcer.track(one.topic, one.state, one.text, now_us, initially=False)
-        return found
+    def on_findings(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
+        """Announce changes of state."""
+        return [m for finding in findings for m in self._announcer.track(finding, now_us)]
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
         """Announce that the receiver or a node was lost or is back."""
-        text = StatusText(CRITICAL, f"Receiver lost: {report.port}")
-        if report.connected:
-            text = StatusText(INFO, f"Receiver connected: {report.port}")
-        found = self._announcer.track("link", report.connected, text, now_us)
+        lost, back = f"Receiver lost: {report.port}", f"Receiver connected: {report.port}"
+        text = status_text(not report.connected, lost, back, CRITICAL)
+        findings = [Finding("link", "connected" if report.connected else "lost", text)]
         if not report.connected:
-            # Without the receiver every node is silent; that need not be announced.
-            return found
+            # Without the receiver every node times out; that need not be announced.
+            return self.on_findings(findings, now_us)
         silent = self._health.silent_nodes(now_us)
         for node in sorted(self._health.known_nodes()):
-            name = self._health.node_name(node)
-            text = StatusText(INFO, f"{name} is back")
-            if node in silent:
-                text = StatusText(CRITICAL, f"{name} silent")
-            found += self._announcer.track(
-                f"node {node}", node not in silent, text, now_us, initially=True
-            )
-        return found + self._on_restarts(now_us)
+            name, is_silent = self._health.node_name(node), node in silent
+            text = status_text(is_silent, f"{name} silent", f"{name} is back", CRITICAL)
+            findings.append(Finding(f"node {node}", is_silent, text))
+        return self.on_findings(findings, now_us) + self._on_restarts(now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Any]:
         """Announce a single event."""
@@ -317,14 +252,9 @@ class Announcements:
             is_new, is_often = restarts > known[-1], restarts - known[0] >= MANY_RESTARTS
             known.append(restarts)
             name = self._health.node_name(node)
-            text = StatusText(INFO, f"{name} no longer restarts")
-            if is_often:
-                text = StatusText(
-                    CRITICAL, f"{name} keeps restarting, or two nodes share id {node}"
-                )
-            found += self._announcer.track(
-                f"restarts {node}", is_often, text, now_us, initially=False
-            )
+            often = f"{name} keeps restarting, or two nodes share id {node}"
+            text = status_text(is_often, often, f"{name} no longer restarts", CRITICAL)
+            found += self._announcer.track(Finding(f"restarts {node}", is_often, text), now_us)
             if is_new and not is_often:
                 found += self.say(StatusText(WARNING, f"{name} restarted"), now_us)
         return found

@@ -18,7 +18,7 @@ are announced when they get worse:
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -51,14 +51,18 @@ CELLS: Final = 10
 MV: Final = 1e3
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """The state of one topic of one board."""
+class Finding(NamedTuple):
+    """The state of one topic, which is announced when it changes."""
 
     topic: str
     state: object
-    """Announced when it changes; False at the start."""
+    """False at the start."""
     text: StatusText
+
+
+def status_text(is_bad: bool, bad: str, good: str, severity: int = WARNING) -> StatusText:
+    """Return the text for a state, with its severity."""
+    return StatusText(severity, bad) if is_bad else StatusText(INFO, good)
 
 
 @dataclass(slots=True)
@@ -102,15 +106,7 @@ class _Node:
 
 
 class NodeHealth:
-    """The newest reports of one aircraft's nodes.
-
-    Parameters
-    ----------
-    vehicle_id : int
-        Whose nodes.
-    supply_low_v : float
-        A lower supply is announced, in V; 0 disables this.
-    """
+    """The newest reports of one aircraft's nodes; a supply below `supply_low_v` is announced."""
 
     def __init__(self, vehicle_id: int, supply_low_v: float) -> None:
         self.supply_low_v = supply_low_v
@@ -125,10 +121,9 @@ class NodeHealth:
     @property
     def firmware(self) -> int:
         """Firmware version of the first node as MAVLink packs it; 0 before it has reported."""
-        for status in self.statuses:
-            major, minor = status.firmware_version
-            return major << 24 | minor << 16
-        return 0
+        statuses = self.statuses
+        major, minor = statuses[0].firmware_version if statuses else (0, 0)
+        return major << 24 | minor << 16
 
     def take(self, status: NodeStatus, name: str) -> list[Finding]:
         """Note a report."""
@@ -142,57 +137,43 @@ class NodeHealth:
         errors = status.bus_errors - before.bus_errors & WORD
         failed = status.radio_failed - before.radio_failed & WORD
         failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
-        number = status.node.node_id
+        bus_errors = known.bus.note(errors > 0)
+        number, supply_v = status.node.node_id, status.supply_mv / MV
+        known.low = self._is_low(supply_v, was_low=known.low)
+        low, good = f"supply low, {supply_v:.2f} V", f"supply OK again, {supply_v:.2f} V"
+        radio = f"radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s"
+        bus = f"bus errors, {status.bus_errors} so far"
         chips = StatusText(INFO, f"{name}: {', '.join(status.chips)}")
         return [
             Finding(f"chips {number}", status.chips or False, chips),
-            self._supply(known, name),
-            _finding(
-                f"bus {number}",
-                known.bus.note(errors > 0),
-                f"{name}: bus errors, {status.bus_errors} so far",
-                f"{name}: bus OK again",
-            ),
-            _finding(
-                f"radio {number}",
-                known.radio.is_bad,
-                f"{name}: radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s",
-                f"{name}: radio OK again",
-            ),
+            _finding(f"supply {number}", name, known.low, low, good),
+            _finding(f"bus {number}", name, bus_errors, bus, "bus OK again"),
+            _finding(f"radio {number}", name, known.radio.is_bad, radio, "radio OK again"),
         ]
+
+    def _is_low(self, supply_v: float, *, was_low: bool) -> bool:
+        limit_v = self.supply_low_v + (HYSTERESIS_V if was_low else 0.0)
+        return bool(self.supply_low_v and supply_v) and supply_v < limit_v
 
     def take_link(self, report: LinkReport, names: dict[int, str]) -> list[Finding]:
         """Note the receiver's radio module, and the payloads for which it had no room."""
         if report.receiver is None:
             return []
-        problem = report.receiver.radio.problem
-        found = [
-            _finding(
-                "receiver radio",
-                bool(problem),
-                f"Receiver: {problem}",
-                "Receiver: radio module works again",
-            )
-        ]
+        problem, works = report.receiver.radio.problem, "radio module works again"
+        found = [_finding("receiver radio", "Receiver", bool(problem), problem, works)]
         for link in report.nodes:
-            node = self._nodes.get(link.node.node_id)
+            number = link.node.node_id
+            node = self._nodes.get(number)
             if link.node.vehicle_id != self._vehicle_id or node is None:
                 continue
             overruns = report.receiver.pipes[link.pipe].overruns
-            worse = node.overruns is not None and overruns > node.overruns
+            is_bad = node.pipe.note(node.overruns is not None and overruns > node.overruns)
             node.overruns = overruns
-            name = names.get(link.node.node_id, "Node")
-            found.append(
-                _finding(
-                    f"pipe {link.node.node_id}",
-                    node.pipe.note(worse),
-                    f"{name}: receiver overrun, {overruns} so far",
-                    f"{name}: receiver keeps up again",
-                )
-            )
+            bad, good = f"receiver overrun, {overruns} so far", "receiver keeps up again"
+            found.append(_finding(f"pipe {number}", names.get(number, "Node"), is_bad, bad, good))
         return found
 
-    def error_counts(self) -> tuple[int, int, int, int]:
+    def error_counts(self) -> list[int]:
         """Sum up bus errors, failed sends, repeated sends and overruns, as SYS_STATUS has room."""
         nodes = self._nodes.values()
         counts = (
@@ -201,8 +182,7 @@ class NodeHealth:
             sum(node.status.radio_retries for node in nodes),
             sum(node.overruns or 0 for node in nodes),
         )
-        bus, failed, retries, overruns = (encoding.uint16(count, unknown=0) for count in counts)
-        return bus, failed, retries, overruns
+        return [encoding.uint16(count, unknown=0) for count in counts]
 
     @property
     def lowest_supply_mv(self) -> int | None:
@@ -234,20 +214,9 @@ class NodeHealth:
             charge_state=state,
         )
 
-    def _supply(self, node: _Node, name: str) -> Finding:
-        status, supply_v = node.status, node.status.supply_mv / MV
-        limit_v = self.supply_low_v + (HYSTERESIS_V if node.low else 0.0)
-        node.low = bool(self.supply_low_v and status.supply_mv) and supply_v < limit_v
-        return _finding(
-            f"supply {status.node.node_id}",
-            node.low,
-            f"{name}: supply low, {supply_v:.2f} V",
-            f"{name}: supply OK again, {supply_v:.2f} V",
-        )
 
-
-def _finding(topic: str, is_bad: bool, bad: str, good: str) -> Finding:
-    return Finding(topic, is_bad, StatusText(WARNING, bad) if is_bad else StatusText(INFO, good))
+def _finding(topic: str, name: str, is_bad: bool, bad: str, good: str) -> Finding:
+    return Finding(topic, is_bad, status_text(is_bad, f"{name}: {bad}", f"{name}: {good}"))
 
 
 GYRO: Final = mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -321,16 +290,13 @@ class Health:
 
     def on_node_status(self, status: NodeStatus) -> list[Finding]:
         """Note a node's report about itself; return the state of its board."""
-        failed = 0
-        for bit, sensors in NODE_SENSORS:
-            if status.sensors_failed & status.sensors_present & bit:
-                failed |= sensors
-        self._faulty[status.node.node_id] = failed
-        self._roles[status.node.node_id] = node_role(status.sensors_present)
+        number, failed = status.node.node_id, status.sensors_failed & status.sensors_present
+        self._faulty[number] = sum(sensors for bit, sensors in NODE_SENSORS if failed & bit)
+        self._roles[number] = node_role(status.sensors_present)
         if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
-        return self.boards.take(status, self.node_name(status.node.node_id))
+        return self.boards.take(status, self.node_name(number))
 
     def on_link(self, report: LinkReport) -> list[Finding]:
         """Note the state of the radio links to this aircraft's nodes; return its findings."""
@@ -350,9 +316,7 @@ class Health:
         for sensor, seen_us in self._seen_us.items():
             if begin_us - seen_us <= self.silent_us:
                 self._seen_us[sensor] = seen_us + stalled_us
-        silent = self.silent_nodes(begin_us)
-        for node_id in self.known_nodes() - silent:
-            self._excused_us[node_id] = now_us
+        self._excused_us |= dict.fromkeys(self.known_nodes() - self.silent_nodes(begin_us), now_us)
 
     def is_alive(self, sensor: int, now_us: int) -> bool:
         """Return whether a sensor has sent a sample recently."""
@@ -365,8 +329,7 @@ class Health:
 
     def sensors(self, now_us: int) -> tuple[int, int, int]:
         """Compute the bit masks of SYS_STATUS: present, enabled, healthy."""
-        present = 0
-        healthy = 0
+        present = healthy = 0
         absent = MAG if self._imu_flags & ImuFlags.MAG_ABSENT else 0
         absent |= PRESSURE if self._imu_flags & ImuFlags.BARO_ABSENT else 0
         faulty = GYRO | ACCEL if self._imu_flags & ImuFlags.SELF_TEST_FAILED else 0
@@ -401,12 +364,9 @@ class Health:
         counts are the nodes' bus errors, failed and repeated radio sends, and the receiver's
         overruns.
         """
-        present, enabled, healthy = self.sensors(now_us)
         bus, failed, retries, overruns = self.boards.error_counts()
         return mavlink.MAVLink_sys_status_message(
-            present,
-            enabled,
-            healthy,
+            *self.sensors(now_us),
             load=min(1000, self._load_permille),
             voltage_battery=self.boards.lowest_supply_mv or encoding.UINT16_MAX,
             current_battery=-1,
@@ -421,14 +381,10 @@ class Health:
 
     def silent_nodes(self, now_us: int) -> frozenset[int]:
         """Return the nodes that have sent payloads before and have timed out."""
-        newest_us = {
-            link.node.node_id: max(
-                link.last_time_us, self._excused_us.get(link.node.node_id, link.last_time_us)
-            )
-            for link in self._nodes
-            if link.received
-        }
-        return frozenset(n for n, us in newest_us.items() if now_us - us > self.silent_us)
+        limit_us = now_us - self.silent_us
+        late = {link.node.node_id for link in self._nodes if link.last_time_us < limit_us}
+        excused = {number for number, us in self._excused_us.items() if us >= limit_us}
+        return self.known_nodes() & late - excused
 
     def node_name(self, node_id: int) -> str:
         """Name a node by its sensors, as far as it has reported them."""

@@ -2,13 +2,14 @@ import pytest
 
 from gateway.vehicle.requests import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
+from gateway.vehicle.telemetry.health import Finding
 
 GOOD, BAD = StatusText(INFO, "good"), StatusText(WARNING, "bad")
 
 
 def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
-    found = announcer.track("topic", good, GOOD if good else BAD, now_us, initially=True)
-    return [m.text for m in found]
+    finding = Finding("topic", not good, GOOD if good else BAD)
+    return [m.text for m in announcer.track(finding, now_us)]
 
 
 def test_a_change_is_reported_once() -> None:
