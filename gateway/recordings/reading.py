@@ -43,6 +43,7 @@ from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.moment import Moment, place_in
 from gateway.recordings.table import (
+    BLOCK_ROWS,
     HEAD_LINES,
     MAX_LINE,
     NO_ROWS,
@@ -108,9 +109,6 @@ class RecordedTable:
         """The rows only."""
         return (row for row in self.rows if isinstance(row, TableRow))
 
-
-ROWS: Final = 1000
-"""Of another program's file that are laid out as columns at once."""
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 
@@ -219,7 +217,7 @@ def recorded_frames(
 def csv_reader(options: ReadOptions) -> CsvReader:
     """Make the reader of another program's CSV."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)
-    return CsvReader(known, options.system_id or 1, lenient=options.columns is None)
+    return CsvReader(known, lenient=options.columns is None)
 
 
 def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
@@ -264,9 +262,9 @@ def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock
 
 def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     reader = csv_reader(options)
-    rows = reader.rows(_lines(path, options.progress))
+    blocks = (block for block in reader.blocks(_lines(path, options.progress)) if len(block))
     try:
-        first = next(rows, None)
+        first = next(blocks, None)
     except ValueError as error:
         encoding = _encoding_of(path).removesuffix("-sig").upper()
         raise FlightError(
@@ -275,19 +273,18 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
     if first is None:
         raise FlightError(f"{path}: holds no row that can be read")
 
-    def lines() -> Iterator[TableRow]:
-        yield from rows
+    def counting() -> Iterator[TableBlock]:
+        yield from chain([first], blocks)
         if reader.skipped:
             text = counted(reader.skipped, "line")
-            table.remarks.append(f"{path}: left out {text} of text before the column names")
+            remarks.append(f"{path}: left out {text} of text before the column names")
         if reader.faults:
-            table.remarks.append(
-                f"{path}: left out {counted(reader.faults, 'line')} that cannot be read"
-            )
+            text = counted(reader.faults, "line")
+            remarks.append(f"{path}: left out {text} that cannot be read")
 
-    table = table_of_rows(chain([first], lines()), options, options.system_id or 1)
-    table.blocks = _going_on(table.blocks, path, table.remarks)
-    return table
+    remarks: list[str] = []
+    header = _header_of_today(options, options.system_id or 1, None)
+    return RecordedTable(header, _going_on(counting(), path, remarks), remarks)
 
 
 def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
@@ -335,7 +332,7 @@ def table_of_rows(
 ) -> RecordedTable:
     """Give rows of another program the head of a table, with the current settings."""
     header = _header_of_today(options, vehicle_id, unix_us_at_zero)
-    blocks = (block_of(some) for some in iter(lambda: [*islice(rows, ROWS)], []))
+    blocks = (block_of(some) for some in iter(lambda: [*islice(rows, BLOCK_ROWS)], []))
     return RecordedTable(header, blocks)
 
 

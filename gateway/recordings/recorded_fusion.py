@@ -34,7 +34,6 @@ from gateway.recordings.columns import (
     NAV_COLUMNS,
     WHOLE_COLUMNS,
     FloatArray,
-    TableRow,
     has_group,
     write_lines,
 )
@@ -404,18 +403,16 @@ def end_of(file: Path, options: ReadOptions) -> int | None:
     if kind is FileKind.OTHER:
         return None
     head, tail = read_ends(file)
-    rows: list[TableRow] = []
     if kind is FileKind.CSV:
         lines = (head + tail).decode(errors="replace").splitlines()
         with suppress(ValueError):
-            rows = list(csv_reader(options).rows(lines))
-        zero_us = 0
-    else:
-        reader = TableReader()
-        events = reader.feed(head + tail, final=True)
-        rows = [event for event in events if isinstance(event, TableRow)]
-        zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
-    return zero_us + rows[-1].time_us if rows else None
+            *_, last = csv_reader(options).blocks(lines)
+            return int(last.cells[-1, 0]) if len(last) else None
+        return None
+    reader = TableReader()
+    rows = reader.feed_block(head + tail, final=True)
+    zero_us = (reader.header.unix_us_at_zero or 0) if reader.header else 0
+    return zero_us + int(rows.cells[-1, 0]) if len(rows) else None
 
 
 def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlock]:

@@ -205,6 +205,8 @@ def encode_block(block: TableBlock) -> bytes:
 
 
 NO_ROWS: Final = np.empty((0, len(COLUMNS)))
+BLOCK_ROWS: Final = 1000
+"""Of another program's file that are laid out as columns at once."""
 
 
 class TableReader:

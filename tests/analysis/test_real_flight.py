@@ -13,7 +13,6 @@ from gateway.recordings.files import read_chunks
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import TRACKER_LOG
-from gateway.recordings.table import block_of
 from gateway.sensing.calibration import NodeCalibration
 
 IN_FLIGHT = slice(15_000, 27_000)
@@ -32,7 +31,7 @@ def test_the_table_has_the_papers_shape(data_dir: Path) -> None:
     ):  # fmt: skip
         fusion = with_value(fusion, f"estimation.reference.{name}", value)
     flight = flight_of_blocks(
-        [block_of(CsvReader(columns).rows([*lines[:2], *lines[IN_FLIGHT]]))],
+        CsvReader(columns).blocks([*lines[:2], *lines[IN_FLIGHT]]),
         NodeCalibration(), fusion, name="arduplane", story="",
     )  # fmt: skip
     table = blend_table(flight, fusion, 1.0)

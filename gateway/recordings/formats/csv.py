@@ -3,24 +3,17 @@
 import csv
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import chain, islice
+from itertools import chain, islice, pairwise
 from typing import Annotated, Final
 
+import numpy as np
 from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
-from gateway.recordings.columns import COLUMNS, TableRow, check_times
+from gateway.recordings.columns import BARO, COLUMNS, GPS, NAV, RAW, SI, FloatArray, settle
+from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
 from gateway.recordings.tlog import is_damaged
-from gateway.records import (
-    NAN,
-    BaroRaw,
-    GpsFix,
-    GpsFixType,
-    ImuCalibrated,
-    ImuFlags,
-    NodeId,
-    Vec3,
-)
+from gateway.records import NAN, GpsFixType, ImuFlags
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
 
@@ -73,54 +66,64 @@ class ColumnMap(Settings, frozen=True):
 class CsvReader:
     """Turn the lines of another program's CSV into rows."""
 
-    def __init__(
-        self, column_map: ColumnMap, vehicle_id: int = 1, *, lenient: bool = False
-    ) -> None:
+    def __init__(self, column_map: ColumnMap, *, lenient: bool = False) -> None:
         self._columns = {
             name: Column(column=column.strip())
             if isinstance(column, str)
             else replace(column, column=column.column.strip())
             for name, column in column_map.columns.items()
         }
-        self._vehicle_id = vehicle_id
         self._lenient = lenient
-        self._is_decimal_comma = False
         self.skipped = 0
         """Lines of text before that with the names of the columns."""
         self.faults = 0
         """Lines that could not be read, or whose time is not between its neighbours."""
 
-    def rows(self, lines: Iterable[str]) -> Iterator[TableRow]:
-        """Read a whole file."""
+    def blocks(self, lines: Iterable[str]) -> Iterator[TableBlock]:
+        """Read a whole file; raises ValueError if it lacks needed columns."""
         kept = (line for line in lines if not line.startswith("#"))
         head = [*islice(kept, MAX_HEAD_LINES)]
         delimiter, names, begin = self._find_names(head)
         self.skipped = begin - 1
-        self._is_decimal_comma = delimiter != ","
-        table = csv.DictReader(chain(head[begin:], kept), names, delimiter=delimiter)
-        before: TableRow | None = None
-        held: TableRow | None = None
-        for row in self._readable(table):
-            if (
-                held is not None
-                and before is not None
-                and is_damaged(before.time_us, held.time_us, row.time_us)
-            ):
-                self.faults += 1
-            elif held is not None:
-                yield held
-                before = held
-            held = row
-        if held is not None:
-            yield held
+        table = csv.reader(chain(head[begin:], kept), delimiter=delimiter)
+        values, held = self._values(table, names, has_decimal_comma=delimiter != ","), NO_ROWS
+        before_us: float | None = None
+        while lines_of_block := [*islice(values, BLOCK_ROWS)]:
+            cells = _cells(dict(zip(self._columns, np.array(lines_of_block).T, strict=True)))
+            faults = settle(cells)
+            self.faults += len(faults)
+            cells = np.concatenate([held, np.delete(cells, [*faults], axis=0)])
+            sound = []
+            for row, (time_us, after_us) in enumerate(pairwise(cells[:, 0].tolist())):
+                if before_us is not None and is_damaged(before_us, time_us, after_us):
+                    self.faults += 1
+                    continue
+                sound.append(row)
+                before_us = time_us
+            held = cells[-1:]
+            yield TableBlock(cells[sound])
+        yield TableBlock(held)
 
-    def _readable(self, table: Iterator[dict[str, str]]) -> Iterator[TableRow]:
+    def _values(
+        self, table: Iterator[list[str]], names: Sequence[str], *, has_decimal_comma: bool
+    ) -> Iterator[list[float]]:
+        """Yield the mapped values of each line; NaN is an empty cell."""
+        at = {name: number for number, name in enumerate(names)}
+        wanted = [(at[c.column], c.scale, c.offset) for c in self._columns.values()]
         while True:
             try:
-                yield self._row(next(table))
+                line = next(table)
+                texts = [line[k].strip() if k < len(line) else "" for k, _, _ in wanted]
+                if has_decimal_comma:
+                    texts = [text.replace(",", ".") for text in texts]
+                if line:
+                    yield [
+                        float(text) * scale + offset if text else NAN
+                        for text, (_, scale, offset) in zip(texts, wanted, strict=True)
+                    ]
             except StopIteration:
                 return
-            except (ValueError, TypeError, OverflowError, csv.Error):
+            except (ValueError, csv.Error):
                 self.faults += 1
 
     def _find_names(self, head: Sequence[str]) -> tuple[str, list[str], int]:
@@ -152,80 +155,54 @@ class CsvReader:
         absent = self._columns.keys() - found.keys()
         return absent & (NEEDED | _begun(found)) if self._lenient else absent
 
-    def _number(self, text: str) -> float:
-        return float(text.replace(",", ".") if self._is_decimal_comma else text)
 
-    def _row(self, cells: Mapping[str, str]) -> TableRow:
-        value = {
-            name: self._number(cells[c.column]) * c.scale + c.offset
-            for name, c in self._columns.items()
-            if (cells[c.column] or "").strip()
-        }
-        time_us = round(value["time_us"]) if "time_us" in value else None
-        if time_us is None:
-            raise ValueError("no time")
-        row = TableRow(
-            time_us=time_us,
-            baro=self._baro(value, time_us),
-            gps=self._gps(value, time_us),
-            imu=self._imu(value, time_us),
-        )
-        check_times(row)
-        return row
+def _cells(values: dict[str, FloatArray]) -> FloatArray:
+    """Lay mapped values of some lines out as rows of the table."""
+    time_us = np.rint(values["time_us"])
+    cells = np.full((len(time_us), len(COLUMNS)), NAN)
 
-    def _imu(self, value: Mapping[str, float], time_us: int) -> ImuCalibrated | None:
-        if "accel_x_b_mps2" not in value or "gyro_x_b_radps" not in value:
-            return None
-        has_mag = "mag_x_b_ut" in value
-        return ImuCalibrated(
-            time_us=time_us,
-            node=NodeId(self._vehicle_id, 0),
-            accel_b_mps2=_vector(value, "accel_{}_b_mps2", "xyz"),
-            gyro_b_radps=_vector(value, "gyro_{}_b_radps", "xyz"),
-            mag_b_ut=_vector(value, "mag_{}_b_ut", "xyz") if has_mag else None,
-            temperature_degc=value.get("temperature_degc", NAN),
-            flags=ImuFlags(int(value.get("imu_flags", ImuFlags.MAG_NEW if has_mag else 0))),
-        )
+    def get(name: str, default: float | FloatArray = NAN) -> FloatArray:
+        found = values.get(name, cells[:, -1])
+        return np.where(np.isnan(found), default, found)
 
-    def _baro(self, value: Mapping[str, float], time_us: int) -> BaroRaw | None:
-        if "baro_pressure_pa" in value:
-            pressure_pa = value["baro_pressure_pa"]
-        else:
-            pressure_pa = pressure_at_height(value.get("baro_alt_m", NAN))
-            if math.isnan(pressure_pa):
-                return None
-        return BaroRaw(
-            time_us=_measured_us(value.get("baro_time_us", time_us), time_us),
-            node=NodeId(self._vehicle_id, 0),
-            node_time_us=time_us,
-            pressure_pa=pressure_pa,
-            temperature_degc=value.get("baro_temperature_degc", NAN),
-        )
-
-    def _gps(self, value: Mapping[str, float], time_us: int) -> GpsFix | None:
-        if "gps_lat_dege7" not in value or "gps_lon_dege7" not in value:
-            return None
-        utc_us = value.get("gps_utc_us", NAN)
-        return GpsFix(
-            time_us=_measured_us(value.get("gps_time_us", time_us), time_us),
-            node=NodeId(self._vehicle_id, 1),
-            node_time_us=time_us,
-            itow_ms=round(value.get("gps_itow_ms", 0)),
-            fix_type=GpsFixType(int(value.get("gps_fix_type", GpsFixType.FIX_3D))),
-            fix_ok=bool(value.get("gps_fix_ok", 1)),
-            satellites=int(value.get("gps_satellites", 0)),
-            lat_dege7=round(value["gps_lat_dege7"]),
-            lon_dege7=round(value["gps_lon_dege7"]),
-            alt_amsl_m=value.get("gps_alt_amsl_m", NAN),
-            vel_n_mps=_velocity(value),
-            alt_ellipsoid_m=value.get("gps_alt_ellipsoid_m", NAN),
-            h_acc_m=value.get("gps_h_acc_m", NAN),
-            v_acc_m=value.get("gps_v_acc_m", NAN),
-            speed_acc_mps=value.get("gps_speed_acc_mps", NAN),
-            course_acc_deg=value.get("gps_course_acc_deg", NAN),
-            pdop=value.get("gps_pdop", NAN),
-            utc_us=None if math.isnan(utc_us) else round(utc_us),
-        )
+    pressure_pa, has_mag = get("baro_pressure_pa"), ~np.isnan(get("mag_x_b_ut"))
+    by_height_pa = [*map(pressure_at_height, get("baro_alt_m").tolist())]
+    north_mps, east_mps = get("gps_vel_north_mps"), get("gps_vel_east_mps")
+    is_known = np.isfinite(north_mps) & np.isfinite(east_mps)
+    level_mps = level_velocity(get("gps_speed_mps"), get("gps_course_deg"))
+    filled = {
+        "time_us": time_us,
+        "node_id": 0.0,
+        "imu_flags": np.trunc(get("imu_flags", np.where(has_mag, float(ImuFlags.MAG_NEW), 0.0))),
+        "baro_time_us": _measured_us(get("baro_time_us"), time_us),
+        "baro_node_id": 0.0,
+        "baro_node_time_us": time_us,
+        "baro_pressure_pa": np.where(np.isnan(pressure_pa), by_height_pa, pressure_pa),
+        "gps_time_us": _measured_us(get("gps_time_us"), time_us),
+        "gps_node_id": 1.0,
+        "gps_node_time_us": time_us,
+        "gps_itow_ms": np.rint(get("gps_itow_ms", 0.0)),
+        "gps_fix_type": np.trunc(get("gps_fix_type", float(GpsFixType.FIX_3D))),
+        "gps_fix_ok": get("gps_fix_ok", 1.0) != 0.0,
+        "gps_satellites": np.trunc(get("gps_satellites", 0.0)),
+        "gps_lat_dege7": np.rint(get("gps_lat_dege7")),
+        "gps_lon_dege7": np.rint(get("gps_lon_dege7")),
+        "gps_vel_north_mps": np.where(is_known, north_mps, level_mps[0]),
+        "gps_vel_east_mps": np.where(is_known, east_mps, level_mps[1]),
+        "gps_utc_us": np.rint(get("gps_utc_us")),
+    }
+    for name, value in (values | filled).items():
+        if name not in EXTRA_FIELDS:
+            cells[:, COLUMNS.index(name)] = value
+    cells[:, RAW] = cells[:, NAV] = NAN
+    for group, needed in (
+        (SI, ("accel_x_b_mps2", "gyro_x_b_radps")),
+        (BARO, ("baro_pressure_pa",)),
+        (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
+    ):
+        is_empty = np.isnan(cells[:, [COLUMNS.index(name) for name in needed]]).any(axis=1)
+        cells[is_empty, group] = NAN
+    return cells
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:
@@ -241,21 +218,14 @@ def _begun(names: Iterable[str]) -> frozenset[str]:
     return frozenset[str]().union(*(axes for axes in VECTORS if not axes.isdisjoint(names)))
 
 
-def _measured_us(own_us: float, row_us: int) -> int:
-    """Return when a value was measured; its line's time if that cannot be, or on another clock."""
-    return round(own_us) if abs(own_us - row_us) <= LATE_US else row_us
+def _measured_us(own_us: FloatArray, row_us: FloatArray) -> FloatArray:
+    """Return when values were measured; their lines' time if that is on another clock."""
+    return np.where(np.abs(own_us - row_us) <= LATE_US, np.rint(own_us), row_us)
 
 
-def _velocity(value: Mapping[str, float]) -> Vec3:
-    """Read a fix's velocity, or compute its horizontal part from speed and course."""
-    north, east, down = _vector(value, "gps_vel_{}_mps", ("north", "east", "down"))
-    if not (math.isfinite(north) and math.isfinite(east)):
-        speed = value.get("gps_speed_mps", NAN)
-        course_rad = math.radians(value.get("gps_course_deg", NAN))
-        north, east = speed * math.cos(course_rad), speed * math.sin(course_rad)
-    return (north, east, down)
-
-
-def _vector(value: Mapping[str, float], name: str, axes: Iterable[str]) -> Vec3:
-    x, y, z = (value.get(name.format(axis), NAN) for axis in axes)
-    return (x, y, z)
+def level_velocity(speed_mps: FloatArray, course_deg: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the velocities north and east of speeds and courses over ground."""
+    # Not numpy's sine: its last digit is another one on some processors.
+    course_rad = [*map(math.radians, np.where(np.isfinite(course_deg), course_deg, NAN).tolist())]
+    north, east = [*map(math.cos, course_rad)], [*map(math.sin, course_rad)]
+    return speed_mps * np.array(north), speed_mps * np.array(east)

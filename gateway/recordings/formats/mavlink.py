@@ -27,9 +27,9 @@ from gateway.recordings.columns import (
     LARGEST_WHOLE,
     NAV,
     SI,
-    BoolArray,
     FloatArray,
 )
+from gateway.recordings.formats.csv import level_velocity
 from gateway.recordings.stream_clock import STREAMS, times_on_clock
 from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
@@ -138,7 +138,8 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     utc_us = values["time_usec"]
     is_civil = (utc_us > FIRST_CIVIL_US) & (utc_us <= LARGEST_WHOLE)
     down_mps = _of_place(places, np.where(reported == FIX_3D, place_at, -1), "vz", CENTI)
-    north_mps, east_mps = _velocity(values, has_fix)
+    speed_mps = np.where(has_fix, _known(values["vel"], CENTI), np.nan)
+    north_mps, east_mps = level_velocity(speed_mps, _known(values["cog"], CENTI))
     return np.column_stack(
         [
             time_us,
@@ -189,16 +190,6 @@ def _vectors(values: Fields, *scales: float) -> list[FloatArray]:
         np.column_stack([values[axis + name].astype(np.float64) for axis in "xyz"]) * scale
         for name, scale in zip(("acc", "gyro", "mag"), scales, strict=True)
     ]
-
-
-def _velocity(values: Fields, has_fix: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Make the level part of the velocity of speed and course; NaN without a fix."""
-    speed_mps = np.where(has_fix, _known(values["vel"], CENTI), np.nan)
-    # Not numpy's sine: its last digit is another one on some processors.
-    course_rad = [*map(math.radians, _known(values["cog"], CENTI).tolist())]
-    north = np.array([*map(math.cos, course_rad)])
-    east = np.array([*map(math.sin, course_rad)])
-    return speed_mps * north, speed_mps * east
 
 
 def _known(values: NDArray[np.uint16], scale: float) -> FloatArray:

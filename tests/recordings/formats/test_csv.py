@@ -18,7 +18,11 @@ NAMES += "gps_vn,gps_ve,gps_vd,note,gps_speed_ms,gps_course_deg"
 
 def read(*lines: str) -> tuple[CsvReader, list[Any]]:
     reader = CsvReader(TRACKER)
-    return reader, list(reader.rows(["# made by somebody", NAMES, *lines]))
+    return reader, rows_of(reader, "# made by somebody", NAMES, *lines)
+
+
+def rows_of(reader: CsvReader, *lines: str) -> list[Any]:
+    return [row for block in reader.blocks(lines) for row in block.events(1)]
 
 
 def test_a_full_line() -> None:
@@ -64,7 +68,7 @@ def test_lines_that_cannot_be_read_are_counted() -> None:
 
 def test_scale_and_offset() -> None:
     columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
-    (row,) = CsvReader(ColumnMap(columns=columns)).rows(["t,p", "2,95000"])
+    (row,) = rows_of(CsvReader(ColumnMap(columns=columns)), "t,p", "2,95000")
     assert row.time_us == 2005
     assert row.baro is not None
     assert row.baro.pressure_pa == 95_000.0
@@ -72,7 +76,7 @@ def test_scale_and_offset() -> None:
 
 def test_a_file_without_the_columns_is_refused() -> None:
     with pytest.raises(ValueError, match="no column ax, ay"):
-        list(CsvReader(TRACKER).rows(["time_s,az", "1,2"]))
+        rows_of(CsvReader(TRACKER), "time_s,az", "1,2")
 
 
 @pytest.mark.parametrize(
@@ -89,7 +93,7 @@ def test_missing_columns_of_a_file_without_a_map_are_the_needed_ones(
     with pytest.raises(
         ValueError, match=f"no column {missing}; found, separated by commas: time_s"
     ):
-        list(CsvReader(TRACKER, lenient=True).rows([names, "1,2"]))
+        rows_of(CsvReader(TRACKER, lenient=True), names, "1,2")
 
 
 @pytest.mark.parametrize(
