@@ -4,6 +4,7 @@ import os
 import sqlite3
 import struct
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -199,8 +200,12 @@ def find_flights(folder: Path, where: str = "") -> list[Row]:
 
 
 class FlightFigures(msgspec.Struct, frozen=True):
-    """Distance over ground in m, greatest height in m, share of lost samples; None if unknown."""
+    """Length in s, distance over ground in m, greatest height in m, share of lost samples.
 
+    None if unknown.
+    """
+
+    duration: float
     distance: float | None = None
     highest: float | None = None
     loss: float | None = None
@@ -224,7 +229,11 @@ def figures_of(folder: Path) -> dict[str, dict[int, FlightFigures]]:
             return [row[column] for row in rows if row[column] is not None]
 
         distances, losses = known("distance"), known("loss")
+        lengths_s: defaultdict[str, float] = defaultdict(float)
+        for row in rows:
+            lengths_s[row["kind"]] += row["duration"] or 0.0
         found.setdefault(name, {})[vehicle] = FlightFigures(
+            max(lengths_s.values()),
             sum(distances) if distances else None,
             max(known("highest"), default=None),
             sum(losses) / len(losses) if losses else None,

@@ -1,6 +1,5 @@
 """`mavgate record …`: control the recorder of a running gateway."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from gateway.batch.catalogue import FlightFigures
-    from gateway.recordings.summary import Glance
 
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
@@ -137,9 +135,12 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     else:
         found = list_recordings(_folder(config))
     if json:
+        figures = _figures(found) if found else {}
         listed = [
-            msgspec.structs.asdict(look) | msgspec.to_builtins(recording, enc_hook=str)
-            for recording, look in _looked_at(found)
+            {"duration_s": _length_s(flown), "vehicles": sorted(flown)}
+            | msgspec.to_builtins(recording, enc_hook=str)
+            for recording in found
+            for flown in [figures.get(recording.name, {})]
         ]
         print_json(listed)
     elif found:
@@ -177,13 +178,6 @@ def _show(status: dict[str, Any]) -> None:
     console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free")
 
 
-def _looked_at(recordings: list[Recording]) -> "Iterator[tuple[Recording, Glance]]":
-    # Imported here: it imports NumPy, for which the other commands must not wait.
-    from gateway.recordings.summary import glance
-
-    return ((recording, glance(recording.files)) for recording in recordings)
-
-
 def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]]":
     """Bring the catalogue of the recordings up to date, and take their figures from it."""
     from gateway.batch.catalogue import CatalogueError, figures_of, index_folder
@@ -210,14 +204,14 @@ def _list(recordings: list[Recording]) -> None:
         "path",
     )  # fmt: skip
     figures = _figures(recordings)
-    for recording, look in _looked_at(recordings):
+    for recording in recordings:
         flown = figures.get(recording.name, {})
-        each = [flown.get(vehicle) for vehicle in look.vehicles]
-        when = civil_time(recording.modified_s * US_PER_S)
+        each = [figure for _, figure in sorted(flown.items())]
+        when, length_s = civil_time(recording.modified_s * US_PER_S), _length_s(flown)
         grid.add_row(
             recording.name,
-            UNKNOWN if look.duration_s is None else _clock(look.duration_s),
-            " ".join(map(str, look.vehicles)) or UNKNOWN,
+            UNKNOWN if length_s is None else _clock(length_s),
+            " ".join(map(str, sorted(flown))) or UNKNOWN,
             _each(each, lambda f: f"{f.distance / 1000:.2f}" if f.distance is not None else ""),
             _each(each, lambda f: f"{f.highest:.0f}" if f.highest is not None else ""),
             _each(each, lambda f: f"{f.loss:.1%}" if f.loss is not None else ""),
@@ -228,9 +222,14 @@ def _list(recordings: list[Recording]) -> None:
     console_of().print(grid)
 
 
-def _each(figures: "list[FlightFigures | None]", text: "Callable[[FlightFigures], str]") -> str:
+def _length_s(flown: "dict[int, FlightFigures]") -> float | None:
+    """Return the length of a recording, given the figures of its vehicles; None if unknown."""
+    return max((figures.duration for figures in flown.values()), default=None)
+
+
+def _each(figures: "list[FlightFigures]", text: "Callable[[FlightFigures], str]") -> str:
     """Write one figure for each vehicle."""
-    texts = ((figure and text(figure)) or UNKNOWN for figure in figures)
+    texts = (text(figure) or UNKNOWN for figure in figures)
     return " ".join(texts) or UNKNOWN
 
 

@@ -18,9 +18,7 @@ from gateway.config import GatewaySettings, load
 from gateway.player import PlayerDaemon
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
-from gateway.recordings.summary import END_BYTES, glance
 from gateway.recordings.table import encode_head
-from gateway.recordings.tlog import TlogRecord
 from tests.kit.cli import invoke
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight, read
@@ -156,18 +154,3 @@ def test_info_takes_another_programs_csv(tmp_path: Path) -> None:
     path.write_bytes(gzip.compress("\n".join(lines).encode() + b"\n"))
     found = json.loads(run("info", path, "--json"))
     assert (found["kind"], found["records"], found["duration_s"]) == ("csv", 501, 5.0)
-
-
-def test_a_glance_reads_the_ends_alone(tmp_path: Path) -> None:
-    records = make_records(COUNT)
-    for i in range(2000, 2010):
-        frame = records[i].frame
-        records[i] = TlogRecord(records[i].time_us, frame[:5] + b"\x09" + frame[6:])
-    path = tmp_path / "long_01.tlog"
-    path.write_bytes(make_tlog(records))
-    assert path.stat().st_size > 2 * END_BYTES
-    assert glance([path]).vehicles == (1,)
-    assert glance([path]).duration_s == pytest.approx((COUNT - 1) * STEP_US / 1e6)
-    empty = tmp_path / "empty_01.tlog"
-    empty.touch()
-    assert glance([empty, tmp_path / "gone.csv"]).duration_s is None
