@@ -165,44 +165,46 @@ def _cells(values: dict[str, FloatArray]) -> FloatArray:
         found = values.get(name, cells[:, -1])
         return np.where(np.isnan(found), default, found)
 
-    pressure_pa, has_mag = get("baro_pressure_pa"), ~np.isnan(get("mag_x_b_ut"))
-    by_height_pa = [*map(pressure_at_height, get("baro_alt_m").tolist())]
+    new_flags = np.where(np.isnan(get("mag_x_b_ut")), 0.0, float(ImuFlags.MAG_NEW))
+    by_height_pa = np.array([*map(pressure_at_height, get("baro_alt_m").tolist())])
     north_mps, east_mps = get("gps_vel_north_mps"), get("gps_vel_east_mps")
+    level = level_velocity(get("gps_speed_mps"), get("gps_course_deg"))
     is_known = np.isfinite(north_mps) & np.isfinite(east_mps)
-    level_mps = level_velocity(get("gps_speed_mps"), get("gps_course_deg"))
     filled = {
-        "time_us": time_us,
-        "node_id": 0.0,
-        "imu_flags": np.trunc(get("imu_flags", np.where(has_mag, float(ImuFlags.MAG_NEW), 0.0))),
+        "time_us": time_us, "node_id": 0.0, "imu_flags": np.trunc(get("imu_flags", new_flags)),
         "baro_time_us": _measured_us(get("baro_time_us"), time_us),
-        "baro_node_id": 0.0,
-        "baro_node_time_us": time_us,
-        "baro_pressure_pa": np.where(np.isnan(pressure_pa), by_height_pa, pressure_pa),
+        "baro_node_id": 0.0, "baro_node_time_us": time_us,
+        "baro_pressure_pa": get("baro_pressure_pa", by_height_pa),
         "gps_time_us": _measured_us(get("gps_time_us"), time_us),
-        "gps_node_id": 1.0,
-        "gps_node_time_us": time_us,
+        "gps_node_id": 1.0, "gps_node_time_us": time_us,
         "gps_itow_ms": np.rint(get("gps_itow_ms", 0.0)),
         "gps_fix_type": np.trunc(get("gps_fix_type", float(GpsFixType.FIX_3D))),
         "gps_fix_ok": get("gps_fix_ok", 1.0) != 0.0,
         "gps_satellites": np.trunc(get("gps_satellites", 0.0)),
         "gps_lat_dege7": np.rint(get("gps_lat_dege7")),
         "gps_lon_dege7": np.rint(get("gps_lon_dege7")),
-        "gps_vel_north_mps": np.where(is_known, north_mps, level_mps[0]),
-        "gps_vel_east_mps": np.where(is_known, east_mps, level_mps[1]),
+        "gps_vel_north_mps": np.where(is_known, north_mps, level[0]),
+        "gps_vel_east_mps": np.where(is_known, east_mps, level[1]),
         "gps_utc_us": np.rint(get("gps_utc_us")),
-    }
+    }  # fmt: skip
     for name, value in (values | filled).items():
         if name not in EXTRA_FIELDS:
             cells[:, COLUMNS.index(name)] = value
     cells[:, RAW] = cells[:, NAV] = NAN
-    for group, needed in (
+    for group, needed in _GROUPS_NEED:
+        cells[np.isnan(cells[:, needed]).any(axis=1), group] = NAN
+    return cells
+
+
+_GROUPS_NEED: Final = [
+    (group, [COLUMNS.index(name) for name in names])
+    for group, names in (
         (SI, ("accel_x_b_mps2", "gyro_x_b_radps")),
         (BARO, ("baro_pressure_pa",)),
         (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
-    ):
-        is_empty = np.isnan(cells[:, [COLUMNS.index(name) for name in needed]]).any(axis=1)
-        cells[is_empty, group] = NAN
-    return cells
+    )
+]
+"""Without these columns there is no such record."""
 
 
 def _cells_of(line: str, delimiter: str) -> list[str]:
