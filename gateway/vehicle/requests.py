@@ -175,53 +175,44 @@ class Service:
 
 BATCH: Final = 10
 BATCH_INTERVAL_US: Final = 10_000
-"""Between batches of this many answers, for all transfers together."""
+"""Between batches of this many answers, for all transfers of a service together."""
+MAX_TRANSFERS: Final = 512
 
 
-class Transfers:
-    """Lists and files on the way to clients: a few answers at a time, each transfer in turn.
+class TransferService(Service):
+    """A service that sends lists and files: a few answers at a time, each transfer in turn.
 
     That bounds the load of the gateway, and overflows neither a receive buffer nor a slow link.
     """
 
     def __init__(self) -> None:
-        self._answers: dict[int, Iterator[Answer]] = {}
-        """What is left of each transfer; whose turn it is comes first."""
+        self._transfers: dict[int, Iterator[Answer]] = {}
+        """The answers that are left of each; whose turn it is comes first."""
         self._due_us = 0
 
-    def __contains__(self, key: int) -> bool:
-        """Return whether a transfer is under way."""
-        return key in self._answers
-
-    def __len__(self) -> int:
-        """Return how many transfers are under way."""
-        return len(self._answers)
-
-    def start(self, key: int, answers: Iterator[Answer]) -> None:
-        """Start a transfer, or start it again."""
-        self._answers[key] = answers
-
-    def stop(self, key: int) -> None:
-        """End a transfer, if it is under way."""
-        self._answers.pop(key, None)
-
     def poll(self, now_us: int) -> list[Answer]:
-        """Return the next answers if they are due."""
+        """Return the next answers of the transfers."""
         found: list[Answer] = []
-        if not self._answers or now_us < self._due_us:
+        if not self._transfers or now_us < self._due_us:
             return found
-        while self._answers and len(found) < BATCH:
-            key = next(iter(self._answers))
-            answers = self._answers.pop(key)
+        while self._transfers and len(found) < BATCH:
+            key = next(iter(self._transfers))
+            answers = self._transfers.pop(key)
             if (answer := next(answers, None)) is not None:
                 found.append(answer)
-                self._answers[key] = answers
+                self._transfers[key] = answers
         self._due_us = now_us + BATCH_INTERVAL_US
         return found
 
     def next_due_us(self) -> int | None:
-        """Return when `poll` has something to do."""
-        return self._due_us if self._answers else None
+        """Return when `poll` has something to send."""
+        return self._due_us if self._transfers else None
+
+    def _start(self, key: int, answers: Iterator[Answer], now_us: int) -> list[Answer]:
+        """Start a transfer, or start it again; return what is sent at once."""
+        if key in self._transfers or len(self._transfers) < MAX_TRANSFERS:
+            self._transfers[key] = answers
+        return self.poll(now_us)
 
 
 TICKS_PER_S: Final = 100_000
@@ -240,13 +231,7 @@ def key_id_of(key: bytes) -> str:
 
 
 class SigningTimestamps:
-    """The timestamps that one vehicle has accepted.
-
-    Parameters
-    ----------
-    kept : mapping, optional
-        The result of `to_keep` in an earlier run.
-    """
+    """The timestamps that one vehicle has accepted, also in earlier runs."""
 
     def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
         self._newest = _copied(kept or {})
@@ -304,15 +289,10 @@ def key_from_passphrase(passphrase: str) -> bytes:
 
 
 class SigningClock:
-    """The timestamps of one signer.
-
-    Parameters
-    ----------
-    unix_us_at_zero : int
-        Unix time when the gateway clock was zero.
-    """
+    """The timestamps of one signer."""
 
     def __init__(self, unix_us_at_zero: int) -> None:
+        """Start with the Unix time when the gateway clock was zero."""
         self._offset_us = unix_us_at_zero - EPOCH_2015_US
 
     def set_gps_time(self, unix_us_at_zero: int) -> None:
@@ -327,17 +307,7 @@ class SigningClock:
 
 
 class Verifier:
-    """Check the signatures of frames that clients send.
-
-    Parameters
-    ----------
-    key : bytes
-        32 bytes.
-    clock : SigningClock
-        Of the gateway.
-    book : SigningTimestamps, optional
-        The timestamps accepted so far; updated with every accepted frame.
-    """
+    """Check the signatures of frames that clients send; add each accepted timestamp to the book."""
 
     def __init__(
         self, key: bytes, clock: SigningClock, book: SigningTimestamps | None = None
@@ -369,23 +339,14 @@ class Verifier:
         return True
 
 
-V1_START: Final = 0xFE
 V2_START: Final = 0xFD
 SIGNED: Final = 0x01
-V1_OVERHEAD: Final = 8
-V2_OVERHEAD: Final = 12
 BROADCAST: Final = 0
 BAD_SIGNATURE: Final = "bad signature"
 
 
 class RequestReader:
-    """Decode frames and check their sender and target.
-
-    Parameters
-    ----------
-    system_id : int
-        The target system of the requests.
-    """
+    """Decode frames and check their sender and target."""
 
     def __init__(self, system_id: int) -> None:
         self.faults: Counter[str] = Counter()
@@ -411,17 +372,13 @@ class RequestReader:
                 self.faults[BAD_SIGNATURE] += 1
                 return None
             allowed = allowed and bool(signed)
-        return Request(
-            incoming.client_id,
-            message.get_srcSystem(),
-            message.get_srcComponent(),
-            message,
-            allowed,
-        )
+        sender = (message.get_srcSystem(), message.get_srcComponent())
+        return Request(incoming.client_id, *sender, message, allowed)
 
     def _decode(self, frame: bytes) -> Any:
         """Decode a frame, or return what is wrong with it."""
-        if not _is_whole(frame):
+        # An unknown incompatibility flag forbids reading on.
+        if not frame or (frame[0] == V2_START and frame[2:] and frame[2] & ~SIGNED):
             return "malformed"
         try:
             message = self._mav.decode(bytearray(frame))
@@ -442,18 +399,6 @@ class RequestReader:
             BROADCAST,
             AUTOPILOT_COMPONENT,
         )
-
-
-def _is_whole(frame: bytes) -> bool:
-    if len(frame) < V1_OVERHEAD:
-        return False
-    if frame[0] == V1_START:
-        return len(frame) == frame[1] + V1_OVERHEAD
-    if frame[0] != V2_START or frame[2] & ~SIGNED:
-        # An unknown incompatibility flag forbids reading on.
-        return False
-    signature = 13 if frame[2] & SIGNED else 0
-    return len(frame) == frame[1] + V2_OVERHEAD + signature
 
 
 MAX_ENTRIES: Final = 64

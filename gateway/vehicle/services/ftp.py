@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.requests import Answer, Reply, Request, Service, Transfers
+from gateway.vehicle.requests import Answer, Reply, Request, TransferService
 
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251
@@ -112,7 +112,7 @@ class _Session:
 File = bytes | Callable[[Request, str], bytes]
 
 
-class FtpService(Service):
+class FtpService(TransferService):
     """Files of one vehicle.
 
     Parameters
@@ -125,10 +125,9 @@ class FtpService(Service):
     types = ("FILE_TRANSFER_PROTOCOL",)
 
     def __init__(self, files: Mapping[str, File]) -> None:
+        super().__init__()
         self._files = dict(files)
         self._sessions: dict[int, _Session] = {}
-        self._bursts = Transfers()
-        """By session."""
         self._last: dict[int, tuple[Packet, Reply]] = {}
         self._handlers: dict[int, Callable[[Request, Packet], bytes]] = {
             Opcode.NONE: lambda *_: b"",
@@ -148,22 +147,13 @@ class FtpService(Service):
         try:
             if packet.opcode == Opcode.BURST_READ_FILE:
                 content = self._content_from(request, packet)
-                self._bursts.start(packet.session, _burst(request, packet, content))
-                return self._bursts.poll(now_us)
+                return self._start(packet.session, _burst(request, packet, content), now_us)
             answer = packet.answer(ACK, *self._carry_out(request, packet))
         except _RefusedError as refused:
             answer = packet.answer(NAK, packet.session, bytes([refused.error]))
         reply = _reply(request, answer)
         self._keep_answer(request.client_id, packet, reply)
         return [reply]
-
-    def poll(self, now_us: int) -> list[Answer]:
-        """Send the next packets of the bursts."""
-        return self._bursts.poll(now_us)
-
-    def next_due_us(self) -> int | None:
-        """Return when `poll` has something to send."""
-        return self._bursts.next_due_us()
 
     def remove_client(self, client_id: int) -> None:
         """Close the sessions of a client that has gone."""
@@ -173,7 +163,7 @@ class FtpService(Service):
 
     def _drop(self, number: int) -> None:
         self._sessions.pop(number)
-        self._bursts.stop(number)
+        self._transfers.pop(number, None)
 
     def _carry_out(self, request: Request, packet: Packet) -> tuple[int, bytes]:
         """Carry out a request; return the session and the data of the answer."""

@@ -19,9 +19,8 @@ from gateway.vehicle.requests import (
     Reply,
     Request,
     SaveSettings,
-    Service,
     SettingsChange,
-    Transfers,
+    TransferService,
 )
 from gateway.vehicle.services.commands import (
     ACCEPTED,
@@ -39,7 +38,7 @@ from gateway.vehicle.services.parameters import (
 )
 
 MAX_LISTENERS: Final = 512
-"""Clients that may request lists and be sent changes."""
+"""Clients that are sent changes."""
 BY_NAME: Final = -1
 PACKED_PATH: Final = "/@PARAM/param.pck"
 """The list as a file, which MAVProxy and Mission Planner read first."""
@@ -58,14 +57,10 @@ FORBIDDEN: Final = mavlink.MAV_PARAM_ERROR_PERMISSION_DENIED
 Entry = TypeVar("Entry")
 
 
-class ReadOnlyParameters(Service, Generic[Entry]):
+class ReadOnlyParameters(TransferService, Generic[Entry]):
     """List and read the parameters of a vehicle; refuse to set them."""
 
     types = ("PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "PARAM_SET")
-
-    def __init__(self) -> None:
-        self._lists = Transfers()
-        """By client."""
 
     def entries(self) -> Mapping[str, Entry]:
         """Return the parameters by name, in their order."""
@@ -90,22 +85,12 @@ class ReadOnlyParameters(Service, Generic[Entry]):
         entries, client_id = self.entries(), request.client_id
         if not entries:
             return [_error(request, UNKNOWN)]
-        if client_id in self._lists or len(self._lists) < MAX_LISTENERS:
-            values = (self.value(entry, client_id) for entry in entries.values())
-            self._lists.start(client_id, values)
-        return self._lists.poll(now_us)
-
-    def poll(self, now_us: int) -> list[Answer]:
-        """Send the next few parameters of the requested lists."""
-        return self._lists.poll(now_us)
-
-    def next_due_us(self) -> int | None:
-        """Return when `poll` has something to send."""
-        return self._lists.next_due_us()
+        values = (self.value(entry, client_id) for entry in entries.values())
+        return self._start(client_id, values, now_us)
 
     def remove_client(self, client_id: int) -> None:
         """Stop the list for a client that has gone."""
-        self._lists.stop(client_id)
+        self._transfers.pop(client_id, None)
 
     def _read(self, request: Request) -> list[Answer]:
         index, entries = request.message.param_index, self.entries()
