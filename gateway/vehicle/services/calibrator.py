@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.geometry.geomagnetism import magnetic_field, year_of
+from gateway.geometry.geomagnetism import MagneticField, magnetic_field, year_of
 from gateway.records import ImuSample, NavFlags, NavState, Vec3
 from gateway.sensing.calibrating import (
     IN_BODY_AXES,
@@ -78,17 +78,27 @@ SIDES: Final = ("back", "front", "left", "right", "up", "down")
 """Which side lies below when +x, -x, +y, -y, +z, -z reads plus one gravity; level is "down"."""
 
 
+Method = Callable[[NodeSamples, NodeCalibration], NodeCalibration]
+
+METHODS: Final[dict[tuple[int, int, int], tuple[CalibrationKind, Method | None]]] = {
+    (1, 0, 0): (CalibrationKind.GYRO, calibrate_gyro),
+    (0, 0, 2): (CalibrationKind.LEVEL, calibrate_level),
+    (0, 0, 4): (CalibrationKind.ACCEL, calibrate_accelerometer_level),
+    (0, 0, 1): (CalibrationKind.ACCEL, None),
+    (0, 1, 0): (CalibrationKind.MAG, None),
+}
+"""By the parameters 1, 2 and 5 of PREFLIGHT_CALIBRATION; with its solver if one rest suffices."""
+
+
 @dataclass(slots=True)
 class _Run:
     kind: CalibrationKind
+    at_rest: Method | None
+    asked: tuple[float, ...]
+    """The parameters that request it."""
     command: Command
     began_us: int
-    six_sides: bool = False
-    simple: bool = False
-    yaw_rad: float | None = None
-    times_us: list[int] = field(default_factory=list)
-    gyro: list[Vec3] = field(default_factory=list)
-    accel: list[Vec3] = field(default_factory=list)
+    samples: list[ImuSample] = field(default_factory=list)
     mag: list[Vec3] = field(default_factory=list)
     mag_times_us: list[int] = field(default_factory=list)
     poses: list[NodeSamples] = field(default_factory=list)
@@ -96,45 +106,45 @@ class _Run:
     progress: int = 0
 
     @property
+    def is_turned(self) -> bool:
+        """Whether the operator turns it about all axes."""
+        return self.kind is CalibrationKind.MAG and self.at_rest is None
+
+    @property
+    def has_sides(self) -> bool:
+        """Whether the operator rests it on six sides."""
+        return self.kind is CalibrationKind.ACCEL and self.at_rest is None
+
+    @property
     def deadline_us(self) -> int:
-        return self.began_us + (SIX_SIDES_TIMEOUT_US if self.six_sides else TIMEOUT_US)
+        return self.began_us + (SIX_SIDES_TIMEOUT_US if self.has_sides else TIMEOUT_US)
 
     def take(self, sample: ImuSample) -> int:
         """Collect a sample; return how long they span."""
-        self.times_us.append(sample.time_us)
-        self.gyro.append(sample.gyro_b_radps)
-        self.accel.append(sample.accel_b_mps2)
+        self.samples.append(sample)
         if sample.mag_b_ut is not None and len(self.mag) < MAG_SAMPLES:
             self.mag.append(sample.mag_b_ut)
             self.mag_times_us.append(sample.time_us)
-        return sample.time_us - self.times_us[0]
+        return sample.time_us - self.samples[0].time_us
 
-    def samples(self) -> NodeSamples:
+    def collected(self) -> NodeSamples:
         """Return what was collected, in body axes, and start again."""
         found = NodeSamples(
-            time_s=np.array(self.times_us) / US_PER_S,
-            accel=np.array(self.accel),
-            gyro=np.array(self.gyro),
+            time_s=np.array([sample.time_us for sample in self.samples]) / US_PER_S,
+            accel=np.array([sample.accel_b_mps2 for sample in self.samples]),
+            gyro=np.array([sample.gyro_b_radps for sample in self.samples]),
             mag_time_s=np.array(self.mag_times_us) / US_PER_S,
             mag=np.array(self.mag, float).reshape(-1, 3),
-            moving=np.zeros(len(self.times_us), np.bool_),
+            moving=np.zeros(len(self.samples), np.bool_),
         )
-        for collected in (self.times_us, self.accel, self.gyro, self.mag, self.mag_times_us):
-            collected.clear()
+        self.samples, self.mag, self.mag_times_us = [], [], []
         return found
 
 
 class Calibrator(Service):
-    """At most one calibration at a time.
+    """At most one calibration at a time, and none in flight.
 
-    Parameters
-    ----------
-    vehicle_id : int
-        Whose sensors they are.
-    in_flight : callable
-        Whether it flies.
-    state : callable
-        The newest estimate, if there is any: where the field of the Earth is looked up.
+    The newest estimate, if there is any, is where the field of the Earth is looked up.
     """
 
     def __init__(
@@ -156,33 +166,30 @@ class Calibrator(Service):
     def start(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_PREFLIGHT_CALIBRATION; all zero cancels."""
         asked = (whole(command.params[0]), whole(command.params[1]), whole(command.params[4]))
-        run = {
-            (1, 0, 0): _Run(CalibrationKind.GYRO, command, now_us),
-            (0, 1, 0): _Run(CalibrationKind.MAG, command, now_us),
-            (0, 0, 1): _Run(CalibrationKind.ACCEL, command, now_us, six_sides=True),
-            (0, 0, 2): _Run(CalibrationKind.LEVEL, command, now_us),
-            (0, 0, 4): _Run(CalibrationKind.ACCEL, command, now_us, simple=True),
-        }.get(asked)
-        if run is None:
-            nothing = not any(whole(value) for value in command.params)
-            return (ACCEPTED, self._cancel()) if nothing else (UNSUPPORTED, [])
-        return self._begin(run)
+        if asked in METHODS:
+            return self._begin(_Run(*METHODS[asked], asked, command, now_us))
+        if any(whole(value) for value in command.params):
+            return UNSUPPORTED, []
+        run, self._run = self._run, None
+        return ACCEPTED, _text("calibration cancelled") if run else []
 
     def start_by_yaw(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_FIXED_MAG_CAL_YAW: parameter 1 is the heading in deg."""
         yaw_deg = command.params[0]
         if not math.isfinite(yaw_deg):
             return UNSUPPORTED, []
-        yaw_rad = math.radians(yaw_deg)
-        return self._begin(_Run(CalibrationKind.MAG, command, now_us, yaw_rad=yaw_rad))
+
+        def solve(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
+            there, yaw_rad = self._field_at(command), math.radians(yaw_deg)
+            return calibrate_magnetometer_by_yaw(samples, calibration, yaw_rad, there)
+
+        return self._begin(_Run(CalibrationKind.MAG, solve, (yaw_deg,), command, now_us))
 
     def _begin(self, run: _Run) -> Outcome:
         if self._in_flight():
             return DENIED, _text("calibration failed: in flight")
-        if (old := self._run) is not None:
-            same = (old.kind, old.six_sides, old.simple, old.yaw_rad)
-            again = same == (run.kind, run.six_sides, run.simple, run.yaw_rad)
-            return (IN_PROGRESS if again else NOT_NOW), []
+        if self._run is not None:
+            return (IN_PROGRESS if run.asked == self._run.asked else NOT_NOW), []
         self._run = run
         return IN_PROGRESS, _text(f"calibration started: 2 {run.kind}")
 
@@ -194,13 +201,13 @@ class Calibrator(Service):
         if self._in_flight():
             return self._fail("in flight")
         passed_us = run.take(sample)
-        if run.kind is CalibrationKind.MAG and run.yaw_rad is None:
+        if run.is_turned:
             return self._on_mag(run, passed_us) if sample.mag_b_ut is not None else []
-        if run.six_sides:
+        if run.has_sides:
             return self._on_side(run) if passed_us > SIDE_US else []
         if passed_us <= REST_US:
             return self._announce(run, min(99, 100 * passed_us // REST_US))
-        return self._solve(run, run.samples())
+        return self._solve(run, run.collected())
 
     def poll(self, now_us: int) -> list[Answer]:
         """End a calibration that takes too long."""
@@ -213,35 +220,25 @@ class Calibrator(Service):
         return self._run.deadline_us if self._run else None
 
     def _solve(self, run: _Run, samples: NodeSamples) -> list[Answer]:
+        """Solve one rest, or the poses if there is no method for one."""
         try:
-            return self._done(run, self._correction(run, samples))
+            if run.at_rest is None:
+                return self._done(run, calibrate_accelerometer(run.poses, IN_BODY_AXES))
+            return self._done(run, run.at_rest(samples, IN_BODY_AXES))
         except CalibrationError as error:
             return self._fail(str(error) if still_windows(samples) else MOVED)
 
-    def _correction(self, run: _Run, samples: NodeSamples) -> NodeCalibration:
-        if run.kind is CalibrationKind.GYRO:
-            return calibrate_gyro(samples, IN_BODY_AXES)
-        if run.kind is CalibrationKind.LEVEL:
-            return calibrate_level(samples, IN_BODY_AXES)
-        if run.simple:
-            return calibrate_accelerometer_level(samples, IN_BODY_AXES)
-        if run.yaw_rad is None:
-            return calibrate_accelerometer(run.poses, IN_BODY_AXES)
-        lat_deg, lon_deg, _ = run.command.location
-        state = self._state()
-        if (
-            not (lat_deg or lon_deg)
-            and state is not None
-            and NavFlags.POSITION_VALID in state.flags
-        ):
+    def _field_at(self, command: Command) -> MagneticField:
+        """Return the field of the Earth at the location of the command, or of the estimate."""
+        state, (lat_deg, lon_deg, _) = self._state(), command.location
+        if not (lat_deg or lon_deg) and state and NavFlags.POSITION_VALID in state.flags:
             lat_deg, lon_deg = state.lat_deg, state.lon_deg
         if not (lat_deg or lon_deg):
             raise CalibrationError("no position: wait for GPS, or give latitude and longitude")
-        there = magnetic_field(lat_deg, lon_deg, 0.0, year_of(None))
-        return calibrate_magnetometer_by_yaw(samples, IN_BODY_AXES, run.yaw_rad, there)
+        return magnetic_field(lat_deg, lon_deg, 0.0, year_of(None))
 
     def _on_side(self, run: _Run) -> list[Answer]:
-        samples, before = run.samples(), sides_of(run.poses)
+        samples, before = run.collected(), sides_of(run.poses)
         new = sides_of([samples]) - before
         if not new:
             return []
@@ -279,10 +276,6 @@ class Calibrator(Service):
         run, self._run = self._run, None
         ack = [run.command.ack(FAILED)] if run else []
         return [*ack, *_text(f"calibration failed: {why}")]
-
-    def _cancel(self) -> list[Answer]:
-        run, self._run = self._run, None
-        return _text("calibration cancelled") if run else []
 
 
 def _text(text: str) -> list[Answer]:
