@@ -68,43 +68,16 @@ class ConfigError(Exception):
 
 
 def load(path: Path) -> GatewaySettings:
-    """Read and check the settings file.
+    """Read and check a TOML file; absent keys keep their defaults.
 
-    Parameters
-    ----------
-    path : Path
-        A TOML file; absent keys keep their defaults.
-
-    Returns
-    -------
-    GatewaySettings
-
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not TOML, or has a key, type or value that is not allowed.
+    Raises ConfigError if it cannot be read, is not TOML, or has a key, type or value that is not
+    allowed.
     """
     return msgspec.convert(_read(path, GatewaySettings), GatewaySettings)
 
 
 def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Read the files of all aircraft that have one.
-
-    Parameters
-    ----------
-    settings : GatewaySettings
-        With the folder, and the values that an aircraft's file leaves out.
-
-    Returns
-    -------
-    dict of int to AircraftSettings
-        By vehicle id.
-
-    Raises
-    ------
-    ConfigError
-        As `load`.
-    """
+    """Read the files of all aircraft that have one, by vehicle id; raises ConfigError as `load`."""
     default = msgspec.to_builtins(settings.default_aircraft)
     found, errors = {}, []
     for vehicle_id in VEHICLE_IDS:
@@ -123,26 +96,8 @@ def load_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
 def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: AircraftSettings) -> Path:
     """Write the settings of an aircraft that differ from the settings file.
 
-    Comments and order of an existing file are kept; it is replaced whole or not at all.
-
-    Parameters
-    ----------
-    settings : GatewaySettings
-        The settings that the aircraft would have without its file.
-    vehicle_id : int
-        1 to 31.
-    aircraft : AircraftSettings
-        Its settings.
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written, or the existing one is not TOML, which is left unchanged.
+    Comments and order of an existing file are kept; it is replaced whole or not at all. Raises
+    OSError if it cannot be written, or the existing one is not TOML, which is left unchanged.
     """
     file = aircraft_file(settings, vehicle_id)
     document = _document(file)
@@ -160,21 +115,8 @@ def save_aircraft(settings: GatewaySettings, vehicle_id: int, aircraft: Aircraft
 def save_endpoint(file: Path, url: str) -> None:
     """Add an endpoint to those of a settings file, which is created if it does not exist.
 
-    Comments and order are kept; the file is replaced whole or not at all.
-
-    Parameters
-    ----------
-    file : Path
-        The settings file.
-    url : str
-        The endpoint.
-
-    Raises
-    ------
-    ConfigError
-        If the file is wrong, or would be with this endpoint.
-    OSError
-        If it cannot be written.
+    Comments and order are kept; the file is replaced whole or not at all. Raises ConfigError if the
+    file is wrong, or would be with this endpoint, and OSError if it cannot be written.
     """
     settings = load(file) if file.exists() else GatewaySettings()
     urls = [*settings.hub.endpoints, url]
@@ -216,17 +158,7 @@ def aircraft_folder(settings: GatewaySettings) -> Path:
 
 
 def render(settings: GatewaySettings) -> str:
-    """Write settings as a documented TOML file.
-
-    Parameters
-    ----------
-    settings : GatewaySettings
-
-    Returns
-    -------
-    str
-        Every setting with its meaning, unit and range as a comment; `load` reads it back equal.
-    """
+    """Return a documented TOML file, with meaning, unit and range of every setting as comments."""
     head = _comment(
         "Settings of mavgate. Every key may be left out: its value here is the default. "
         "`mavgate check-config FILE` lists the errors in a file."

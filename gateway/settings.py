@@ -29,7 +29,7 @@ def setting(
     path: bool = False,
     choices: Collection[str] = (),
 ) -> msgspec.Meta:
-    """Describe one setting: meaning, unit and allowed values.
+    """Describe one setting, as `Annotated[float, setting(...)]`.
 
     Parameters
     ----------
@@ -37,10 +37,8 @@ def setting(
         One or more sentences for the person who edits the file.
     unit : str
         Unit of the value; empty for a name, a switch or a pure number.
-    ge, le : float, optional
-        Least and greatest allowed number.
-    pattern : str, optional
-        Regular expression that a text must match.
+    ge, le, pattern : optional
+        Least and greatest allowed number; regular expression that a text must match.
     rotation : bool
         Whether the value is a rotation matrix, which is set by angles as a parameter.
     path : bool
@@ -48,11 +46,6 @@ def setting(
     choices : collection of str, optional
         The allowed texts if the type does not list them, as for a registry that may grow. The
         settings class checks them itself.
-
-    Returns
-    -------
-    msgspec.Meta
-        To be used as `Annotated[float, setting(...)]`.
     """
     extra = {"unit": unit, "rotation": rotation, "path": path, "choices": choices}
     if pattern is not None:

@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
-from gateway.vehicle.plan import MISSION, read_item
+from gateway.vehicle.plan import KINDS, MISSION, read_item
 from gateway.vehicle.requests import Answer, Reply, Request, RequestReader, Service
 from gateway.vehicle.services.commands import (
     ACCEPTED,
@@ -38,7 +38,7 @@ from gateway.vehicle.services.commands import (
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.intervals import HEARTBEAT, KEEPS_CLIENTS_US, NONE
-from gateway.vehicle.services.missions import KINDS, MissionService
+from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.services.parameter_service import ReadOnlyParameters
 from gateway.vehicle.services.parameters import Metadata
 

@@ -119,7 +119,7 @@ class FtpService(TransferService):
     ----------
     files : mapping of str to bytes or callable
         Absolute paths, and their content, or the functions that generate it from the request and
-        the query of its path, such as `start=50&count=10`.
+        the query of its path, such as `withdefaults=1`.
     """
 
     types = ("FILE_TRANSFER_PROTOCOL",)

@@ -47,10 +47,9 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import (
     ACCEPTED,
-    FENCE,
+    KINDS,
     MAX_ITEMS,
     MISSION,
-    RALLY,
     Item,
     check_item,
     read_item,
@@ -67,7 +66,6 @@ MAX_CLIENTS: Final = 512
 """Clients whose form is stored."""
 CHECKS: Final = 3
 """The last item is asked for so many times more where the ACK may have been lost."""
-KINDS: Final = (MISSION, FENCE, RALLY)
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
 CHANGING: Final = frozenset(
     {

@@ -261,22 +261,17 @@ def packed_parameters(table: ParameterTable, query: str) -> bytes:
     in the lower, and the number of others less one in the upper four bits; the other characters;
     the value; the default, if the flag is set. The padding at block boundaries in [1]_ is left
     out: it protects against values that change between two reads, and a file here is fixed when it
-    is opened. The query has `start`, `count` and `withdefaults`, each optional, as
-    `start=50&count=10`.
+    is opened. Of the options of the query, `withdefaults=1` adds the defaults.
 
     References
     ----------
     .. [1] ArduPilot, libraries/AP_Filesystem/README.md, "The @PARAM VFS"
     """
-    wanted = dict(part.partition("=")[::2] for part in query.split("&"))
-    start = _number(wanted.get("start"), 0)
-    count = _number(wanted.get("count"), len(table.parameters))
-    with_defaults = _number(wanted.get("withdefaults"), 0) != 0
-    chosen = list(table.parameters.values())[start : start + count]
-    magic = PACKED_WITH_DEFAULTS if with_defaults else PACKED
-    packed = struct.pack("<HHH", magic, len(chosen), len(table.parameters))
+    with_defaults = "withdefaults=1" in query.split("&")
+    magic, count = PACKED_WITH_DEFAULTS if with_defaults else PACKED, len(table.parameters)
+    packed = struct.pack("<HHH", magic, count, count)
     last = ""
-    for parameter in chosen:
+    for parameter in table.parameters.values():
         name, number = parameter.name, table.number(parameter)
         default = parameter.to_number(parameter.field.default)
         flag = int(with_defaults and default != number)
@@ -287,10 +282,6 @@ def packed_parameters(table: ParameterTable, query: str) -> bytes:
         packed += struct.pack("<f", number) + (struct.pack("<f", default) if flag else b"")
         last = name
     return packed
-
-
-def _number(text: str | None, missing: int) -> int:
-    return int(text) if text and text.isascii() and text.isdecimal() else missing
 
 
 @cache
