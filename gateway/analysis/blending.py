@@ -23,7 +23,13 @@ from gateway.analysis.flight import (
     fixes_of,
     fuse_track,
 )
-from gateway.analysis.metrics import mean_abs, position_error_m, rms
+from gateway.analysis.metrics import (
+    mean_abs,
+    position_error_m,
+    rms,
+    rotation_error,
+    total_error_rad,
+)
 from gateway.estimation.reference import is_usable
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
@@ -76,11 +82,6 @@ def withhold(flight: Flight, every: int) -> BoolArray:
     return np.asarray(~(usable & (np.cumsum(usable) % every == 0)))
 
 
-def split(flight: Flight, keep: BoolArray) -> tuple[Flight, Flight]:
-    """Split a flight by its fixes: those to fuse, and those to compare with."""
-    return flight.with_fixes(keep), flight.with_fixes(~keep)
-
-
 def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     """Compare a track with fixes, each at the time at which it was valid."""
     if not len(fixes):
@@ -131,8 +132,8 @@ class Judge:
 
 
 def make_judge(flight: Flight, keep: BoolArray) -> Judge:
-    """Split the fixes of a flight."""
-    return judge_of(*split(flight, keep))
+    """Split the fixes of a flight into those to fuse, and those to compare with."""
+    return judge_of(flight.with_fixes(keep), flight.with_fixes(~keep))
 
 
 def judge_of(fused: Flight, held: Flight) -> Judge:
@@ -141,28 +142,30 @@ def judge_of(fused: Flight, held: Flight) -> Judge:
 
 
 def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
-    """Score one track."""
+    """Score one track; NaN where the flight has nothing to compare with."""
     flight = judge.fused
-    scored = flight.scored
-    to_gps = position_error_m(track, judge.interpolated)[scored]
+    to_gps = position_error_m(track, judge.interpolated)[flight.scored]
+    # The withheld fixes that fall among the scored samples.
+    nearest = np.searchsorted(flight.time_us, judge.held.valid_us).clip(0, len(flight.time_us) - 1)
+    to_held = error_at_fixes_m(track, judge.held)[flight.scored[nearest]]
     found = {
         "north_m": mean_abs(to_gps[:, 0]),
         "east_m": mean_abs(to_gps[:, 1]),
         "interpolated_m": rms(np.hypot(to_gps[:, 0], to_gps[:, 1])),
-        "held_m": rms(np.hypot(*_scored_fix_errors(track, judge).T)),
+        "held_m": rms(np.hypot(*to_held.T)),
         "reference_m": float("nan"),
+        "attitude_deg": float("nan"),
     }
     if flight.reference is not None:
-        error = position_error_m(track, flight.reference.track)[scored]
+        truth = flight.reference.track
+        error = position_error_m(track, truth)[flight.scored]
+        turned = total_error_rad(rotation_error(track.q_nb, truth.q_nb))
         found["reference_m"] = rms(np.hypot(error[:, 0], error[:, 1]))
+        found["attitude_deg"] = rms(np.degrees(turned[flight.scored]))
     return found
 
 
-def blend_table(
-    flight: Flight,
-    fusion: FusionSettings,
-    interval_s: float,
-) -> pd.DataFrame:
+def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> pd.DataFrame:
     """Fuse a flight with every pair of weights, as in Table I."""
     judge = make_judge(flight, thin(flight, interval_s))
     rows = []
@@ -184,11 +187,3 @@ def grows(table: pd.DataFrame, column: str) -> bool:
     """Return whether an error grows with alpha and with beta, row by row and column by column."""
     grid = table.pivot_table(index="alpha", columns="beta", values=column).to_numpy()
     return bool(np.all(np.diff(grid, axis=0) > 0.0) and np.all(np.diff(grid, axis=1) > 0.0))
-
-
-def _scored_fix_errors(track: FlightTrack, judge: Judge) -> FloatArray:
-    """Errors at the held fixes that fall among the scored samples."""
-    errors = error_at_fixes_m(track, judge.held)
-    times = judge.fused.time_us
-    index = np.searchsorted(times, judge.held.valid_us).clip(0, len(times) - 1)
-    return np.asarray(errors[judge.fused.scored[index]])

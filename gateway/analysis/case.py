@@ -2,22 +2,24 @@
 
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
 
 from gateway.analysis.blending import make_judge, score, withhold
 from gateway.analysis.flight import (
+    Fixes,
     Flight,
     FlightTrack,
-    FloatArray,
     LocalFrame,
     fixes_of,
     fuse_track,
     local_frame,
     smooth_track,
 )
-from gateway.analysis.metrics import errors_over_time, rms
+from gateway.analysis.metrics import errors_over_time, greatest, rms
+from gateway.analysis.pilot_figures import PilotFigures, pilot_figures
 from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.recordings.fuse import FusionSettings, with_estimator
@@ -34,7 +36,7 @@ SMOOTHED: Final = "smoothed"
 """Name of the smoothed track, which uses the whole flight."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Case:
     """A flight, the settings it is fused with, and the results."""
 
@@ -56,6 +58,16 @@ class Case:
     def track(self) -> FlightTrack:
         """The track of the chosen estimator."""
         return self.tracks[self.chosen]
+
+    @cached_property
+    def fixes(self) -> Fixes:
+        """The usable fixes."""
+        return fixes_of(self.flight)
+
+    @cached_property
+    def figures(self) -> PilotFigures | None:
+        """The flight in figures; None without GPS."""
+        return None if self.frame is None else pilot_figures(self.flight, self.track, self.frame)
 
     @property
     def truth_name(self) -> str:
@@ -85,20 +97,21 @@ HOLD_OUT: Final = 5
 def summarise(case: Case) -> dict[str, float]:
     """Summarise a flight."""
     flight, track = case.flight, case.track
-    fixes = fixes_of(flight)
-    gap_s = np.diff(fixes.arrival_us) / US_PER_S
+    gap_s = np.diff(case.fixes.arrival_us) / US_PER_S
+    alt_m = track.alt_amsl_m[flight.scored]
+    alt_m = alt_m[np.isfinite(alt_m)]
     filtering = case.fusion.estimation.paper
-    smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.accel_b_mps2)
-    shaking = flight.accel_b_mps2 - smooth
+    smooth = apply(filtering.accel_filter, filtering, flight.rate_hz, flight.imu.accel_b_mps2)
+    shaking = flight.imu.accel_b_mps2 - smooth
     speed = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
     found = {
         "duration, s": flight.duration_s,
         "IMU samples a second": flight.rate_hz,
-        "usable GPS fixes": float(len(fixes)),
-        "longest time without a fix, s": float(gap_s.max()) if len(gap_s) else float("nan"),
+        "usable GPS fixes": float(len(case.fixes)),
+        "longest time without a fix, s": greatest(gap_s),
         "distance flown, m": ground_distance_m(track.time_us, track.lat_deg, track.lon_deg),
-        "greatest height above the start, m": _climbed_m(track.alt_amsl_m[flight.scored]),
-        "greatest ground speed, m/s": _greatest(speed[flight.scored]),
+        "greatest height above the start, m": greatest(alt_m - alt_m[:1]),
+        "greatest ground speed, m/s": greatest(speed[flight.scored]),
         "shaking above the low-pass, m/s² RMS": rms(shaking),
         "error at withheld fixes, m RMS": withheld_error_m(case, case.chosen),
     }
@@ -138,13 +151,3 @@ def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, o
         elif of_a != of_b:
             found.append((f"{prefix}{field.name}", of_a, of_b))
     return found
-
-
-def _climbed_m(alt_m: FloatArray) -> float:
-    known = alt_m[np.isfinite(alt_m)]
-    return float(known.max() - known[0]) if len(known) else float("nan")
-
-
-def _greatest(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if len(known) else float("nan")

@@ -4,7 +4,7 @@ Flights of all sources have the same form: the samples of a recording in the ord
 were processed, on the gateway clock.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -50,6 +50,7 @@ from gateway.records import (
     NavFlags,
 )
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
+from gateway.sensing.chain import ImuLog
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 
 FloatArray = NDArray[np.float64]
@@ -74,11 +75,6 @@ class FlightTrack:
     alt_amsl_m: FloatArray
     vel_n_mps: FloatArray
     """Shape (N, 3), NED."""
-
-    def each(self, time_us: IntArray, change: Callable[[FloatArray], FloatArray]) -> "FlightTrack":
-        """Return the track at other times, its columns changed by a function."""
-        columns = (self.q_nb, self.lat_deg, self.lon_deg, self.alt_amsl_m, self.vel_n_mps)
-        return FlightTrack(time_us, *map(change, columns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,19 +113,9 @@ class Flight:
         return self.samples.imu.time_us
 
     @property
-    def accel_b_mps2(self) -> FloatArray:
-        """Shape (N, 3), specific force, calibrated."""
-        return self.samples.imu.accel_b_mps2
-
-    @property
-    def gyro_b_radps(self) -> FloatArray:
-        """Shape (N, 3), calibrated."""
-        return self.samples.imu.gyro_b_radps
-
-    @property
-    def mag_b_ut(self) -> FloatArray:
-        """Shape (N, 3), calibrated, NaN unless newly sampled."""
-        return self.samples.imu.mag_b_ut
+    def imu(self) -> ImuLog:
+        """The calibrated IMU samples; the magnetometer is NaN unless newly sampled."""
+        return self.samples.imu
 
     @property
     def fixes(self) -> list[GpsFix]:
@@ -137,18 +123,11 @@ class Flight:
         return [record for _, record in self.samples.aiding if isinstance(record, GpsFix)]
 
     @property
-    def baro_time_us(self) -> IntArray:
-        """Shape (M,), of the barometer samples."""
-        return np.array([r.time_us for _, r in self._heights], np.int64)
-
-    @property
-    def baro_alt_m(self) -> FloatArray:
-        """Shape (M,), height in the standard atmosphere."""
-        return np.array([r.alt_pressure_m for _, r in self._heights], np.float64)
-
-    @property
-    def _heights(self) -> list[tuple[int, BaroSample]]:
-        return [(k, r) for k, r in self.samples.aiding if isinstance(r, BaroSample)]
+    def baro(self) -> tuple[IntArray, FloatArray]:
+        """Times in us, and heights in the standard atmosphere in m, of the barometer samples."""
+        found = [record for _, record in self.samples.aiding if isinstance(record, BaroSample)]
+        times_us = np.array([record.time_us for record in found], np.int64)
+        return times_us, np.array([record.alt_pressure_m for record in found], np.float64)
 
     @property
     def time_s(self) -> FloatArray:
@@ -389,4 +368,5 @@ def at_times(track: FlightTrack, time_us: IntArray) -> FlightTrack:
     def chosen(values: FloatArray) -> FloatArray:
         return np.where(near if values.ndim == 1 else near[:, np.newaxis], values[nearest], np.nan)
 
-    return track.each(time_us, chosen)
+    columns = (track.q_nb, track.lat_deg, track.lon_deg, track.alt_amsl_m, track.vel_n_mps)
+    return FlightTrack(time_us, *map(chosen, columns))

@@ -9,20 +9,26 @@ from gateway.geometry.geodesy import radii_m
 
 def rms(values: FloatArray) -> float:
     """Root of the mean square of the known values; NaN if none is known."""
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(np.square(known)))) if len(known) else float("nan")
+    return float(np.sqrt(np.mean(np.square(known)))) if len(known := _known(values)) else np.nan
 
 
 def mean_abs(values: FloatArray) -> float:
     """Mean size of the known values; NaN if none is known."""
-    known = values[np.isfinite(values)]
-    return float(np.mean(np.abs(known))) if len(known) else float("nan")
+    return float(np.mean(np.abs(known))) if len(known := _known(values)) else np.nan
 
 
 def worst(values: FloatArray) -> float:
     """Greatest size among the known values; NaN if none is known."""
-    known = values[np.isfinite(values)]
-    return float(np.max(np.abs(known))) if len(known) else float("nan")
+    return greatest(np.abs(values))
+
+
+def greatest(values: FloatArray) -> float:
+    """Greatest of the known values; NaN if none is known."""
+    return float(known.max()) if len(known := _known(values)) else np.nan
+
+
+def _known(values: FloatArray) -> FloatArray:
+    return values[np.isfinite(values)]
 
 
 def rotation_error(q_nb: FloatArray, reference_q_nb: FloatArray) -> FloatArray:

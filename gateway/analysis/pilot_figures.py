@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 
 from gateway.analysis.flight import Flight, FlightTrack, FloatArray, LocalFrame, fixes_of
+from gateway.analysis.metrics import greatest
 from gateway.units import US_PER_S
 
 AIRBORNE_MPS: Final = 3.0
@@ -64,26 +65,22 @@ def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> Pilo
     airborne = _held(seconds, (speed_mps > AIRBORNE_MPS) & (height_m > AIRBORNE_M))
     outages = _gaps(flight.seconds(fixes_of(flight).arrival_us), flight.duration_s, OUTAGE_S)
     losses = _gaps(seconds, flight.duration_s, LINK_LOSS_S)
+    events = [
+        *_flight_events(seconds, airborne, height_m, speed_mps),
+        *_gap_events(outages, "gps", "GPS"),
+        *_gap_events(losses, "link", "link"),
+    ]
     return PilotFigures(
         began_unix_s=_began_unix_s(flight),
         airborne_s=float(np.diff(seconds)[airborne[1:]].sum()),
         distance_m=_distance_m(place, airborne),
-        highest_m=_greatest(height_m),
-        fastest_mps=_greatest(speed_mps),
-        climb_mps=_greatest(_smoothed(-track.vel_n_mps[:, 2], round(flight.rate_hz))),
-        farthest_m=_greatest(np.hypot(place[:, 0], place[:, 1])),
+        highest_m=greatest(height_m),
+        fastest_mps=greatest(speed_mps),
+        climb_mps=greatest(_smoothed(-track.vel_n_mps[:, 2], round(flight.rate_hz))),
+        farthest_m=greatest(np.hypot(place[:, 0], place[:, 1])),
         gps_outages_s=outages,
         link_losses_s=losses,
-        events=tuple(
-            sorted(
-                [
-                    *_flight_events(seconds, airborne, height_m, speed_mps),
-                    *_gap_events(outages, "gps", "GPS"),
-                    *_gap_events(losses, "link", "link"),
-                ],
-                key=lambda event: event.time_s,
-            )
-        ),
+        events=tuple(sorted(events, key=lambda event: event.time_s)),
     )
 
 
@@ -93,10 +90,6 @@ def _began_unix_s(flight: Flight) -> float:
         if fix.utc_us is not None:
             return float(fix.utc_us - fix.time_us + flight.time_us[0]) / US_PER_S
     return float("nan")
-
-
-def _greatest(values: FloatArray) -> float:
-    return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
 
 
 def _smoothed(values: FloatArray, count: int) -> FloatArray:
@@ -147,14 +140,10 @@ def _flight_events(
     for index in np.flatnonzero(np.diff(airborne)) + 1:
         text = "in the air" if airborne[index] else "on the ground"
         events.append(FlightEvent(float(seconds[index]), "flight", text))
-    if np.isfinite(height_m).any():
-        top = int(np.nanargmax(height_m))
-        events.append(FlightEvent(float(seconds[top]), "flight", f"highest, {height_m[top]:.0f} m"))
-    if np.isfinite(speed_mps).any():
-        top = int(np.nanargmax(speed_mps))
-        events.append(
-            FlightEvent(float(seconds[top]), "flight", f"fastest, {speed_mps[top]:.1f} m/s")
-        )
+    for values, form in ((height_m, "highest, {:.0f} m"), (speed_mps, "fastest, {:.1f} m/s")):
+        if np.isfinite(values).any():
+            top = int(np.nanargmax(values))
+            events.append(FlightEvent(float(seconds[top]), "flight", form.format(values[top])))
     return events
 
 

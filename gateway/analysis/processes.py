@@ -6,13 +6,18 @@ import os
 import select
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
-from multiprocessing.pool import Pool
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 START: Final = "fork" if "fork" in multiprocessing.get_all_start_methods() else "spawn"
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+_work: Callable[[Any], Any]
+"""The work of a process of `forked`."""
 
 
 def cores() -> int:
@@ -21,12 +26,37 @@ def cores() -> int:
 
 
 @contextmanager
-def copies(count: int, begin: Callable[..., None], *arguments: Any) -> Iterator[Pool]:
-    """Open a pool of forked processes."""
+def forked(
+    work: Callable[[Item], Result], jobs: int | None = None
+) -> Iterator[Callable[[Sequence[Item]], Iterator[tuple[int, Result]]]]:
+    """Open processes that work on items; yields the function that numbers their results.
+
+    The results come in any order. The processes share all that the work refers to.
+    """
+    count = jobs or cores()
+    if count == 1:
+        yield lambda items: enumerate(map(work, items))
+        return
     with no_warning_of_threads():
-        pool = multiprocessing.get_context(START).Pool(count, _begin, (begin, *arguments))
+        pool = multiprocessing.get_context(START).Pool(count, _begin, (_take_work, work))
+
+    def run(items: Sequence[Item]) -> Iterator[tuple[int, Result]]:
+        # Few messages, and an even load.
+        chunk = max(1, min(8, len(items) // (16 * count)))
+        return pool.imap_unordered(_do, enumerate(items), chunk)
+
     with pool:
-        yield pool
+        yield run
+
+
+def _take_work(work: Callable[[Any], Any]) -> None:
+    global _work
+    _work = work
+
+
+def _do(numbered: tuple[int, Any]) -> tuple[int, Any]:
+    number, item = numbered
+    return number, _work(item)
 
 
 def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connection:

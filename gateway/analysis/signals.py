@@ -32,14 +32,10 @@ class Response:
     """Group delay."""
 
 
-def design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients:
-    """Design the gateway's low-pass of one kind."""
-    return design_lowpass(kind, settings.accel_cutoff_hz, rate_hz, settings.chebyshev_ripple_db)
-
-
 def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
     """Compute the frequency response from a hundredth of the cutoff to half the sample rate."""
-    b, a = _polynomials(design(kind, settings, rate_hz))
+    *b, a1, a2 = _design(kind, settings, rate_hz)
+    a = [1.0, a1, a2]
     low_hz = 0.01 * settings.accel_cutoff_hz
     frequency = np.geomspace(low_hz, 0.499 * rate_hz, RESPONSE_POINTS)
     _, h = signal.freqz(b, a, frequency, fs=rate_hz)
@@ -54,9 +50,15 @@ def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
 
 def apply(kind: Kind, settings: PaperSettings, rate_hz: float, x: FloatArray) -> FloatArray:
     """Filter an array of shape (N, 3) as the gateway does."""
-    finite = np.where(np.isfinite(x), x, 0.0)
-    low_pass = VectorFilter(lambda hz: design(kind, settings, hz), rate_hz)
-    return low_pass.run(finite)
+    return _low_pass(kind, settings, rate_hz).run(np.where(np.isfinite(x), x, 0.0))
+
+
+def _low_pass(kind: Kind, settings: PaperSettings, rate_hz: float) -> VectorFilter:
+    return VectorFilter(lambda hz: _design(kind, settings, hz), rate_hz)
+
+
+def _design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients:
+    return design_lowpass(kind, settings.accel_cutoff_hz, rate_hz, settings.chebyshev_ripple_db)
 
 
 def compare(settings: PaperSettings, rate_hz: float) -> pd.DataFrame:
@@ -88,17 +90,10 @@ def _properties(kind: Kind, settings: PaperSettings, rate_hz: float) -> dict[str
 def _time_ns(kind: Kind, settings: PaperSettings, rate_hz: float) -> float:
     """Measure the time a sample on three axes takes, best of some runs."""
     x = np.zeros((TIMED_SAMPLES, 3))
-    low_pass = VectorFilter(lambda hz: design(kind, settings, hz), rate_hz)
+    low_pass = _low_pass(kind, settings, rate_hz)
     low_pass.run(x)
-    return (
-        1e9
-        / TIMED_SAMPLES
-        * min(timeit.repeat(lambda: low_pass.run(x), number=1, repeat=TIMED_RUNS))
-    )
-
-
-def _polynomials(c: Coefficients) -> tuple[FloatArray, FloatArray]:
-    return np.array(c[:3]), np.array([1.0, c[3], c[4]])
+    seconds = min(timeit.repeat(lambda: low_pass.run(x), number=1, repeat=TIMED_RUNS))
+    return 1e9 / TIMED_SAMPLES * seconds
 
 
 SEGMENT_S: Final = 8.0

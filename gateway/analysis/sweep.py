@@ -7,8 +7,9 @@ fusion to score it: a filter that only copies its GPS, noise included, gains not
 import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Literal
 
 import msgspec
@@ -18,9 +19,8 @@ from scipy.optimize import OptimizeResult, differential_evolution
 
 from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, withhold
 from gateway.analysis.case import ESTIMATORS
-from gateway.analysis.flight import Flight, FlightTrack, fuse_track
-from gateway.analysis.metrics import rms, rotation_error, total_error_rad
-from gateway.analysis.processes import copies, cores
+from gateway.analysis.flight import Flight, fuse_track
+from gateway.analysis.processes import forked
 from gateway.recordings.fuse import FusionSettings
 from gateway.settings import Settings, fields_of
 
@@ -153,9 +153,16 @@ COLUMN_OF: Final[dict[Metric, str]] = {
     "reference": "reference_m",
     "attitude": "attitude_deg",
 }
+_LACKING: Final[dict[Metric, str]] = {
+    "held": "withheld fixes",
+    "interpolated": "GPS",
+    "reference": "reference of the position",
+    "attitude": "reference of the attitude",
+}
 SEED: Final = 1
 
-Trial = tuple[Values, Mapping[str, float]]
+Scores = dict[str, float]
+Trial = tuple[Values, Scores]
 """The values that were tried, and their scores."""
 
 
@@ -166,11 +173,6 @@ class Contest:
     fusion: FusionSettings
     keys: tuple[str, ...]
     judge: Judge
-
-
-def settings_at(contest: Contest, values: Sequence[Value]) -> FusionSettings:
-    """Return the settings with the values of one trial."""
-    return with_values(contest.fusion, contest.keys, values)
 
 
 def make_contest(
@@ -192,23 +194,18 @@ def make_contest(
     return Contest(fusion, tuple(keys), make_judge(flight, keep))
 
 
-def score_of(contest: Contest, fusion: FusionSettings) -> dict[str, float]:
+def score_of(contest: Contest, fusion: FusionSettings) -> Scores:
     """Fuse the flight with any settings, and score it by the fixes of the contest."""
-    judge = rejudged(contest.judge, fusion)
-    return _scores(fuse_track(judge.fused, fusion), judge)
+    judge = contest.judge
+    if fusion.estimation.reference != judge.fused.fusion.estimation.reference:
+        # Judged by its own latency: judged by the recording's, that would win.
+        judge = judge_of(*(replace(f, fusion=fusion) for f in (judge.fused, judge.held_flight)))
+    return score(fuse_track(judge.fused, fusion), judge)
 
 
-def run_trial(contest: Contest, values: Sequence[Value]) -> dict[str, float]:
+def run_trial(contest: Contest, values: Sequence[Value]) -> Scores:
     """Fuse the flight with these values, and score it; see `COLUMN_OF` for the scores."""
-    return score_of(contest, settings_at(contest, values))
-
-
-def rejudged(judge: Judge, settings: FusionSettings) -> Judge:
-    """Return the judge with a trial's own latency: judged by the recording's, that would win."""
-    if settings.estimation.reference == judge.fused.fusion.estimation.reference:
-        return judge
-    fused, held = (replace(flight, fusion=settings) for flight in (judge.fused, judge.held_flight))
-    return judge_of(fused, held)
+    return score_of(contest, with_values(contest.fusion, contest.keys, values))
 
 
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
@@ -264,14 +261,6 @@ def _is_alike(a: Mapping[str, float], b: Mapping[str, float]) -> bool:
     return all(a[key] == b[key] or math.isnan(a[key] + b[key]) for key in a)
 
 
-_LACKING: Final[dict[Metric, str]] = {
-    "held": "withheld fixes",
-    "interpolated": "GPS",
-    "reference": "reference of the position",
-    "attitude": "reference of the attitude",
-}
-
-
 def optimise(
     axes: Sequence[Axis],
     evaluate: Callable[[list[Values]], list[float]],
@@ -300,52 +289,9 @@ def optimise(
     return tuple(float(v) for v in found.x)
 
 
-def _scores(track: FlightTrack, judge: Judge) -> dict[str, float]:
-    """Return the errors of a track by the columns of `COLUMN_OF` and of `blending.score`."""
-    return {**score(track, judge), "attitude_deg": _attitude_deg(track, judge)}
-
-
-def _attitude_deg(track: FlightTrack, judge: Judge) -> float:
-    reference = judge.fused.reference
-    if reference is None:
-        return math.nan
-    error = total_error_rad(rotation_error(track.q_nb, reference.track.q_nb))
-    return rms(np.degrees(error[judge.fused.scored]))
-
-
-Scores = dict[str, float]
 Run = Callable[[Sequence[Values]], Iterator[tuple[int, Scores]]]
 
-_contest: Contest | None = None
-"""Of this process of the pool; it has no other place for it."""
 
-
-@contextmanager
-def pool(contest: Contest, jobs: int | None = None) -> Iterator[Run]:
-    """Open a pool of processes."""
-    count = jobs or cores()
-    if count == 1:
-        yield lambda points: ((k, run_trial(contest, values)) for k, values in enumerate(points))
-        return
-    with copies(count, _begin, contest) as processes:
-
-        def run(points: Sequence[Values]) -> Iterator[tuple[int, Scores]]:
-            return processes.imap_unordered(_run, enumerate(points), _chunk(points, count))
-
-        yield run
-
-
-def _chunk(points: Sequence[Values], jobs: int) -> int:
-    """Return how many points a process is given at once: few messages, and an even load."""
-    return max(1, min(8, len(points) // (4 * jobs)))
-
-
-def _begin(contest: Contest) -> None:
-    global _contest
-    _contest = contest
-
-
-def _run(numbered: tuple[int, Values]) -> tuple[int, Scores]:
-    assert _contest is not None
-    index, values = numbered
-    return index, run_trial(_contest, values)
+def pool(contest: Contest, jobs: int | None = None) -> AbstractContextManager[Run]:
+    """Open a pool of processes that run trials."""
+    return forked(partial(run_trial, contest), jobs)

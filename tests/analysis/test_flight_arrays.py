@@ -17,19 +17,19 @@ def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:
     flight = short_flight()
     assert flight.rate_hz == pytest.approx(50.0, rel=0.01)
     assert flight.duration_s == pytest.approx(DURATION_S, abs=0.1)
-    rest = flight.accel_b_mps2[: round(5 * flight.rate_hz)].mean(axis=0)
+    rest = flight.imu.accel_b_mps2[: round(5 * flight.rate_hz)].mean(axis=0)
     assert rest == pytest.approx([0.0, 0.0, -9.80665], abs=0.03)
     assert flight.reference is not None
     assert flight.reference.is_exact
     assert len(flight.reference.track.lat_deg) == len(flight.time_us)
-    assert np.linalg.norm(flight.gyro_b_radps[:200].mean(axis=0)) < math.radians(0.3)
+    assert np.linalg.norm(flight.imu.gyro_b_radps[:200].mean(axis=0)) < math.radians(0.3)
 
 
 def test_the_magnetometer_is_there_before_and_after_calibration() -> None:
     flight = short_flight()
     assert flight.mag_uncalibrated_b_ut is not None
     before = np.linalg.norm(flight.mag_uncalibrated_b_ut, axis=1)
-    after = np.linalg.norm(flight.mag_b_ut, axis=1)
+    after = np.linalg.norm(flight.imu.mag_b_ut, axis=1)
     assert np.nanstd(after) < 0.2 * np.nanstd(before)
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gateway.analysis.blending import error_at_fixes_m, interpolate, split, thin, withhold
+from gateway.analysis.blending import error_at_fixes_m, interpolate, thin, withhold
 from gateway.analysis.flight import Fixes, fixes_of
 from tests.analysis.flights import short_flight
 
@@ -41,7 +41,8 @@ def test_a_track_over_the_date_line_is_compared_with_the_fixes_there() -> None:
 
 def test_thinning_keeps_one_fix_a_second() -> None:
     flight = short_flight()
-    kept, dropped = split(flight, thin(flight, 1.0))
+    keep = thin(flight, 1.0)
+    kept, dropped = flight.with_fixes(keep), flight.with_fixes(~keep)
     intervals_s = np.diff(fixes_of(kept).arrival_us) * 1e-6
     assert intervals_s.min() > 0.9
     assert np.median(intervals_s) == pytest.approx(1.0, abs=0.1)
@@ -51,7 +52,8 @@ def test_thinning_keeps_one_fix_a_second() -> None:
 
 def test_every_nth_usable_fix_is_withheld() -> None:
     flight = short_flight()
-    kept, held = split(flight, withhold(flight, 4))
+    keep = withhold(flight, 4)
+    kept, held = flight.with_fixes(keep), flight.with_fixes(~keep)
     total = len(fixes_of(flight))
     assert len(fixes_of(held)) == total // 4
     assert len(fixes_of(kept)) == total - total // 4

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import pytest
 
-from gateway.analysis.processes import copies
+from gateway.analysis.processes import forked
 from gateway.batch.executors import LocalProcesses
 
 COLLECTED: list[str] = []
@@ -53,8 +53,8 @@ def test_a_worker_collects_nothing_that_its_parent_left() -> None:
 @pytest.mark.io
 @pytest.mark.usefixtures("_left_over")
 def test_a_copy_collects_nothing_that_its_parent_left() -> None:
-    with copies(1, lambda: None) as pool:
-        assert pool.map(collect, [0]) == [[]]
+    with forked(collect, 2) as run:
+        assert dict(run([0, 1])) == {0: [], 1: []}
 
 
 PARENT = """

@@ -66,8 +66,10 @@ def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
     )
     chain = SensorChain(ideal_calibration(SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
-    assert flight.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
-    assert np.isfinite(flight.mag_b_ut[:, 0]).tolist() == [s.mag_b_ut is not None for s in samples]
+    assert flight.imu.accel_b_mps2.tolist() == [list(s.accel_b_mps2) for s in samples]
+    assert np.isfinite(flight.imu.mag_b_ut[:, 0]).tolist() == [
+        s.mag_b_ut is not None for s in samples
+    ]
     assert len(fixes_of(flight)) > 100
     assert (flight.node_time_us is not None) == raw
     assert flight.recorded is not None
@@ -130,6 +132,6 @@ def test_the_nearest_row_is_taken_if_it_is_near() -> None:
 def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> None:
     flight = short_flight()
     bare = replace(flight.with_fixes([False] * len(flight.fixes)), reference=None)
-    bare = with_imu(bare, mag_b_ut=np.full_like(flight.mag_b_ut, np.nan))
+    bare = with_imu(bare, mag_b_ut=np.full_like(flight.imu.mag_b_ut, np.nan))
     titles = [section.title for section in make_report(make_case(bare)).sections]
     assert titles == ["Acceleration filters", "Noise", "Timing and loss"]

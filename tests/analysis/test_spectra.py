@@ -41,7 +41,7 @@ def test_too_short_a_log_has_no_deviation() -> None:
 
 def test_the_rest_before_take_off_is_found() -> None:
     flight = short_flight()
-    rest = longest_rest(flight.accel_b_mps2, flight.gyro_b_radps, flight.rate_hz)
+    rest = longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
     assert flight.time_s[rest.start] < 1.0
     assert 9.0 < flight.time_s[rest.stop - 1] < 15.0
 

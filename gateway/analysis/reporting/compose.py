@@ -4,11 +4,10 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.analysis.case import Case
-from gateway.analysis.flight import fixes_of
 from gateway.analysis.reporting.estimators import comparison, estimators, weights
 from gateway.analysis.reporting.ground_track import gps_interpolation, ground_track, orientation
 from gateway.analysis.reporting.page import Fact, Report, Section
-from gateway.analysis.reporting.pilot import figures_of, pilot_facts, the_flight
+from gateway.analysis.reporting.pilot import pilot_facts, the_flight
 from gateway.analysis.reporting.raw_sensors import (
     acceleration,
     heights,
@@ -47,11 +46,11 @@ def make_report(case: Case, other: Case | None = None) -> Report:
 
 
 def _facts(case: Case) -> list[Fact]:
-    flight, figures = case.flight, figures_of(case)
+    flight = case.flight
     return [
-        *([] if figures is None else pilot_facts(figures)),
+        *([] if case.figures is None else pilot_facts(case.figures)),
         Fact(f"{flight.duration_s:.0f} s", "recorded"),
         Fact(f"{len(flight.time_us)}", f"IMU samples, {flight.rate_hz:.0f} a second"),
-        Fact(f"{len(fixes_of(flight))}", "usable GPS fixes"),
+        Fact(f"{len(case.fixes)}", "usable GPS fixes"),
         Fact(case.chosen, "estimator"),
     ]

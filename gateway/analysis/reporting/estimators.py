@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from gateway.analysis.blending import PAPER_TABLE, WEIGHTS, blend_table, grows, interpolate
 from gateway.analysis.case import HOLD_OUT, Case, changed_settings, summarise, withheld_error_m
-from gateway.analysis.flight import BoolArray, FlightTrack, Reference, fixes_of
+from gateway.analysis.flight import BoolArray, FlightTrack, Reference
 from gateway.analysis.metrics import (
     errors_over_time,
     position_error_m,
@@ -42,6 +42,17 @@ OWN_GPS: Final = (
     "best"
 )
 OTHER: Final = style.GREEN
+ERROR_COLUMNS: Final = (
+    ("roll, deg", rms, "roll_deg"),
+    ("pitch, deg", rms, "pitch_deg"),
+    ("yaw, deg", rms, "yaw_deg"),
+    ("tilt, deg", rms, "tilt_deg"),
+    ("worst tilt, deg", worst, "tilt_deg"),
+    ("horizontal, m", rms, "horizontal_m"),
+    ("worst horizontal, m", worst, "horizontal_m"),
+    ("height, m", rms, "height_m"),
+    ("speed, m/s", rms, "speed_mps"),
+)
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
@@ -55,7 +66,7 @@ def estimators(case: Case) -> Section | None:
     if case.flight.recorded is not None:
         tracks["recorded in flight"] = case.flight.recorded
     table = error_table(tracks, reference, case.flight.scored)
-    if len(fixes_of(case.flight)) > HOLD_OUT:
+    if len(case.fixes) > HOLD_OUT:
         withheld = {name: withheld_error_m(case, name) for name in case.tracks}
         table["withheld fixes, m"] = table["estimator"].map(withheld)
     return Section(
@@ -88,22 +99,10 @@ def error_table(
     """Score tracks against a reference."""
     rows = []
     for name, track in tracks.items():
-        errors = errors_over_time(track, reference.track)
-        errors = {key: np.where(scored, value, np.nan) for key, value in errors.items()}
-        rows.append(
-            {
-                "estimator": name,
-                "roll, deg": rms(errors["roll_deg"]),
-                "pitch, deg": rms(errors["pitch_deg"]),
-                "yaw, deg": rms(errors["yaw_deg"]),
-                "tilt, deg": rms(errors["tilt_deg"]),
-                "worst tilt, deg": worst(errors["tilt_deg"]),
-                "horizontal, m": rms(errors["horizontal_m"]),
-                "worst horizontal, m": worst(errors["horizontal_m"]),
-                "height, m": rms(errors["height_m"]),
-                "speed, m/s": rms(errors["speed_mps"]),
-            }
-        )
+        found = errors_over_time(track, reference.track)
+        errors = {key: np.where(scored, value, np.nan) for key, value in found.items()}
+        figures = {column: figure(errors[key]) for column, figure, key in ERROR_COLUMNS}
+        rows.append({"estimator": name, **figures})
     return pd.DataFrame(rows).dropna(axis="columns", how="all")
 
 
@@ -113,7 +112,7 @@ def _reference(case: Case) -> Reference | None:
         return case.flight.reference
     if case.frame is None:
         return None
-    track = interpolate(fixes_of(case.flight), case.flight.time_us)
+    track = interpolate(case.fixes, case.flight.time_us)
     return Reference(track, is_exact=False, story=OWN_GPS)
 
 
@@ -127,25 +126,20 @@ def _smoothed_story(case: Case) -> str:
 
 def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
     errors = {name: errors_over_time(t, reference.track) for name, t in case.tracks.items()}
-    kinds = [
-        (key, label)
-        for key, label in (
-            ("tilt_deg", "tilt (deg)"),
-            ("heading_deg", "heading (deg)"),
-            ("horizontal_m", "horizontal (m)"),
-        )
-        if any(np.isfinite(found[key]).any() for found in errors.values())
-    ]
-    figure, axes = style.panels(width_in, len(kinds), 1.75)
-    for panel, (key, label) in zip(axes, kinds, strict=True):
+    kinds = {
+        "tilt_deg": "tilt (deg)",
+        "heading_deg": "heading (deg)",
+        "horizontal_m": "horizontal (m)",
+    }
+    known = [k for k in kinds if any(np.isfinite(found[k]).any() for found in errors.values())]
+    figure, axes = style.over_time(width_in, 1.75, [kinds[key] for key in known])
+    for panel, key in zip(axes, known, strict=True):
         for name, found in errors.items():
             colour = COLOURS.get(name, OTHER)
             shown = np.where(case.flight.scored, found[key], np.nan)
             style.draw(panel, case.flight.time_s, shown, colour, name, lw=1.0)
-        panel.set_ylabel(label)
         if key == "horizontal_m":
             panel.set_yscale("log")
-    axes[-1].set_xlabel("time (s)")
     style.legend_above(axes[0], 3)
     return figure
 
@@ -161,7 +155,19 @@ def comparison(a: Case, b: Case) -> Section:
     same = np.array_equal(a.flight.time_us, b.flight.time_us)
     what = "the same flight with other settings" if same else b.flight.name
     lead = f"A is {a.flight.name}, fused by `{a.chosen}`; B is {what}, fused by `{b.chosen}`."
-    pictures = [_difference(a, b) if same else _profiles(a, b)]
+    if same:
+        picture = Picture(
+            "comparison_difference",
+            lambda width: _draw_difference(a, b, width),
+            "Distance between the two fused tracks over time.",
+        )
+    else:
+        picture = Picture(
+            "comparison_profiles",
+            lambda width: _draw_profiles(a, b, width),
+            "Height above the start and ground speed of both flights, each from its own start.",
+        )
+    pictures = [picture]
     if _on_one_map(a, b):
         pictures.append(
             Picture(
@@ -188,22 +194,6 @@ def _tables(a: Case, b: Case) -> list[ReportTable]:
     return tables
 
 
-def _difference(a: Case, b: Case) -> Picture:
-    return Picture(
-        "comparison_difference",
-        lambda width: _draw_difference(a, b, width),
-        "Distance between the two fused tracks over time.",
-    )
-
-
-def _profiles(a: Case, b: Case) -> Picture:
-    return Picture(
-        "comparison_profiles",
-        lambda width: _draw_profiles(a, b, width),
-        "Height above the start and ground speed of both flights, each from its own start.",
-    )
-
-
 def _on_one_map(a: Case, b: Case) -> bool:
     if a.frame is None or b.frame is None:
         return False
@@ -213,21 +203,20 @@ def _on_one_map(a: Case, b: Case) -> bool:
 
 
 def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:
-    figure, (above, below) = style.panels(width_in, 2, 1.9)
+    figure, (above, below) = style.over_time(width_in, 1.9, ["apart (m)", "turned apart (deg)"])
     time = a.flight.time_s
     apart = position_error_m(b.track, a.track)
     turned = total_error_rad(rotation_error(b.track.q_nb, a.track.q_nb))
     style.draw(above, time, np.hypot(apart[:, 0], apart[:, 1]), style.BLUE, "horizontal")
     style.draw(above, time, np.abs(apart[:, 2]), style.ORANGE, "vertical")
     style.draw(below, time, np.degrees(turned), style.GREEN, "attitude")
-    above.set_ylabel("apart (m)")
-    below.set(ylabel="turned apart (deg)", xlabel="time (s)")
     style.legend_above(above)
     return figure
 
 
 def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
-    figure, (above, below) = style.panels(width_in, 2, 2.0)
+    labels = ["above the start (m)", "ground speed (m/s)"]
+    figure, (above, below) = style.over_time(width_in, 2.0, labels)
     for case, name, colour in zip((a, b), NAMES, AB_COLOURS, strict=True):
         track, scored = case.track, case.flight.scored
         alt = np.where(scored, track.alt_amsl_m, np.nan)
@@ -236,8 +225,6 @@ def _draw_profiles(a: Case, b: Case, width_in: float) -> Figure:
             style.draw(above, case.flight.time_s, alt - known[0], colour, name)
         speed = np.where(scored, np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1]), np.nan)
         style.draw(below, case.flight.time_s, speed, colour, name)
-    above.set_ylabel("above the start (m)")
-    below.set(ylabel="ground speed (m/s)", xlabel="time (s)")
     style.legend_above(above)
     return figure
 
@@ -269,6 +256,7 @@ def weights(case: Case) -> Section | None:
     thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
     if not _is_judged(thinned) or not _is_judged(full := blend_table(case.flight, case.fusion, 0)):
         return None
+    paper = PAPER_TABLE.rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
     return Section(
         "Alpha and beta: Table I",
         _lead(thinned),
@@ -283,7 +271,7 @@ def weights(case: Case) -> Section | None:
         [
             ReportTable(
                 "table1",
-                _beside_paper(thinned),
+                _renamed(thinned).merge(paper, on=["alpha", "beta"], how="left"),
                 "GPS thinned to one fix a second. Latitude and longitude: mean error against "
                 "interpolated GPS, as in the paper. Held out: horizontal RMS error at the fixes "
                 "withheld from the filter. Against reference: horizontal RMS error over the "
@@ -334,16 +322,9 @@ def _renamed(table: pd.DataFrame) -> pd.DataFrame:
     return table[known].rename(columns=names)
 
 
-def _beside_paper(table: pd.DataFrame) -> pd.DataFrame:
-    shown = _renamed(table)
-    paper = PAPER_TABLE.rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
-    merged: pd.DataFrame = shown.merge(paper, on=["alpha", "beta"], how="left")
-    return merged
-
-
 def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, 2.5 if width_in >= style.WIDE_IN else 4.2))
     wide = width_in >= style.WIDE_IN
+    figure = Figure(figsize=(width_in, 2.5 if wide else 4.2))
     axes = figure.subplots(1, 4) if wide else figure.subplots(2, 2)
     grids = [
         ("this flight, latitude", table, "north_m"),
@@ -366,9 +347,8 @@ def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
                 color="#ffffff" if dark else "#000000",
             )  # fmt: skip
         panel.set_title(title)
-        panel.set(xticks=range(len(WEIGHTS)), yticks=range(len(WEIGHTS)))
-        panel.set_xticklabels([f"{weight:g}" for weight in WEIGHTS])
-        panel.set_yticklabels([f"{weight:g}" for weight in WEIGHTS])
+        panel.set_xticks(range(len(WEIGHTS)), [f"{weight:g}" for weight in WEIGHTS])
+        panel.set_yticks(range(len(WEIGHTS)), [f"{weight:g}" for weight in WEIGHTS])
         panel.grid(visible=False)
         panel.set_xlabel("beta")
     for panel in axes.ravel()[:: 4 if wide else 2]:

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from gateway.analysis.blending import interpolate
 from gateway.analysis.case import Case
-from gateway.analysis.flight import FlightTrack, FloatArray, IntArray, LocalFrame, fixes_of
+from gateway.analysis.flight import FlightTrack, FloatArray, IntArray, LocalFrame
 from gateway.analysis.metrics import euler_rad, rms, worst
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
@@ -29,7 +29,7 @@ MAX_STEP_S: Final = 0.5
 def orientation(case: Case) -> Section | None:
     """Build the section; None without a compass."""
     flight = case.flight
-    if not np.isfinite(flight.mag_b_ut).any():
+    if not np.isfinite(flight.imu.mag_b_ut).any():
         return None
     lines = yaw_lines(case)
     below = "its error" if flight.reference else f"how far it is from the estimator {case.chosen}"
@@ -89,7 +89,7 @@ def yaw_lines(case: Case) -> YawLines:
     start = int(np.argmax(known))
     gyro_q = np.full((len(flight.time_us), 4), np.nan)
     gyro_q[start:] = _attitude_by_rate(
-        flight.time_us[start:], flight.gyro_b_radps[start:], judge.q_nb[start]
+        flight.time_us[start:], flight.imu.gyro_b_radps[start:], judge.q_nb[start]
     )
     reference_deg = continuous_yaw_deg(judge.q_nb)
     yaw = {GYRO: continuous_yaw_deg(gyro_q)}
@@ -135,7 +135,9 @@ def _attitude_by_rate(time_us: IntArray, gyro_b_radps: FloatArray, q_nb: FloatAr
 
 
 def _draw_yaw(case: Case, lines: YawLines, width_in: float) -> Figure:
-    figure, (above, below) = style.panels(width_in, 2, 2.3)
+    below_label = "yaw error (deg)" if case.flight.reference else "difference (deg)"
+    labels = ["yaw, turns counted on (deg)", below_label]
+    figure, (above, below) = style.over_time(width_in, 2.3, labels)
     time = case.flight.time_s
     if case.flight.reference:
         style.draw(
@@ -144,20 +146,17 @@ def _draw_yaw(case: Case, lines: YawLines, width_in: float) -> Figure:
     for (name, yaw), colour in zip(lines.yaw_deg.items(), COLOURS, strict=False):
         style.draw(above, time, yaw, colour, name)
         style.draw(below, time, lines.error_deg(name), colour, name)
-    above.set_ylabel("yaw, turns counted on (deg)")
-    below.set_ylabel("yaw error (deg)" if case.flight.reference else "difference (deg)")
-    below.set_xlabel("time (s)")
     style.legend_outside(figure, above, 4 if width_in >= style.WIDE_IN else 2)
     return figure
 
 
 def _draw_quaternion(case: Case, width_in: float) -> Figure:
-    figure, (axes,) = style.panels(width_in, 1, 2.8)
+    figure, (axes,) = style.over_time(width_in, 2.8, ["part of the quaternion (1)"])
     q_nb = continuous(case.track.q_nb)
     colours = (style.INK, style.BLUE, style.RED, style.GREEN)
     for name, part, colour in zip("wxyz", q_nb.T, colours, strict=True):
         style.draw(axes, case.flight.time_s, part, colour, name)
-    axes.set(xlabel="time (s)", ylabel="part of the quaternion (1)", ylim=(-1.05, 1.05))
+    axes.set_ylim(-1.05, 1.05)
     style.legend_above(axes)
     return figure
 
@@ -177,6 +176,7 @@ def ground_track(case: Case) -> Section | None:
     """Build the section of the map; None without GPS."""
     if case.frame is None:
         return None
+    broad = f", the broad line the {case.truth_name}" if case.flight.reference else ""
     return Section(
         "Ground track",
         "The flight from above, on a plain local map: no map tiles, so the page needs no network. "
@@ -186,7 +186,7 @@ def ground_track(case: Case) -> Section | None:
                 "ground_track",
                 lambda width: _draw_map(case, width),
                 "Metres east and north of the first fix, with a grid of latitude and longitude. "
-                + _map_caption(case),
+                f"Dots are GPS fixes, the line is the fused track{broad}.",
             )
         ],
     )
@@ -196,7 +196,7 @@ def gps_interpolation(case: Case) -> Section | None:
     """Build the section of figures 11 to 13; None without GPS."""
     if case.frame is None:
         return None
-    count = len(fixes_of(case.flight))
+    count = len(case.fixes)
     return Section(
         "GPS before and after interpolation",
         f"GPS measures {count} times in this flight, the IMU {len(case.flight.time_us)} "
@@ -227,16 +227,10 @@ def gps_interpolation(case: Case) -> Section | None:
     )
 
 
-def _map_caption(case: Case) -> str:
-    if case.flight.reference is None:
-        return "Dots are GPS fixes, the line is the fused track."
-    return f"Dots are GPS fixes, the line is the fused track, the broad line the {case.truth_name}."
-
-
 def _draw_map(case: Case, width_in: float) -> Figure:
     frame = case.frame
     assert frame is not None
-    fixes = fixes_of(case.flight)
+    fixes = case.fixes
     figure = Figure(figsize=(width_in, width_in * 0.72 if width_in >= style.WIDE_IN else 4.2))
     axes = figure.subplots()
     reference = case.flight.reference
@@ -245,7 +239,8 @@ def _draw_map(case: Case, width_in: float) -> Figure:
     north_m, east_m = frame.north_m(fixes.lat_deg), frame.east_m(fixes.lon_deg)
     axes.plot(east_m, north_m, ".", color=style.ORANGE, ms=3.2, label="GPS fixes")
     _path(axes, frame, case.track, style.BLUE, "fused", lw=1.2)
-    _start_and_end(axes, east_m, north_m)
+    axes.plot(east_m[0], north_m[0], "^", color=style.GREEN, ms=7, label="start")
+    axes.plot(east_m[-1], north_m[-1], "s", color=style.RED, ms=6, label="end", mfc="none")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="east of the first fix (m)", ylabel="north of the first fix (m)")
     style.legend_outside(figure, axes, 5 if width_in >= style.WIDE_IN else 3)
@@ -263,32 +258,25 @@ def _path(
     axes.plot(place[:, 1], place[:, 0], color=colour, label=label, **style_of)
 
 
-def _start_and_end(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> None:
-    axes.plot(east_m[0], north_m[0], "^", color=style.GREEN, ms=7, label="start")
-    axes.plot(east_m[-1], north_m[-1], "s", color=style.RED, ms=6, label="end", mfc="none")
-
-
 def _graticule(axes: Axes, frame: LocalFrame) -> None:
     """Label latitude and longitude on the upper and right side."""
     per_lat = float(frame.north_m(np.array([frame.lat_deg + 1.0]))[0])
     per_lon = float(frame.east_m(np.array([frame.lon_deg + 1.0]))[0])
-    right = axes.secondary_yaxis(
-        "right",
-        functions=(lambda m: frame.lat_deg + m / per_lat, lambda d: (d - frame.lat_deg) * per_lat),
-    )
-    top = axes.secondary_xaxis(
-        "top",
-        functions=(lambda m: frame.lon_deg + m / per_lon, lambda d: (d - frame.lon_deg) * per_lon),
-    )
-    for axis in (right.yaxis, top.xaxis):
+    for add, side, origin, scale, name in (
+        (axes.secondary_yaxis, "right", frame.lat_deg, per_lat, "latitude (deg)"),
+        (axes.secondary_xaxis, "top", frame.lon_deg, per_lon, "longitude (deg)"),
+    ):
+        functions = (
+            lambda m, o=origin, s=scale: o + m / s,
+            lambda d, o=origin, s=scale: (d - o) * s,
+        )
+        shown = add(side, functions=functions)
+        axis = shown.yaxis if side == "right" else shown.xaxis
         axis.get_major_formatter().set_useOffset(False)
         axis.set_major_locator(MaxNLocator(4))
-    right.tick_params(labelsize=7.0, labelcolor=style.MUTED)
-    top.tick_params(labelsize=7.0, labelcolor=style.MUTED)
-    right.spines["right"].set_visible(True)
-    top.spines["top"].set_visible(True)
-    right.set_ylabel("latitude (deg)", color=style.MUTED, fontsize=7.0)
-    top.set_xlabel("longitude (deg)", color=style.MUTED, fontsize=7.0)
+        axis.set_label_text(name, color=style.MUTED, fontsize=7.0)
+        shown.tick_params(labelsize=7.0, labelcolor=style.MUTED)
+        shown.spines[side].set_visible(True)
 
 
 def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> None:
@@ -317,7 +305,7 @@ def _scale_and_north(axes: Axes, east_m: FloatArray, north_m: FloatArray) -> Non
 
 def _excerpt(case: Case) -> tuple[int, int]:
     """Choose the fixes around the sharpest turn of the track."""
-    fixes = fixes_of(case.flight)
+    fixes = case.fixes
     course = np.unwrap(np.arctan2(fixes.vel_n_mps[:, 1], fixes.vel_n_mps[:, 0]))
     speed = np.hypot(fixes.vel_n_mps[:, 0], fixes.vel_n_mps[:, 1])
     seconds = case.flight.seconds(fixes.valid_us)
@@ -335,7 +323,7 @@ def _excerpt(case: Case) -> tuple[int, int]:
 def _draw_interpolation(case: Case, width_in: float) -> Figure:
     frame = case.frame
     assert frame is not None
-    fixes = fixes_of(case.flight)
+    fixes = case.fixes
     begin, end = _excerpt(case)
     figure, axes = style.panels(width_in, 1, 3.4, columns=2, share_x=False)
     place = frame.place(fixes.lat_deg[begin:end], fixes.lon_deg[begin:end])
@@ -353,26 +341,22 @@ def _draw_interpolation(case: Case, width_in: float) -> Figure:
 
 def _draw_coordinates(case: Case, width_in: float) -> Figure:
     flight = case.flight
-    fixes = fixes_of(flight)
+    fixes = case.fixes
     begin, end = _excerpt(case)
     low_us, high_us = fixes.arrival_us[begin], fixes.arrival_us[min(end, len(fixes) - 1)]
     rows = (flight.time_us >= low_us) & (flight.time_us <= high_us)
     time_us = flight.time_us[rows]
     straight = interpolate(fixes, time_us)
     held = np.searchsorted(fixes.arrival_us, time_us, side="right") - 1
-    figure, axes = style.panels(width_in, 2, 2.2)
+    figure, axes = style.over_time(width_in, 2.2, ["latitude (deg)", "longitude (deg)"])
     seconds = flight.seconds(time_us)
     for panel, name in zip(axes, ("lat_deg", "lon_deg"), strict=True):
-        panel.step(
-            seconds, getattr(fixes, name)[held], color=style.ORANGE, label="raw, held", lw=1.0
-        )
-        panel.plot(
-            seconds, getattr(straight, name), color=style.GREEN, label="interpolated", lw=1.6
-        )
+        raw = getattr(fixes, name)[held]
+        panel.step(seconds, raw, color=style.ORANGE, label="raw, held", lw=1.0)
+        line = getattr(straight, name)
+        panel.plot(seconds, line, color=style.GREEN, label="interpolated", lw=1.6)
         panel.plot(seconds, getattr(case.track, name)[rows], color=style.BLUE, label="fused")
         panel.yaxis.get_major_formatter().set_useOffset(False)
-    axes[0].set_ylabel("latitude (deg)")
-    axes[1].set(ylabel="longitude (deg)", xlabel="time (s)")
     style.legend_above(axes[0])
     return figure
 
@@ -380,21 +364,19 @@ def _draw_coordinates(case: Case, width_in: float) -> Figure:
 def _draw_residuals(case: Case, width_in: float) -> Figure:
     flight, frame = case.flight, case.frame
     assert frame is not None
-    fixes = fixes_of(flight)
+    fixes = case.fixes
     straight = interpolate(fixes, flight.time_us)
     base = frame.place(straight.lat_deg, straight.lon_deg)
     newest = np.searchsorted(fixes.arrival_us, flight.time_us, side="right") - 1
     held = frame.place(fixes.lat_deg[newest], fixes.lon_deg[newest]) - base
     fused = frame.place(case.track.lat_deg, case.track.lon_deg) - base
     held[~flight.scored], fused[~flight.scored] = np.nan, np.nan
-    figure, axes = style.panels(width_in, 2, 1.6)
-    for panel, axis, name in zip(axes, (0, 1), ("north (m)", "east (m)"), strict=True):
+    figure, axes = style.over_time(width_in, 1.6, ["north (m)", "east (m)"])
+    for axis, panel in enumerate(axes):
         style.draw(panel, flight.time_s, held[:, axis], style.ORANGE, "held", lw=0.8)
         style.draw(panel, flight.time_s, fused[:, axis], style.BLUE, "fused", lw=1.0)
-        panel.set_ylabel(name)
         if np.isfinite(held[:, axis]).any():
             limit = float(np.nanquantile(np.abs(held[:, axis]), 0.995)) + 1.0
             panel.set_ylim(-limit, limit)
-    axes[-1].set_xlabel("time (s)")
     style.legend_above(axes[0])
     return figure

@@ -1,7 +1,7 @@
 """The report as one self-contained HTML page, and its figures and tables as files."""
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -11,7 +11,7 @@ import pandas as pd
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from gateway.analysis.processes import START, copies, cores
+from gateway.analysis.processes import START, forked
 from gateway.analysis.reporting.style import (
     NARROW_IN,
     WIDE_IN,
@@ -116,13 +116,19 @@ def write_report(
     with written_together(folder) as fresh:
         for section in report.sections:
             for table in section.tables:
-                _write(fresh / f"{table.name}.csv", table.frame.to_csv(index=False).encode())
+                write_new(fresh / f"{table.name}.csv", [table.frame.to_csv(index=False).encode()])
         pictures = [picture for section in report.sections for picture in section.pictures]
         drawn = {}
-        for picture in draw_all(pictures, fresh, jobs or cores()):
-            drawn[picture.name] = picture
-            on_picture()
-        _write(fresh / PAGE_NAME, render_page(report, drawn).encode())
+
+        def draw(number: int) -> Drawn:
+            # A picture cannot be sent to another process, only be inherited.
+            return _drawn(pictures[number], fresh)
+
+        with forked(draw, jobs if START == "fork" else 1) as run:
+            for _, picture in run(range(len(pictures))):
+                drawn[picture.name] = picture
+                on_picture()
+        write_new(fresh / PAGE_NAME, [render_page(report, drawn).encode()])
     return folder / PAGE_NAME
 
 
@@ -150,44 +156,12 @@ def count_pictures(sections: Iterable[Section]) -> int:
     return sum(len(section.pictures) for section in sections)
 
 
-def draw_all(pictures: Sequence[Picture], folder: Path, jobs: int) -> Iterator[Drawn]:
-    """Draw pictures into files, in any order."""
-    if jobs == 1 or START != "fork":
-        yield from (_write_picture(picture, folder) for picture in pictures)
-        return
-    with copies(jobs, _begin, pictures, folder) as pool:
-        yield from pool.imap_unordered(_draw_one, range(len(pictures)))
-
-
-_work: tuple[Sequence[Picture], Path] | None = None
-"""Of a process that draws."""
-
-
-def _begin(pictures: Sequence[Picture], folder: Path) -> None:
-    global _work
-    _work = (pictures, folder)
-
-
-def _draw_one(index: int) -> Drawn:
-    assert _work is not None
-    pictures, folder = _work
-    return _write_picture(pictures[index], folder)
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_new(path, [content])
-
-
-def _write_picture(picture: Picture, folder: Path) -> Drawn:
+def _drawn(picture: Picture, folder: Path) -> Drawn:
     with styled():
         wide = picture.draw(WIDE_IN)
         wide_svg = to_svg(wide)
-        _write(folder / f"{picture.name}.png", to_png(wide))
+        write_new(folder / f"{picture.name}.png", [to_png(wide)])
         narrow_svg = to_svg(picture.draw(NARROW_IN))
-    _write(folder / f"{picture.name}.svg", stand_alone(wide_svg).encode())
-    return Drawn(
-        picture.name,
-        Markup(for_page(wide_svg)),
-        Markup(for_page(narrow_svg)),
-        prose(picture.caption),
-    )
+    write_new(folder / f"{picture.name}.svg", [stand_alone(wide_svg).encode()])
+    wide_part, narrow_part = Markup(for_page(wide_svg)), Markup(for_page(narrow_svg))
+    return Drawn(picture.name, wide_part, narrow_part, prose(picture.caption))

@@ -11,9 +11,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from gateway.analysis.case import Case
-from gateway.analysis.flight import FloatArray, fixes_of
+from gateway.analysis.flight import FloatArray
 from gateway.analysis.metrics import euler_rad
-from gateway.analysis.pilot_figures import FlightEvent, PilotFigures, pilot_figures
+from gateway.analysis.pilot_figures import PilotFigures
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Fact, Picture, ReportTable, Section
 
@@ -23,11 +23,6 @@ EVENT_COLOURS: Final = {"flight": style.GREEN, "gps": style.ORANGE, "link": styl
 EVENT_NAMES: Final = {"flight": "flight", "gps": "GPS lost", "link": "link lost"}
 KNOTS_PER_MPS: Final = 1.943844
 FEET_PER_M: Final = 3.28084
-
-
-def figures_of(case: Case) -> PilotFigures | None:
-    """Summarise the flight; None without GPS."""
-    return None if case.frame is None else pilot_figures(case.flight, case.track, case.frame)
 
 
 def pilot_facts(figures: PilotFigures) -> list[Fact]:
@@ -50,10 +45,13 @@ def pilot_facts(figures: PilotFigures) -> list[Fact]:
 
 def the_flight(case: Case) -> Section | None:
     """Build the section; None without GPS."""
-    figures = figures_of(case)
+    figures = case.figures
     if figures is None:
         return None
-    lat, lon = fixes_of(case.flight).lat_deg[0], fixes_of(case.flight).lon_deg[0]
+    lat, lon = case.fixes.lat_deg[0], case.fixes.lon_deg[0]
+    events = pd.DataFrame(
+        [(event.text, event.time_s) for event in figures.events], columns=["event", "at, s"]
+    )
     return Section(
         "The flight",
         f"From {lat:.5f}, {lon:.5f}, by the estimator `{case.chosen}`. In the air means faster "
@@ -75,7 +73,7 @@ def the_flight(case: Case) -> Section | None:
         ],
         [
             ReportTable("flight_figures", _figures_table(case, figures), "The flight in figures."),
-            ReportTable("flight_events", _events_table(figures.events), "Events.", digits=1),
+            ReportTable("flight_events", events, "Events.", digits=1),
         ],
     )
 
@@ -89,18 +87,15 @@ def _sum_text(gaps: tuple[tuple[float, float], ...]) -> str:
 def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
     outages = figures.gps_outages_s
     longest = f"longest {max(end - begin for begin, end in outages):.1f} s" if outages else ""
+    climb = _feet(60 * figures.climb_mps)
+    knots = f"{figures.fastest_mps * KNOTS_PER_MPS:.1f} kt"
     rows = [
         ("recorded", case.flight.duration_s, "s", ""),
         ("in the air", figures.airborne_s, "s", ""),
         ("distance over ground", figures.distance_m, "m", ""),
         ("highest above the first fix", figures.highest_m, "m", _feet(figures.highest_m)),
-        ("fastest over ground", figures.fastest_mps, "m/s", _knots(figures.fastest_mps)),
-        (
-            "fastest climb over a second",
-            figures.climb_mps,
-            "m/s",
-            _feet_a_minute(figures.climb_mps),
-        ),
+        ("fastest over ground", figures.fastest_mps, "m/s", knots),
+        ("fastest climb over a second", figures.climb_mps, "m/s", f"{climb}/min"),
         ("farthest from the first fix", figures.farthest_m, "m", ""),
         ("GPS outages", len(outages), "", longest),
         ("link losses", len(figures.link_losses_s), "", ""),
@@ -111,19 +106,6 @@ def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
 
 def _feet(metres: float) -> str:
     return f"{metres * FEET_PER_M:.0f} ft"
-
-
-def _feet_a_minute(mps: float) -> str:
-    return f"{_feet(60 * mps)}/min"
-
-
-def _knots(mps: float) -> str:
-    return f"{mps * KNOTS_PER_MPS:.1f} kt"
-
-
-def _events_table(events: tuple[FlightEvent, ...]) -> pd.DataFrame:
-    rows = [(event.text, event.time_s) for event in events]
-    return pd.DataFrame(rows, columns=["event", "at, s"])
 
 
 def _draw_map(case: Case, width_in: float) -> Figure:
@@ -156,7 +138,7 @@ def _draw_map(case: Case, width_in: float) -> Figure:
 
 
 def _mark_events(axes: Axes, case: Case) -> None:
-    figures, frame, track = figures_of(case), case.frame, case.track
+    figures, frame, track = case.figures, case.frame, case.track
     assert figures is not None
     assert frame is not None
     for kind, colour in EVENT_COLOURS.items():
@@ -173,34 +155,25 @@ def _mark_events(axes: Axes, case: Case) -> None:
 def _draw_over_time(case: Case, figures: PilotFigures, width_in: float) -> Figure:
     frame, track = case.frame, case.track
     assert frame is not None
-    figure, axes = style.panels(width_in, 5, 1.2)
     roll, pitch, _ = (np.degrees(angle) for angle in euler_rad(track.q_nb).T)
-    lines: tuple[tuple[str, FloatArray], ...] = (
-        (
-            "height (m)",
-            np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan),
-        ),
-        ("speed (m/s)", np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])),
-        ("roll (deg)", roll),
-        ("pitch (deg)", pitch),
-    )
-    for panel, (label, values) in zip(axes, lines, strict=False):
+    lines: dict[str, FloatArray] = {
+        "height (m)": np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan),
+        "speed (m/s)": np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1]),
+        "roll (deg)": roll,
+        "pitch (deg)": pitch,
+    }
+    figure, axes = style.over_time(width_in, 1.2, [*lines, ""])
+    for panel, (label, values) in zip(axes, lines.items(), strict=False):
         style.draw(panel, case.flight.time_s, values, style.BLUE, label, lw=1.0)
-        panel.set_ylabel(label)
     gaps = (("gps", figures.gps_outages_s), ("link", figures.link_losses_s))
     for panel in axes:
         for kind, found in gaps:
             for begin, end in found:
                 panel.axvspan(begin, end, color=EVENT_COLOURS[kind], alpha=0.25, lw=0)
-    _timeline(axes[-1], figures.events)
-    axes[-1].set_xlabel("time (s)")
-    return figure
-
-
-def _timeline(axes: Axes, events: tuple[FlightEvent, ...]) -> None:
     heights = {"flight": 2.0, "gps": 1.0, "link": 0.0}
     for kind, height in heights.items():
-        times = [event.time_s for event in events if event.kind == kind]
-        axes.plot(times, [height] * len(times), "|", color=EVENT_COLOURS[kind], ms=11, mew=2.0)
-    axes.set(ylim=(-0.6, 2.6), yticks=list(heights.values()))
-    axes.set_yticklabels([EVENT_NAMES[kind] for kind in heights])
+        times = [event.time_s for event in figures.events if event.kind == kind]
+        axes[-1].plot(times, [height] * len(times), "|", color=EVENT_COLOURS[kind], ms=11, mew=2.0)
+    axes[-1].set_ylim(-0.6, 2.6)
+    axes[-1].set_yticks(list(heights.values()), [EVENT_NAMES[kind] for kind in heights])
+    return figure

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from gateway.analysis.blending import MAX_GAP_S
 from gateway.analysis.case import Case
-from gateway.analysis.flight import Flight, FloatArray, IntArray, fixes_of
+from gateway.analysis.flight import Flight, FloatArray, IntArray
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
 from gateway.analysis.signals import (
@@ -92,7 +92,7 @@ def _excerpt(case: Case, axis: int, name: str) -> Picture:
 def liveliest(flight: Flight, axis: int) -> slice:
     """Find the stretch of `EXCERPT_S` in which a smoothed axis of the acceleration moves most."""
     count = min(max(round(EXCERPT_S * flight.rate_hz), 2), len(flight.time_us))
-    x = np.nan_to_num(flight.accel_b_mps2[:, axis])
+    x = np.nan_to_num(flight.imu.accel_b_mps2[:, axis])
     first = np.concatenate([[0.0], np.cumsum(x)])
     second = np.concatenate([[0.0], np.cumsum(x * x)])
     mean = (first[count:] - first[:-count]) / count
@@ -104,40 +104,36 @@ def liveliest(flight: Flight, axis: int) -> slice:
 def _draw_excerpt(case: Case, axis: int, width_in: float) -> Figure:
     flight = case.flight
     part = liveliest(flight, axis)
-    figure, axes = style.panels(width_in, 2, 2.0)
+    paper = case.fusion.estimation.paper
+    labels = [f"specific force {AXIS_NAMES[axis]} (m/s²)", "difference (m/s²)"]
+    figure, axes = style.over_time(width_in, 2.0, labels)
     time = flight.time_s[part]
-    raw = flight.accel_b_mps2[part, axis]
+    raw = flight.imu.accel_b_mps2[part, axis]
     axes[0].plot(time, raw, color=style.MUTED, lw=0.7, alpha=0.6, label="raw")
     filtered = {
-        kind: apply(kind, case.fusion.estimation.paper, flight.rate_hz, flight.accel_b_mps2)[
-            part, axis
-        ]
+        kind: apply(kind, paper, flight.rate_hz, flight.imu.accel_b_mps2)[part, axis]
         for kind in KINDS
     }
     for kind, line in filtered.items():
         dashes = (0, (4, 2)) if kind == "chebyshev" else "-"
         axes[0].plot(time, line, color=COLOURS[kind], ls=dashes, label=kind.capitalize())
-    axes[0].set_ylabel(f"specific force {AXIS_NAMES[axis]} (m/s²)")
     style.legend_above(axes[0])
     difference = filtered["chebyshev"] - filtered["butterworth"]
     axes[1].plot(time, difference, color=style.GREEN)
     axes[1].axhline(0.0, color=style.MUTED, lw=0.7)
-    axes[1].set(xlabel="time (s)", ylabel="difference (m/s²)")
     return figure
 
 
 def _draw_response(case: Case, width_in: float) -> Figure:
-    rate_hz = case.flight.rate_hz
+    rate_hz, paper = case.flight.rate_hz, case.fusion.estimation.paper
     figure, axes = style.panels(width_in, 1, 2.6, columns=3, share_x=True)
     for kind in KINDS:
-        found = response(kind, case.fusion.estimation.paper, rate_hz)
+        found = response(kind, paper, rate_hz)
         lines = (found.gain_db, found.phase_deg, found.delay_ms)
         for panel, line in zip(axes, lines, strict=True):
             panel.semilogx(found.frequency_hz, line, color=COLOURS[kind], label=kind.capitalize())
     for panel, label in zip(axes, ("gain (dB)", "phase (deg)", "group delay (ms)"), strict=True):
-        panel.axvline(
-            case.fusion.estimation.paper.accel_cutoff_hz, color=style.MUTED, lw=0.8, ls=":"
-        )
+        panel.axvline(paper.accel_cutoff_hz, color=style.MUTED, lw=0.8, ls=":")
         panel.set(xlabel="frequency (Hz)", ylabel=label)
     axes[0].set_ylim(bottom=-60.0)
     style.legend_above(axes[0], 2)
@@ -154,7 +150,7 @@ LONGEST_LOSS_US: Final = 60 * US_PER_S
 def noise(case: Case) -> Section:
     """Build the section of spectra and Allan deviations."""
     flight = case.flight
-    rest = longest_rest(flight.accel_b_mps2, flight.gyro_b_radps, flight.rate_hz)
+    rest = longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
     rest_s = (rest.stop - rest.start) / flight.rate_hz
     pictures = [
         Picture(
@@ -237,7 +233,7 @@ def missing_samples(node_time_us: IntArray) -> FloatArray:
 
 def magnetometer(case: Case) -> Section | None:
     """Build the section of the magnetometer's sphere; None without one."""
-    before, after = case.flight.mag_uncalibrated_b_ut, case.flight.mag_b_ut
+    before, after = case.flight.mag_uncalibrated_b_ut, case.flight.imu.mag_b_ut
     if before is None or not np.isfinite(after).any():
         return None
     before, after = before[np.isfinite(before[:, 0])], after[np.isfinite(after[:, 0])]
@@ -277,9 +273,9 @@ def magnetometer(case: Case) -> Section | None:
 def heights(case: Case) -> Section | None:
     """Build the section of height sources; None if there is only one."""
     flight = case.flight
-    if case.frame is None or not len(flight.baro_time_us):
+    if case.frame is None or not len(flight.baro[0]):
         return None
-    offset_m = baro_offset_m(flight)
+    offset_m = baro_offset_m(case)
     return Section(
         "Height sources",
         "Height above mean sea level by GPS, by the barometer and fused. The barometer gives the "
@@ -299,11 +295,10 @@ def heights(case: Case) -> Section | None:
     )
 
 
-def baro_offset_m(flight: Flight) -> float:
+def baro_offset_m(case: Case) -> float:
     """Mean difference of GPS height and barometer height."""
-    fixes = fixes_of(flight)
-    baro = np.interp(fixes.valid_us, flight.baro_time_us, flight.baro_alt_m)
-    return float(np.nanmean(fixes.alt_amsl_m - baro))
+    baro_m = np.interp(case.fixes.valid_us, *case.flight.baro)
+    return float(np.nanmean(case.fixes.alt_amsl_m - baro_m))
 
 
 def _height_table(case: Case, offset_m: float) -> pd.DataFrame:
@@ -323,10 +318,11 @@ def _height_table(case: Case, offset_m: float) -> pd.DataFrame:
 
 
 def _height_lines(case: Case, offset_m: float) -> dict[str, tuple[IntArray, FloatArray, str]]:
-    flight, fixes = case.flight, fixes_of(case.flight)
+    flight, fixes = case.flight, case.fixes
+    baro_us, baro_m = flight.baro
     return {
         "GPS": (fixes.valid_us, fixes.alt_amsl_m, style.ORANGE),
-        "barometer, shifted": (flight.baro_time_us, flight.baro_alt_m + offset_m, style.GREEN),
+        "barometer, shifted": (baro_us, baro_m + offset_m, style.GREEN),
         f"fused ({case.chosen})": (
             flight.time_us,
             np.where(flight.scored, case.track.alt_amsl_m, np.nan),
@@ -345,7 +341,7 @@ def _height_reference(case: Case, time_us: IntArray) -> FloatArray:
 
 def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
     flight = case.flight
-    figure, (above, below) = style.panels(width_in, 2, 2.1)
+    figure, (above, below) = style.over_time(width_in, 2.1, ["height AMSL (m)", "difference (m)"])
     if flight.reference is not None:
         truth = flight.reference.track.alt_amsl_m
         style.draw(above, flight.time_s, truth, style.REFERENCE, case.truth_name, lw=3, alpha=0.3)
@@ -355,38 +351,37 @@ def _draw_heights(case: Case, offset_m: float, width_in: float) -> Figure:
         alt_m = np.where(np.diff(seconds, append=seconds[-1:]) > MAX_GAP_S, np.nan, alt_m)
         style.draw(above, seconds, alt_m, colour, name, lw=1.0)
         style.draw(below, seconds, alt_m - _height_reference(case, time_us), colour, name, lw=1.0)
-    above.set_ylabel("height AMSL (m)")
-    below.set(ylabel="difference (m)", xlabel="time (s)")
     style.legend_above(above, 4 if width_in >= style.WIDE_IN else 2)
     return figure
 
 
 def _draw_spectrum(flight: Flight, width_in: float) -> Figure:
-    figure, (left, right) = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
-    signals = (
-        (left, flight.accel_b_mps2, "specific force ((m/s²)²/Hz)"),
-        (right, flight.gyro_b_radps, "angular rate ((rad/s)²/Hz)"),
-    )
-    for panel, x, label in signals:
-        frequency, density = power_density(x, flight.rate_hz)
-        for axis, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
-            panel.loglog(frequency, density[:, axis], color=colour, lw=1.0, label=name)
-        panel.set(xlabel="frequency (Hz)", ylabel=label)
-        style.legend_above(panel)
-    return figure
+    accel, gyro = flight.imu.accel_b_mps2, flight.imu.gyro_b_radps
+    lines = {
+        "specific force ((m/s²)²/Hz)": power_density(accel, flight.rate_hz),
+        "angular rate ((rad/s)²/Hz)": power_density(gyro, flight.rate_hz),
+    }
+    return _draw_logarithmic(lines, "frequency (Hz)", 1.0, width_in)
 
 
 def _draw_allan(flight: Flight, rest: slice, width_in: float) -> Figure:
-    figure, (left, right) = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
-    signals = (
-        (left, flight.accel_b_mps2, "specific force (m/s²)"),
-        (right, np.degrees(flight.gyro_b_radps), "angular rate (deg/s)"),
-    )
-    for panel, x, label in signals:
-        tau, deviation = allan_deviation(x[rest], flight.rate_hz)
-        for axis, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
-            panel.loglog(tau, deviation[:, axis], color=colour, label=name)
-        panel.set(xlabel="averaging time (s)", ylabel=f"Allan deviation,\n{label}")
+    accel, gyro = flight.imu.accel_b_mps2[rest], np.degrees(flight.imu.gyro_b_radps)[rest]
+    lines = {
+        "Allan deviation,\nspecific force (m/s²)": allan_deviation(accel, flight.rate_hz),
+        "Allan deviation,\nangular rate (deg/s)": allan_deviation(gyro, flight.rate_hz),
+    }
+    return _draw_logarithmic(lines, "averaging time (s)", 1.2, width_in)
+
+
+def _draw_logarithmic(
+    lines: dict[str, tuple[FloatArray, FloatArray]], xlabel: str, line_width: float, width_in: float
+) -> Figure:
+    """Draw x and the values of three axes over it, by the label of the panel."""
+    figure, axes = style.panels(width_in, 1, 2.7, columns=2, share_x=False)
+    for panel, (label, (x, values)) in zip(axes, lines.items(), strict=True):
+        for part, name, colour in zip(values.T, "xyz", AXIS_COLOURS, strict=True):
+            panel.loglog(x, part, color=colour, lw=line_width, label=name)
+        panel.set(xlabel=xlabel, ylabel=label)
         style.legend_above(panel)
     return figure
 
@@ -415,10 +410,8 @@ def _draw_sphere(before: FloatArray, after: FloatArray, width_in: float) -> Figu
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     step = max(1, len(before) // MAX_DOTS)
     for panel, (i, j) in zip(axes, ((0, 1), (0, 2)), strict=True):
-        panel.plot(
-            before[::step, i], before[::step, j], ".", color=style.ORANGE, ms=2, label="before"
-        )
-        panel.plot(after[::step, i], after[::step, j], ".", color=style.BLUE, ms=2, label="after")
+        for name, found, colour in (("before", before, style.ORANGE), ("after", after, style.BLUE)):
+            panel.plot(found[::step, i], found[::step, j], ".", color=colour, ms=2, label=name)
         panel.plot(radius * np.cos(angle), radius * np.sin(angle), color=style.INK, lw=0.8)
         panel.plot(0.0, 0.0, "+", color=style.INK, ms=8)
         panel.set_aspect("equal", adjustable="datalim")

@@ -6,7 +6,7 @@ replaced by CSS variables, so the page's own theme colours it.
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final
 
@@ -98,6 +98,17 @@ def panels(
     figure = Figure(figsize=(width_in, rows * row_height_in))
     axes = figure.subplots(rows, columns, sharex=share_x, squeeze=False)
     return figure, list(axes.ravel())
+
+
+def over_time(
+    width_in: float, row_height_in: float, labels: Sequence[str]
+) -> tuple[Figure, list[Axes]]:
+    """Create labelled panels one below the other over a time in seconds."""
+    figure, axes = panels(width_in, len(labels), row_height_in)
+    for panel, label in zip(axes, labels, strict=True):
+        panel.set_ylabel(label)
+    axes[-1].set_xlabel("time (s)")
+    return figure, axes
 
 
 def envelope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:

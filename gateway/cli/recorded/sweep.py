@@ -304,7 +304,7 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
 
 def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:
     """Put the best values into the whole settings."""
-    fusion: FusionSettings = sweeping.settings_at(contest, best)
+    fusion: FusionSettings = with_values(contest.fusion, contest.keys, best)
     return msgspec.structs.replace(settings, estimation=fusion.estimation)
 
 

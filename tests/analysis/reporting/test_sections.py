@@ -23,6 +23,6 @@ def test_lost_and_late_samples_are_measured() -> None:
 def test_the_excerpt_is_where_the_acceleration_changes() -> None:
     flight = short_flight()
     count = round(EXCERPT_S * flight.rate_hz)
-    accel = np.zeros_like(flight.accel_b_mps2)
+    accel = np.zeros_like(flight.imu.accel_b_mps2)
     accel[2 * count : 3 * count, 1] = np.resize([1.0, -1.0], count)
     assert liveliest(with_imu(flight, accel_b_mps2=accel), 1) == slice(2 * count, 3 * count)

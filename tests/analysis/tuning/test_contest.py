@@ -13,8 +13,8 @@ from gateway.analysis.sweep import (
     optimise,
     pool,
     run_trial,
-    settings_at,
     tabulate,
+    with_values,
 )
 from tests.analysis.flights import short_case, short_flight
 
@@ -24,7 +24,7 @@ LATENCY = "estimation.reference.gps_latency_s"
 
 def test_varying_an_estimators_setting_chooses_it() -> None:
     contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
-    settings = settings_at(contest, (0.3, 0.4))
+    settings = with_values(contest.fusion, contest.keys, (0.3, 0.4))
     assert settings.estimation.estimator == "paper"
     assert settings.estimation.paper.alpha_accel == 0.3
 
