@@ -81,6 +81,17 @@ class Recipient(Protocol):
         """Send one frame now or queue it; never block, never raise."""
 
 
+class FrameSource(Protocol):
+    """A client whose frames are forwarded."""
+
+    @property
+    def client_id(self) -> int:
+        """Unique for the lifetime of the hub."""
+
+    def count_received(self, frames: int, size: int, heard_us: int) -> None:
+        """Count frames that were forwarded by cached routes."""
+
+
 class Mavlink1Client:
     """A client that is sent MAVLink 1 frames.
 
@@ -224,7 +235,7 @@ class Route:
         Of the frames.
     targets : sequence of (Recipient, _RateLimit or None)
         The clients that get them, and how often.
-    source_id : int
+    source : FrameSource
         The client that brings them.
     path : Path
         Of the frames' system.
@@ -235,23 +246,27 @@ class Route:
     """
 
     __slots__ = (
-        "_direct", "_extra", "_limited", "_needs_frame", "_on_foreign", "_others", "_path",
-        "_rejects", "_source_id", "frames", "message_id", "size",
+        "_datagram_bytes", "_datagrams", "_direct", "_extra", "_heard_us", "_limited",
+        "_on_foreign", "_others", "_path", "_rejects", "_sent_us", "_source",
+        "frames", "message_id", "size",
     )  # fmt: skip
 
     def __init__(
         self,
         message_id: int,
         targets: Sequence[tuple[Recipient, _RateLimit | None]],
-        source_id: int,
+        source: FrameSource,
         path: Path,
         rejects: Callable[[MavFrame, int], bool] | None,
         on_foreign: Callable[[bytes], None] | None,
     ) -> None:
         self.message_id = message_id
-        self._source_id = source_id
+        self._source = source
         self.frames = self.size = 0
         """Not yet in the counters of the direct clients."""
+        self._datagrams = self._datagram_bytes = self._heard_us = 0
+        """Not yet in the figures of the source and of the path either."""
+        self._sent_us = path.stream.sent_us
         self._path = path
         self._rejects = rejects
         self._on_foreign = on_foreign
@@ -259,15 +274,15 @@ class Route:
         self._direct = [client for client in free if client.is_direct]
         self._others = [client for client in free if not client.is_direct]
         self._limited = [(client, limit) for client, limit in targets if limit is not None]
-        self._needs_frame = bool(self._others or self._limited or rejects is not None)
-        self._extra = CRC_EXTRA.get(message_id)
+        needs_frame = bool(self._others or self._limited or rejects is not None)
+        self._extra = None if needs_frame else CRC_EXTRA.get(message_id)
 
     def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
         """Send a frame to every client; a rejected one to none."""
         self._path.heard_us = now_us
         if not is_checked:
             if self._rejects is None:
-                self._path.stream.accept(frame.sequence, self._source_id, now_us)
+                self._path.stream.accept(frame.sequence, self._source.client_id, now_us)
             elif self._rejects(frame, now_us):
                 return
         for client in self._others:
@@ -278,18 +293,26 @@ class Route:
         self._write(frame.data)
 
     def forward_datagram(self, data: bytes, now_us: int) -> bool:
-        """Do the same with a datagram of this kind; return False if it is not one valid frame.
+        """Send a datagram of this kind to every client, and count it in bulk; see `settle`.
 
-        Most routes need nothing of the frame but its bytes and its sequence number.
+        Return False if it is not one valid frame, or the route needs more of the frame than its
+        bytes and its sequence number: then `forward` does it.
         """
-        if self._extra is None or not is_whole_frame(data, self._extra):
+        extra = self._extra
+        if extra is None or not is_whole_frame(data, extra):
             return False
-        if self._needs_frame:
-            self.forward(frame_of(data), now_us)
-            return True
-        self._path.heard_us = now_us
-        self._path.stream.accept(data[SEQUENCE_V2], self._source_id, now_us)
-        self._write(data)
+        self._datagrams += 1
+        self._datagram_bytes += len(data)
+        self._heard_us = now_us
+        self._sent_us[data[SEQUENCE_V2]] = now_us
+        for client in self._direct:
+            write = client.write
+            try:
+                write(data)
+            except OSError as error:
+                client.recover_uncounted(data, error)
+        if self._on_foreign is not None:
+            self._on_foreign(data)
         return True
 
     def _write(self, data: bytes) -> None:
@@ -297,17 +320,22 @@ class Route:
         self.frames += 1
         self.size += len(data)
         for client in self._direct:
+            write = client.write
             try:
-                client.write(data)
+                write(data)
             except OSError as error:
                 client.recover_uncounted(data, error)
         if self._on_foreign is not None:
             self._on_foreign(data)
 
     def settle(self) -> tuple[int, int]:
-        """Add the common count to the clients' counters; return the frames and bytes."""
+        """Add the common counts to the clients' counters; return the frames and bytes."""
         frames, size = self.frames, self.size
-        self.frames = self.size = 0
+        if datagrams := self._datagrams:
+            self._source.count_received(datagrams, self._datagram_bytes, self._heard_us)
+            self._path.count(datagrams, self._source.client_id, self._heard_us)
+            frames, size = frames + datagrams, size + self._datagram_bytes
+        self.frames = self.size = self._datagrams = self._datagram_bytes = 0
         if frames:
             for client in self._direct:
                 client.counters.sent += frames
@@ -476,21 +504,22 @@ class Fanout:
     def make_route(
         self,
         frame: MavFrame,
-        source_id: int,
+        source: FrameSource,
         path: Path,
         rejects: Callable[[MavFrame, int], bool] | None,
         on_foreign: Callable[[bytes], None] | None,
     ) -> Route:
         """Make the route of broadcasts like this one from a client; see `Route`."""
-        if max(len(self.cache.of(source_id)), len(self.cache.others)) >= MAX_ROUTES:
+        if max(len(self.cache.of(source.client_id)), len(self.cache.others)) >= MAX_ROUTES:
             self.cache.clear()
+        source_id = source.client_id
         targets: list[tuple[Recipient, _RateLimit | None]] = []
         for subscription in self._subscriptions.values():
             interval_us = subscription.interval_us(frame, is_ours=False)
             if subscription.client.client_id != source_id and interval_us != NO_MESSAGES:
                 limit = subscription.limit_of(frame.key, interval_us) if interval_us else None
                 targets.append((subscription.recipient, limit))
-        return Route(frame.message_id, targets, source_id, path, rejects, on_foreign)
+        return Route(frame.message_id, targets, source, path, rejects, on_foreign)
 
     def align(self, client_ids: Sequence[int]) -> None:
         """Send links to one peer the same frames, number for number, from now on.

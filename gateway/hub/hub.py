@@ -401,6 +401,7 @@ class Hub:
         # First, so that the next tick follows whatever happens below.
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
+        self._fanout.cache.settle()
         for endpoint in list(self._endpoints.values()):
             if not isinstance(endpoint, Client):
                 self._tick_one(endpoint, now_us)

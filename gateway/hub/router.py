@@ -239,7 +239,7 @@ class Router:
             path = path or Path(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
-            route = self._fanout.make_route(frame, source_id, path, rejects, self._on_foreign)
+            route = self._fanout.make_route(frame, client, path, rejects, self._on_foreign)
             if telemetry and (self._rejects is None or not client.may_return):
                 self._fanout.cache.of(source_id)[key] = route
             else:

@@ -99,6 +99,13 @@ class Path:
     copied_us: int = 0
     """When the newest copy was received."""
 
+    def count(self, frames: int, client_id: int, heard_us: int) -> None:
+        """Register frames whose sequence numbers are in the stream already."""
+        self.heard_us = max(self.heard_us, heard_us)
+        self.stream.count += frames
+        if heard_us >= self.stream.newest_us:
+            self.stream.newest_us, self.stream.leader = heard_us, client_id
+
     def is_fresh(self, now_us: int) -> bool:
         """Return whether a frame was received recently."""
         return now_us - self.heard_us <= ROUTE_FRESH_US

@@ -40,6 +40,9 @@ class Sink:
     def transmit(self, frame: MavFrame) -> None:
         self.frames.append((self.now_us, frame.data))
 
+    def count_received(self, frames: int, size: int, heard_us: int) -> None:
+        self.counters.received += frames
+
     def since(self, since_us: int) -> list[bytes]:
         return [frame for us, frame in self.frames if us >= since_us]
 
@@ -156,7 +159,8 @@ def test_a_link_of_a_few_bytes_gets_one_message_alone(budget: int) -> None:
 def test_what_another_vehicle_says_over_a_satellite_goes_to_all() -> None:
     flight = Flight("udp:h:1", "udp:h:2?budget=20", "udp:h:3?budget=5760")
     frame = b"\xfd\x01\0\0\0\x2a\1\xeb\0\0" + bytes(3)
-    flight.fanout.make_route(frame_of(frame), 9, Path(0, 0), None, None).forward(
+    source = Sink(9, "udp:h:9")
+    flight.fanout.make_route(frame_of(frame), source, Path(0, 0), None, None).forward(
         frame_of(frame), 10
     )
     assert [len(sink.frames) for sink in flight.sinks] == [1, 1, 1]

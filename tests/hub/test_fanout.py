@@ -40,6 +40,9 @@ class Peer:
         assert frames_in(frame.data) == [frame.data]
         self.sent.append(frame)
 
+    def count_received(self, frames: int, size: int, heard_us: int) -> None:
+        self.counters.received += frames
+
     def sequences(self) -> list[int]:
         return [frame.sequence for frame in self.sent]
 
@@ -58,7 +61,8 @@ def forward(fanout: Fanout, data: bytes, source_id: int, now_us: int = 0) -> Non
     frame = frame_of(data)
     routes = fanout.cache.of(source_id)
     if frame.key not in routes:
-        routes[frame.key] = fanout.make_route(frame, source_id, Path(0, 0), None, None)
+        source = Peer(Fanout(FrameSigner()), source_id)
+        routes[frame.key] = fanout.make_route(frame, source, Path(0, 0), None, None)
     routes[frame.key].forward(frame, now_us)
 
 
@@ -253,3 +257,26 @@ def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
             )
             forward(fanout, frame, 99, 0)
     assert len(fanout.cache.of(99)) <= MAX_ROUTES
+
+
+def test_datagrams_of_a_cached_route_are_counted_when_it_is_settled(
+    fanout: Fanout, vehicle: Sender
+) -> None:
+    class DirectPeer(Peer):
+        is_direct = True
+
+        def write(self, data: bytes) -> None:
+            self.sent.append(frame_of(data))
+
+    peer, source, path = DirectPeer(fanout, 1), DirectPeer(fanout, 2), Path(0, 0)
+    frames = [vehicle.attitude() for _ in range(3)]
+    route = fanout.make_route(frame_of(frames[0]), source, path, None, None)
+    assert all(route.forward_datagram(frame, 70 + i) for i, frame in enumerate(frames))
+    assert not route.forward_datagram(frames[0][:-1] + b"?", 99)
+    assert peer.frames == frames
+    assert route.settle() == (3, sum(map(len, frames)))
+    assert route.settle() == (0, 0)
+    assert (peer.counters.sent, source.counters.received) == (3, 3)
+    stream = path.stream
+    assert (path.heard_us, stream.count, stream.newest_us, stream.leader) == (72, 3, 72, 2)
+    assert list(stream.sent_us[:3]) == [70, 71, 72]

@@ -45,7 +45,7 @@ async def test_one_wake_up_takes_a_little_of_a_flood(rig: Any, kind: str) -> Non
         send(sock)
     async with asyncio.timeout(60):
         while taken[-1] < all_of_it:
-            client._on_readable(client._socket)
+            client._read()
             taken.append(client.counters.bytes_received)
             await asyncio.sleep(0)
     assert max(after - before for before, after in itertools.pairwise(taken)) <= READ_BYTES
@@ -107,5 +107,5 @@ async def test_untrusted_client_that_leaves_while_it_waits_is_not_read_again(rig
     send(sock)
     await rig.until(lambda: client.counters.bytes_received > len(NOISE))
     hub.vanish(client)
-    client._read_later(paused, client._on_readable)
+    client._read_later(paused, client._read)
     assert not hub.clients()

@@ -288,8 +288,8 @@ async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> Non
 class Waiting:
     """A socket with datagrams in it, which counts how often it is read."""
 
-    def __init__(self, *datagrams: bytes) -> None:
-        self.datagrams = list(datagrams)
+    def __init__(self) -> None:
+        self.datagrams: list[bytes] = []
         self.reads = 0
 
     def recv(self, _size: int) -> bytes:
@@ -306,24 +306,21 @@ async def test_datagrams_one_by_one_cost_one_read_each_and_a_burst_is_read_at_on
     hub = rig.hub(f"udp:127.0.0.1:{station.port}")
     await rig.until_open(hub)
     (client,) = hub._clients.values()
-    clock = [1_000_000]
-    monkeypatch.setattr(hub, "now_us", lambda: clock[0])
+    waiting = Waiting()
+    monkeypatch.setattr(client, "_socket", waiting)
+    read = client._reader(waiting)
 
-    def wake_up(waiting: Waiting) -> Waiting:
-        with monkeypatch.context() as patch:
-            patch.setattr(client, "_socket", waiting)
-            client._on_readable(waiting)
-        return waiting
+    def wake_up(after_us: int, *datagrams: bytes) -> int:
+        rig.clock.us += after_us
+        waiting.datagrams += datagrams
+        waiting.reads = 0
+        read()
+        return waiting.reads
 
     for _ in range(3):
-        clock[0] += 1000
-        alone = wake_up(Waiting(station.sender.heartbeat()))
-        assert (alone.reads, alone.datagrams) == (1, [])
-    burst = Waiting(*(station.sender.heartbeat() for _ in range(10)))
-    clock[0] += 1000
-    assert wake_up(burst).reads == 1
-    clock[0] += 50
-    assert (wake_up(burst).reads, burst.datagrams) == (11, [])
+        assert (wake_up(1000, station.sender.heartbeat()), waiting.datagrams) == (1, [])
+    assert wake_up(1000, *(station.sender.heartbeat() for _ in range(10))) == 1
+    assert (wake_up(50), waiting.datagrams) == (10, [])
     assert client.counters.received == 13
 
 

@@ -232,9 +232,13 @@ class Client:
         elif not self.endpoint.monitor:
             self.context.deliver(self, frame, now_us)
 
-    def limit_reads(
-        self, sock: socket.socket, read: Callable[[socket.socket], None], size: int
-    ) -> None:
+    def count_received(self, frames: int, size: int, heard_us: int) -> None:
+        """Count frames that were forwarded by cached routes."""
+        self.counters.received += frames
+        self.counters.bytes_received += size
+        self.heard_us = max(self.heard_us or 0, heard_us)
+
+    def limit_reads(self, sock: socket.socket, read: Callable[[], None], size: int) -> None:
         """Stop reading for a while from an untrusted client, if all such sent too much."""
         if self.trusted:
             return
@@ -243,14 +247,14 @@ class Client:
             self.loop.remove_reader(sock)
             self._read_later(sock, read)
 
-    def _read_later(self, sock: socket.socket, read: Callable[[socket.socket], None]) -> None:
+    def _read_later(self, sock: socket.socket, read: Callable[[], None]) -> None:
         if sock.fileno() < 0:
             # Closed meanwhile.
             return
         if pause_us := self.read_pause_us():
             self.loop.call_later(pause_us / US_PER_S, self._read_later, sock, read)
         else:
-            self.loop.add_reader(sock, read, sock)
+            self.loop.add_reader(sock, read)
 
     def read_pause_us(self) -> int:
         """Return how long not to read from this client."""

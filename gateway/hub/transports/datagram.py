@@ -4,6 +4,7 @@ import asyncio
 import socket
 import struct
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint
@@ -16,8 +17,8 @@ NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 4096
 """Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
 are cut off."""
-READ_BUDGET: Final = 64
-"""Datagrams read at one wake-up, if they are small."""
+READS: Final = (None,) * 64
+"""Most datagrams read at one wake-up, if they are small; faster to iterate than a range."""
 ALONE_US: Final = 300
 """A datagram that arrives so long after the last wake-up is most likely the only one. A second
 read, which would raise BlockingIOError, is omitted; if there are more, the loop wakes again."""
@@ -36,7 +37,7 @@ class DatagramClient(Client):
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
     _is_gathering = False
-    _woken_us = 0
+    _read: Callable[[], None]
 
     def __post_init__(self) -> None:
         """Start without a socket."""
@@ -91,19 +92,13 @@ class DatagramClient(Client):
         self._socket = sock
         self.write = self._direct = write
         self.revive()
-        self.loop.add_reader(sock, self._on_readable, sock)
+        self._read = self._reader(sock)
+        self.loop.add_reader(sock, self._read)
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process one datagram of this peer."""
         if self.state != "open":
             self.revive()
-        route = self.routes.get(data[KEY_V2])
-        if route is not None and route.forward_datagram(data, now_us):
-            counters = self.counters
-            counters.received += 1
-            counters.bytes_received += len(data)
-            self.heard_us = now_us
-            return
         frame = read_datagram(data)
         if frame is None:
             self.receive(split_datagram(data), len(data), now_us)
@@ -182,7 +177,7 @@ class DatagramClient(Client):
         if self._socket is not None and not isinstance(self.loop, asyncio.SelectorEventLoop):
             # libuv stops watching a socket with an error.
             self.loop.remove_reader(self._socket)
-            self.loop.add_reader(self._socket, self._on_readable, self._socket)
+            self.loop.add_reader(self._socket, self._read)
 
     def _wait(self, data: bytes) -> None:
         """Queue datagrams while the socket buffer is full; the oldest makes room."""
@@ -204,30 +199,44 @@ class DatagramClient(Client):
         self.loop.remove_writer(sock)
         self.write = self._direct
 
-    def _on_readable(self, sock: socket.socket) -> None:
-        now_us = self.context.now_us()
-        is_alone = now_us - self._woken_us > ALONE_US
-        self._woken_us = now_us
-        size, most = 0, 0 if is_alone else self.context.read_bytes
-        for _ in range(READ_BUDGET):
+    def _reader(self, sock: socket.socket) -> Callable[[], None]:
+        """Return the function that reads a socket; its names are looked up once, not each time."""
+        context, routes, receive = self.context, self.routes, sock.recv
+        now, woken_us = context.now_us, 0
+
+        def read() -> None:
+            nonlocal woken_us
+            now_us = now()
+            is_alone = now_us - woken_us > ALONE_US
+            woken_us = now_us
+            size, most = 0, 0 if is_alone else context.read_bytes
             try:
-                data = sock.recv(MAX_DATAGRAM)
-            except BlockingIOError:
-                break
-            except ConnectionRefusedError:
-                self._note_refusal()
-                return
+                for _ in READS:
+                    data = receive(MAX_DATAGRAM)
+                    size += len(data)
+                    route = routes.get(data[KEY_V2])
+                    if (
+                        route is None
+                        or self.state != "open"
+                        or not route.forward_datagram(data, now_us)
+                    ):
+                        self.accept(data, now_us)
+                        if self._socket is not sock:
+                            return
+                    if size >= most:
+                        break
             except OSError as error:
-                self.become("unreachable", error)
-                return
-            size += len(data)
-            self.accept(data, now_us)
-            if self._socket is not sock:
-                return
-            if size >= most:
-                break
-        if not self.trusted:
-            self.limit_reads(sock, self._on_readable, size)
+                self._note_read_error(error)
+            if not self.trusted:
+                self.limit_reads(sock, read, size)
+
+        return read
+
+    def _note_read_error(self, error: OSError) -> None:
+        if isinstance(error, ConnectionRefusedError):
+            self._note_refusal()
+        elif not isinstance(error, BlockingIOError):
+            self.become("unreachable", error)
 
 
 class DatagramPeer(DatagramClient):

@@ -7,6 +7,7 @@ connection when nothing was acknowledged for long.
 import asyncio
 import socket
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port
@@ -133,6 +134,7 @@ class StreamClient(QueuedClient):
     _chunk_bytes = CHUNK_BYTES
     _joined = 0
     """Bytes written to the present segment."""
+    _read: Callable[[], None]
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once if nothing waits, else queue it."""
@@ -158,7 +160,8 @@ class StreamClient(QueuedClient):
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock
         self._splitter.reset()
-        self.loop.add_reader(sock, self._on_readable, sock)
+        self._read = partial(self._on_readable, sock)
+        self.loop.add_reader(sock, self._read)
         self.begin()
 
     def begin(self) -> None:
@@ -251,7 +254,7 @@ class StreamClient(QueuedClient):
             return
         self.accept(data, self.context.now_us())
         if self._socket is sock:
-            self.limit_reads(sock, self._on_readable, len(data))
+            self.limit_reads(sock, self._read, len(data))
 
 
 class StreamListener(Listener[Peer]):

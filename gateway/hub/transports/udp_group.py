@@ -7,11 +7,12 @@ the first.
 
 import socket
 import struct
+from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import EndpointKind
 from gateway.hub.transports.base import RETRY_US
-from gateway.hub.transports.datagram import MAX_DATAGRAM, READ_BUDGET, DatagramClient
+from gateway.hub.transports.datagram import MAX_DATAGRAM, READS, DatagramClient
 
 MULTICAST_HOPS: Final = 1
 """The local network only."""
@@ -73,7 +74,7 @@ class GroupClient(DatagramClient):
 
     def _on_group(self, sock: socket.socket) -> None:
         size, most = 0, self.context.read_bytes
-        for _ in range(READ_BUDGET):
+        for _ in READS:
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
             except OSError:
@@ -83,7 +84,7 @@ class GroupClient(DatagramClient):
                 self.accept(data, self.context.now_us())
             if size >= most:
                 break
-        self.limit_reads(sock, self._on_group, size)
+        self.limit_reads(sock, partial(self._on_group, sock), size)
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:

@@ -15,7 +15,7 @@ from gateway.hub.transports.base import READ_BYTES, RETRY_US, HubContext, Listen
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,
     MAX_DATAGRAM,
-    READ_BUDGET,
+    READS,
     DatagramPeer,
     bound_socket,
     local_host_of,
@@ -132,7 +132,7 @@ class UdpListener(Listener[DatagramPeer]):
     def _pass_on_others(self, sock: socket.socket, peer: Address, local_host: str) -> None:
         """Process datagrams of others that arrived between bind and connect of a socket."""
         size = 0
-        for _ in range(READ_BUDGET):
+        for _ in READS:
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
             except OSError:
