@@ -69,7 +69,7 @@ FILTER: Final = "gateway.estimation.eskf"
 VALIDITY: Final = ("delayed.store_integrals", "delayed.look_back", "delayed.past_state")
 SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hanging")
 MECHANISMS: Final = (
-    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("vibration",)),
+    Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("predict.add_vibration",)),
     Mechanism(
         "steps of the gyroscope bias", "predict", "unexpected_bias_density", NO_NUMBER,
         ("predict.unexpected_bias_density", "predict.follow_bias_steps"),

@@ -35,7 +35,7 @@ from gateway.compiled.entry_point import (
 
 KERNEL_MODULES: Final = (
     "gateway.estimation.eskf.filter",
-    "gateway.estimation.smoother.forward",
+    "gateway.estimation.smoother",
     "gateway.recordings.stream_clock",
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",

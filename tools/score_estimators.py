@@ -33,7 +33,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
-from gateway.estimation.smoother.smoother import smooth
+from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180, wrap_pi
 from tools.flights import Flight, north_east_m, read_flight, run_paper, simulated_flight
 from tools.peers import PEERS

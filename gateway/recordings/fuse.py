@@ -27,7 +27,7 @@ from gateway.estimation.kernel import (
     SampleLog,
 )
 from gateway.estimation.select import EstimationSettings
-from gateway.estimation.smoother.smoother import smooth
+from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180
 from gateway.recordings.columns import (
     BARO,

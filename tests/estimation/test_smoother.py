@@ -22,7 +22,7 @@ from gateway.estimation.eskf.state import STATES
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
-from gateway.estimation.smoother.smoother import AXES_RAD, _backward, smooth
+from gateway.estimation.smoother import AXES_RAD, _backward, smooth
 from tools.flights import Flight, read_flight, simulated_flight
 from tools.score_estimators import (
     attitude_scores,

@@ -28,12 +28,7 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.eskf.update import (
-    begin_row,
-    inject,
-    innovation_variance,
-    update_scalar,
-)
+from gateway.estimation.eskf.update import begin_row, inject, innovation_variance, update_scalar
 from gateway.estimation.record import FloatArray, as_quat
 from gateway.geometry.quaternion import body_axes
 from gateway.records import Vec3

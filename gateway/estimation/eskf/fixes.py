@@ -13,12 +13,7 @@ from gateway.estimation.columns import (
     GPS_USABLE,
     GPS_VEL,
 )
-from gateway.estimation.eskf.alignment import (
-    MEMORY_S,
-    NOISE_MPS,
-    TRACK_NOISE_MPS,
-    add_velocity,
-)
+from gateway.estimation.eskf.alignment import MEMORY_S, NOISE_MPS, TRACK_NOISE_MPS, add_velocity
 from gateway.estimation.eskf.delayed import (
     is_unlikely,
     look_back,
@@ -30,11 +25,18 @@ from gateway.estimation.eskf.faults import gap_limit_s, is_sound
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import watch_latency
 from gateway.estimation.eskf.magnetometer import raise_hard_iron_by_dip, turn_heading
-from gateway.estimation.eskf.measurements import restart_baro
 from gateway.estimation.eskf.predict import propagate
 from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import GPS_ERROR, GYRO_SCALE, NEVER_S, POS, VEL, State
-from gateway.estimation.eskf.update import reset_state
+from gateway.estimation.eskf.state import (
+    GPS_ERROR,
+    GYRO_SCALE,
+    NEVER_S,
+    POS,
+    VEL,
+    State,
+    reset_state,
+)
+from gateway.estimation.eskf.update import restart_baro
 from gateway.estimation.record import FloatArray, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.records import NAN, Vec3

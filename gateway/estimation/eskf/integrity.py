@@ -22,12 +22,6 @@ from gateway.estimation.eskf.alignment import (
     level_difference,
 )
 from gateway.estimation.eskf.magnetometer import reset_hard_iron, turn_heading
-from gateway.estimation.eskf.measurements import (
-    gravity_force_n,
-    gravity_variance,
-    sustained_sq,
-    update_gravity,
-)
 from gateway.estimation.eskf.predict import NO_HEADING_VAR, propagate
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
@@ -37,8 +31,16 @@ from gateway.estimation.eskf.state import (
     GYRO_SCALE,
     VEL,
     State,
+    level_variance,
+    raise_variance,
+    reset_state,
 )
-from gateway.estimation.eskf.update import level_variance, raise_variance, reset_state
+from gateway.estimation.eskf.update import (
+    gravity_force_n,
+    gravity_variance,
+    sustained_sq,
+    update_gravity,
+)
 from gateway.estimation.record import as_quat, fill, write_quat
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 from gateway.units import STANDARD_GRAVITY_MPS2

@@ -18,15 +18,17 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.eskf.predict import NO_HEADING_VAR, propagate
 from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import ACCEL_BIAS, ATT, GYRO_SCALE, HARD_IRON, MAG_LATENCY, State
-from gateway.estimation.eskf.update import (
-    begin_row,
-    consider,
-    inject,
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
+    GYRO_SCALE,
+    HARD_IRON,
+    MAG_LATENCY,
+    State,
     raise_variance,
     reset_state,
-    update_scalar,
 )
+from gateway.estimation.eskf.update import begin_row, consider, inject, update_scalar
 from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (

@@ -38,16 +38,12 @@ from gateway.estimation.eskf.state import (
     STATES,
     VEL,
     State,
+    limit_variance,
+    raise_variance,
+    scale_state,
 )
-from gateway.estimation.eskf.update import limit_variance, raise_variance, scale_state
 from gateway.estimation.record import FloatArray, as_quat, fill, write_quat, write_vec
-from gateway.geometry.quaternion import (
-    body_axes,
-    from_rotation_vector,
-    multiply,
-    normalise,
-    rotate,
-)
+from gateway.geometry.quaternion import body_axes, from_rotation_vector, multiply, normalise, rotate
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -63,6 +59,8 @@ BIAS_CHANCE_SQ: Final = 6.0
 """A sum is chance up to this multiple of its variance: chi-squared of 1, 98.6 %."""
 BIAS_RAISE_S: Final = 0.3
 """Time in which the rest is added to the variance of the bias."""
+STEP_LIMIT: Final = 1e4
+"""A larger squared change from sample to sample is a fault, and NaN compares false."""
 CLIMB_DENSITY: Final = 4.0
 """Random walk of the height without GPS, m2/s: a climb of 2 m/s that lasts for a second."""
 
@@ -118,6 +116,28 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     s.pending_noise[1] += p.accel_scale_sq * SCALE_S * accel_sq * dt
     s.pending_s += dt
     follow_gravity(s, p, force_i, dt)
+
+
+@compiled
+def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
+    """Add the noise by how the changes from sample to sample change: motion is steady, noise not.
+
+    The second difference contains the noise of three samples, the middle one twice: six variances
+    on each of three axes.
+    """
+    gyro_sq = accel_sq = 0.0
+    for k in range(3):
+        change = gyro[k] - s.imu_before[k]
+        gyro_sq += (change - s.imu_change[k]) ** 2
+        s.imu_change[k] = change
+        change = accel[k] - s.imu_before[3 + k]
+        accel_sq += (change - s.imu_change[3 + k]) ** 2
+        s.imu_change[3 + k] = change
+        s.imu_before[k], s.imu_before[3 + k] = gyro[k], accel[k]
+    if gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
+        share = dt * dt / 18.0
+        s.pending_noise[0] += p.gyro_vibration_sq * share * gyro_sq
+        s.pending_noise[1] += p.accel_vibration_sq * share * accel_sq
 
 
 @compiled

@@ -10,14 +10,10 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.columns import FRESH_GPS_S
-from gateway.estimation.eskf.integrity import (
-    lose_attitude,
-    require_bias_variance,
-)
+from gateway.estimation.eskf.integrity import lose_attitude, require_bias_variance
 from gateway.estimation.eskf.magnetometer import UNTURNED_RAD, begin_turn, reset_hard_iron
 from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State
-from gateway.estimation.eskf.update import reset_state
+from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State, reset_state
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 

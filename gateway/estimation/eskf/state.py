@@ -16,8 +16,10 @@ The error state, in the order of the covariance's rows:
 | MAG_LATENCY | age of the field in a magnetometer sample | s |
 """
 
+import math
 from typing import Annotated, Final
 
+from gateway.compiled import compiled
 from gateway.estimation.record import FloatArray
 
 ATT: Final = 0
@@ -275,3 +277,41 @@ class State:
     """How often each state was reset."""
     raised: Annotated[FloatArray, (STATES,)]
     """Variance added to each state outside the process model."""
+
+
+@compiled
+def level_variance(s: State) -> float:
+    """Return the variance of roll and pitch together, rad2."""
+    return float(s.P[ATT, ATT] + s.P[ATT + 1, ATT + 1])
+
+
+@compiled
+def reset_state(s: State, k: int, variance: float) -> None:
+    """Give one state a new variance, uncorrelated with the others."""
+    s.resets[k] += 1.0
+    for j in range(STATES):
+        s.P[k, j] = 0.0
+        s.P[j, k] = 0.0
+    s.P[k, k] = variance
+
+
+@compiled
+def raise_variance(s: State, k: int, more: float) -> None:
+    """Add to the variance of one state outside the process model."""
+    s.P[k, k] += more
+    s.raised[k] += more
+
+
+@compiled
+def scale_state(P: FloatArray, k: int, share: float) -> None:
+    """Scale a row and a column of a covariance; the correlations stay."""
+    for j in range(STATES):
+        P[k, j] *= share
+        P[j, k] *= share
+
+
+@compiled
+def limit_variance(P: FloatArray, k: int, most: float) -> None:
+    """Limit the variance of one state; the correlations stay."""
+    if P[k, k] > most:
+        scale_state(P, k, math.sqrt(most / P[k, k]))

@@ -1,4 +1,6 @@
-"""The measurement update: one number at a time, gated, with the states that must not change.
+"""The measurement update, and the measurements other than GPS and compass.
+
+An update is one number at a time, gated, with the states that must not change.
 
 A measurement of several numbers is several scalar updates, so no matrix is inverted. `h` is the row
 of the measurement matrix; innovations are reduced by what earlier rows of the same group have
@@ -15,6 +17,8 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.eskf.predict import propagate
+from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
     ATT,
@@ -29,11 +33,28 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.record import FloatArray, as_quat, fill, write_quat
-from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
+from gateway.estimation.record import as_quat, fill, write_quat
+from gateway.geometry.quaternion import (
+    body_axes,
+    from_rotation_vector,
+    multiply,
+    normalise,
+    rotate,
+    rotate_inverse,
+)
+from gateway.records import Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 NO_GATE_SQ: Final = 1e12
 """A gate that no innovation reaches."""
+GRAVITY_TOLERANCE: Final = 0.02
+"""A mean force beyond gravity by more than this share, an MPU6050's scale error, accelerates."""
+LEVEL_INTERVAL_S: Final = 0.1
+"""Interval of the measurements that stand in for GPS."""
+REST_VELOCITY_VAR: Final = 0.2**2
+"""Of a vehicle that idles, m2/s2."""
+REST_RATE_VAR: Final = 0.002**2
+"""Of the mean rate at rest, which has the noise of an idling engine, rad2/s2."""
 
 
 @compiled
@@ -114,38 +135,88 @@ def inject(s: State) -> None:
 
 
 @compiled
-def level_variance(s: State) -> float:
-    """Return the variance of roll and pitch together, rad2."""
-    return float(s.P[ATT, ATT] + s.P[ATT + 1, ATT + 1])
+def gravity_force_n(s: State) -> Vec3:
+    """Return the low-pass filtered force in NED by the present attitude, m/s2."""
+    f = s.force_lp_i
+    force_b = rotate_inverse(as_quat(s.q_ib), (f[1, 0], f[1, 1], f[1, 2]))
+    return rotate(as_quat(s.q_nb), force_b)
 
 
 @compiled
-def reset_state(s: State, k: int, variance: float) -> None:
-    """Give one state a new variance, uncorrelated with the others."""
-    s.resets[k] += 1.0
+def sustained_sq(s: State) -> float:
+    """Return the square of the horizontal acceleration that a mean force beyond gravity implies."""
+    f = s.force_lp_i
+    most = (1.0 + GRAVITY_TOLERANCE) * STANDARD_GRAVITY_MPS2 + math.sqrt(
+        s.P[ACCEL_BIAS, ACCEL_BIAS]
+    )
+    return float(max(f[1, 0] ** 2 + f[1, 1] ** 2 + f[1, 2] ** 2 - most * most, 0.0))
+
+
+@compiled
+def gravity_variance(s: State, p: Gains) -> float:
+    """Return the variance of one horizontal axis of the filtered force, m2/s4."""
+    settling = 2.0 * p.gravity_tau_s / s.force_lp_s
+    motion = p.gravity_motion_sq * (1.0 + settling * settling) * s.force_dev_sq
+    return p.gravity_var + motion + sustained_sq(s)
+
+
+@compiled
+def update_gravity(s: State, p: Gains, dt: float) -> None:
+    """Level by the direction of the filtered force, whose errors last for its time constants.
+
+    The bias of the accelerometer cannot be separated from tilt here, so it is only considered: the
+    covariance of the level contains it, and the first fixes resolve both.
+    """
+    propagate(s, p)
+    north, east, down = gravity_force_n(s)
+    variance = gravity_variance(s, p) * max(1.0, 2.0 * p.gravity_tau_s / dt)
+    x, y, z = body_axes(as_quat(s.q_nb))
+    for k in range(2):
+        begin_row(s)
+        consider(s, ACCEL_BIAS, 3)
+        consider(s, ATT + 2, 1)
+        s.h[ATT + 1 - k] = down if k == 0 else -down
+        s.h[ACCEL_BIAS] = -x[k]
+        s.h[ACCEL_BIAS + 1] = -y[k]
+        s.h[ACCEL_BIAS + 2] = -z[k]
+        update_scalar(s, -north if k == 0 else -east, variance, p.gate_sq)
+    inject(s)
+
+
+@compiled
+def update_rest(s: State, p: Gains) -> None:
+    """Update by rest: the mean rate is the gyroscope's bias, and the velocity is zero."""
+    propagate(s, p)
+    for k in range(3):
+        begin_row(s)
+        s.h[GYRO_BIAS + k] = 1.0
+        update_scalar(s, s.gyro_mean[k] - s.gyro_bias_b[k], REST_RATE_VAR, NO_GATE_SQ)
+    if s.aided == 1:
+        for k in range(3):
+            begin_row(s)
+            s.h[VEL + k] = 1.0
+            update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
+    inject(s)
+
+
+@compiled
+def update_height(s: State, p: Gains) -> None:
+    """Update by the barometer's depth."""
+    propagate(s, p)
+    begin_row(s)
+    s.h[POS + 2] = 1.0
+    s.h[BARO_OFFSET] = -1.0
+    update_scalar(s, s.baro_down_m + s.baro_offset_m - s.pos_n[2], p.baro_var, p.gate_sq)
+    inject(s)
+
+
+@compiled
+def restart_baro(s: State, p: Gains) -> None:
+    """Take the barometer's offset from the present height."""
+    propagate(s, p)
+    s.baro_offset_m = s.pos_n[2] - s.baro_down_m
+    s.resets[BARO_OFFSET] += 1.0
     for j in range(STATES):
-        s.P[k, j] = 0.0
-        s.P[j, k] = 0.0
-    s.P[k, k] = variance
-
-
-@compiled
-def raise_variance(s: State, k: int, more: float) -> None:
-    """Add to the variance of one state outside the process model."""
-    s.P[k, k] += more
-    s.raised[k] += more
-
-
-@compiled
-def scale_state(P: FloatArray, k: int, share: float) -> None:
-    """Scale a row and a column of a covariance; the correlations stay."""
-    for j in range(STATES):
-        P[k, j] *= share
-        P[j, k] *= share
-
-
-@compiled
-def limit_variance(P: FloatArray, k: int, most: float) -> None:
-    """Limit the variance of one state; the correlations stay."""
-    if P[k, k] > most:
-        scale_state(P, k, math.sqrt(most / P[k, k]))
+        s.P[BARO_OFFSET, j] = s.P[POS + 2, j]
+        s.P[j, BARO_OFFSET] = s.P[j, POS + 2]
+    s.P[BARO_OFFSET, BARO_OFFSET] = s.P[POS + 2, POS + 2] + p.baro_var

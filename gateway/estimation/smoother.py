@@ -1,0 +1,432 @@
+"""A recorded flight from both ends: the Rauch-Tung-Striebel smoother over the Kalman filter.
+
+The filter runs forward as live. At each node a copy of it continues by inertial samples alone; at
+the next node the two differ by the corrections of all measurements in between, late fixes included,
+in whatever order they came. Backward, each node is corrected by the correction of the next one, in
+proportion to their covariance [1]_, so an outage is bridged from its end as well. What came before
+a reset is not corrected by what came after.
+
+Where manoeuvres contradict the GPS latency that is set, the flight is smoothed with the latency
+that they show.
+
+References
+----------
+.. [1] H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic
+   systems", AIAA Journal 3(8), 1965.
+"""
+
+import math
+from typing import Final
+
+import numpy as np
+
+from gateway.compiled import address_of, array_at, compiled, record_at
+from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.columns import (
+    ATTITUDE_VALID,
+    CLIPPED,
+    GPS_COLUMNS,
+    HEADING_VALID,
+    HEADING_VALID_RAD,
+    IMU_COLUMNS,
+    NAV_ALT,
+    NAV_ATTITUDE_STD,
+    NAV_COLUMNS,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_LON,
+    NAV_POS_STD,
+    NAV_QUAT,
+    NAV_VEL,
+    NAV_VEL_STD,
+    imu_vectors,
+)
+from gateway.estimation.eskf.filter import (
+    FLOAT,
+    GAINS_LAYOUT,
+    INT,
+    LEVEL_VALID_RAD,
+    STATE_LAYOUT,
+    move,
+    row_at,
+    take_baro,
+    take_imu,
+    write_output,
+    write_position,
+)
+from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.latency import begin_certain
+from gateway.estimation.eskf.predict import COVARIANCE_S, apply_transition, propagate
+from gateway.estimation.eskf.settings import Gains
+from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
+    BARO_OFFSET,
+    GPS_ERROR,
+    GYRO_BIAS,
+    GYRO_SCALE,
+    HARD_IRON,
+    MAG_LATENCY,
+    MOVING_STATES,
+    POS,
+    STATES,
+    VEL,
+    State,
+)
+from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.record import FloatArray, IntArray, as_quat, copy_record
+from gateway.geometry.angle import wrap_180
+from gateway.geometry.geodesy import displacement_m, radii_m
+from gateway.geometry.quaternion import multiply
+
+NODE_S: Final = 0.5
+"""Interval of the nodes; in between the corrections are interpolated."""
+LASTING_CORRELATION_S: Final = 0.75
+LASTING_VIBRATION: Final = 1.5
+"""Slow errors are noise to a filter that fades, but not to averages over minutes: the smoother
+counts fewer fixes as independent, and more of the vibration, which aliases to slow errors."""
+AXES_RAD: Final = 0.005
+"""Error of the sensor axes, which averages do not reduce: half a per cent."""
+LEAST_VAR: Final = 1e-24
+RIDGE: Final = 1e-9
+"""Added to the correlation matrix so that it can be inverted."""
+BLOCK: Final = 256
+"""Nodes whose gains are computed at once."""
+BYTES_PER_SECOND: Final = round(3 * 8 * STATES * STATES / NODE_S)
+"""Memory for a second of flight."""
+
+STATE_SIZE: Final = STATE_LAYOUT.itemsize
+MATRIX: Final = STATES * STATES
+BYTE: Final = np.dtype(np.uint8)
+
+
+@compiled
+def predict_copy(s: State, p: Gains, F: FloatArray) -> None:
+    """Propagate the copy's covariance and the transition."""
+    apply_transition(s, F, STATES)
+    kept = math.exp(-s.pending_s / p.gps_error_s)
+    for j in range(STATES):
+        for k in range(3):
+            F[GPS_ERROR + k, j] *= kept
+    propagate(s, p)
+
+
+@compiled
+def correction(s: State, copy: State, d: FloatArray) -> None:
+    """Write the filter's state minus the copy's, as errors."""
+    c = as_quat(copy.q_nb)
+    q = multiply(as_quat(s.q_nb), (c[0], -c[1], -c[2], -c[3]))
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    angle = 2.0 * math.atan2(sine, abs(q[0]))
+    share = math.copysign(angle / sine if sine > 1e-12 else 2.0, q[0])
+    north, east = displacement_m(copy.origin[0], copy.origin[1], s.origin[0], s.origin[1], 0.0)
+    for k in range(3):
+        d[ATT + k] = share * q[1 + k]
+        d[VEL + k] = s.vel_n[k] - copy.vel_n[k]
+        moved = north if k == 0 else (east if k == 1 else 0.0)
+        d[POS + k] = s.pos_n[k] + moved - copy.pos_n[k]
+        d[GYRO_BIAS + k] = s.gyro_bias_b[k] - copy.gyro_bias_b[k]
+        d[ACCEL_BIAS + k] = s.accel_bias_b[k] - copy.accel_bias_b[k]
+        d[GPS_ERROR + k] = s.gps_error_n[k] - copy.gps_error_n[k]
+        d[HARD_IRON + k] = s.hard_iron_b[k] - copy.hard_iron_b[k]
+        d[GYRO_SCALE + k] = s.gyro_scale_b[k] - copy.gyro_scale_b[k]
+    d[BARO_OFFSET] = s.baro_offset_m - copy.baro_offset_m
+    d[MAG_LATENCY] = s.mag_latency_s - copy.mag_latency_s
+
+
+@compiled
+def end_stretch(s: State, copy: State, F: FloatArray, predicted: FloatArray) -> None:
+    """Write the predicted covariance, and cut the transition of states that were reset.
+
+    So are states that are not estimated without GPS: velocity and position, and what is only
+    considered then.
+    """
+    unaided = min(s.aided, copy.aided) == 0
+    for i in range(STATES):
+        for j in range(STATES):
+            predicted[i, j] = copy.P[i, j]
+    for i in range(STATES):
+        unestimated = VEL <= i < POS + 3 or ACCEL_BIAS <= i < ACCEL_BIAS + 3
+        unestimated = unestimated or GYRO_SCALE <= i < GYRO_SCALE + 3
+        if copy.started == 0 or s.resets[i] != copy.resets[i] or (unaided and unestimated):
+            for j in range(STATES):
+                F[i, j] = predicted[i, j] = predicted[j, i] = 0.0
+            predicted[i, i] = 1.0
+
+
+@compiled
+def is_reset(s: State, copy: State) -> bool:
+    """Return whether a part of the filter has been reset since the copy was made."""
+    for k in range(STATES):
+        if s.resets[k] != copy.resets[k]:
+            return True
+    return bool(s.started != copy.started)
+
+
+@compiled
+def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: FloatArray) -> None:
+    """Move the copy by one IMU sample, if the filter has used it."""
+    if s.started == 0 or time_us <= s.time_us:
+        return
+    s.time_us, s.time_s = time_us, (time_us - s.base_us) * 1e-6
+    if not used:
+        return
+    gyro, accel, _ = imu_vectors(row)
+    dt, s.imu_s = s.time_s - s.imu_s, s.time_s
+    move(s, p, gyro, accel, row[CLIPPED], dt)
+    if s.pending_s >= COVARIANCE_S:
+        predict_copy(s, p, F)
+
+
+@compiled
+def share_raised(s: State, copy: State) -> None:
+    """Raise variances of the copy as those of the filter."""
+    for k in range(STATES):
+        copy.P[k, k] += s.raised[k] - copy.raised[k]
+        copy.raised[k] = s.raised[k]
+
+
+@compiled
+def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> None:
+    """Write the prediction, and of its standard deviations what the covariance does not contain.
+
+    Where the filter was reset, its own output stands.
+    """
+    chosen = s if reset else copy
+    write_output(chosen, p, row)
+    if s.aided == 0:
+        write_position(s, row)
+    flags = int(row[NAV_FLAGS]) | (ATTITUDE_VALID if chosen.started == 1 else 0)
+    if chosen.heading_known == 1 and chosen.heading_true == 1:
+        flags |= HEADING_VALID
+    row[NAV_FLAGS] = float(flags)
+    if reset:
+        return
+    for k in range(3):
+        row[NAV_ATTITUDE_STD + k] = beyond(row[NAV_ATTITUDE_STD + k], copy.P[ATT + k, ATT + k])
+        row[NAV_VEL_STD + k] = beyond(row[NAV_VEL_STD + k], copy.P[VEL + k, VEL + k])
+        row[NAV_POS_STD + k] = beyond(row[NAV_POS_STD + k], copy.P[POS + k, POS + k])
+
+
+@compiled
+def beyond(std: float, variance: float) -> float:
+    """Return the part of a standard deviation beyond a variance; NaN stays."""
+    rest = std * std - variance
+    return 0.0 if rest < 0.0 else math.sqrt(rest)
+
+
+@EntryPoint
+def run_forward(
+    states: int,
+    gains: int,
+    node_count: int,
+    nodes_at: int,
+    imu_count: int,
+    imu_times_us: int,
+    imu_rows: int,
+    baro_count: int,
+    baro_times_us: int,
+    baro_alts_m: int,
+    gps_count: int,
+    gps_times_us: int,
+    gps_rows: int,
+    outputs: int,
+    covariances: int,
+    transitions: int,
+    predictions: int,
+    corrections: int,
+    resets: int,
+) -> None:
+    """Run the filter, and a copy of it from each node to the next; all arguments are addresses.
+
+    `states` are two records, `nodes` the index of the first sample of each stretch and the end.
+    Written are the output rows, and by stretch the covariance at its begin, the transition, the
+    predicted covariance and the correction; by sample whether the filter was reset.
+    """
+    s = record_at(states, STATE_LAYOUT)
+    copy = record_at(states + STATE_SIZE, STATE_LAYOUT)
+    both = array_at(states, (2, STATE_SIZE), BYTE)
+    p = record_at(gains, GAINS_LAYOUT)
+    nodes = array_at(nodes_at, (node_count,), INT)
+    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
+    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
+    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
+    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    was_reset = array_at(resets, (imu_count,), BYTE)
+    baros = fixes = 0
+    for k in range(node_count - 1):
+        P = array_at(covariances + 8 * k * MATRIX, (STATES, STATES), FLOAT)
+        F = array_at(transitions + 8 * k * MATRIX, (STATES, STATES), FLOAT)
+        propagate(s, p)
+        for i in range(STATES):
+            for j in range(STATES):
+                P[i, j] = s.P[i, j]
+                F[i, j] = 1.0 if i == j else 0.0
+        for i in range(STATE_SIZE):
+            both[1, i] = both[0, i]
+        for i in range(nodes[k], nodes[k + 1]):
+            now_us, row = imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS)
+            while baros < baro_count and baro_time_us[baros] <= now_us:
+                take_baro(s, p, baro_alt_m[baros])
+                baros += 1
+            while fixes < gps_count and gps_time_us[fixes] <= now_us:
+                take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
+                fixes += 1
+            take_imu(s, p, now_us, row)
+            move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
+            share_raised(s, copy)
+            reset = is_reset(s, copy)
+            was_reset[i] = 1 if reset else 0
+            write_row(s, copy, p, reset, row_at(outputs, i, NAV_COLUMNS))
+        propagate(s, p)
+        predict_copy(copy, p, F)
+        predicted = array_at(predictions + 8 * k * MATRIX, (STATES, STATES), FLOAT)
+        end_stretch(s, copy, F, predicted)
+        correction(s, copy, row_at(corrections, k, STATES))
+
+
+def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, float]:
+    """Smooth a whole log.
+
+    Parameters
+    ----------
+    estimator : KernelEstimator
+        The Kalman filter, fresh or in a state to continue from; it is not changed.
+    log : SampleLog
+        At each IMU sample, the barometer samples and fixes that are not later come first. Takes
+        `BYTES_PER_SECOND` of memory.
+
+    Returns
+    -------
+    states : ndarray, shape (n, NAV_COLUMNS)
+        One row per IMU sample. Rates are the filter's; attitude and heading are valid where their
+        smoothed standard deviation allows it.
+    latency_s : float
+        The GPS latency that the flight was smoothed with.
+    """
+    gains: Gains = copy_record(estimator.gains)
+    gains.gps_latency_s = latency_s = estimator.latency_of(log)
+    gains.gps_correlation_s = max(gains.gps_correlation_s, LASTING_CORRELATION_S)
+    gains.gyro_vibration_sq *= LASTING_VIBRATION
+    state = estimator.state
+    begin_certain(state, latency_s)
+    states = np.zeros(2, np.asarray(state).dtype)
+    states[0] = state
+    nodes = _nodes(log.imu_time_us)
+    count = len(nodes) - 1
+    out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+    P, F, predicted = (np.empty((count, STATES, STATES)) for _ in range(3))
+    d, reset = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
+    inputs = [
+        nodes, log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
+    ]  # fmt: skip
+    inputs = [np.ascontiguousarray(array) for array in inputs]
+    at = [address_of(array) for array in inputs]
+    run_forward(
+        address_of(states), address_of(gains), len(nodes), at[0],
+        len(inputs[1]), at[1], at[2], len(inputs[3]), at[3], at[4], len(inputs[5]), at[5], at[6],
+        *map(address_of, (out, P, F, predicted, d, reset)),
+    )  # fmt: skip
+    begins, ends, variances = _backward(P, F, predicted, d, states[0]["P"])
+    _correct(out, log.imu_time_us, nodes, begins, ends, variances, reset != 0)
+    return out, latency_s
+
+
+def _nodes(time_us: IntArray) -> IntArray:
+    """Return the index of the first sample in each `NODE_S`, and the end."""
+    if len(time_us) == 0:
+        return np.zeros(1, np.int64)
+    slot = (time_us - time_us[0]) // round(NODE_S * 1e6)
+    firsts = np.flatnonzero(np.diff(slot, prepend=slot[0] - 1) != 0)
+    return np.append(firsts, len(time_us)).astype(np.int64)
+
+
+def _backward(
+    P: FloatArray, F: FloatArray, predicted: FloatArray, d: FloatArray, last_P: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Run the recursion from the end, whose covariance is `last_P`.
+
+    Returns the corrections at the begin of each stretch and of the predictions at its end, shape
+    (m + 1, STATES) and (m, STATES), and the smoothed variances, (m + 1, STATES).
+    """
+    count = len(d)
+    begins, ends = np.zeros((count + 1, STATES)), np.empty((count, STATES))
+    variances = np.empty((count + 1, STATES))
+    later_P = last_P
+    variances[count] = np.diagonal(later_P)
+    for k in range(count - 1, -1, -1):
+        if k % BLOCK == BLOCK - 1 or k == count - 1:
+            first = k - k % BLOCK
+            gains = _gains(P[first : k + 1], F[first : k + 1], predicted[first : k + 1])
+        gain = gains[k - first]
+        ends[k] = d[k] + begins[k + 1]
+        begins[k] = gain @ ends[k]
+        later_P = P[k] + gain @ (later_P - predicted[k]) @ gain.T
+        variances[k] = np.diagonal(later_P)
+    return begins, ends, variances
+
+
+def _gains(P: FloatArray, F: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Compute `P F^T predicted^-1` for many nodes, on correlations, which are of one size."""
+    scale = np.sqrt(np.maximum(np.diagonal(predicted, axis1=1, axis2=2), LEAST_VAR))
+    norm = predicted / (scale[:, :, None] * scale[:, None, :]) + RIDGE * np.eye(STATES)
+    gains = np.linalg.solve(norm, (F @ P) / scale[:, :, None]).transpose(0, 2, 1)
+    return np.asarray(gains / scale[:, None, :])
+
+
+def _correct(
+    out: FloatArray,
+    time_us: IntArray,
+    nodes: IntArray,
+    begins: FloatArray,
+    ends: FloatArray,
+    variances: FloatArray,
+    reset: np.ndarray,
+) -> None:
+    """Apply the corrections between the nodes, and write the smoothed standard deviations."""
+    stretch = np.repeat(np.arange(len(nodes) - 1), np.diff(nodes))
+    if len(stretch) == 0:
+        return
+    # A stretch begins at the last sample of the one before.
+    start_us = time_us[np.maximum(nodes[:-1] - 1, 0)]
+    length = np.maximum(time_us[nodes[1:] - 1] - start_us, 1)
+    share = ((time_us - start_us[stretch]) / length[stretch])[:, None]
+    # A reset cannot be interpolated: the filter's own output is corrected as at the next node.
+    cut = np.add.reduceat(reset, nodes[:-1])[stretch] > 0
+    share[cut, 0] = reset[cut]
+    following = np.where(reset[:, None], begins[stretch + 1], ends[stretch])
+    off = (1.0 - share) * begins[stretch] + share * following
+    quat = slice(NAV_QUAT, NAV_QUAT + 4)
+    out[:, quat] = _rotated(off[:, ATT : ATT + 3], out[:, quat])
+    # Without GPS, position and velocity are those of the newest fix, and no states.
+    aided = np.isfinite(out[:, NAV_POS_STD])
+    out[aided, NAV_VEL : NAV_VEL + 3] += off[aided, VEL : VEL + 3]
+    if aided.any():
+        lat_deg = float(out[np.argmax(aided), NAV_LAT])
+        meridian_m, parallel_m = radii_m(lat_deg, 0.0)
+        out[aided, NAV_LAT] += np.degrees(off[aided, POS] / meridian_m)
+        lon_deg = out[aided, NAV_LON] + np.degrees(off[aided, POS + 1] / parallel_m)
+        out[aided, NAV_LON] = wrap_180(lon_deg)
+        out[aided, NAV_ALT] -= off[aided, POS + 2]
+    variance = ((1.0 - share) * variances[stretch] + share * variances[stretch + 1])[
+        :, :MOVING_STATES
+    ]
+    variance[reset] = 0.0
+    variance[:, ATT : ATT + 3] += AXES_RAD**2
+    for column, first in ((NAV_ATTITUDE_STD, ATT), (NAV_VEL_STD, VEL), (NAV_POS_STD, POS)):
+        std = out[:, column : column + 3]
+        std[:] = np.sqrt(std**2 + np.maximum(variance[:, first : first + 3], 0.0))
+    attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
+    flags = out[:, NAV_FLAGS].astype(np.int64)
+    flags[attitude_std[:, :2].max(axis=1) >= LEVEL_VALID_RAD] &= ~ATTITUDE_VALID
+    flags[attitude_std[:, 2] >= HEADING_VALID_RAD] &= ~HEADING_VALID
+    out[:, NAV_FLAGS] = flags
+
+
+def _rotated(turn: FloatArray, q: FloatArray) -> FloatArray:
+    """Rotate attitudes by small rotation vectors in NED, shape (n, 3) and (n, 4)."""
+    angle = np.linalg.norm(turn, axis=1, keepdims=True)
+    w, v = np.cos(0.5 * angle), turn * (0.5 * np.sinc(0.5 * angle / math.pi))
+    vector = w * q[:, 1:] + q[:, :1] * v + np.cross(v, q[:, 1:])
+    scalar = w * q[:, :1] - np.sum(v * q[:, 1:], axis=1, keepdims=True)
+    return np.hstack([scalar, vector])

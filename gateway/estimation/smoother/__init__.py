@@ -1,1 +1,0 @@
-"""A recorded flight smoothed from both ends."""
