@@ -93,20 +93,7 @@ def imu_row(sample: ImuSample) -> ImuRow:
 def imu_rows(
     accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, mag_b_ut: FloatArray, flags: IntArray
 ) -> FloatArray:
-    """Lay out many IMU samples.
-
-    Parameters
-    ----------
-    accel_b_mps2, gyro_b_radps, mag_b_ut : ndarray, shape (n, 3)
-        Unfiltered; the field NaN unless new.
-    flags : ndarray of int, shape (n,)
-        `ImuFlags`.
-
-    Returns
-    -------
-    ndarray, shape (n, IMU_COLUMNS)
-        What `imu_row` gives for each.
-    """
+    """Lay out n IMU samples, as `imu_row` each: vectors (n, 3), and `ImuFlags` (n,)."""
     shown = [(flags & int(bits)) != 0 for bits in ROW_FLAGS]
     return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
@@ -122,22 +109,7 @@ def imu_vectors(row: FloatArray) -> tuple[Vec3, Vec3, Vec3]:
 
 
 def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsRow:
-    """Lay out a fix together with the Earth's magnetic field at its position.
-
-    Parameters
-    ----------
-    fix : GpsFix
-        As it arrived.
-    settings : ReferenceSettings
-        Limits of usable fixes.
-    earth : EarthField
-        Updated with the position of a usable fix.
-
-    Returns
-    -------
-    tuple of floats
-        `GPS_COLUMNS` of them.
-    """
+    """Lay out a fix, and the Earth's magnetic field, which a usable fix updates."""
     lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
     usable = is_usable(fix, settings)
     if usable:
@@ -161,20 +133,7 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
 
 
 def nav_state(time_us: int, row: FloatArray) -> NavState:
-    """Read a navigation state out of a kernel's output row.
-
-    Parameters
-    ----------
-    time_us : int
-        Gateway clock.
-    row : ndarray, shape (NAV_COLUMNS,)
-        Output of a kernel.
-
-    Returns
-    -------
-    NavState
-        The same as a record.
-    """
+    """Read a navigation state out of a kernel's output row, shape (NAV_COLUMNS,)."""
     v = row.tolist()
     return NavState(
         time_us=time_us,
@@ -226,19 +185,9 @@ FRESH_GPS_S: Final = 1.5
 
 @compiled
 def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
-    """Return the flags that follow from the age of the last accepted and rejected fix.
+    """Return the bits of `NavFlags` that follow from the age of the last fix and rejected one.
 
-    Parameters
-    ----------
-    since_fix_s, since_reject_s : float
-        Ages in s.
-    hold_s : float
-        Dead reckoning longer than this is no position any more.
-
-    Returns
-    -------
-    int
-        Bits of `NavFlags`.
+    Dead reckoning for longer than `hold_s` is no position any more.
     """
     flags = POSITION_VALID | VELOCITY_VALID if since_fix_s < hold_s else 0
     flags |= USING_GPS if since_fix_s < FRESH_GPS_S else DEAD_RECKONING | DEGRADED

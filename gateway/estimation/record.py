@@ -23,17 +23,9 @@ Declared = TypeVar("Declared")
 
 
 def layout(declaration: type) -> np.dtype[np.void]:
-    """Derive the memory layout from a declaration.
+    """Derive the memory layout: one 8-byte aligned field per annotation of a class, in their order.
 
-    Parameters
-    ----------
-    declaration : type
-        A class whose annotations are `float`, `int` or `Annotated[FloatArray, shape]`.
-
-    Returns
-    -------
-    numpy.dtype
-        Structured type with one 8-byte aligned field per annotation, in their order.
+    The annotations are `float`, `int` or `Annotated[FloatArray, shape]`.
     """
     return _layout(cast(Hashable, declaration))
 
@@ -53,45 +45,16 @@ def _layout(declaration: Hashable) -> np.dtype[np.void]:
 
 
 def new_record(declaration: type[Declared]) -> Declared:
-    """Make a record of zeros.
-
-    Parameters
-    ----------
-    declaration : type
-        See `layout`.
-
-    Returns
-    -------
-    Declared
-        A numpy record that behaves as declared.
-    """
+    """Make a record of zeros."""
     return cast(Declared, np.zeros(1, layout(declaration))[0])
 
 
 def filled_record(declaration: type[Declared], values: dict[str, Any]) -> Declared:
-    """Make a record and fill every field; a field without a value is an error.
-
-    Parameters
-    ----------
-    declaration : type
-        See `layout`.
-    values : dict
-        By field name; further names are ignored.
-
-    Returns
-    -------
-    Declared
-        The filled record.
-
-    Raises
-    ------
-    KeyError
-        If a field has no value.
-    """
-    record = np.zeros(1, layout(declaration))[0]
-    for name in record.dtype.names or ():
-        record[name] = values[name]
-    return cast(Declared, record)
+    """Make a record of values by field name; KeyError for a missing one, others are ignored."""
+    record = new_record(declaration)
+    for name in layout(declaration).names or ():
+        setattr(record, name, values[name])
+    return record
 
 
 def copy_record(record: Declared) -> Declared:
@@ -110,25 +73,7 @@ def pack_record(record: object) -> Packed:
 
 
 def unpack_record(declaration: type[Declared], packed: Packed) -> Declared:
-    """Read a record back.
-
-    Parameters
-    ----------
-    declaration : type
-        See `layout`.
-    packed : Packed
-        From `pack_record`.
-
-    Returns
-    -------
-    Declared
-        The same to the last bit.
-
-    Raises
-    ------
-    ValueError
-        If it was written from another declaration, or is damaged.
-    """
+    """Read a record back; raises ValueError if it is one of another declaration, or damaged."""
     wanted, (mark, data) = layout(declaration), packed
     if mark != _mark(wanted) or len(data) != wanted.itemsize:
         raise ValueError("a state of another layout")

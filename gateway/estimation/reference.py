@@ -56,20 +56,7 @@ class ReferenceSettings(Settings, frozen=True):
 
 
 def is_usable(fix: GpsFix, settings: ReferenceSettings) -> bool:
-    """Return whether a fix may be fused.
-
-    Parameters
-    ----------
-    fix : GpsFix
-        As it came; an accuracy that is not known (NaN) does not speak against it.
-    settings : ReferenceSettings
-        The accuracy limit.
-
-    Returns
-    -------
-    bool
-        False for no fix, a fix that the receiver does not confirm, or values that cannot be.
-    """
+    """Return whether a fix may be fused; one of unknown accuracy (NaN) may."""
     return (
         fix.fix_ok
         and fix.fix_type in USABLE_FIXES
@@ -83,13 +70,7 @@ EarthLocation = tuple[float, float, MagneticField]
 
 
 class EarthField:
-    """The magnetic reference: looked up once, and again after a long way.
-
-    Parameters
-    ----------
-    settings : ReferenceSettings
-        Whether the declination comes from the model.
-    """
+    """The magnetic reference: looked up once, and again after a long way."""
 
     def __init__(self, settings: ReferenceSettings) -> None:
         self._settings = settings
@@ -113,20 +94,7 @@ class EarthField:
         return math.nan if self.state is None else self.state[2].declination_rad
 
     def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
-        """Look up the field at a position, if it is far from the last one.
-
-        Parameters
-        ----------
-        lat_deg, lon_deg, alt_m : float
-            Where the aircraft is.
-        utc_us : int or None
-            Unix time, if known.
-
-        Returns
-        -------
-        bool
-            Whether the field was looked up again.
-        """
+        """Look up the field at a position and Unix time; return False if it is near the last."""
         if self.state is not None:
             north_m, east_m = displacement_m(*self.state[:2], lat_deg, lon_deg, alt_m)
             if math.hypot(north_m, east_m) < FIELD_RENEWAL_M:

@@ -17,19 +17,9 @@ ESTIMATORS: Final[dict[str, Maker]] = {}
 
 
 def add_estimator(name: str, make: Maker) -> None:
-    """Let the settings name one more estimator.
+    """Let `[estimation] estimator` name one more estimator.
 
-    Parameters
-    ----------
-    name : str
-        Value of `[estimation] estimator`.
-    make : callable
-        Builds one for one aircraft from the settings of all; see `Estimator` for what it offers.
-
-    Raises
-    ------
-    ValueError
-        If there is an estimator of that name.
+    `make` builds one for one aircraft. Raises ValueError if there is an estimator of that name.
     """
     if name in ESTIMATORS:
         raise ValueError(f"there is an estimator {name!r} already")
@@ -56,18 +46,7 @@ class EstimationSettings(Settings, frozen=True):
 
 
 def make_estimator(settings: EstimationSettings) -> Estimator:
-    """Build the estimator that the settings name.
-
-    Parameters
-    ----------
-    settings : EstimationSettings
-        The choice and every estimator's own settings.
-
-    Returns
-    -------
-    Estimator
-        Fresh, for one aircraft.
-    """
+    """Build the estimator that the settings name, for one aircraft."""
     return ESTIMATORS[settings.estimator](settings)
 
 

@@ -15,26 +15,10 @@ ECCENTRICITY_SQ = 6.694_379_990_141_317e-3
 
 @compiled
 def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
-    """Compute the radii of curvature at a latitude and height.
+    """Compute metres per radian of latitude and of longitude, at a height above the ellipsoid.
 
-    Parameters
-    ----------
-    lat_deg : float
-        Geodetic latitude in degrees.
-    alt_m : float
-        Height above the ellipsoid in metres.
-
-    Returns
-    -------
-    meridian_m : float
-        Metres per radian of latitude.
-    parallel_m : float
-        Metres per radian of longitude; the cosine of the latitude is included.
-
-    References
-    ----------
-    .. [1] P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation
-       Systems", 2nd ed., 2013, eq. 2.105 and 2.106.
+    See P. D. Groves, "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems",
+    2nd ed., 2013, eq. 2.105 and 2.106; the second radius contains the cosine of the latitude.
     """
     sin_lat = math.sin(math.radians(lat_deg))
     w_sq = 1.0 - ECCENTRICITY_SQ * sin_lat * sin_lat
@@ -48,21 +32,9 @@ def radii_m(lat_deg: float, alt_m: float) -> tuple[float, float]:
 def offset_deg(
     lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float
 ) -> tuple[float, float]:
-    """Step a short way north and east.
+    """Return latitude and longitude after a step north and east.
 
-    Parameters
-    ----------
-    lat_deg, lon_deg : float
-        Start in degrees.
-    alt_m : float
-        Height in metres.
-    north_m, east_m : float
-        Step in metres; exact to first order, so for steps well below a kilometre.
-
-    Returns
-    -------
-    tuple of 2 floats
-        Latitude and longitude in degrees, the longitude in [-180, 180).
+    It is exact to first order, so for steps well below a kilometre. Longitude is in [-180, 180).
     """
     meridian, parallel = radii_m(lat_deg, alt_m)
     lat = lat_deg + math.degrees(north_m / meridian)
@@ -74,20 +46,7 @@ def offset_deg(
 def displacement_m(
     from_lat_deg: float, from_lon_deg: float, to_lat_deg: float, to_lon_deg: float, alt_m: float
 ) -> tuple[float, float]:
-    """Measure a short way as metres north and east, radii taken at the start.
-
-    Parameters
-    ----------
-    from_lat_deg, from_lon_deg, to_lat_deg, to_lon_deg : float
-        Both ends in degrees.
-    alt_m : float
-        Height in metres.
-
-    Returns
-    -------
-    tuple of 2 floats
-        Metres north and east.
-    """
+    """Measure a short way as metres north and east, with the radii at its start."""
     meridian, parallel = radii_m(from_lat_deg, alt_m)
     delta_lon = wrap_180(to_lon_deg - from_lon_deg)
     return (

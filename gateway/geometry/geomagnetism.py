@@ -35,22 +35,7 @@ def year_of(utc_us: int | None) -> float:
 
 
 def magnetic_field(lat_deg: float, lon_deg: float, alt_m: float, year: float) -> MagneticField:
-    """Look up the main field.
-
-    Parameters
-    ----------
-    lat_deg, lon_deg : float
-        Geodetic latitude and longitude in degrees.
-    alt_m : float
-        Height in metres; the geoid's separation does not matter here.
-    year : float
-        Decimal year, see `year_of`.
-
-    Returns
-    -------
-    MagneticField
-        Declination, dip and strength.
-    """
+    """Look up the main field; the difference of ellipsoid and geoid does not matter here."""
     found = _model().calculate(
         glat=lat_deg, glon=lon_deg, alt=alt_m * 1e-3, time=year, allow_date_outside_lifespan=True
     )

@@ -27,18 +27,8 @@ IDENTITY: Quat = (1.0, 0.0, 0.0, 0.0)
 def multiply(p: Quat, q: Quat) -> Quat:
     """Compose two rotations: the Hamilton product `p * q`.
 
-    Eq. 14; deviation: the printed second row has `-c1*d2` and the last row `b1*b2` in place of
-    `b1*c2`, which is no Hamilton product.
-
-    Parameters
-    ----------
-    p, q : tuple of 4 floats
-        Quaternions, scalar first.
-
-    Returns
-    -------
-    tuple of 4 floats
-        The rotation `q` followed by `p`.
+    It is the rotation `q` followed by `p`. Eq. 14; deviation: the printed second row has `-c1*d2`
+    and the last row `b1*b2` in place of `b1*c2`, which is no Hamilton product.
     """
     pw, px, py, pz = p
     qw, qx, qy, qz = q
@@ -61,20 +51,7 @@ def normalise(q: Quat) -> Quat:
 
 @compiled
 def rotate(q: Quat, v: Vec3) -> Vec3:
-    """Take a vector from the body to the navigation frame: eq. 13, `q * v * conj(q)`.
-
-    Parameters
-    ----------
-    q : tuple of 4 floats
-        `q_nb`, unit norm.
-    v : tuple of 3 floats
-        Vector in the body frame.
-
-    Returns
-    -------
-    tuple of 3 floats
-        The same vector in NED.
-    """
+    """Take a vector from the body to the navigation frame by `q_nb`: eq. 13, `q * v * conj(q)`."""
     w, x, y, z = q
     tx = 2.0 * (y * v[2] - z * v[1])
     ty = 2.0 * (z * v[0] - x * v[2])
@@ -100,18 +77,7 @@ def body_axes(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
 
 @compiled
 def from_rotation_vector(v: Vec3) -> Quat:
-    """Turn a rotation vector into a quaternion: eq. 9 to 12, the standard axis-angle form.
-
-    Parameters
-    ----------
-    v : tuple of 3 floats
-        Axis times angle in rad; any length, zero included.
-
-    Returns
-    -------
-    tuple of 4 floats
-        Unit quaternion.
-    """
+    """Turn a rotation vector, axis times angle in rad, into a unit quaternion: eq. 9 to 12."""
     angle_sq = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
     if angle_sq < 1e-12:
         # Series of sin(a/2)/a: the closed form divides by zero here.
@@ -124,18 +90,7 @@ def from_rotation_vector(v: Vec3) -> Quat:
 
 @compiled
 def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
-    """Build `q_nb` from intrinsic Z-Y-X angles (yaw, then pitch, then roll).
-
-    Parameters
-    ----------
-    roll_rad, pitch_rad, yaw_rad : float
-        Angles in rad.
-
-    Returns
-    -------
-    tuple of 4 floats
-        `q_nb`, unit norm.
-    """
+    """Build `q_nb` from intrinsic Z-Y-X angles (yaw, then pitch, then roll)."""
     cr, sr = math.cos(0.5 * roll_rad), math.sin(0.5 * roll_rad)
     cp, sp = math.cos(0.5 * pitch_rad), math.sin(0.5 * pitch_rad)
     cy, sy = math.cos(0.5 * yaw_rad), math.sin(0.5 * yaw_rad)
@@ -149,20 +104,10 @@ def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quat:
 
 @compiled
 def to_euler(q: Quat) -> Vec3:
-    """Split `q_nb` into roll, pitch and yaw.
+    """Split `q_nb` into roll and yaw in (-pi, pi] and pitch in [-pi/2, pi/2], in that order.
 
     Eq. 16; deviations: the printed pitch repeats the roll's numerator, and the first denominator
     has `S4` for `S3`; the angles are named as the field names them (roll phi, yaw psi).
-
-    Parameters
-    ----------
-    q : tuple of 4 floats
-        `q_nb`, unit norm.
-
-    Returns
-    -------
-    tuple of 3 floats
-        `roll_rad` and `yaw_rad` in (-pi, pi], `pitch_rad` in [-pi/2, pi/2].
     """
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
@@ -172,18 +117,7 @@ def to_euler(q: Quat) -> Vec3:
 
 
 def from_euler_array(angles_rad: FloatArray) -> FloatArray:
-    """Apply `from_euler` to each row.
-
-    Parameters
-    ----------
-    angles_rad : ndarray, shape (n, 3)
-        Roll, pitch and yaw.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        Quaternions, scalar first.
-    """
+    """Apply `from_euler` to each row of roll, pitch and yaw, shape (n, 3); returns (n, 4)."""
     angles = np.ascontiguousarray(angles_rad, np.float64)
     found = np.empty((len(angles), 4))
     _from_euler_array(len(angles), address_of(angles), address_of(found))
@@ -206,7 +140,7 @@ def integrate_rate(dt_s: FloatArray, gyro_b_radps: FloatArray, q_nb: FloatArray)
     Parameters
     ----------
     dt_s : ndarray, shape (n,)
-        Interval that each sample stands for.
+        Interval of each sample.
     gyro_b_radps : ndarray, shape (n, 3)
         Rate in body FRD.
     q_nb : ndarray, shape (4,)

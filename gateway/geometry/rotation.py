@@ -13,16 +13,8 @@ _GIMBAL_LOCK = 1e-9
 def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
     """Build a matrix from yaw, then pitch, then roll, each about the axes already turned (Z-Y-X).
 
-    Parameters
-    ----------
-    roll_pitch_yaw_deg : tuple of 3 floats
-        In degrees.
-
-    Returns
-    -------
-    tuple of 3 tuples of 3 floats
-        Rows of the matrix that takes vectors of the turned axes to those turned from; whole
-        quarters of a turn give exact zeros and ones.
+    It takes vectors of the turned axes to those turned from; whole quarters of a turn give exact
+    zeros and ones.
     """
     (cr, sr), (cp, sp), (cy, sy) = (_cos_sin(angle) for angle in roll_pitch_yaw_deg)
     # Adding zero makes a plain zero of a negative one.
@@ -34,19 +26,10 @@ def matrix_from_euler_deg(roll_pitch_yaw_deg: Vec3) -> Matrix3:
 
 
 def euler_deg_from_matrix(matrix: Matrix3) -> Vec3:
-    """Return the angles of `matrix_from_euler_deg`.
+    """Return the angles of `matrix_from_euler_deg`, the pitch from -90 to 90.
 
-    Parameters
-    ----------
-    matrix : tuple of 3 tuples of 3 floats
-        Rows of a rotation matrix.
-
-    Returns
-    -------
-    tuple of 3 floats
-        Roll (-180 to 180), pitch (-90 to 90), yaw (-180 to 180) in degrees. Where the pitch is a
-        right angle, only the sum or difference of roll and yaw is determined, and the roll is
-        zero.
+    Where the pitch is a right angle, only the sum or difference of roll and yaw is determined, and
+    the roll is zero.
     """
     (xx, xy, _), (yx, yy, _), (zx, zy, zz) = matrix
     level = math.hypot(xx, yx)

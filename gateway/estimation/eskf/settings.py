@@ -3,6 +3,8 @@
 import math
 from typing import Annotated
 
+import msgspec
+
 from gateway.estimation.record import filled_record
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.settings import Settings, setting
@@ -263,25 +265,12 @@ class Gains:
 
 
 def make_gains(settings: EskfSettings, reference: ReferenceSettings) -> Gains:
-    """Convert the settings to SI units.
-
-    Parameters
-    ----------
-    settings : EskfSettings
-        Of this filter.
-    reference : ReferenceSettings
-        GPS latency, relocking and declination.
-
-    Returns
-    -------
-    Gains
-        A flat record for the compiled code.
-    """
-    return filled_record(Gains, _inertial_gains(settings) | _aiding_gains(settings, reference))
+    """Convert the settings to SI units; those of the same name are in SI units already."""
+    same = msgspec.structs.asdict(reference) | msgspec.structs.asdict(settings)
+    return filled_record(Gains, same | _variances(settings, reference))
 
 
-def _inertial_gains(s: EskfSettings) -> dict[str, float]:
-    """Return the gains of the inertial sensors, of gravity and rest."""
+def _variances(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float]:
     return {
         "gyro_density": (s.gyro_noise_degprs * RAD_PER_DEG) ** 2,
         "gyro_vibration_sq": s.gyro_vibration**2,
@@ -297,43 +286,25 @@ def _inertial_gains(s: EskfSettings) -> dict[str, float]:
         "accel_bias_var": s.accel_bias_mps2**2,
         "accel_bias_uncalibrated_var": s.accel_bias_uncalibrated_mps2**2,
         "accel_bias_density": s.accel_bias_walk_mps2prs**2,
-        "gravity_tau_s": s.gravity_tau_s,
         "gravity_var": s.gravity_noise_mps2**2,
         "gravity_motion_sq": s.gravity_motion**2,
         "rest_gyro_radps": math.radians(s.rest_gyro_degps),
-        "rest_accel_mps2": s.rest_accel_mps2,
-        "rest_time_s": s.rest_time_s,
-        "rest_speed_mps": s.rest_speed_mps,
         "bias_limit_radps": math.radians(s.bias_limit_degps),
-    }
-
-
-def _aiding_gains(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float]:
-    """Return the gains of GPS, compass and barometer."""
-    return {
         "gps_position_var": s.gps_position_m**2,
         "gps_height_var": s.gps_height_m**2,
         "gps_error_var": s.gps_error_m**2,
         "gps_height_error_var": s.gps_height_error_m**2,
-        "gps_error_s": s.gps_error_s,
         "gps_velocity_var": s.gps_velocity_mps**2,
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
-        "gps_correlation_s": s.gps_correlation_s,
-        "gps_latency_s": reference.gps_latency_s,
-        "gps_relock_s": reference.gps_relock_s,
         "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
-        "mag_latency_s": s.mag_latency_s,
         "mag_late_sq": s.mag_latency_std_s**2,
         "hard_iron_var": s.hard_iron_ut**2,
         "hard_iron_uncalibrated_var": s.hard_iron_uncalibrated_ut**2,
         "hard_iron_density": s.hard_iron_walk_utprs**2,
-        "field_norm_tolerance": s.field_norm_tolerance,
         "field_dip_tolerance_rad": math.radians(s.field_dip_tolerance_deg),
         "declination_rad": EarthField(reference).declination_rad,
         "baro_var": s.baro_noise_m**2,
         "baro_density": s.baro_walk_mprs**2,
-        "dead_reckoning_s": s.dead_reckoning_s,
         "gate_sq": s.gate_sigma**2,
-        "gate_m": s.gate_m,
     }
