@@ -66,7 +66,7 @@ class Mechanism(NamedTuple):
 
 
 FILTER: Final = "gateway.estimation.eskf"
-VALIDITY: Final = ("delayed.store_integrals", "delayed.look_back", "delayed.past_state")
+VALIDITY: Final = ("predict.store_integrals", "predict.look_back", "fixes.past_state")
 SENSORS: Final = ("faults.check_sensor", "faults.check_sensors", "faults.is_hanging")
 MECHANISMS: Final = (
     Mechanism("noise by vibration", "filter", "add_vibration", NOTHING, ("predict.add_vibration",)),
@@ -97,7 +97,7 @@ MECHANISMS: Final = (
     ),
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
     Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING, ("latency",)),
-    Mechanism("GPS glitches", "delayed", "note_glitch", NOTHING, ("delayed.note_glitch",)),
+    Mechanism("GPS glitches", "fixes", "note_glitch", NOTHING, ("fixes.note_glitch",)),
     Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO, SENSORS),
 )  # fmt: skip
 FULL: Final = "full filter"

@@ -4,8 +4,9 @@ A live sample is one row, a log many of the same: this is why both give the same
 """
 
 import math
+from collections import namedtuple
 from functools import cache
-from typing import Final
+from typing import Any, Final, cast
 
 import numpy as np
 
@@ -159,21 +160,8 @@ def nav_row(state: NavState) -> list[float]:
     ]  # fmt: skip
 
 
-ATTITUDE_VALID: Final = int(NavFlags.ATTITUDE_VALID)
-HEADING_VALID: Final = int(NavFlags.HEADING_VALID)
-POSITION_VALID: Final = int(NavFlags.POSITION_VALID)
-VELOCITY_VALID: Final = int(NavFlags.VELOCITY_VALID)
-ALTITUDE_VALID: Final = int(NavFlags.ALTITUDE_VALID)
-AT_REST: Final = int(NavFlags.AT_REST)
-USING_GPS: Final = int(NavFlags.USING_GPS)
-USING_MAG: Final = int(NavFlags.USING_MAG)
-USING_BARO: Final = int(NavFlags.USING_BARO)
-MAG_DISTURBED: Final = int(NavFlags.MAG_DISTURBED)
-GPS_REJECTED: Final = int(NavFlags.GPS_REJECTED)
-DEAD_RECKONING: Final = int(NavFlags.DEAD_RECKONING)
-SENSOR_FAULT: Final = int(NavFlags.SENSOR_FAULT)
-DEGRADED: Final = int(NavFlags.DEGRADED)
-MAG_MISPLACED: Final = int(NavFlags.MAG_MISPLACED)
+FLAG: Final = cast(Any, namedtuple("Flag", NavFlags.__members__))(*map(int, NavFlags))
+"""The bits of `NavFlags` by their names, as plain numbers for compiled code."""
 
 HEADING_VALID_RAD: Final = 0.26
 """A heading is valid up to this standard deviation."""
@@ -189,8 +177,8 @@ def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
 
     Dead reckoning for longer than `hold_s` is no position any more.
     """
-    flags = POSITION_VALID | VELOCITY_VALID if since_fix_s < hold_s else 0
-    flags |= USING_GPS if since_fix_s < FRESH_GPS_S else DEAD_RECKONING | DEGRADED
+    flags: int = FLAG.POSITION_VALID | FLAG.VELOCITY_VALID if since_fix_s < hold_s else 0
+    flags |= FLAG.USING_GPS if since_fix_s < FRESH_GPS_S else FLAG.DEAD_RECKONING | FLAG.DEGRADED
     if since_reject_s < FRESH_GPS_S:
-        flags |= GPS_REJECTED | DEGRADED
+        flags |= FLAG.GPS_REJECTED | FLAG.DEGRADED
     return flags

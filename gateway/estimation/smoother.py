@@ -23,10 +23,9 @@ import numpy as np
 from gateway.compiled import address_of, array_at, compiled, record_at
 from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
-    ATTITUDE_VALID,
     CLIPPED,
+    FLAG,
     GPS_COLUMNS,
-    HEADING_VALID,
     HEADING_VALID_RAD,
     IMU_COLUMNS,
     NAV_ALT,
@@ -196,9 +195,9 @@ def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> 
     write_output(chosen, p, row)
     if s.aided == 0:
         write_position(s, row)
-    flags = int(row[NAV_FLAGS]) | (ATTITUDE_VALID if chosen.started == 1 else 0)
+    flags = int(row[NAV_FLAGS]) | (FLAG.ATTITUDE_VALID if chosen.started == 1 else 0)
     if chosen.heading_known == 1 and chosen.heading_true == 1:
-        flags |= HEADING_VALID
+        flags |= FLAG.HEADING_VALID
     row[NAV_FLAGS] = float(flags)
     if reset:
         return
@@ -418,8 +417,8 @@ def _correct(
         std[:] = np.sqrt(std**2 + np.maximum(variance[:, first : first + 3], 0.0))
     attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
     flags = out[:, NAV_FLAGS].astype(np.int64)
-    flags[attitude_std[:, :2].max(axis=1) >= LEVEL_VALID_RAD] &= ~ATTITUDE_VALID
-    flags[attitude_std[:, 2] >= HEADING_VALID_RAD] &= ~HEADING_VALID
+    flags[attitude_std[:, :2].max(axis=1) >= LEVEL_VALID_RAD] &= ~FLAG.ATTITUDE_VALID
+    flags[attitude_std[:, 2] >= HEADING_VALID_RAD] &= ~FLAG.HEADING_VALID
     out[:, NAV_FLAGS] = flags
 
 

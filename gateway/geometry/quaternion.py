@@ -50,6 +50,24 @@ def normalise(q: Quat) -> Quat:
 
 
 @compiled
+def difference(a: Vec3, b: Vec3) -> Vec3:
+    """Subtract two vectors."""
+    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+
+
+@compiled
+def scaled(v: Vec3, factor: float) -> Vec3:
+    """Multiply a vector by a number."""
+    return (v[0] * factor, v[1] * factor, v[2] * factor)
+
+
+@compiled
+def norm_sq(v: Vec3) -> float:
+    """Return the squared length of a vector."""
+    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+
+
+@compiled
 def rotate(q: Quat, v: Vec3) -> Vec3:
     """Take a vector from the body to the navigation frame by `q_nb`: eq. 13, `q * v * conj(q)`."""
     w, x, y, z = q
@@ -78,7 +96,7 @@ def body_axes(q: Quat) -> tuple[Vec3, Vec3, Vec3]:
 @compiled
 def from_rotation_vector(v: Vec3) -> Quat:
     """Turn a rotation vector, axis times angle in rad, into a unit quaternion: eq. 9 to 12."""
-    angle_sq = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    angle_sq = norm_sq(v)
     if angle_sq < 1e-12:
         # Series of sin(a/2)/a: the closed form divides by zero here.
         scale = 0.5 - angle_sq / 48.0

@@ -12,13 +12,12 @@ from gateway.estimation.columns import (
     ACCEL,
     ACCEL_UNCALIBRATED,
     CLIPPED,
+    FLAG,
     GPS_LAT,
     GPS_VEL,
     GYRO,
     GYRO_UNCALIBRATED,
-    HEADING_VALID,
     MAG,
-    MAG_MISPLACED,
     NAV_ATTITUDE_STD,
     NAV_FLAGS,
 )
@@ -171,7 +170,7 @@ def test_errors_are_small_again_after_a_disturbance(flight: Flight, name: str) -
 
 def test_swapped_compass_axes_are_reported(flight: Flight) -> None:
     flags = run_eskf(swapped_compass(flight).flight)[-1, NAV_FLAGS].astype(int)
-    assert flags & MAG_MISPLACED
+    assert flags & FLAG.MAG_MISPLACED
 
 
 @pytest.mark.parametrize("rate_hz", [1, 2, 5, 20, 1000])
@@ -206,7 +205,7 @@ def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
 
 def test_magnetic_heading_without_declination_is_not_valid(flight: Flight) -> None:
     alone = flight.with_gps(np.zeros(len(flight.log.gps), bool))
-    assert not (run_eskf(alone)[:, NAV_FLAGS].astype(int) & HEADING_VALID).any()
+    assert not (run_eskf(alone)[:, NAV_FLAGS].astype(int) & FLAG.HEADING_VALID).any()
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
+    FLAG,
     GPS_LAT,
-    HEADING_VALID,
     HEADING_VALID_RAD,
     NAV_ATTITUDE_STD,
     NAV_COLUMNS,
@@ -199,7 +199,7 @@ def test_real_car(data_dir) -> None:
     fixes_s = flight.log.gps_time_us * 1e-6
     gap = flight.with_gps(np.abs(fixes_s - fixes_s.mean()) > 40.0)
     live, smoothed = run_eskf(gap), run_smoothed(gap)
-    valid = [out[:, NAV_FLAGS].astype(int) & HEADING_VALID != 0 for out in (live, smoothed)]
+    valid = [out[:, NAV_FLAGS].astype(int) & FLAG.HEADING_VALID != 0 for out in (live, smoothed)]
     assert valid[1].sum() > valid[0].sum()
     sure = smoothed[:, NAV_ATTITUDE_STD + 2] < HEADING_VALID_RAD
     np.testing.assert_array_equal(valid[1], sure)

@@ -44,9 +44,10 @@ NOISE_MPS: Final = 0.2
 """Noise of a GPS velocity in a pair."""
 TRACK_NOISE_MPS: Final = 0.6
 """The same of a velocity derived from two positions."""
-CONTRADICTION_SIGMA: Final = 4.0
-CONTRADICTION_MPS2: Final = 4.0
-"""Differences beyond both contradict the other pairs; a turn by 25 deg causes the second one."""
+MISMATCH_SIGMA: Final = 4.0
+"""Standard deviations beyond which a difference is no chance."""
+MISMATCH_MPS2: Final = 4.0
+"""Difference of a pair that also contradicts the other pairs: a turn by 25 deg causes it."""
 DRIFT_RADPS: Final = 0.3 * RAD_PER_DEG
 """Drift of the gyroscope frame by an unknown bias."""
 SQUARINGS: Final = 14
@@ -123,7 +124,7 @@ def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> floa
     north, east, down = rotate(q_ni, force)
     level_off = math.hypot(north, east) - math.hypot(reference[0], reference[1])
     off_sq = level_off * level_off + (down - reference[2]) ** 2
-    if off_sq < CONTRADICTION_MPS2**2 + CONTRADICTION_SIGMA**2 * misfit / weight:
+    if off_sq < MISMATCH_MPS2**2 + MISMATCH_SIGMA**2 * misfit / weight:
         return 0.0
     return off_sq * weight / (2.0 * ENOUGH_PAIRS)
 

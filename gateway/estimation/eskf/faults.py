@@ -23,11 +23,14 @@ from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import ATT, NEVER_S, POS, VEL, State
 from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import (
+    difference,
     from_rotation_vector,
     multiply,
+    norm_sq,
     normalise,
     rotate,
     rotate_inverse,
+    scaled,
 )
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -86,7 +89,7 @@ def is_zero_sample(gyro: Vec3, accel: Vec3) -> bool:
 @compiled
 def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
     """Return whether the filter may start with a sample, and set the fault if not."""
-    force = math.sqrt(accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2) / STANDARD_GRAVITY_MPS2
+    force = math.sqrt(norm_sq(accel)) / STANDARD_GRAVITY_MPS2
     sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
     s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
     return s.fault == 0
@@ -95,14 +98,7 @@ def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
 @compiled
 def change_of(v: Vec3, values: FloatArray, first: int) -> float:
     """Return the length of a vector minus three numbers of an array."""
-    x, y, z = v[0] - values[first], v[1] - values[first + 1], v[2] - values[first + 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@compiled
-def is_repeated(s: State, gyro: Vec3, accel: Vec3) -> bool:
-    """Return whether both sensors repeat the last sample."""
-    return change_of(gyro, s.imu_last, 0) == 0.0 and change_of(accel, s.imu_last, 3) == 0.0
+    return math.sqrt(norm_sq(difference(v, as_vec(values[first : first + 3]))))
 
 
 @compiled
@@ -112,13 +108,13 @@ def is_hanging(s: State, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bo
     A live sensor does not repeat six numbers, but a log may hold samples, and an input without
     noise is constant at rest.
     """
-    if is_repeated(s, gyro, accel):
+    most_s = max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1])
+    if change_of(gyro, s.imu_last, 0) == 0.0 and change_of(accel, s.imu_last, 3) == 0.0:
         s.hold_s[0] += dt
         at_rest = is_usual_bias(s, gyro) and not moving
-        most_s = max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1])
         return bool(s.hold_s[0] > most_s and not at_rest)
     held_s = s.hold_s[0] + dt
-    if s.hold_s[0] <= max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1]):
+    if s.hold_s[0] <= most_s:
         s.hold_s[1] += held_s / (USUAL_HOLD_S + held_s) * (held_s - s.hold_s[1])
     s.hold_s[0] = 0.0
     return False
@@ -170,40 +166,26 @@ def check_sensors(
 
 
 @compiled
-def held_gyro(s: State) -> Vec3:
-    """Return the last sound rate, rad/s."""
-    return (s.imu_held[0], s.imu_held[1], s.imu_held[2])
-
-
-@compiled
-def held_accel(s: State) -> Vec3:
-    """Return the last sound force, m/s2."""
-    return (s.imu_held[3], s.imu_held[4], s.imu_held[5])
-
-
-@compiled
 def substitute_gyro(s: State) -> Vec3:
     """Return the rate for a sample without a sound one."""
-    return held_gyro(s) if s.missing_s[0] < HOLD_S else as_vec(s.gyro_bias_b)
+    return as_vec(s.imu_held[0:3]) if s.missing_s[0] < HOLD_S else as_vec(s.gyro_bias_b)
 
 
 @compiled
 def substitute_accel(s: State) -> Vec3:
     """Return the force for a sample without a sound one."""
     if s.missing_s[1] < HOLD_S:
-        return held_accel(s)
-    f = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, -STANDARD_GRAVITY_MPS2))
-    b = s.accel_bias_b
-    return (f[0] + b[0], f[1] + b[1], f[2] + b[2])
+        return as_vec(s.imu_held[3:6])
+    gravity = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, STANDARD_GRAVITY_MPS2))
+    return difference(as_vec(s.accel_bias_b), gravity)
 
 
 @compiled
 def add_clipping_noise(s: State, dt: float) -> None:
     """Add noise for a sensor at the end of its range: as much as it reads may be cut off."""
-    gyro, accel = held_gyro(s), held_accel(s)
     for k in range(3):
-        s.pending_noise[0] += (dt * gyro[k]) ** 2
-        s.pending_noise[1] += (dt * accel[k]) ** 2
+        s.pending_noise[0] += (dt * s.imu_held[k]) ** 2
+        s.pending_noise[1] += (dt * s.imu_held[3 + k]) ** 2
 
 
 @compiled
@@ -239,8 +221,7 @@ def follow_step(s: State, gyro: Vec3, dt: float) -> None:
     if s.usual_step_s == 0.0:
         s.usual_step_s = min(dt, SLOWEST_STEP_S)
     s.usual_step_s += STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
-    mean_sq = (gyro[0] ** 2 + gyro[1] ** 2 + gyro[2] ** 2) / 3.0
-    s.imu_usual[2] += min(dt / TURNING_S, 1.0) * (mean_sq - s.imu_usual[2])
+    s.imu_usual[2] += min(dt / TURNING_S, 1.0) * (norm_sq(gyro) / 3.0 - s.imu_usual[2])
 
 
 @compiled
@@ -258,8 +239,7 @@ def interpolate(
     turned = unseen_turn_var(s, gyro_before, gyro, as_vec(s.gyro_bias_b), unseen_s)
     s.pending_noise[0] += turned
     moved = UNSEEN_MPS2**2 * unseen_s * min(unseen_s, RATE_TAU_S)
-    force_sq = accel[0] ** 2 + accel[1] ** 2 + accel[2] ** 2
-    s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * force_sq
+    s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * norm_sq(accel)
     share = 0.5 * unseen_s / dt
     return part_way(gyro, gyro_before, share), part_way(accel, accel_before, share)
 
@@ -288,13 +268,12 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         lose_attitude(s, p)
         return
     mean, about, steady = steady_turn(s)
-    before = held_gyro(s)
+    before = as_vec(s.imu_held[0:3])
     share = 2.0 * end_share_s(dt) / dt
     rate = rate_of(s, part_way(steady, part_way(before, gyro, 0.5), share))
-    turning = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
     turned_var = unseen_turn_var(s, before, gyro, steady, dt)
-    turned_var += ((WANDER_RADPS + turning) * dt) ** 2
-    turn = from_rotation_vector((rate[0] * dt, rate[1] * dt, rate[2] * dt))
+    turned_var += ((WANDER_RADPS + math.sqrt(norm_sq(mean))) * dt) ** 2
+    turn = from_rotation_vector(scaled(rate, dt))
     write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), turn)))
     write_quat(s.q_ib, normalise(multiply(as_quat(s.q_ib), turn)))
     if s.aided == 1:
@@ -315,15 +294,10 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
 def steady_turn(s: State) -> tuple[Vec3, float, Vec3]:
     """Return the mean rate before a gap, its part about down, and that part with the bias."""
     bias = as_vec(s.gyro_bias_b)
-    mean = (s.imu_mean[0] - bias[0], s.imu_mean[1] - bias[1], s.imu_mean[2] - bias[2])
+    mean = difference(as_vec(s.imu_mean[0:3]), bias)
     down_b = rotate_inverse(as_quat(s.q_nb), (0.0, 0.0, 1.0))
     about = down_b[0] * mean[0] + down_b[1] * mean[1] + down_b[2] * mean[2]
-    steady = (
-        bias[0] + about * down_b[0],
-        bias[1] + about * down_b[1],
-        bias[2] + about * down_b[2],
-    )
-    return mean, about, steady
+    return mean, about, difference(bias, scaled(down_b, -about))
 
 
 @compiled

@@ -13,20 +13,14 @@ from gateway.compiled import array_at, compiled, record_at
 from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
     ACCEL_UNCALIBRATED,
-    ALTITUDE_VALID,
-    AT_REST,
-    ATTITUDE_VALID,
     BARO_STALE_S,
     CLIPPED,
-    DEGRADED,
+    FLAG,
     FRESH_GPS_S,
     GPS_COLUMNS,
     GYRO_UNCALIBRATED,
-    HEADING_VALID,
     HEADING_VALID_RAD,
     IMU_COLUMNS,
-    MAG_DISTURBED,
-    MAG_MISPLACED,
     MAG_UNCALIBRATED,
     NAV_ALT,
     NAV_ATTITUDE_STD,
@@ -39,13 +33,9 @@ from gateway.estimation.columns import (
     NAV_RATE,
     NAV_VEL,
     NAV_VEL_STD,
-    SENSOR_FAULT,
-    USING_BARO,
-    USING_MAG,
     gps_flags,
     imu_vectors,
 )
-from gateway.estimation.eskf.delayed import store_integrals
 from gateway.estimation.eskf.faults import (
     ACCEL_LIMIT_MPS2,
     GAP_S,
@@ -69,6 +59,7 @@ from gateway.estimation.eskf.fixes import take_gps
 from gateway.estimation.eskf.integrity import (
     accel_bias_var,
     discard_calibration,
+    end_aiding,
     gyro_bias_var,
     lose_attitude,
     reset_accel_bias,
@@ -89,6 +80,7 @@ from gateway.estimation.eskf.predict import (
     add_vibration,
     integrate,
     propagate,
+    store_integrals,
 )
 from gateway.estimation.eskf.rest import begin_means, detect_rest, is_moving
 from gateway.estimation.eskf.settings import Gains
@@ -104,7 +96,6 @@ from gateway.estimation.eskf.state import (
     POS,
     VEL,
     State,
-    reset_state,
 )
 from gateway.estimation.eskf.update import (
     LEVEL_INTERVAL_S,
@@ -257,9 +248,7 @@ def restart_clock(s: State, time_us: int) -> None:
     s.base_us, s.time_us, s.time_s, s.imu_s = time_us, time_us, 0.0, 0.0
     clear_times(s)
     if s.aided == 1:
-        for k in range(3):
-            reset_state(s, VEL + k, 0.0)
-        s.aided = 0
+        end_aiding(s)
 
 
 @compiled
@@ -318,10 +307,7 @@ def level(s: State, p: Gains) -> None:
 def end_dead_reckoning(s: State, p: Gains) -> None:
     """Stop estimating position and velocity."""
     propagate(s, p)
-    s.aided = 0
-    for k in range(3):
-        reset_state(s, VEL + k, 0.0)
-        s.vel_n[k] = 0.0
+    end_aiding(s)
 
 
 @compiled
@@ -393,21 +379,21 @@ def write_position(s: State, row: FloatArray) -> None:
 @compiled
 def flags_of(s: State, p: Gains) -> int:
     """Return the flags, see `NavFlags`."""
-    flags = AT_REST if s.at_rest == 1 else 0
+    flags: int = FLAG.AT_REST if s.at_rest == 1 else 0
     if s.time_s - s.mag_s < STALE_MAG_S:
-        flags |= MAG_DISTURBED if s.mag_disturbed == 1 else USING_MAG
+        flags |= FLAG.MAG_DISTURBED if s.mag_disturbed == 1 else FLAG.USING_MAG
     if s.mag_misplaced == 1:
-        flags |= MAG_DISTURBED | MAG_MISPLACED | DEGRADED
+        flags |= FLAG.MAG_DISTURBED | FLAG.MAG_MISPLACED | FLAG.DEGRADED
     if s.time_s - s.baro_s < BARO_STALE_S:
-        flags |= USING_BARO
+        flags |= FLAG.USING_BARO
     if s.fault == 1:
-        flags |= SENSOR_FAULT | DEGRADED
+        flags |= FLAG.SENSOR_FAULT | FLAG.DEGRADED
     if s.started == 1 and max(s.P[ATT, ATT], s.P[ATT + 1, ATT + 1]) < LEVEL_VALID_RAD**2:
-        flags |= ATTITUDE_VALID
+        flags |= FLAG.ATTITUDE_VALID
     if s.heading_known == 1 and s.heading_true == 1 and heading_std_rad(s) < HEADING_VALID_RAD:
-        flags |= HEADING_VALID
+        flags |= FLAG.HEADING_VALID
     if s.has_height == 1 or s.baro_s != NEVER_S:
-        flags |= ALTITUDE_VALID
+        flags |= FLAG.ALTITUDE_VALID
     if s.fix_s == NEVER_S:
         return flags
     hold_s = p.dead_reckoning_s if s.aided == 1 else NO_HOLD_S

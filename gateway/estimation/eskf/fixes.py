@@ -1,4 +1,14 @@
-"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update."""
+"""GPS fixes as they arrive: recognised, completed, and used to start, restart or update.
+
+A fix is compared with the state at the time it was valid, `L` seconds ago, and its row carries that
+state's error to the present one:
+
+    vel_then = vel - att x S + R L accel_bias
+    pos_then = pos - L vel + att x (L S - D) - R L^2 / 2 accel_bias
+
+with `S` and `D` the first and second integral of the specific force over the lag. This equals
+fusing the fix in time, but for the process noise of the few tenths of a second between.
+"""
 
 import math
 from typing import Final
@@ -8,26 +18,31 @@ from gateway.estimation.columns import (
     GPS_ALT,
     GPS_DECLINATION,
     GPS_DIP,
+    GPS_H_ACC,
     GPS_LAT,
     GPS_LON,
+    GPS_SPEED_ACC,
     GPS_USABLE,
+    GPS_V_ACC,
     GPS_VEL,
 )
-from gateway.estimation.eskf.alignment import MEMORY_S, NOISE_MPS, TRACK_NOISE_MPS, add_velocity
-from gateway.estimation.eskf.delayed import (
-    is_unlikely,
-    look_back,
-    past_state,
-    set_error_variances,
-    update_fix,
+from gateway.estimation.eskf.alignment import (
+    MAX_PAIR_S,
+    MEMORY_S,
+    NOISE_MPS,
+    PAIR_S,
+    TRACK_NOISE_MPS,
+    add_velocity,
 )
 from gateway.estimation.eskf.faults import gap_limit_s, is_sound
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import watch_latency
-from gateway.estimation.eskf.magnetometer import raise_hard_iron_by_dip, turn_heading
-from gateway.estimation.eskf.predict import propagate
+from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron_by_dip, turn_heading
+from gateway.estimation.eskf.predict import look_back, propagate
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
+    ACCEL_BIAS,
+    ATT,
     GPS_ERROR,
     GYRO_SCALE,
     NEVER_S,
@@ -35,17 +50,25 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
     reset_state,
+    reset_states,
 )
-from gateway.estimation.eskf.update import restart_baro
-from gateway.estimation.record import FloatArray, as_vec, write_vec
+from gateway.estimation.eskf.update import (
+    begin_row,
+    inject,
+    innovation_variance,
+    restart_baro,
+    update_scalar,
+)
+from gateway.estimation.record import FloatArray, as_quat, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
+from gateway.geometry.quaternion import body_axes, difference, norm_sq, scaled
 from gateway.records import NAN, Vec3
+from gateway.units import STANDARD_GRAVITY_MPS2
 
 FASTEST_MPS: Final = 1000.0
 """A larger velocity is an error."""
-BASELINE_S: Final = 0.9
+BASELINE_S: Final = 2.0 * PAIR_S
 """Positions closer together differ mostly by their noise."""
-MAX_BASELINE_S: Final = 2.5
 ZERO_S: Final = 3.0
 ZERO_MPS: Final = 2.0
 """Fixes that move so fast for this time contradict a velocity of exactly zero."""
@@ -64,6 +87,27 @@ AGREE_S: Final = 5.0
 FIRST_VELOCITY_VAR: Final = 0.5**2
 NO_VELOCITY_VAR: Final = 5.0**2
 """Of the first velocity with and without one in the fix, m2/s2."""
+NOISE_SHARE: Final = 0.2
+"""Share of a receiver's accuracy that is noise from fix to fix."""
+ERROR_SHARES: Final = (0.7, 0.7, 0.9)
+"""Share of it that is slow error, north, east (of a radial accuracy) and down."""
+SPEED_SHARES: Final = (0.4, 0.4, 0.8)
+"""Share of its speed accuracy that is noise of one axis."""
+SLOW_MPS: Final = 0.05
+SLOW_S: Final = 4.0
+"""Slow error of GPS velocities where the receiver reports none, and its correlation time."""
+LEAST_S: Final = 0.05
+"""Fixes closer together count as that far apart."""
+LEAST_LAG_S: Final = 0.1
+"""Over less, a mean acceleration is mostly vibration."""
+GLITCH_GATE_SQ: Final = (9.0, 16.0)
+MOST_GLITCH: Final = (5.0, 30.0)
+"""Gates of velocity and position beyond which an innovation is a glitch, and its largest size."""
+GLITCH_S: Final = 10.0
+"""Fixes of this time share a glitch."""
+GLITCH_FADE_S: Final = 1.0
+LAG_S: Final = 0.2
+"""Lag of the receiver's own filter in a manoeuvre."""
 
 
 @compiled
@@ -128,15 +172,14 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
         return False
     last, has_velocity = s.fix_last, is_sound(vel, FASTEST_MPS)
     repeated = lat == last[0] and lon == last[1]
-    for k in range(3):
-        repeated = repeated and (vel[k] == last[2 + k] or not has_velocity)
+    if has_velocity:
+        repeated = repeated and norm_sq(difference(vel, as_vec(last[2:5]))) == 0.0
     if not repeated:
         last[0], last[1], last[5] = lat, lon, s.time_s
-        for k in range(3):
-            last[2 + k] = vel[k]
+        write_vec(last[2:5], vel)
         return True
     if has_velocity:
-        return math.sqrt(vel[0] ** 2 + vel[1] ** 2 + vel[2] ** 2) <= STATIONARY_MPS
+        return math.sqrt(norm_sq(vel)) <= STATIONARY_MPS
     return bool(s.time_s - last[5] >= SLOWEST_FIXES_S)
 
 
@@ -188,8 +231,7 @@ def is_zero_false(s: State, pos: Vec3, vel: Vec3) -> bool:
             way_m = math.hypot(pos[0] - s.zero_from[1], pos[1] - s.zero_from[2])
             s.zero_false = 1 if way_m > ZERO_MPS * dt else 0
         s.zero_from[0] = s.time_s
-        for k in range(3):
-            s.zero_from[1 + k] = pos[k]
+        write_vec(s.zero_from[1:4], pos)
     return s.zero_false == 1
 
 
@@ -204,11 +246,10 @@ def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[V
     if is_sound(vel, FASTEST_MPS) or not 0.0 <= dt < BASELINE_S:
         f[0] = valid_s
         track = ((pos[0] - f[1]) / dt, (pos[1] - f[2]) / dt, (pos[2] - f[3]) / dt)
-        for k in range(3):
-            f[1 + k] = pos[k]
+        write_vec(f[1:4], pos)
         if is_sound(vel, FASTEST_MPS):
             return vel, valid_s
-        known = 0.0 <= dt <= MAX_BASELINE_S
+        known = 0.0 <= dt <= MAX_PAIR_S
         climb = track[2] if known and math.isfinite(track[2]) else 0.0
         if is_level_sound(vel):
             return (vel[0], vel[1], climb), valid_s
@@ -245,13 +286,8 @@ def fuse_fix(s: State, p: Gains, row: FloatArray, pos: Vec3, vel: Vec3, lag: flo
     propagate(s, p)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
     past_pos, past_vel = past_state(s, lag)
-    e = s.gps_error_n
-    off_pos = (
-        pos[0] - past_pos[0] - e[0],
-        pos[1] - past_pos[1] - e[1],
-        pos[2] - past_pos[2] - e[2],
-    )
-    off_vel = (vel[0] - past_vel[0], vel[1] - past_vel[1], vel[2] - past_vel[2])
+    off_pos = difference(difference(pos, past_pos), as_vec(s.gps_error_n))
+    off_vel = difference(vel, past_vel)
     far = math.hypot(off_pos[0], off_pos[1]) >= p.gate_m and is_unlikely(s, p, row, off_pos, lag)
     if far and have_agreed(s, p, pos, vel):
         restart_at(s, p, pos, as_vec(s.fix_vel), lag)
@@ -288,17 +324,15 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix, `lag` seconds old; NaN where it has none."""
     propagate(s, p)
     sound = is_sound(vel, FASTEST_MPS)
-    for k in range(3):
-        reset_state(s, VEL + k, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
-        s.vel_n[k] = vel[k] if sound else 0.0
+    reset_states(s, VEL, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
+    write_vec(s.vel_n, vel if sound else (0.0, 0.0, 0.0))
     for k in range(2):
         start_position(s, k, pos[k] + s.vel_n[k] * lag, p.gps_position_var)
     start_height(s, p, pos[2] + s.vel_n[2] * lag)
     s.aided = 1
     if s.was_aided == 0:
         s.was_aided = 1
-        for k in range(3):
-            reset_state(s, GYRO_SCALE + k, p.gyro_scale_var)
+        reset_states(s, GYRO_SCALE, p.gyro_scale_var)
         raise_hard_iron_by_dip(s, s.earth_field[1])
 
 
@@ -321,3 +355,183 @@ def start_position(s: State, k: int, value: float, noise_var: float) -> None:
     reset_state(s, POS + k, error_var + noise_var)
     reset_state(s, GPS_ERROR + k, error_var)
     s.P[POS + k, GPS_ERROR + k] = s.P[GPS_ERROR + k, POS + k] = -error_var
+
+
+@compiled
+def past_state(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return position and velocity `lag` seconds ago, from the present ones and `then`."""
+    now, then = s.integrals, s.then
+    vel = difference(as_vec(s.vel_n), difference(as_vec(now[3:6]), as_vec(then[3:6])))
+    pos = (
+        s.pos_n[0] - vel[0] * lag - (now[6] - then[6] - then[3] * lag),
+        s.pos_n[1] - vel[1] * lag - (now[7] - then[7] - then[4] * lag),
+        s.pos_n[2] - vel[2] * lag - (now[8] - then[8] - then[5] * lag),
+    )
+    return pos, vel
+
+
+@compiled
+def lag_integrals(s: State, lag: float) -> tuple[Vec3, Vec3]:
+    """Return `S` and `D`: the specific force in NED integrated once and twice over the lag."""
+    now, then, g = s.integrals, s.then, STANDARD_GRAVITY_MPS2
+    once = (now[3] - then[3], now[4] - then[4], now[5] - then[5] - g * lag)
+    twice = (
+        now[6] - then[6] - then[3] * lag,
+        now[7] - then[7] - then[4] * lag,
+        now[8] - then[8] - then[5] * lag - 0.5 * g * lag * lag,
+    )
+    return once, twice
+
+
+@compiled
+def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
+    """Take the slow errors of a fix from the accuracies that the receiver reports."""
+    for k in range(3):
+        usual = p.gps_error_var if k < 2 else p.gps_height_error_var
+        accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+        s.gps_error_var[k] = reported_variance(usual, accuracy, ERROR_SHARES[k])
+        slow = reported_variance(SLOW_MPS * SLOW_MPS, row[GPS_SPEED_ACC], SPEED_SHARES[k])
+        s.pos_density[k] = 2.0 * SLOW_S * slow
+
+
+@compiled
+def reported_variance(variance: float, accuracy: float, share: float) -> float:
+    """Return the variance by a reported accuracy, or the usual one where there is none."""
+    return (share * accuracy) ** 2 if accuracy > 0.0 else variance
+
+
+@compiled
+def position_variance(s: State, p: Gains, row: FloatArray, k: int, since_s: float) -> float:
+    """Return the noise of one coordinate of a fix, m2; its latency varies."""
+    usual = p.gps_position_var if k < 2 else p.gps_height_var
+    accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
+    white = reported_variance(usual, accuracy, NOISE_SHARE)
+    late = p.gps_jitter_sq * s.vel_n[k] * s.vel_n[k]
+    return float((white + late) * max(1.0, p.gps_correlation_s / since_s))
+
+
+@compiled
+def velocity_variance(
+    s: State, p: Gains, row: FloatArray, accel_n: Vec3, k: int, since_s: float
+) -> float:
+    """Return the white noise with the long-term effect of one velocity's errors, m2/s2."""
+    accuracy = row[GPS_SPEED_ACC]
+    usual = p.gps_velocity_var if k < 2 else p.gps_climb_var
+    white = reported_variance(usual, accuracy, SPEED_SHARES[k])
+    assumed = NOISE_MPS * NOISE_MPS
+    if k < 2 and s.time_s - s.mag_used_s > STALE_MAG_S:
+        # Without a compass the heading depends on these velocities alone.
+        white = max(white, assumed * s.fix_excess)
+    white *= max(1.0, p.gps_correlation_s / since_s)
+    late = p.gps_jitter_sq * accel_n[k] * accel_n[k]
+    level_sq = accel_n[0] * accel_n[0] + accel_n[1] * accel_n[1]
+    excess = (s.fix_excess - 1.0) * (assumed + p.gps_jitter_sq * level_sq)
+    return max(white + late, excess)
+
+
+@compiled
+def mean_acceleration(s: State, lag: float) -> Vec3:
+    """Return the mean acceleration over the lag, m/s2; `then` is overwritten."""
+    span = s.time_s - look_back(s, s.time_s - max(lag, LEAST_LAG_S))
+    if span <= 0.0:
+        return (0.0, 0.0, 0.0)
+    gained = difference(as_vec(s.integrals[3:6]), as_vec(s.then[3:6]))
+    return (gained[0] / span, gained[1] / span, gained[2] / span)
+
+
+@compiled
+def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
+    """Write the row of one component of a late velocity."""
+    begin_row(s)
+    set_turned(s, k, scaled(once, -1.0))
+    s.h[VEL + k] = 1.0
+    set_accel_bias(s, k, lag)
+
+
+@compiled
+def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
+    """Write the row of one component of a late position, which has the slow GPS error."""
+    begin_row(s)
+    set_turned(s, k, difference(scaled(once, lag), twice))
+    s.h[VEL + k] = -lag
+    s.h[POS + k] = 1.0
+    s.h[GPS_ERROR + k] = 1.0
+    set_accel_bias(s, k, -0.5 * lag * lag)
+
+
+@compiled
+def set_turned(s: State, k: int, w: Vec3) -> None:
+    """Write how `(att x w)[k]` depends on the attitude error."""
+    a, b = (k + 1) % 3, (k + 2) % 3
+    s.h[ATT + a] = w[b]
+    s.h[ATT + b] = -w[a]
+
+
+@compiled
+def set_accel_bias(s: State, k: int, share: float) -> None:
+    """Write `share` times row `k` of `R_nb` for the accelerometer bias."""
+    x, y, z = body_axes(as_quat(s.q_nb))
+    s.h[ACCEL_BIAS] = share * x[k]
+    s.h[ACCEL_BIAS + 1] = share * y[k]
+    s.h[ACCEL_BIAS + 2] = share * z[k]
+
+
+@compiled
+def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> bool:
+    """Return whether a position is outside the gate, north or east."""
+    once, twice = lag_integrals(s, lag)
+    worst = 0.0
+    for k in range(2):
+        position_row(s, k, once, twice, lag)
+        total = innovation_variance(s, position_variance(s, p, row, k, p.gps_correlation_s))
+        worst = max(worst, off[k] * off[k] / total)
+    return worst > p.gate_sq
+
+
+@compiled
+def note_glitch(s: State, k: int, off: float, variance: float, since_s: float) -> None:
+    """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
+
+    `k` is 0 for velocities and 1 for positions. Taken for errors that are new in each fix, a glitch
+    would win over sound inertial sensors. The variance that errs as much in the long run is that of
+    one error times the number of fixes that share it.
+    """
+    off = min(abs(off), MOST_GLITCH[k])
+    excess = off * off / GLITCH_GATE_SQ[k] - innovation_variance(s, variance)
+    s.glitch[k] = max(s.glitch[k], excess * max(1.0, GLITCH_S / since_s))
+
+
+@compiled
+def update_fix(
+    s: State, p: Gains, row: FloatArray, off_pos: Vec3, off_vel: Vec3, lag: float
+) -> None:
+    """Update by velocity and position of a fix; components that are not finite are left out."""
+    once, twice = lag_integrals(s, lag)
+    since_s = max(s.time_s - s.update_s, LEAST_S)
+    s.update_s = s.time_s
+    accel_n = mean_acceleration(s, lag)
+    faded = math.exp(-since_s / GLITCH_FADE_S)
+    s.glitch[0] *= faded
+    s.glitch[1] *= faded
+    s.glitch[2] = max(norm_sq(accel_n), s.glitch[2] * faded)
+    late_var = LAG_S * LAG_S * s.glitch[2]
+    # The whole fix is checked before any of it is used: a glitch affects all components.
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            note_glitch(s, 0, off_vel[k], variance + late_var, since_s)
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s)
+            note_glitch(s, 1, off_pos[k], variance, since_s)
+    for k in range(3):
+        if math.isfinite(off_vel[k]):
+            velocity_row(s, k, once, lag)
+            variance = velocity_variance(s, p, row, accel_n, k, since_s)
+            update_scalar(s, off_vel[k], variance + s.glitch[0], GLITCH_GATE_SQ[0])
+        if math.isfinite(off_pos[k]):
+            position_row(s, k, once, twice, lag)
+            variance = position_variance(s, p, row, k, since_s) + s.glitch[1]
+            update_scalar(s, off_pos[k], variance, p.gate_sq)
+    inject(s)

@@ -16,6 +16,7 @@ from gateway.compiled import compiled
 from gateway.estimation.eskf.alignment import (
     ENOUGH_PAIRS,
     MAX_PAIR_S,
+    MISMATCH_SIGMA,
     align,
     clear_pairs,
     heading_difference,
@@ -34,6 +35,7 @@ from gateway.estimation.eskf.state import (
     level_variance,
     raise_variance,
     reset_state,
+    reset_states,
 )
 from gateway.estimation.eskf.update import (
     gravity_force_n,
@@ -41,7 +43,7 @@ from gateway.estimation.eskf.update import (
     sustained_sq,
     update_gravity,
 )
-from gateway.estimation.record import as_quat, fill, write_quat
+from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -54,11 +56,10 @@ FOUND_HEADING_RAD: Final = 0.3
 """Alignments with smaller standard deviations are accepted: the filter is linear within them."""
 PATIENCE_S: Final = 8.0
 """For each of these times that the attitude has been lost, a worse level is accepted."""
-MISMATCH_SIGMA: Final = 4.0
 MISMATCH_LEVEL_RAD: Final = 0.14
-MISMATCH_HEADING_RAD: Final = 0.3
 MISMATCH_S: Final = 2.0
-"""The attitude is replaced when the alignment differs by both limits for this time."""
+"""The attitude is replaced when the alignment differs by more than this, or more in heading than
+is accepted, and than chance explains, for this time."""
 GRAVITY_MISMATCH_RAD: Final = 0.6
 GRAVITY_MISMATCH_S: Final = 5.0
 """The same without GPS, where manoeuvres imitate a tilt."""
@@ -83,12 +84,17 @@ def begin_attitude(s: State, p: Gains, level_var: float, heading_var: float) -> 
     reset_state(s, ATT + 1, level_var)
     # While no heading is known, it is counted from where the filter began, which is certain.
     reset_state(s, ATT + 2, heading_var if s.heading_known == 1 or s.lost == 1 else 0.0)
-    for k in range(3):
-        reset_state(s, VEL + k, 0.0)
-        s.vel_n[k] = 0.0
-    s.aided = 0
+    end_aiding(s)
     # The integrals in NED contain the old attitude.
     s.ring_count = 0
+
+
+@compiled
+def end_aiding(s: State) -> None:
+    """Stop estimating position and velocity."""
+    reset_states(s, VEL, 0.0)
+    fill(s.vel_n, 0.0)
+    s.aided = 0
 
 
 @compiled
@@ -160,7 +166,7 @@ def differs_from_alignment(s: State) -> bool:
     if s.heading_known == 0 or s.aligned_std[1] > FOUND_HEADING_RAD:
         return False
     allowed = MISMATCH_SIGMA * math.sqrt(s.aligned_std[1] ** 2 + s.P[ATT + 2, ATT + 2])
-    return abs(heading_difference(found, q_nb)) > max(MISMATCH_HEADING_RAD, allowed)
+    return abs(heading_difference(found, q_nb)) > max(FOUND_HEADING_RAD, allowed)
 
 
 @compiled
@@ -194,11 +200,10 @@ def discard_calibration(s: State, p: Gains) -> None:
     reset_accel_bias(s, p)
     reset_hard_iron(s, p)
     fill(s.gyro_scale_b, 0.0)
-    for k in range(3):
-        if s.rest_seen > 0:
-            s.gyro_bias_b[k] = s.rest_bias_b[k]
-        reset_state(s, GYRO_BIAS + k, gyro_bias_var(s, p))
-        reset_state(s, GYRO_SCALE + k, p.gyro_scale_var)
+    if s.rest_seen > 0:
+        write_vec(s.gyro_bias_b, as_vec(s.rest_bias_b))
+    reset_states(s, GYRO_BIAS, gyro_bias_var(s, p))
+    reset_states(s, GYRO_SCALE, p.gyro_scale_var)
 
 
 @compiled
@@ -206,8 +211,7 @@ def reset_accel_bias(s: State, p: Gains) -> None:
     """Discard the accelerometer bias."""
     propagate(s, p)
     fill(s.accel_bias_b, 0.0)
-    for k in range(ACCEL_BIAS, ACCEL_BIAS + 3):
-        reset_state(s, k, accel_bias_var(s, p))
+    reset_states(s, ACCEL_BIAS, accel_bias_var(s, p))
 
 
 @compiled
@@ -217,8 +221,7 @@ def reset_gyro_bias(s: State, p: Gains) -> None:
     fill(s.gyro_bias_b, 0.0)
     fill(s.rest_bias_b, 0.0)
     s.rest_seen = 0
-    for k in range(GYRO_BIAS, GYRO_BIAS + 3):
-        reset_state(s, k, gyro_bias_var(s, p))
+    reset_states(s, GYRO_BIAS, gyro_bias_var(s, p))
 
 
 @compiled

@@ -16,17 +16,19 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
-from gateway.estimation.eskf.delayed import look_back
+from gateway.estimation.columns import FRESH_GPS_S
+from gateway.estimation.eskf.alignment import MISMATCH_SIGMA
+from gateway.estimation.eskf.predict import look_back
 from gateway.estimation.eskf.state import LATENCIES, NEVER_S, State
 from gateway.estimation.record import FloatArray, fill
+from gateway.geometry.quaternion import norm_sq
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 STEP_S: Final = 0.05
 """Between the latencies, from 0 to 0.6 s: no receiver is later."""
 LEAST_PAIR_S: Final = 0.15
-MOST_PAIR_S: Final = 1.5
-"""Shortest and longest interval of two velocities that are compared."""
+"""Shortest interval of two velocities that are compared."""
 WINDOW_S: Final = 8.0
 """The drift of the gyroscope frame is negligible for this time."""
 WINDOW_PAIRS: Final = 6.0
@@ -45,8 +47,6 @@ CONFLICT_S: Final = 0.07
 """The set latency stays in use within this difference: position may lag behind velocity by that."""
 MOST_HALF_SPAN: Final = 3
 """A parabola is fitted to at most so many misfits on either side of the smallest."""
-LEAST_RISE: Final = 16.0
-"""Rise of twice the negative log-likelihood, four standard deviations, that a parabola needs."""
 SLEW: Final = 0.01
 """Change of the latency in use per second, so that no fix seems to jump."""
 NEWTON_STEPS: Final = 12
@@ -85,11 +85,10 @@ def watch_latency(s: State, set_s: float, arrival_s: float, vel: Vec3) -> None:
     if not 0.0 <= arrival_s - s.window_from[4] <= WINDOW_S:
         close_window(s)
         s.window_from[4] = arrival_s
-    whole = 0.0 < dt < MOST_PAIR_S
+    whole = 0.0 < dt < FRESH_GPS_S
     f = s.window_from
     g = STANDARD_GRAVITY_MPS2
     change = (vel[0] - f[1], vel[1] - f[2], vel[2] - f[3] - g * dt)
-    change_sq = change[0] ** 2 + change[1] ** 2 + change[2] ** 2
     for k in range(LATENCIES):
         look_back(s, arrival_s - STEP_S * k)
         for j in range(3):
@@ -100,12 +99,12 @@ def watch_latency(s: State, set_s: float, arrival_s: float, vel: Vec3) -> None:
                 for i in range(3):
                     s.window_products[k, 3 * i + j] += change[i] * measured
         if whole:
-            s.window_products[k, 9] += change_sq
+            s.window_products[k, 9] += norm_sq(change)
     if whole:
         s.window_sums[0] += 1.0
         for i in range(3):
             s.window_sums[1 + i] += change[i] / dt
-        s.window_sums[4] += change_sq / (dt * dt)
+        s.window_sums[4] += norm_sq(change) / (dt * dt)
         settle_latency(s, set_s, dt)
     f[0], f[1], f[2], f[3] = arrival_s, vel[0], vel[1], vel[2]
 
@@ -186,7 +185,7 @@ def sharpest_parabola(s: State, least: int) -> tuple[float, float]:
     for half in range(1, MOST_HALF_SPAN + 1):
         lowest, curve = fit_parabola(s.latency_misfit, least, half)
         # The noise is the same over any span, so it bends a short one more.
-        if curve * half * half > LEAST_RISE * (MOST_HALF_SPAN + 1 - half):
+        if curve * half * half > MISMATCH_SIGMA**2 * (MOST_HALF_SPAN + 1 - half):
             return lowest, curve
     return 0.0, 0.0
 

@@ -27,17 +27,21 @@ from gateway.estimation.eskf.state import (
     State,
     raise_variance,
     reset_state,
+    reset_states,
 )
 from gateway.estimation.eskf.update import begin_row, consider, inject, update_scalar
 from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
     body_axes,
+    difference,
     from_rotation_vector,
     multiply,
+    norm_sq,
     normalise,
     rotate,
     rotate_inverse,
+    scaled,
 )
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG
@@ -90,24 +94,6 @@ UNTURNED_RAD: Final = 4.0 * math.pi
 
 
 @compiled
-def is_zero(v: Vec3) -> bool:
-    """Return whether all three numbers are zero."""
-    return v[0] == 0.0 and v[1] == 0.0 and v[2] == 0.0
-
-
-@compiled
-def norm_sq(v: Vec3) -> float:
-    """Return the squared length."""
-    return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
-
-
-@compiled
-def difference(a: Vec3, b: Vec3) -> Vec3:
-    """Subtract two vectors."""
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
-
-
-@compiled
 def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
     """Return whether a sample contains a usable new field; to be called for each sample."""
     stuck = norm_sq(as_vec(s.mag_turned)) > STUCK_TURN_RAD * STUCK_TURN_RAD
@@ -117,7 +103,7 @@ def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
     strength_sq = norm_sq(mag_b)
     if not FIELD_RANGE_UT[0] ** 2 < strength_sq < FIELD_RANGE_UT[1] ** 2:
         return False
-    if is_zero(difference(mag_b, as_vec(s.mag_last))):
+    if norm_sq(difference(mag_b, as_vec(s.mag_last))) == 0.0:
         return bool(s.mag_misplaced == 0 and not stuck)
     write_vec(s.mag_last, mag_b)
     fill(s.mag_turned, 0.0)
@@ -211,11 +197,7 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     """Use one sound reading of the calibrated field in body FRD, uT."""
     if s.lost == 1:
         return
-    turned = (
-        s.rate_b[0] * s.mag_latency_s,
-        s.rate_b[1] * s.mag_latency_s,
-        s.rate_b[2] * s.mag_latency_s,
-    )
+    turned = scaled(as_vec(s.rate_b), s.mag_latency_s)
     earth_b = difference(mag_b, as_vec(s.hard_iron_b))
     present_b = rotate_inverse(from_rotation_vector(turned), earth_b)
     field_n = rotate(as_quat(s.q_nb), present_b)
@@ -328,9 +310,8 @@ def raise_hard_iron_by_dip(s: State, earth_dip_rad: float) -> None:
 def reset_hard_iron(s: State, p: Gains) -> None:
     """Discard the hard iron that was found."""
     propagate(s, p)
-    for k in range(3):
-        s.hard_iron_b[k] = 0.0
-        reset_state(s, HARD_IRON + k, hard_iron_var(s, p))
+    fill(s.hard_iron_b, 0.0)
+    reset_states(s, HARD_IRON, hard_iron_var(s, p))
 
 
 @compiled

@@ -33,8 +33,10 @@ from gateway.estimation.eskf.state import (
     GYRO_BIAS,
     GYRO_SCALE,
     HARD_IRON,
+    INTEGRALS,
     MOVING_STATES,
     POS,
+    SLOTS,
     STATES,
     VEL,
     State,
@@ -42,8 +44,17 @@ from gateway.estimation.eskf.state import (
     raise_variance,
     scale_state,
 )
-from gateway.estimation.record import FloatArray, as_quat, fill, write_quat, write_vec
-from gateway.geometry.quaternion import body_axes, from_rotation_vector, multiply, normalise, rotate
+from gateway.estimation.record import FloatArray, as_quat, as_vec, fill, write_quat, write_vec
+from gateway.geometry.quaternion import (
+    body_axes,
+    difference,
+    from_rotation_vector,
+    multiply,
+    norm_sq,
+    normalise,
+    rotate,
+    scaled,
+)
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -61,6 +72,8 @@ BIAS_RAISE_S: Final = 0.3
 """Time in which the rest is added to the variance of the bias."""
 STEP_LIMIT: Final = 1e4
 """A larger squared change from sample to sample is a fault, and NaN compares false."""
+SPACING_S: Final = 0.005
+"""Samples that come faster share a slot; between slots the integrals are interpolated."""
 CLIMB_DENSITY: Final = 4.0
 """Random walk of the height without GPS, m2/s: a climb of 2 m/s that lasts for a second."""
 
@@ -82,20 +95,19 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
 
     Midpoint rule: the force acts at the attitude half way through the interval.
     """
-    c = s.accel_bias_b
     rate = rate_of(s, gyro)
     write_vec(s.rate_b, rate)
-    half = from_rotation_vector((0.5 * rate[0] * dt, 0.5 * rate[1] * dt, 0.5 * rate[2] * dt))
+    half = from_rotation_vector(scaled(rate, 0.5 * dt))
     q_i = multiply(as_quat(s.q_ib), half)
     write_quat(s.q_ib, normalise(multiply(q_i, half)))
     q = multiply(as_quat(s.q_nb), half)
     write_quat(s.q_nb, normalise(multiply(q, half)))
     x, y, z = body_axes(q)
-    f0, f1, f2 = accel[0] - c[0], accel[1] - c[1], accel[2] - c[2]
-    force_i = rotate(q_i, (f0, f1, f2))
+    f = difference(accel, as_vec(s.accel_bias_b))
+    force_i = rotate(q_i, f)
     accel_sq = 0.0
     for k in range(3):
-        force = x[k] * f0 + y[k] * f1 + z[k] * f2
+        force = x[k] * f[0] + y[k] * f[1] + z[k] * f[2]
         s.pending_force_n[k] += force * dt
         s.pending_turn[k, 0] += x[k] * dt
         s.pending_turn[k, 1] += y[k] * dt
@@ -111,8 +123,7 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         if s.aided == 1:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
             s.vel_n[k] += a * dt
-    turn_rad = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
-    s.pending_noise[0] += p.gyro_turn_var * turn_rad
+    s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(norm_sq(rate)))
     s.pending_noise[1] += p.accel_scale_sq * SCALE_S * accel_sq * dt
     s.pending_s += dt
     follow_gravity(s, p, force_i, dt)
@@ -155,6 +166,49 @@ def follow_gravity(s: State, p: Gains, force_i: Vec3, dt: float) -> None:
         s.force_lp_i[1, k] += share * (s.force_lp_i[0, k] - s.force_lp_i[1, k])
         deviation_sq += (s.force_lp_i[0, k] - s.force_lp_i[1, k]) ** 2
     s.force_dev_sq += slow * (deviation_sq - s.force_dev_sq)
+
+
+@compiled
+def store_integrals(s: State) -> None:
+    """Store the present integrals."""
+    newest = (s.ring_count - 1) % SLOTS
+    if s.ring_count > 0 and s.time_s - s.ring[newest, 0] < SPACING_S:
+        return
+    slot = s.ring_count % SLOTS
+    s.ring[slot, 0] = s.time_s
+    for k in range(INTEGRALS):
+        s.ring[slot, 1 + k] = s.integrals[k]
+    s.ring_count += 1
+
+
+@compiled
+def look_back(s: State, time_s: float) -> float:
+    """Interpolate the integrals of a past time into `then`; return the time they hold for."""
+    count = s.ring_count
+    if time_s >= s.time_s or count == 0:
+        for k in range(INTEGRALS):
+            s.then[k] = s.integrals[k]
+        return float(s.time_s)
+    oldest = max(0, count - SLOTS)
+    low, high = oldest, count
+    while low < high:
+        middle = (low + high) // 2
+        if s.ring[middle % SLOTS, 0] <= time_s:
+            low = middle + 1
+        else:
+            high = middle
+    if low == oldest:
+        for k in range(INTEGRALS):
+            s.then[k] = s.ring[oldest % SLOTS, 1 + k]
+        return float(s.ring[oldest % SLOTS, 0])
+    before, after = (low - 1) % SLOTS, low % SLOTS
+    t0 = s.ring[before, 0]
+    t1 = s.time_s if low == count else s.ring[after, 0]
+    share = (time_s - t0) / (t1 - t0) if t1 > t0 else 0.0
+    for k in range(INTEGRALS):
+        end = s.integrals[k] if low == count else s.ring[after, 1 + k]
+        s.then[k] = s.ring[before, 1 + k] + share * (end - s.ring[before, 1 + k])
+    return time_s
 
 
 @compiled

@@ -13,7 +13,8 @@ from gateway.estimation.columns import FRESH_GPS_S
 from gateway.estimation.eskf.integrity import lose_attitude, require_bias_variance
 from gateway.estimation.eskf.magnetometer import UNTURNED_RAD, begin_turn, reset_hard_iron
 from gateway.estimation.eskf.settings import Gains
-from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State, reset_state
+from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State, reset_states
+from gateway.estimation.record import as_vec, write_vec
 from gateway.records import Vec3
 from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
 
@@ -131,8 +132,7 @@ def begin_rest(s: State, p: Gains) -> None:
     s.rest_seen = 1
     if off > USUAL_BIAS_RADPS:
         lose_attitude(s, p)
-        for k in range(3):
-            s.gyro_bias_b[k] = s.gyro_mean[k]
-            reset_state(s, GYRO_BIAS + k, p.gyro_bias_change_radps**2)
+        write_vec(s.gyro_bias_b, as_vec(s.gyro_mean))
+        reset_states(s, GYRO_BIAS, p.gyro_bias_change_radps**2)
         begin_turn(s, (0.0, 0.0, 0.0))
         reset_hard_iron(s, p)

@@ -40,7 +40,7 @@ INTEGRALS: Final = 9
 """Force in the gyroscope frame, acceleration in NED, and the integral of that: three numbers each,
 each integrated once more over time."""
 SLOTS: Final = 512
-"""Past integrals that are kept: 2.5 s at `delayed.SPACING_S`, more than the longest latency."""
+"""Past integrals that are kept: 2.5 s at `predict.SPACING_S`, more than the longest latency."""
 LATENCIES: Final = 13
 """Latencies that are compared at once, see `latency`."""
 MOMENTS: Final = 8
@@ -119,7 +119,7 @@ class State:
     level_s: float
     """Last measurement of gravity or rest."""
 
-    # Past integrals for late fixes, see `delayed`.
+    # Past integrals for late fixes, see `fixes`.
     integrals: Annotated[FloatArray, (INTEGRALS,)]
     then: Annotated[FloatArray, (INTEGRALS,)]
     """Work space: the integrals at the time of a fix."""
@@ -293,6 +293,13 @@ def reset_state(s: State, k: int, variance: float) -> None:
         s.P[k, j] = 0.0
         s.P[j, k] = 0.0
     s.P[k, k] = variance
+
+
+@compiled
+def reset_states(s: State, first: int, variance: float) -> None:
+    """Do the same for the three states of a vector."""
+    for k in range(3):
+        reset_state(s, first + k, variance)
 
 
 @compiled
