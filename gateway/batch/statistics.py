@@ -1,7 +1,7 @@
 """Statistics over many flights and their page: chance, cross-validation, errors."""
 
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -160,152 +160,79 @@ WORSE_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class FlightErrors:
-    """The errors of one flight."""
-
-    place: str
-    digest: str
-    vehicle: int | None
-    began: str | None
-    held_m: Mapping[str, float]
-    """At withheld fixes, by estimator."""
-
-    @property
-    def group(self) -> str:
-        """Aircraft and day; a flight without a day is a group of its own."""
-        return group_of(self.vehicle, self.began, self.digest)
-
-
-@dataclass(frozen=True, slots=True)
-class GroupErrors:
-    """The errors of one estimator on the flights of one aircraft."""
-
-    vehicle: int | None
-    """None for all aircraft together."""
-    estimator: str
-    flights: int
-    median_m: float
-    most_m: float
-    """Nine flights in ten are better."""
-    worst_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """One flight, fused by two versions."""
-
-    place: str
-    estimator: str
-    before_m: float
-    after_m: float
-
-    @property
-    def is_worse(self) -> bool:
-        """Whether it got worse by more than rounding and luck."""
-        return self.after_m > self.before_m * WORSE and self.after_m > self.before_m + WORSE_M
-
-
-@dataclass(frozen=True, slots=True)
 class Versus:
     """A season against the same flights of another version."""
 
     leads: dict[str, Lead]
     """Of now over then, by estimator."""
-    worse: list[Change]
-    """The worst first."""
+    worse: pd.DataFrame
+    """`place`, `estimator`, `before_m` and `after_m` of flights, the worst first."""
     compared: int
     """Flights that both have."""
 
 
-def group_of(vehicle: int | None, began: str | None, digest: str) -> str:
-    """Name the aircraft and day of a flight, which share weather and the state of the sensors."""
-    return f"{vehicle} {began[:10] if began else digest}"
+def group_of(result: FlightResult) -> str:
+    """Name aircraft and day, which share weather and the state of the sensors.
 
-
-def errors_by_group(flights: Iterable[FlightErrors]) -> list[GroupErrors]:
-    """Sum errors up: all aircraft together first, then each."""
-    found: dict[tuple[int | None, str], list[float]] = defaultdict(list)
-    vehicles: set[int | None] = set()
-    for flight in flights:
-        vehicles.add(flight.vehicle)
-        for estimator, error_m in flight.held_m.items():
-            found[flight.vehicle, estimator].append(error_m)
-            if flight.vehicle is not None:
-                found[None, estimator].append(error_m)
-    if len(vehicles) == 1:
-        found = {key: errors for key, errors in found.items() if key[0] is not None} or found
-    return [
-        GroupErrors(
-            vehicle,
-            estimator,
-            len(errors),
-            float(np.median(errors)),
-            float(np.quantile(errors, 0.9)),
-            max(errors),
-        )
-        for (vehicle, estimator), errors in sorted(
-            found.items(), key=lambda entry: (entry[0][0] or 0, entry[0][1])
-        )
-    ]
-
-
-def versus(now: Iterable[FlightErrors], then: Iterable[FlightErrors]) -> Versus:
-    """Compare the flights that both have, by the digests of their files."""
-    before = {flight.digest: flight for flight in then}
-    both = [(flight, before[flight.digest]) for flight in now if flight.digest in before]
-    leads: dict[str, Lead] = {}
-    changes: list[Change] = []
-    for estimator in sorted(
-        {name for flight, old in both for name in flight.held_m if name in old.held_m}
-    ):
-        pairs = [(f, o) for f, o in both if estimator in f.held_m and estimator in o.held_m]
-        after = np.array([flight.held_m[estimator] for flight, _ in pairs])
-        old = np.array([flight.held_m[estimator] for _, flight in pairs])
-        lead = lead_of(after, old, [flight.group for flight, _ in pairs])
-        if lead is not None:
-            leads[estimator] = lead
-        changes += [
-            Change(f.place, estimator, o.held_m[estimator], f.held_m[estimator]) for f, o in pairs
-        ]
-    worse = [change for change in changes if change.is_worse]
-    return Versus(leads, sorted(worse, key=lambda c: c.before_m / c.after_m), len(both))
+    A flight without a day is a group of its own.
+    """
+    return f"{result.vehicle} {result.began[:10] if result.began else result.digest}"
 
 
 ALL: Final = "all"
 
 
-def errors_of(results: Sequence[FlightResult]) -> list[FlightErrors]:
-    """Take the errors out of the results that have some."""
-    return [
-        FlightErrors(
-            result.place, result.digest, result.vehicle, result.began, result.figures[HELD]
-        )
-        for result in results
-        if HELD in result.figures
+def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
+    """Sum errors at withheld fixes up: all aircraft together first, then each."""
+    errors = pd.DataFrame(
+        [(r.vehicle, name, m) for r in results for name, m in r.figures.get(HELD, {}).items()],
+        columns=["vehicle", "estimator", "m"],
+    )
+    vehicles = errors["vehicle"].dropna().unique()
+    parts = [
+        (f"{vehicle:.0f}", errors[errors["vehicle"] == vehicle]) for vehicle in sorted(vehicles)
     ]
+    if len(parts) != 1 or errors["vehicle"].isna().any():
+        parts.insert(0, (ALL, errors))
+    return pd.DataFrame(
+        [
+            (aircraft, name, len(m), m.median(), m.quantile(0.9), m.max())
+            for aircraft, part in parts
+            for name, m in part.groupby("estimator")["m"]
+        ],
+        columns=["aircraft", "estimator", "flights", "median, m", "9 in 10 below, m", "worst, m"],
+    )
+
+
+def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
+    """Compare the flights that both have errors of, by the digests of their files."""
+    before = {old.digest: old.figures[HELD] for old in then if HELD in old.figures}
+    both = [new for new in now if HELD in new.figures and new.digest in before]
+    changes = pd.DataFrame(
+        [
+            (new.place, group_of(new), name, before[new.digest][name], after_m)
+            for new in both
+            for name, after_m in new.figures[HELD].items()
+            if name in before[new.digest]
+        ],
+        columns=["place", "group", "estimator", "before_m", "after_m"],
+    )
+    leads = {
+        str(name): lead_of(
+            part["after_m"].to_numpy(), part["before_m"].to_numpy(), [*part["group"]]
+        )
+        for name, part in changes.groupby("estimator")
+    }
+    before_m, after_m = changes["before_m"], changes["after_m"]
+    worse = changes[(after_m > before_m * WORSE) & (after_m > before_m + WORSE_M)]
+    gain = (worse["before_m"] / worse["after_m"]).to_numpy(np.float64)
+    worse = worse.iloc[np.argsort(gain, kind="stable")]
+    return Versus({k: lead for k, lead in leads.items() if lead is not None}, worse, len(both))
 
 
 def flight_table(results: Sequence[FlightResult]) -> pd.DataFrame:
     """Lay all results out, a row a recording."""
     return pd.DataFrame([_row(result) for result in results])
-
-
-def group_table(groups: Sequence[GroupErrors]) -> pd.DataFrame:
-    """Lay the errors by aircraft and estimator out."""
-    return pd.DataFrame(
-        [
-            (
-                ALL if group.vehicle is None else str(group.vehicle),
-                group.estimator,
-                group.flights,
-                group.median_m,
-                group.most_m,
-                group.worst_m,
-            )
-            for group in groups
-        ],
-        columns=["aircraft", "estimator", "flights", "median, m", "9 in 10 below, m", "worst, m"],
-    )
 
 
 def write_season_page(
@@ -315,46 +242,50 @@ def write_season_page(
     # They need the extra plot, for which the command has looked.
     from gateway.analysis.reporting.page import Fact, Report, ReportTable, Section, write_report
 
-    errors = errors_of(results)
+    judged = [result for result in results if HELD in result.figures]
     broken = [result for result in results if result.error is not None]
-    groups = group_table(errors_by_group(errors))
     sections = [
         Section(
             "Errors by aircraft and estimator",
             "Each flight was fused without every fifth fix, which then judged: the figures are the "
             "root mean square errors of the flights, horizontal.",
-            [_picture(errors)] if errors else [],
-            [ReportTable("errors", groups, "Errors at withheld fixes.")],
+            [_picture(judged)] if judged else [],
+            [ReportTable("errors", errors_by_group(judged), "Errors at withheld fixes.")],
         )
     ]
     if compared is not None:
         sections.append(_versus_section(compared))
     if broken:
-        sections.append(_failed_section(broken))
+        rows = [(_file_name(result.place), result.error) for result in broken]
+        failed = ReportTable("failed", pd.DataFrame(rows, columns=["recording", "why"]), "Failed.")
+        lead = "They are in none of the other tables."
+        sections.append(Section("Recordings that failed", lead, tables=[failed]))
     if len(broken) < len(results):
         flights = flight_table([result for result in results if result.error is None])
         # The page is narrow; a flight's distance is in flights.csv.
-        table = ReportTable(
-            "flight_errors", flights.drop(columns=["failed", "distance, m"]), "Flights."
-        )
+        flights = flights.drop(columns=["failed", "distance, m"])
+        table = ReportTable("flight_errors", flights, "Flights.")
         sections.append(Section("Flights", "In the order given.", tables=[table]))
     seconds = sum(r.figures.get("summary", {}).get("duration, s", 0.0) for r in results)
-    vehicles = {flight.vehicle for flight in errors}
     facts = [
         Fact(str(len(results) - len(broken)), "flights"),
         Fact(f"{seconds / 3600.0:.1f} h", "recorded"),
-        Fact(str(len(vehicles)), "aircraft"),
+        Fact(str(len({result.vehicle for result in judged})), "aircraft"),
         Fact(str(len(broken)), "recordings that failed"),
     ]
     story = "All flights of a season, fused again by every estimator."
     return write_report(Report("Season", story, facts, sections), folder, jobs=1)
 
 
+def _file_name(place: str) -> str:
+    return place.rsplit("/", 1)[-1]
+
+
 def _row(result: FlightResult) -> dict[str, Any]:
     summary = result.figures.get("summary", result.figures)
     held = result.figures.get(HELD, {})
     return {
-        "recording": result.place.rsplit("/", 1)[-1],
+        "recording": _file_name(result.place),
         "aircraft": "" if result.vehicle is None else str(result.vehicle),
         "began": result.began or "",
         "duration, s": _number(summary.get("duration, s", summary.get("duration_s"))),
@@ -375,53 +306,37 @@ def _versus_section(compared: Versus) -> Any:
         [(name, lead.text) for name, lead in compared.leads.items()],
         columns=["estimator", "now against then"],
     )
-    worse = pd.DataFrame(
-        [
-            (change.place.rsplit("/", 1)[-1], change.estimator, change.before_m, change.after_m)
-            for change in compared.worse
-        ],
-        columns=["recording", "estimator", "then, m", "now, m"],
-    )
     lead = (
         f"Both fused {counted(compared.compared, 'flight')}. A flight is listed as worse where its "
         "error grew by more than 5 % and 5 cm."
     )
     tables = [ReportTable("versus", leads, "Errors of now over those of then.")]
-    if compared.worse:
+    if len(compared.worse):
+        worse = compared.worse.drop(columns="group").assign(
+            place=compared.worse["place"].map(_file_name)
+        )
+        worse.columns = pd.Index(["recording", "estimator", "then, m", "now, m"])
         tables.append(ReportTable("worse", worse, f"{len(worse)} that got worse."))
     return Section("Against the other results", lead, tables=tables)
 
 
-def _failed_section(broken: Sequence[FlightResult]) -> Any:
-    from gateway.analysis.reporting.page import ReportTable, Section
-
-    rows = [(result.place.rsplit("/", 1)[-1], result.error) for result in broken]
-    frame = pd.DataFrame(rows, columns=["recording", "why"])
-    lead = "They are in none of the other tables."
-    return Section("Recordings that failed", lead, tables=[ReportTable("failed", frame, "Failed.")])
-
-
-def _picture(errors: Sequence[FlightErrors]) -> Any:
+def _picture(results: Sequence[FlightResult]) -> Any:
     from matplotlib.ticker import FuncFormatter
 
     from gateway.analysis.reporting import style
     from gateway.analysis.reporting.estimators import COLOURS, OTHER
     from gateway.analysis.reporting.page import Picture
 
-    names = sorted({name for flight in errors for name in flight.held_m})
+    errors = [result.figures[HELD] for result in results]
+    names = sorted({name for held_m in errors for name in held_m})
 
     def draw(width_in: float) -> Any:
         figure, (axes,) = style.panels(width_in, 1, 2.6)
         for name in names:
-            values = np.sort([f.held_m[name] for f in errors if name in f.held_m])
+            values = np.sort([held_m[name] for held_m in errors if name in held_m])
             share = np.arange(len(values) + 1) / len(values)
-            axes.step(
-                [values[0], *values],
-                share,
-                where="post",
-                label=name,
-                color=COLOURS.get(name, OTHER),
-            )
+            colour = COLOURS.get(name, OTHER)
+            axes.step([values[0], *values], share, where="post", label=name, color=colour)
         axes.set_xlabel("error at withheld fixes, m")
         axes.set_ylabel("share of the flights")
         axes.set_xscale("log")

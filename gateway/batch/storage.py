@@ -21,8 +21,6 @@ from gateway.recordings.index import parts_together, recording_name
 
 MARK: Final = "://"
 """Separates the scheme of a URL from the rest; no local path has it."""
-OF_ONE_PROCESS: Final = "memory"
-"""A file system that no other process sees: its files travel with the work."""
 HERE: Final = "file"
 """The file system that needs no package."""
 REMOTE_ENDINGS: Final = (*ENDINGS, ".parquet", ".ulg", ".bin")
@@ -43,29 +41,21 @@ class StorageError(WorkError):
     """A place that cannot be reached; the text says which and why."""
 
 
-class StoredFile(msgspec.Struct, frozen=True):
-    """One file of a recording."""
-
-    place: str
-    """Local path or URL."""
-    data: bytes | None = None
-    """The file itself, where no other process could read it."""
-
-
 class BatchItem(msgspec.Struct, frozen=True):
     """One recording to work on: its parts, in order."""
 
-    parts: tuple[StoredFile, ...]
+    places: tuple[str, ...]
+    """Local paths or URLs of its parts."""
 
     @property
     def place(self) -> str:
         """Path or URL of its first part, without a user's name and password."""
-        return without_user(self.parts[0].place)
+        return without_user(self.places[0])
 
     @property
     def is_fetched(self) -> bool:
         """Whether a part of it has to be fetched from elsewhere."""
-        return any(part.data is None and is_url(part.place) for part in self.parts)
+        return any(map(is_url, self.places))
 
 
 def is_url(name: str) -> bool:
@@ -90,12 +80,13 @@ def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem
     """
     places = list(dict.fromkeys(place for name in names for place in _places(name)))
     if each_file:
-        return [BatchItem((_part(place),)) for place in places]
+        return [BatchItem((_plain(place),)) for place in places]
     by_path = {Path(place): place for place in places}
     with_table = {_series(path) for path in by_path if _ending(path) == ".csv"}
     wanted = [p for p in by_path if _ending(p) == ".csv" or _series(p) not in with_table]
     return [
-        BatchItem(tuple(_part(by_path[path]) for path in paths)) for paths in parts_together(wanted)
+        BatchItem(tuple(_plain(by_path[path]) for path in paths))
+        for paths in parts_together(wanted)
     ]
 
 
@@ -106,7 +97,7 @@ def stamp_of_item(item: BatchItem) -> str:
     nothing is fetched for it; raises OSError and StorageError.
     """
     if item.is_fetched:
-        stamps = [_stamp_of(part) for part in item.parts]
+        stamps = [_stamp_of(place) for place in item.places]
         if all(stamps):
             return sha256("\n".join(stamps).encode()).hexdigest()
     with local_files(item) as paths:
@@ -122,27 +113,20 @@ def digest_of_files(paths: Sequence[Path]) -> str:
 @contextmanager
 def local_files(item: BatchItem) -> Iterator[list[Path]]:
     """Have the files of a recording on this machine's disk."""
-    if not any(part.data is not None or is_url(part.place) for part in item.parts):
-        yield [Path(part.place) for part in item.parts]
+    if not item.is_fetched:
+        yield [Path(place) for place in item.places]
         return
     with TemporaryDirectory(prefix="mavgate-") as folder:
-        yield [_fetched(part, Path(folder, str(number))) for number, part in enumerate(item.parts)]
+        yield [_fetched(place, Path(folder, str(k))) for k, place in enumerate(item.places)]
 
 
-def _fetched(part: StoredFile, folder: Path) -> Path:
-    if part.data is None and not is_url(part.place):
-        return Path(part.place)
+def _fetched(place: str, folder: Path) -> Path:
+    if not is_url(place):
+        return Path(place)
     folder.mkdir()
-    path = folder / part.place.rsplit("/", 1)[-1]
-    if part.data is not None:
-        path.write_bytes(part.data)
-        return path
-    storage, remote = _storage(part.place)
-    with (
-        _storage_errors(part.place),
-        storage.open(remote, "rb") as source,
-        path.open("wb") as target,
-    ):
+    path = folder / place.rsplit("/", 1)[-1]
+    storage, remote = _storage(place)
+    with _storage_errors(place), storage.open(remote, "rb") as source, path.open("wb") as target:
         shutil.copyfileobj(source, target, CHUNK)
     return path
 
@@ -173,26 +157,24 @@ def _places(name: str) -> list[str]:
     return places
 
 
-def _part(place: str) -> StoredFile:
+def _plain(place: str) -> str:
+    """Return a path as absolute, and the URL of a local file as its path."""
     if not is_url(place):
-        return StoredFile(str(Path(place).absolute()))
+        return str(Path(place).absolute())
     storage, remote = _storage(place)
     protocols = {storage.protocol} if isinstance(storage.protocol, str) else {*storage.protocol}
-    if HERE in protocols:
-        return StoredFile(remote)
-    with _storage_errors(place):
-        return StoredFile(place, storage.cat_file(remote) if OF_ONE_PROCESS in protocols else None)
+    return remote if HERE in protocols else place
 
 
-def _stamp_of(part: StoredFile) -> str:
+def _stamp_of(place: str) -> str:
     """Return a file's place, size and change as its storage reports them, or nothing."""
-    if part.data is not None or not is_url(part.place):
+    if not is_url(place):
         return ""
-    storage, remote = _storage(part.place)
-    with _storage_errors(part.place):
+    storage, remote = _storage(place)
+    with _storage_errors(place):
         facts = storage.info(remote)
     stamps = [str(facts[name]) for name in STAMPS if facts.get(name)]
-    return "\t".join([without_user(part.place), str(facts.get("size")), *stamps]) if stamps else ""
+    return "\t".join([without_user(place), str(facts.get("size")), *stamps]) if stamps else ""
 
 
 def _storage(url: str) -> tuple[Any, str]:

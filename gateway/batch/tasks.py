@@ -13,7 +13,7 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, ClassVar, Final, Protocol
+from typing import Any, ClassVar, Final
 
 import msgspec
 
@@ -76,81 +76,69 @@ class Worked:
     files: Files = field(default_factory=dict)
 
 
-class FlightTask(Protocol):
-    """One work on one recording."""
-
-    @property
-    def name(self) -> str:
-        """Of the command."""
-        ...
-
-    @property
-    def fingerprint(self) -> bytes:
-        """All that affects the result, except the recording and the version."""
-        ...
-
-    def do(self, files: list[Path], name: str) -> Worked:
-        """Do it; raises FlightError, OSError, ValueError if there is no flight in it."""
-        ...
-
-
 @dataclass(frozen=True)
-class _ReadingTask:
-    """A task of which all that changes the outcome is how the recording is read."""
+class FlightTask(ABC):
+    """One work on one recording; only how that is read changes the outcome."""
 
     name: ClassVar[str]
+    """Of the command."""
     options: ReadOptions
 
     @property
     def fingerprint(self) -> bytes:
-        """See `FlightTask`."""
-        return options_bytes(self.options)
-
-
-class _JudgingTask(_ReadingTask, ABC):
-    """Fuses with every estimator, and judges each by withheld fixes."""
-
-    def do(self, files: list[Path], name: str) -> Worked:
-        """See `FlightTask`."""
-        read = read_season_flight(files, self.options, name)
-        case = make_case(read.flight)
-        return Worked(read.vehicle, read.began, _figures(case), self._files_of(read, case, name))
+        """All that affects the result, except the recording and the version."""
+        current = self.options.current
+        values = {
+            "default": current.default,
+            "aircraft": {str(number): own for number, own in sorted(current.aircraft.items())},
+            "choice": self.options.choice,
+            "columns": self.options.columns,
+            "system": self.options.system_id,
+        }
+        return msgspec.json.encode(values, order="sorted")
 
     @abstractmethod
-    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files: ...
+    def do(self, files: list[Path], name: str) -> Worked:
+        """Do it; raises FlightError, OSError, ValueError if there is no flight in it."""
 
 
 @dataclass(frozen=True)
-class FuseTask(_JudgingTask):
+class FuseTask(FlightTask):
     """Fuse with every estimator, judge each by withheld fixes, write the settings' own states."""
 
     name: ClassVar[str] = "fuse"
 
-    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:
+    def do(self, files: list[Path], name: str) -> Worked:
+        """See `FlightTask`."""
+        read, case = _judged(files, self.options, name)
         states = fuse(read.flight.samples, make_estimator(case.fusion.estimation)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
-        return {f"fused/{name}.csv": b"".join(lines)}
+        fused = {f"fused/{name}.csv": b"".join(lines)}
+        return Worked(read.vehicle, read.began, _figures(case), fused)
 
 
 @dataclass(frozen=True)
-class ReportTask(_JudgingTask):
+class ReportTask(FlightTask):
     """Make the page of each flight."""
 
     name: ClassVar[str] = "report"
 
-    def _files_of(self, read: "ReadFlight", case: Case, name: str) -> Files:  # noqa: ARG002
+    def do(self, files: list[Path], name: str) -> Worked:
+        """See `FlightTask`."""
         # They need the extra plot, and take a second to import.
         from gateway.analysis.reporting.compose import make_report
         from gateway.analysis.reporting.page import write_report
 
+        read, case = _judged(files, self.options, name)
         with TemporaryDirectory(prefix="mavgate-") as folder:
             write_report(make_report(case), Path(folder), jobs=1)
             pages = sorted(Path(folder).iterdir())
-            return {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
+            made = {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
+        return Worked(read.vehicle, read.began, _figures(case), made)
 
 
 @dataclass(frozen=True)
-class SweepTask(_ReadingTask):
+class SweepTask(FlightTask):
     """Score every point of a grid of settings."""
 
     axes: tuple[Axis, ...]
@@ -184,7 +172,7 @@ class SweepTask(_ReadingTask):
 
 
 @dataclass(frozen=True)
-class InfoTask(_ReadingTask):
+class InfoTask(FlightTask):
     """Describe the content of each file."""
 
     name: ClassVar[str] = "info"
@@ -237,32 +225,17 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
             raise
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
-            for part, file in zip(item.parts, files, strict=True):
-                text = text.replace(str(file), without_user(part.place))
+            for place, file in zip(item.places, files, strict=True):
+                text = text.replace(str(file), without_user(place))
             return msgspec.structs.replace(result, error=as_text(text)), {}
-    return (
-        msgspec.structs.replace(
-            result,
-            vehicle=worked.vehicle,
-            began=worked.began,
-            figures=worked.figures,
-            files=tuple(worked.files),
-        ),
-        worked.files,
+    done = msgspec.structs.replace(
+        result,
+        vehicle=worked.vehicle,
+        began=worked.began,
+        figures=worked.figures,
+        files=tuple(worked.files),
     )
-
-
-def options_bytes(options: ReadOptions) -> bytes:
-    """Write down how flights are read, so that it can be compared later."""
-    current = options.current
-    values = {
-        "default": current.default,
-        "aircraft": {str(number): own for number, own in sorted(current.aircraft.items())},
-        "choice": options.choice,
-        "columns": options.columns,
-        "system": options.system_id,
-    }
-    return msgspec.json.encode(values, order="sorted")
+    return done, worked.files
 
 
 def without_secrets(options: ReadOptions) -> ReadOptions:
@@ -287,6 +260,12 @@ def name_of(item: BatchItem) -> str:
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
     return name
+
+
+def _judged(files: Sequence[Path], options: ReadOptions, name: str) -> tuple[ReadFlight, Case]:
+    """Read a flight, and fuse it with every estimator."""
+    read = read_season_flight(files, options, name)
+    return read, make_case(read.flight)
 
 
 def _figures(case: Case) -> dict[str, Any]:
@@ -317,11 +296,11 @@ class ResultFolder:
         descriptor = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             _lock(descriptor, self.folder)
-            self._clear()
+            shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
             try:
                 yield
             finally:
-                self._clear()
+                shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
         finally:
             # Processes that were forked meanwhile have it open, too.
             with suppress(OSError):
@@ -351,10 +330,6 @@ class ResultFolder:
             (staged / unit).replace(target)
         shutil.rmtree(staged, ignore_errors=True)
         write_new(self._path(result.key), [msgspec.json.encode(result)], overwrite=True)
-
-    def _clear(self) -> None:
-        """Remove the files that were not put in their place."""
-        shutil.rmtree(self.folder / PARTIAL, ignore_errors=True)
 
     def _path(self, key: str) -> Path:
         return self.folder / RESULTS / f"{key}.json"

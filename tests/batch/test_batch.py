@@ -15,7 +15,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.ground_track import ground_track
 from gateway.batch.executors import LocalProcesses, WorkError, WorkFailed, failure_of
-from gateway.batch.storage import BatchItem, StorageError, StoredFile, items_of
+from gateway.batch.storage import BatchItem, StorageError, items_of
 from gateway.batch.tasks import (
     RESULTS,
     FlightResult,
@@ -156,7 +156,7 @@ def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_missing_file_is_reported_in_plain_words(season: Path, tmp_path: Path) -> None:
     gone = tmp_path / "gone.csv"
-    items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((StoredFile(str(gone)),))]
+    items = [*items_of([str(season / FLIGHTS[0])]), BatchItem((str(gone),))]
     reported: list[tuple[str, int, int]] = []
     results = run_season(
         InfoTask(OPTIONS), items, LocalProcesses(1), None, lambda *now: reported.append(now)
@@ -235,7 +235,7 @@ def test_tables_stand_for_their_recordings_tlogs(tmp_path: Path) -> None:
     for name in ("a_01.tlog", "a_01_v1.csv", "a_02_v1.csv", "b_01.tlog"):
         (tmp_path / name).write_text("x")
     found = items_of([str(tmp_path)])
-    names = [[Path(part.place).name for part in item.parts] for item in found]
+    names = [[Path(place).name for place in item.places] for item in found]
     assert names == [["a_01_v1.csv", "a_02_v1.csv"], ["b_01.tlog"]]
     assert len(items_of([str(tmp_path)], each_file=True)) == 4
 

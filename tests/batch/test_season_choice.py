@@ -6,13 +6,13 @@ import pandas as pd
 import pytest
 
 from gateway.batch.statistics import (
-    FlightErrors,
     choose,
     errors_by_group,
     folds_of,
     lead_of,
     versus,
 )
+from gateway.batch.tasks import FlightResult
 from gateway.config import load
 from tests.kit.cli import invoke
 
@@ -79,21 +79,23 @@ def test_single_day_cannot_be_separated_from_chance() -> None:
     assert lead_of(np.array([np.nan]), np.ones(1), ["a"]) is None
 
 
-def flight(place: str, vehicle: int, **held_m: float) -> FlightErrors:
-    return FlightErrors(place, place, vehicle, "2026-06-01 10:00:00", held_m)
+def flight(place: str, vehicle: int, **held_m: float) -> FlightResult:
+    return FlightResult(
+        place=place, digest=place, key="", task="fuse", version="", vehicle=vehicle,
+        began="2026-06-01 10:00:00", figures={"held_m": held_m},
+    )  # fmt: skip
 
 
 def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
     rows = errors_by_group(
         [flight("a", 1, eskf=1.0), flight("b", 1, eskf=3.0), flight("c", 2, eskf=8.0, paper=1.0)]
     )
-    summary = [(r.vehicle, r.estimator, r.flights, r.median_m, r.worst_m) for r in rows]
-    assert summary == [
-        (None, "eskf", 3, 3.0, 8.0),
-        (None, "paper", 1, 1.0, 1.0),
-        (1, "eskf", 2, 2.0, 3.0),
-        (2, "eskf", 1, 8.0, 8.0),
-        (2, "paper", 1, 1.0, 1.0),
+    assert rows.drop(columns="9 in 10 below, m").to_numpy().tolist() == [
+        ["all", "eskf", 3, 3.0, 8.0],
+        ["all", "paper", 1, 1.0, 1.0],
+        ["1", "eskf", 2, 2.0, 3.0],
+        ["2", "eskf", 1, 8.0, 8.0],
+        ["2", "paper", 1, 1.0, 1.0],
     ]
 
 
@@ -101,7 +103,7 @@ def test_worse_flights_are_listed_the_worst_first() -> None:
     then = [flight("a", 1, eskf=1.0), flight("b", 1, eskf=1.0), flight("c", 1, eskf=1.0)]
     now = [flight("a", 1, eskf=1.04), flight("b", 1, eskf=2.0), flight("c", 1, eskf=3.0)]
     found = versus([*now, flight("new", 1, eskf=9.0)], then)
-    assert [(c.place, c.after_m) for c in found.worse] == [("c", 3.0), ("b", 2.0)]
+    assert found.worse[["place", "after_m"]].to_numpy().tolist() == [["c", 3.0], ["b", 2.0]]
     assert found.compared == 3
 
 

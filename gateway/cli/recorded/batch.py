@@ -163,17 +163,14 @@ def sweep(
 
 def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
-    from gateway.batch.statistics import errors_by_group, errors_of, flight_table, write_season_page
+    from gateway.batch.statistics import errors_by_group, flight_table, write_season_page
 
     compared = None if against is None else _compare(results, against)
     grid = table_of(
         "aircraft", "estimator", "flights", "median, m", "9 in 10, m", "worst, m", left=2
     )
-    for row in errors_by_group(errors_of(results)):
-        grid.add_row(
-            "all" if row.vehicle is None else str(row.vehicle), row.estimator, str(row.flights),
-            f"{row.median_m:.3f}", f"{row.most_m:.3f}", f"{row.worst_m:.3f}",
-        )  # fmt: skip
+    for aircraft, name, flights, *errors_m in errors_by_group(results).itertuples(index=False):
+        grid.add_row(aircraft, name, str(flights), *(f"{error_m:.3f}" for error_m in errors_m))
     console = console_of()
     console.print(grid)
     if compared is not None:
@@ -190,10 +187,10 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
 
 
 def _compare(results: Sequence[FlightResult], against: Path) -> "Versus":
-    from gateway.batch.statistics import errors_of, versus
+    from gateway.batch.statistics import versus
 
     with refusing():
-        found = versus(errors_of(results), errors_of([*read_results(against)]))
+        found = versus(results, read_results(against))
     if not found.compared:
         refuse(f"{against}: holds no result of any of these recordings")
     return found
@@ -203,7 +200,7 @@ def _show_versus(compared: "Versus") -> None:
     console = console_of()
     for estimator, lead in compared.leads.items():
         console.print(f"{estimator} against the other results: {lead.text}")
-    for change in compared.worse:
+    for change in compared.worse.itertuples():
         console.print(
             f"worse: {change.place}, {change.estimator}: {change.before_m:.3f} m before, "
             f"{change.after_m:.3f} m now",

@@ -347,7 +347,7 @@ def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
     """Return the errors with the settings that the flights came with, and what is best."""
     errors = np.array([_numbers(result.figures["scores"]) for result in swept])
     base = np.array(_numbers([result.figures["base"] for result in swept]))
-    groups = [group_of(result.vehicle, result.began, result.digest) for result in swept]
+    groups = [group_of(result) for result in swept]
     try:
         return base, choose(errors, base, groups)
     except ValueError as error:
