@@ -10,7 +10,6 @@ import io
 import logging
 import os
 import sys
-from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -26,121 +25,70 @@ from gateway.printable import PrintableFormatter, printable, reason_of
 RECORDINGS: Final = "Recordings"
 GATEWAY: Final = "A running gateway"
 
-
-@dataclass(frozen=True, slots=True)
-class CommandEntry:
-    """Module and summary of a command."""
-
-    module: str
-    """Below `gateway.cli`."""
-    summary: str
-    panel: str | None = None
-
-
-COMMANDS: Final[dict[str, CommandEntry]] = {
-    "run": CommandEntry(
-        "live.run", "Run the gateway on the receiver's serial port until interrupted."
-    ),
-    "demo": CommandEntry(
-        "live.demo", "Fly the simulated tracker, over and over, until interrupted."
-    ),
-    "panel": CommandEntry(
-        "live.panel",
-        "Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.",
-    ),
-    "fleet": CommandEntry(
-        "live.fleet", "Show the vehicles of many sites here, through a Zenoh router."
-    ),
-    "setup": CommandEntry(
-        "live.first_start",
-        "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
-    ),
-    "calibrate": CommandEntry(
-        "live.calibrate",
-        "Calibrate an aircraft's sensors and save the result with its residuals.",
-    ),
-    "ports": CommandEntry("live.flash", "List the serial ports, and the one that `auto` selects."),
-    "check-config": CommandEntry(
-        "live.doctor",
-        "Check the settings and those of the aircraft, or print all settings with their defaults.",
-    ),
-    "flash": CommandEntry(
-        "live.flash",
-        "Write a ready-made program with its settings to a board, or read them back.",
-    ),
-    "doctor": CommandEntry(
-        "live.doctor",
-        "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
-    ),
-    "map": CommandEntry(
-        "live.map", "Fetch an area of a map for the panel, for use without a network."
-    ),
-    "report": CommandEntry(
-        "recorded.report",
-        "Make a page of figures and tables of a flight, those of the paper included.",
-    ),
-    "page": CommandEntry(
-        "recorded.report",
-        "Make one HTML file of a flight, which opens offline in any browser.",
-        RECORDINGS,
-    ),
-    "sweep": CommandEntry(
-        "recorded.sweep",
-        "Try settings on one flight or many, and write the best as a settings file.",
-    ),
-    "record": CommandEntry(
-        "live.record", "Start, stop, name, list and delete recordings.", RECORDINGS
-    ),
-    "play": CommandEntry(
-        "recorded.play",
-        "Play recordings to the ground stations, several at once if you like.",
-        RECORDINGS,
-    ),
-    "seek": CommandEntry("recorded.play", "Seek in the running player.", RECORDINGS),
-    "player": CommandEntry("recorded.play", "Control the running player.", RECORDINGS),
-    "convert": CommandEntry("recorded.convert", "Convert, trim and join recordings.", RECORDINGS),
-    "fuse": CommandEntry(
-        "recorded.convert",
-        "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
-        RECORDINGS,
-    ),
-    "info": CommandEntry(
-        "recorded.info",
-        "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
-        RECORDINGS,
-    ),
-    "batch": CommandEntry(
-        "recorded.batch",
-        "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
-        RECORDINGS,
-    ),
-    "catalogue": CommandEntry(
-        "recorded.catalogue",
-        "Index all recordings under a folder, and list and search what is in them.",
-        RECORDINGS,
-    ),
-    "recover": CommandEntry(
-        "recorded.info",
-        "Write the intact part of a damaged recording to a new file, and list what was left out.",
-        RECORDINGS,
-    ),
-    "status": CommandEntry(
-        "live.clients",
-        "Show the status of the gateway: receiver, nodes, aircraft, clients.",
-        GATEWAY,
-    ),
-    "clients": CommandEntry("live.clients", "List, add and remove clients and sources.", GATEWAY),
-    "mark": CommandEntry(
-        "live.clients",
-        "Mark a location: ground stations show distance and bearing to it. Without one, clear it.",
-        GATEWAY,
-    ),
-    "reload": CommandEntry(
-        "live.clients",
-        "Apply changed settings of the hub and of signing; other clients stay connected.",
-        GATEWAY,
-    ),
+MODULES: Final = {
+    "live.run": ("run",),
+    "live.demo": ("demo",),
+    "live.panel": ("panel",),
+    "live.fleet": ("fleet",),
+    "live.first_start": ("setup",),
+    "live.calibrate": ("calibrate",),
+    "live.flash": ("ports", "flash"),
+    "live.doctor": ("check-config", "doctor"),
+    "live.map": ("map",),
+    "recorded.report": ("report", "page"),
+    "recorded.sweep": ("sweep",),
+    "live.record": ("record",),
+    "recorded.play": ("play", "seek", "player"),
+    "recorded.convert": ("convert", "fuse"),
+    "recorded.info": ("info", "recover"),
+    "recorded.batch": ("batch",),
+    "recorded.catalogue": ("catalogue",),
+    "live.clients": ("status", "clients", "mark", "reload"),
 }
+"""The commands of each module below `gateway.cli`."""
+
+COMMANDS: Final = {
+    "run": "Run the gateway on the receiver's serial port until interrupted.",
+    "demo": "Fly the simulated tracker, over and over, until interrupted.",
+    "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
+    "tuning.",
+    "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
+    "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
+    "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
+    "ports": "List the serial ports, and the one that `auto` selects.",
+    "check-config": "Check the settings and those of the aircraft, or print all settings with their "
+    "defaults.",
+    "flash": "Write a ready-made program with its settings to a board, or read them back.",
+    "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
+    "map": "Fetch an area of a map for the panel, for use without a network.",
+    "report": "Make a page of figures and tables of a flight, those of the paper included.",
+    "page": "Make one HTML file of a flight, which opens offline in any browser.",
+    "sweep": "Try settings on one flight or many, and write the best as a settings file.",
+    "record": "Start, stop, name, list and delete recordings.",
+    "play": "Play recordings to the ground stations, several at once if you like.",
+    "seek": "Seek in the running player.",
+    "player": "Control the running player.",
+    "convert": "Convert, trim and join recordings.",
+    "fuse": "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
+    "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+    "batch": "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+    "catalogue": "Index all recordings under a folder, and list and search what is in them.",
+    "recover": "Write the intact part of a damaged recording to a new file, and list what was left "
+    "out.",
+    "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
+    "clients": "List, add and remove clients and sources.",
+    "mark": "Mark a location: ground stations show distance and bearing to it. Without one, clear "
+    "it.",
+    "reload": "Apply changed settings of the hub and of signing; other clients stay connected.",
+}
+"""The summary of each command, in the order of the list."""
+
+PANELS: Final = {
+    **dict.fromkeys(("page", "record", "play", "seek", "player", "convert"), RECORDINGS),
+    **dict.fromkeys(("fuse", "info", "batch", "catalogue", "recover"), RECORDINGS),
+    **dict.fromkeys(("status", "clients", "mark", "reload"), GATEWAY),
+}
+"""The headings under which commands are listed, if not under that of all."""
 
 
 def load_command(name: str) -> Any:
@@ -148,9 +96,10 @@ def load_command(name: str) -> Any:
     part = typer.Typer(rich_markup_mode="rich")
     # With a callback it is a group, however few commands the file has.
     part.callback()(lambda: None)
-    if COMMANDS[name].panel != GATEWAY:
+    if PANELS.get(name) != GATEWAY:
         _load_extensions()
-    import_module(f"gateway.cli.{COMMANDS[name].module}").register(part)
+    module = next(module for module, names in MODULES.items() if name in names)
+    import_module(f"gateway.cli.{module}").register(part)
     group = typer.main.get_group(part)
     gc.enable()
     return tidied(group.commands[name])
@@ -201,11 +150,11 @@ class LazyGroup(TyperGroup):
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ARG002
         """Return a command; only its summary while a list is made."""
-        entry = COMMANDS.get(cmd_name)
-        if entry is None:
+        summary = COMMANDS.get(cmd_name)
+        if summary is None:
             return None
         if self._listing:
-            return TyperCommand(cmd_name, help=entry.summary, rich_help_panel=entry.panel)
+            return TyperCommand(cmd_name, help=summary, rich_help_panel=PANELS.get(cmd_name))
         return load_command(cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

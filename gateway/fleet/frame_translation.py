@@ -20,10 +20,9 @@ References
 
 import hmac
 import struct
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import StrEnum
 from typing import Any, Final
 
 from fastcrc.crc16 import mcrf4xx
@@ -48,14 +47,6 @@ WINDOW_TICKS: Final = 5 * TICKS_PER_S
 """Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
 MAX_STREAMS: Final = 1024
 """Streams of one site; only a holder of the passphrase begins one."""
-
-
-class Rejection(StrEnum):
-    """Why a frame of a site with a passphrase is dropped; also the name of its counter."""
-
-    UNSIGNED = "unsigned"
-    FORGED = "forged"
-    REPLAYED = "replayed"
 
 
 @dataclass(slots=True)
@@ -85,12 +76,12 @@ class SiteSignatures:
         self._clock = SigningClock(unix_us_at_zero)
         self._windows: dict[tuple[int, int, int], _Window] = {}
 
-    def check(self, frame: MavFrame, now_us: int) -> Rejection | None:
-        """Return why a frame of the site is rejected; None if it is accepted."""
+    def check(self, frame: MavFrame, now_us: int) -> str:
+        """Return the counter of why a frame of the site is rejected; empty if it is accepted."""
         if not frame.signed:
-            return Rejection.UNSIGNED
+            return "unsigned"
         if not self.is_genuine(frame):
-            return Rejection.FORGED
+            return "forged"
         data = frame.data
         timestamp = int.from_bytes(data[-HASH_BYTES - TIMESTAMP_BYTES : -HASH_BYTES], "little")
         stream = (data[-SIGNATURE_SIZE], *frame.origin)
@@ -98,9 +89,9 @@ class SiteSignatures:
         if window is None:
             oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
             if timestamp < oldest or len(self._windows) >= MAX_STREAMS:
-                return Rejection.REPLAYED
+                return "replayed"
             window = self._windows[stream] = _Window(timestamp)
-        return None if window.accepts(timestamp) else Rejection.REPLAYED
+        return "" if window.accepts(timestamp) else "replayed"
 
     def is_genuine(self, frame: MavFrame) -> bool:
         """Return whether a signed frame was signed with the passphrase."""
@@ -157,26 +148,6 @@ NAMING: Final = COMMAND_OFFSETS.keys() | FIELD_OFFSETS.keys()
 
 
 @dataclass(slots=True)
-class TranslationCounters:
-    """Dropped frames by cause."""
-
-    unmapped: int = 0
-    """No id is left for their vehicle."""
-    unknown: int = 0
-    """Unknown message, so its checksum cannot be computed."""
-    signed: int = 0
-    """Signed, would have to change, and there is no passphrase."""
-    unsigned: int = 0
-    """Unsigned, though the site has a passphrase."""
-    forged: int = 0
-    """Not signed with the site's passphrase."""
-    replayed: int = 0
-    """Signed, but the timestamp was used already or is too old."""
-    looped: int = 0
-    """Sent from here, and returned through the site."""
-
-
-@dataclass(slots=True)
 class VehicleTraffic:
     """Received frames of one vehicle."""
 
@@ -212,7 +183,14 @@ class FrameTranslation:
         self._signatures = signatures
         self._loops = loops or LoopDetection()
         self._sequences: dict[tuple[int, int], int] = {}
-        self.counters = TranslationCounters()
+        self.counters: Counter[str] = Counter()
+        """Dropped frames by cause.
+
+        `unmapped`: no id is left for their vehicle. `unknown`: an unknown message, whose checksum
+        cannot be computed. `signed`: it would have to change, and there is no passphrase.
+        `unsigned`, `forged` and `replayed` have not passed the check of the site's passphrase.
+        `looped`: sent from here, and returned through the site.
+        """
         self.traffic: dict[int, VehicleTraffic] = {}
         """By system id at the site."""
 
@@ -227,18 +205,18 @@ class FrameTranslation:
         `is_own` if the site's gateway made it, so that it cannot have been here before.
         """
         if self._signatures is not None and (rejection := self._signatures.check(frame, now_us)):
-            self._count(rejection)
+            self.counters[rejection] += 1
             return None
         system_id = frame.origin[0]
         vehicle = (self._site, system_id)
         if not is_own:
             has_id = self.id_of(system_id) is not None
             if self._loops.is_returned(frame, vehicle, has_id=has_id, now_us=now_us):
-                self.counters.looped += 1
+                self.counters["looped"] += 1
                 return None
         own_id = self._ids.id_of(*vehicle)
         if own_id is None:
-            self.counters.unmapped += 1
+            self.counters["unmapped"] += 1
             return None
         self._update_traffic(frame, now_us)
         given = self._rewritten(frame, own_id, self._id_here)
@@ -259,7 +237,7 @@ class FrameTranslation:
         signatures = self._signatures
         # The site itself checks for replays: it knows all its streams.
         if signatures is not None and frame.signed and not signatures.is_genuine(frame):
-            self._count("forged")
+            self.counters["forged"] += 1
             return None
         changed = self._rewritten(frame, sender, self._id_there)
         if changed is None:
@@ -284,11 +262,8 @@ class FrameTranslation:
         try:
             return rewrite(frame, sender, rename, self._signatures)
         except _CannotPassError as error:
-            self._count(str(error))
+            self.counters[str(error)] += 1
             return None
-
-    def _count(self, counter: str) -> None:
-        setattr(self.counters, counter, getattr(self.counters, counter) + 1)
 
     def _update_traffic(self, frame: MavFrame, now_us: int) -> None:
         origin, sequence = frame.origin, frame.sequence
@@ -345,8 +320,9 @@ def changes_of_names(frame: MavFrame, rename: Callable[[int], int]) -> list[Chan
     if message_id not in NAMING:
         return []
     payload = frame.payload
-    if message_id in FIELD_OFFSETS:
-        return _bytes_changed(payload, FIELD_OFFSETS[message_id], rename)
+    if offsets := FIELD_OFFSETS.get(message_id):
+        named = ((at, payload[at]) for at in offsets if at < len(payload) and payload[at])
+        return [(at, bytes((rename(was),))) for at, was in named if rename(was) != was]
     at = COMMAND_OFFSETS[message_id]
     # MAVLink 2 cuts zeros off at the end of a payload.
     command = int.from_bytes(payload[at : at + 2], "little")
@@ -357,10 +333,3 @@ def changes_of_names(frame: MavFrame, rename: Callable[[int], int]) -> list[Chan
         if 0 < value <= LAST_ID and (fresh := rename(int(value))) != value:
             found.append((offset, struct.pack("<f", fresh)))
     return found
-
-
-def _bytes_changed(
-    payload: bytes, offsets: list[int], rename: Callable[[int], int]
-) -> list[Change]:
-    named = ((at, payload[at]) for at in offsets if at < len(payload) and payload[at])
-    return [(at, bytes((rename(was),))) for at, was in named if rename(was) != was]

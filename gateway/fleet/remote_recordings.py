@@ -2,20 +2,14 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from itertools import chain
 from typing import Final
 
 import msgspec
 
-from gateway.fleet.session import (
-    Decoded,
-    FleetSession,
-    NoAnswerError,
-    QueryRefusedError,
-    key_pattern,
-)
+from gateway.fleet.session import FleetSession, NoAnswerError, QueryRefusedError, key_pattern
 from gateway.hub.endpoint import SITE_NAME
-from gateway.hub.transports.zenoh.session import recordings_key
+from gateway.hub.transports.zenoh.session import off_loop, recordings_key
 from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
 from gateway.live.control_socket import ControlError, Verbs
 
@@ -45,11 +39,10 @@ class RemoteRecordings:
     async def _list(self, site: str = "") -> dict[str, list[RemoteRecording]]:
         patterns = [key_pattern(site)] if site else self._session.patterns
         query = RecordingQuery()
-        asked = (self._query(each, query, LIST_TIMEOUT_S, _list_from) for each in patterns)
-        found: dict[str, list[RemoteRecording]] = {}
-        for answers in await asyncio.gather(*asked):
-            found |= {site: listed for site, listed in answers.items() if listed is not None}
-        return found
+        asked = (self._query(each, query, LIST_TIMEOUT_S) for each in patterns)
+        answers = [*chain.from_iterable(each.items() for each in await asyncio.gather(*asked))]
+        # Not on the loop: a list may be long.
+        return await off_loop(_lists_in, answers)
 
     async def _piece(self, site: str, file: str, offset: int, size: int) -> dict[str, bytes | None]:
         query = RecordingQuery(file, offset, size)
@@ -63,28 +56,24 @@ class RemoteRecordings:
     async def _ask_one(self, site: str, query: RecordingQuery, timeout_s: float) -> bytes | None:
         if not SITE_NAME.fullmatch(site):
             raise ControlError(f"{site!r} is no name of a site")
-        return (await self._query(site, query, timeout_s, lambda _, data: data)).get(site)
+        return (await self._query(site, query, timeout_s)).get(site)
 
-    async def _query(
-        self,
-        site: str,
-        query: RecordingQuery,
-        timeout_s: float,
-        decode: Callable[[str, bytes], Decoded],
-    ) -> dict[str, Decoded]:
+    async def _query(self, site: str, query: RecordingQuery, timeout_s: float) -> dict[str, bytes]:
         payload = msgspec.json.encode(query)
         try:
-            return await self._session.query(recordings_key(site), payload, timeout_s, decode)
+            return await self._session.query(recordings_key(site), payload, timeout_s)
         except NoAnswerError:
             return {}
         except QueryRefusedError as error:
             raise ControlError(str(error)) from error
 
 
-def _list_from(site: str, data: bytes) -> list[RemoteRecording] | None:
-    """Decode the list of a site; None, with a warning, if it is malformed."""
-    try:
-        return msgspec.json.decode(data, type=list[RemoteRecording])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        log.warning("site %s: malformed list of recordings: %s", site, error)
-        return None
+def _lists_in(answers: list[tuple[str, bytes]]) -> dict[str, list[RemoteRecording]]:
+    """Decode the lists of sites; a malformed one is left out, with a warning."""
+    found = {}
+    for site, data in answers:
+        try:
+            found[site] = msgspec.json.decode(data, type=list[RemoteRecording])
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            log.warning("site %s: malformed list of recordings: %s", site, error)
+    return found

@@ -38,6 +38,10 @@ MAX_SESSIONS: Final = 16
 """Sessions under the name of one site that are remembered; more are forged."""
 
 
+CAUSES: Final = ("unknown", "signed", "unsigned", "forged", "replayed", "looped")
+"""Why frames of a site are dropped; see `FrameTranslation.counters`."""
+
+
 class SiteClient(Client):
     """One site of the fleet."""
 
@@ -107,7 +111,7 @@ class SiteClient(Client):
 
     def describe(self, now_us: int) -> dict[str, Any]:
         """Return the site and its vehicles as they are now."""
-        round_trip_us, counters = self.round_trip_us, self.translation.counters
+        round_trip_us, dropped = self.round_trip_us, self.translation.counters
         return {
             "name": self.endpoint.site,
             "is_here": self.is_here,
@@ -127,12 +131,7 @@ class SiteClient(Client):
             "sent": self.counters.sent,
             "dropped": self.counters.dropped,
             "bytes_garbage": self.counters.bytes_garbage,
-            "unknown": counters.unknown,
-            "signed": counters.signed,
-            "unsigned": counters.unsigned,
-            "forged": counters.forged,
-            "replayed": counters.replayed,
-            "looped": counters.looped,
+            **{cause: dropped[cause] for cause in CAUSES},
         }
 
     @property
@@ -144,18 +143,11 @@ class SiteClient(Client):
 
 def site_endpoint(site: str) -> Endpoint:
     """Return the endpoint that stands for a site in tables."""
-    place = f"site:{site}"
+    url = f"site:{site}"
     return Endpoint(
-        url=place,
-        kind="site",
-        host=site,
-        port=0,
-        location=place,
-        name=site,
-        allow=NO_BROADCASTS,
-        trusted=True,
-        site=site,
-    )
+        url=url, kind="site", host=site, port=0, location=url, name=site, allow=NO_BROADCASTS,
+        trusted=True, site=site,
+    )  # fmt: skip
 
 
 log = logging.getLogger(__name__)
@@ -173,20 +165,8 @@ ABANDONED_US: Final = 3600 * US_PER_S
 class FleetServer:
     """Sites, their vehicles, and the ground stations here.
 
-    Parameters
-    ----------
-    settings : FleetSettings
-        Sites and router.
-    hub_settings : HubSettings
-        Endpoints of the ground stations.
-
-    Raises
-    ------
-    ValueError
-        If a pattern, Zenoh's file or the file of ids is malformed, or it would listen beyond
-        loopback without authentication.
-    ModuleNotFoundError
-        If Zenoh is not installed.
+    Raises ValueError if a pattern, Zenoh's file or the file of ids is malformed, or it would listen
+    beyond loopback without authentication; ModuleNotFoundError if Zenoh is not installed.
     """
 
     def __init__(self, settings: FleetSettings, hub_settings: HubSettings) -> None:

@@ -9,8 +9,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -54,8 +53,6 @@ VERIFIED: Final = ("tls", "quic")
 """Protocols whose clients can be verified by their certificates."""
 LOCAL: Final = "unixsock-stream"
 """The protocol that no other machine can reach."""
-
-Decoded = TypeVar("Decoded")
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,20 +177,15 @@ class FleetSession:
                 timeout=PING_TIMEOUT_S,
             )
 
-    async def query(
-        self, key: str, payload: bytes, timeout_s: float, decode: Callable[[str, bytes], Decoded]
-    ) -> dict[str, Decoded]:
+    async def query(self, key: str, payload: bytes, timeout_s: float) -> dict[str, bytes]:
         """Query the sites of a key at the lowest priority; return the first answer of each.
 
-        Answers are decoded on a thread, and none is above `MAX_ANSWER`. Raises NoAnswerError if
-        there is none, QueryRefusedError if all are refusals.
+        None is above `MAX_ANSWER`. Raises NoAnswerError if there is none, QueryRefusedError if all
+        are refusals.
         """
         if self._session is None:
             raise NoAnswerError(f"{self.locator}: no session")
-        work: Callable[[], dict[str, Decoded]] = partial(
-            _query, self._session, key, payload, timeout_s, decode
-        )
-        return await off_loop(work)
+        return await off_loop(_query, self._session, key, payload, timeout_s)
 
     def _declare(self, session: "zenoh.Session") -> None:
         import zenoh
@@ -265,15 +257,11 @@ def missing_authentication(locator: str, config: "zenoh.Config") -> str:
 
 
 def _query(
-    session: "zenoh.Session",
-    key: str,
-    payload: bytes,
-    timeout_s: float,
-    decode: Callable[[str, bytes], Decoded],
-) -> dict[str, Decoded]:
+    session: "zenoh.Session", key: str, payload: bytes, timeout_s: float
+) -> dict[str, bytes]:
     import zenoh
 
-    found: dict[str, Decoded] = {}
+    found: dict[str, bytes] = {}
     refusal = ""
     room = MAX_ANSWERS
     try:
@@ -298,7 +286,7 @@ def _query(
             elif answer is not None and reply.ok is not None:
                 site = site_of(str(reply.ok.key_expr))
                 if site and site not in found:
-                    found[site] = decode(site, answer.to_bytes())
+                    found[site] = answer.to_bytes()
             elif fault is not None:
                 refusal = fault.to_bytes().decode(errors="replace")
     except zenoh.ZError as error:

@@ -176,8 +176,8 @@ async def test_malformed_list_of_one_site_hides_no_others() -> None:
         "sound": sound,
     }
 
-    async def query(key: str, payload: bytes, timeout_s: float, decode: Any) -> Any:
-        return {site: decode(site, data) for site, data in answers.items()}
+    async def query(key: str, payload: bytes, timeout_s: float) -> Any:
+        return answers
 
     session = MagicMock(patterns=["*"], query=query)
     found = await RemoteRecordings(session)._list()

@@ -40,9 +40,9 @@ def test_looped_frames_end_after_one_round_and_assign_no_id() -> None:
             ring.now_us += STEP_US
             assert ring.give("c", given) is None
     assert ring.ids.items() == [(("a", 1), 1), (("b", 1), 2)]
-    assert ring.sites["c"].counters.looped == 600
+    assert ring.sites["c"].counters["looped"] == 600
     assert ring.sites["c"].traffic == {}
-    assert ring.sites["a"].counters.looped == ring.sites["b"].counters.looped == 0
+    assert ring.sites["a"].counters["looped"] == ring.sites["b"].counters["looped"] == 0
 
 
 def test_frame_returned_through_its_own_site_is_no_loop() -> None:
@@ -77,7 +77,7 @@ def test_two_gateways_with_equal_frames_are_taken_for_a_loop() -> None:
             assert given is not None
             assert ring.give("c", given) is None, "fed back it ends all the same"
     assert ring.ids.items() == [(("a", 1), 1), (("b", 1), 2)]
-    assert [ring.sites[name].counters.looped for name in "abc"] == [0, 0, 200]
+    assert [ring.sites[name].counters["looped"] for name in "abc"] == [0, 0, 200]
 
 
 def test_two_equal_vehicles_with_constant_frames_keep_their_ids() -> None:
@@ -101,7 +101,7 @@ def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
         assert given is not None
         passed += ring.give("c", given) is not None
     assert passed == MAX_CHANCE
-    assert ring.sites["c"].counters.looped == 100 - MAX_CHANCE
+    assert ring.sites["c"].counters["looped"] == 100 - MAX_CHANCE
     own = Sender(2, 1).pack(mavlink.MAVLink_attitude_message(1, 2, 0, 0, 0, 0, 0))
     assert ring.give("c", own) is not None, "an aircraft that is really there"
 

@@ -102,7 +102,7 @@ def reply(site: str, payload: bytes | int, *, is_error: bool = False) -> Any:
 def query(*replies: Any) -> dict[str, bytes]:
     session = MagicMock()
     session.get.return_value = iter(replies)
-    return fleet_session._query(session, "key", b"", 1.0, lambda _, data: data)
+    return fleet_session._query(session, "key", b"", 1.0)
 
 
 def test_first_answer_of_each_site_is_used() -> None:
@@ -129,7 +129,7 @@ def test_endless_answers_are_cut_off(monkeypatch: pytest.MonkeyPatch, payload: b
     session = MagicMock()
     session.get.return_value = endless()
     try:
-        found = fleet_session._query(session, "key", b"", 1.0, lambda _, data: data)
+        found = fleet_session._query(session, "key", b"", 1.0)
         assert sum(map(len, found.values())) <= 10_000
     except NoAnswerError:
         assert not payload
