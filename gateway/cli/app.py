@@ -56,8 +56,8 @@ COMMANDS: Final = {
     "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
     "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
     "ports": "List the serial ports, and the one that `auto` selects.",
-    "check-config": "Check the settings and those of the aircraft, or print all settings with their "
-    "defaults.",
+    "check-config": "Check the settings and those of the aircraft, or print all settings with "
+    "their defaults.",
     "flash": "Write a ready-made program with its settings to a board, or read them back.",
     "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
     "map": "Fetch an area of a map for the panel, for use without a network.",
