@@ -25,6 +25,7 @@ from gateway.live.serial_port import SerialSettings
 from gateway.live.session import RecordingSettings
 from gateway.output import PRIVATE, write_new
 from gateway.panel.panel_settings import PanelSettings
+from gateway.printable import UserError
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -63,7 +64,7 @@ class GatewaySettings(Settings, frozen=True):
         return AircraftSettings(vehicle=self.vehicle, estimation=self.estimation)
 
 
-class ConfigError(Exception):
+class ConfigError(UserError):
     """An invalid settings file; the text has a line for each error."""
 
 

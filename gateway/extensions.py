@@ -13,12 +13,14 @@ import logging
 from importlib.metadata import entry_points
 from typing import Final
 
+from gateway.printable import UserError
+
 log = logging.getLogger(__name__)
 
 GROUP: Final = "mavgate.extensions"
 
 
-class ExtensionError(Exception):
+class ExtensionError(UserError):
     """An extension that cannot be used; the text says which and why."""
 
 

@@ -4,6 +4,11 @@ import logging
 import os
 from typing import Final
 
+
+class UserError(Exception):
+    """An error whose text names the fault and the remedy; it ends a command without a traceback."""
+
+
 _CONTROL: Final = (*range(0x20), *range(0x7F, 0xA0))
 """C0 and C1 control characters move the cursor, rename the window, or type for the user."""
 _INVISIBLE: Final = (

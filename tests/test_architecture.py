@@ -36,7 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft"},
     "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable"},
-    "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output"},
+    "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output", "printable"},
     "batch": FOUNDATION
     | STAGES
     | JOINED
@@ -47,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
     "live": FOUNDATION | STAGES | JOINED | {"status", "config", "recordings", "output"} | EDGES,
-    "extensions": set(),
+    "extensions": {"printable"},
     "player": FOUNDATION | STAGES | JOINED | {"recordings", "config"} | EDGES,
     "cli": FOUNDATION
     | STAGES

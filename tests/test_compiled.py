@@ -151,7 +151,7 @@ def test_without_a_library_the_error_names_the_command_that_builds_it(
         "from gateway.cli.__main__ import main; main()"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
+    assert done.returncode == 2
     [line] = done.stderr.splitlines()
     assert line.startswith(f"{path}: the library of compiled kernels ")
     assert f"`{BUILD_COMMAND}`" in line

@@ -21,6 +21,7 @@ from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, 
 from gateway.analysis.case import ESTIMATORS
 from gateway.analysis.flight import Flight, fuse_track
 from gateway.analysis.processes import forked
+from gateway.printable import UserError
 from gateway.recordings.fuse import FusionSettings
 from gateway.settings import Settings, fields_of
 
@@ -36,7 +37,7 @@ Value = float | int | str | bool
 Values = tuple[Value, ...]
 
 
-class SweepError(ValueError):
+class SweepError(UserError, ValueError):
     """A sweep that cannot be done; the text says why."""
 
 

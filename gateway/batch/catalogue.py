@@ -26,6 +26,7 @@ from gateway.batch.facts import (
     feature,
     feature_collection,
 )
+from gateway.printable import UserError
 from gateway.recordings.files import (
     CHUNK,
     GZIP,
@@ -90,7 +91,7 @@ _WAYS_OUT: Final = {
 Row = dict[str, Any]
 
 
-class CatalogueError(Exception):
+class CatalogueError(UserError):
     """A catalogue that cannot be read, or an invalid query."""
 
 

@@ -20,7 +20,7 @@ from typing import Any, Final, Protocol, TypeVar
 from gateway import __version__
 from gateway.analysis.processes import START, cores, keep_inherited, no_warning_of_threads
 from gateway.extensions import load_extensions
-from gateway.printable import reason_of
+from gateway.printable import UserError, reason_of
 
 WAITING: Final = 2
 """Pieces of work a process that are handed out: one is worked at, one waits. Bounds the memory."""
@@ -31,7 +31,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-class WorkError(Exception):
+class WorkError(UserError):
     """Work that cannot be done; the text says why."""
 
 
@@ -164,7 +164,7 @@ LARGEST_KEPT_BYTES: Final = 32 << 20
 """Larger blocks are freed at once; glibc takes no more."""
 
 
-class ClusterError(Exception):
+class ClusterError(UserError):
     """A cluster that cannot be used; the text says why."""
 
 

@@ -19,6 +19,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
+from gateway.cli.support.terminal import refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
 
@@ -123,12 +124,9 @@ def tidied(command: Any) -> Any:
 def _load_extensions() -> None:
     """Load the extensions, or end the command; one that only asks a gateway does not need them."""
     # Imported late, because the search for installed packages takes 20 ms.
-    from gateway.extensions import ExtensionError, load_extensions
+    from gateway.extensions import load_extensions
 
-    try:
-        load_extensions()
-    except ExtensionError as error:
-        sys.exit(f"mavgate: {error}")
+    load_extensions()
 
 
 class LazyGroup(TyperGroup):
@@ -139,6 +137,11 @@ class LazyGroup(TyperGroup):
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002
         """Return all names, in the order of the table."""
         return [*COMMANDS]
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run a command; errors that a user can mend end it with their text."""
+        with refusing():
+            return super().invoke(ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; the error for an unknown name suggests the nearest."""

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from gateway.printable import UserError
+
 if TYPE_CHECKING:
     import asyncio
 
@@ -50,7 +52,7 @@ _CREDENTIALS: Final = struct.Struct("3i")
 """Linux `struct ucred`: process, user, group."""
 
 
-class ControlError(Exception):
+class ControlError(UserError):
     """A request that was refused, or no gateway to send it to; the text says why."""
 
 

@@ -23,7 +23,7 @@ import serial
 from msgspec.structs import replace
 from serial.tools import list_ports
 
-from gateway.printable import reason_of
+from gateway.printable import UserError, reason_of
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
 from gateway.wire.framing import Frame, FrameDecoder
@@ -79,7 +79,7 @@ class SerialSettings(Settings, frozen=True):
     ] = 500_000
 
 
-class PortNotFoundError(Exception):
+class PortNotFoundError(UserError):
     """No port fits the setting, or it cannot be opened; the text says why, and what is there."""
 
 

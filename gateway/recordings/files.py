@@ -25,6 +25,7 @@ from typing import IO, Any, BinaryIO, Final, Literal, cast
 
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.printable import UserError
 from gateway.recordings.formats.mavlink import layout_of
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
 from gateway.recordings.tlog import (
@@ -66,7 +67,7 @@ SettingsChoice = Literal["recorded", "current"]
 NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
 
 
-class FlightError(Exception):
+class FlightError(UserError):
     """A file without the data that a command needs; the text names the data and the file."""
 
 

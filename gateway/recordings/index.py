@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.output import sync_folder
+from gateway.printable import UserError
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
 MAX_NAME: Final = 100
@@ -31,7 +32,7 @@ class Recording:
     """When it was last written, in s since 1970."""
 
 
-class RecordingError(ValueError):
+class RecordingError(UserError, ValueError):
     """The request cannot be carried out; the text says why."""
 
 

@@ -214,6 +214,19 @@ def recorded_frames(
     return heapq.merge(*streams, key=lambda record: record.time_us)
 
 
+def read_column_map(path: Path) -> ColumnMap:
+    """Read a column map; raises FlightError if it is invalid."""
+    try:
+        return msgspec.toml.decode(path.read_text(encoding="utf-8-sig"), type=ColumnMap)
+    except UnicodeDecodeError as error:
+        line = 1 + error.object.count(b"\n", 0, error.start)
+        raise FlightError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
+    except OSError as error:
+        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise FlightError(f"{path}: is no column map: {error}") from error
+
+
 def csv_reader(options: ReadOptions) -> CsvReader:
     """Make the reader of another program's CSV."""
     known = options.columns or msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)

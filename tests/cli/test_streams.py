@@ -52,7 +52,7 @@ def test_signs_that_the_output_lacks_are_written_as_numbers() -> None:
 def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
     name = str(tmp_path / ("x" * 300))
     done = run("recover", name, "-o", str(tmp_path / "out.tlog"))
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert done.stderr == f"{name}: File name too long\n"
 
 

@@ -18,14 +18,13 @@ from gateway.cli.support.options import (
     ask,
     folder_of,
     is_running,
-    read_aircraft,
     read_options,
     read_settings,
 )
-from gateway.cli.support.recording_options import files_of, refusing
+from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock
-from gateway.config import GatewaySettings, save_aircraft
+from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
 from gateway.live.serial_port import (
     PortNotFoundError,
@@ -136,7 +135,7 @@ def calibrate(
     once; without one, or with --port, the receiver is read.
     """
     settings = read_settings(config)
-    aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
+    aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
     chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
     old = aircraft.calibration
     is_live = log is None and port is None and config is None and is_running()
@@ -153,8 +152,7 @@ def calibrate(
             console.print("the gateway uses it, and saves it")
             return
         changed = msgspec.structs.replace(aircraft, calibration=calibration)
-        with refusing():
-            console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
+        console.print(f"saved in {save_aircraft(settings, vehicle, changed)}")
 
     if log is not None:
         poses = _poses_of_log(_read_log(log, settings, vehicle))
@@ -273,17 +271,16 @@ def _missing(samples: list[NodeSamples]) -> list[str]:
 
 def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSamples:
     raws, moving, moved_us = list[ImuRaw](), list[bool](), -MOVING_US
-    with refusing():
-        (path, *_) = files_of([path], folder_of(settings), "tables")
-        table = open_rows(path, read_options(settings))
-        for row in table.plain_rows:
-            fix = row.gps
-            if fix is not None and fix.node.vehicle_id == vehicle:
-                moves = fix.fix_ok and math.hypot(*fix.vel_n_mps[:2]) > MOVING_MPS
-                moved_us = fix.time_us if moves else -MOVING_US
-            if row.raw is not None and row.raw.node.vehicle_id == vehicle:
-                raws.append(row.raw)
-                moving.append(row.time_us - moved_us < MOVING_US)
+    (path, *_) = files_of([path], folder_of(settings), "tables")
+    table = open_rows(path, read_options(settings))
+    for row in table.plain_rows:
+        fix = row.gps
+        if fix is not None and fix.node.vehicle_id == vehicle:
+            moves = fix.fix_ok and math.hypot(*fix.vel_n_mps[:2]) > MOVING_MPS
+            moved_us = fix.time_us if moves else -MOVING_US
+        if row.raw is not None and row.raw.node.vehicle_id == vehicle:
+            raws.append(row.raw)
+            moving.append(row.time_us - moved_us < MOVING_US)
     if not raws:
         refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")
     return node_samples(raws, moving)

@@ -30,16 +30,13 @@ from gateway.cli.live.run import (
 from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
-    load_settings,
-    or_refuse,
     read_options,
+    read_settings,
 )
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     files_of,
     progress_of,
-    read_column_map,
-    refusing,
 )
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
@@ -82,9 +79,9 @@ def demo(
     """
 
     def read() -> GatewaySettings:
-        return with_endpoints(load_settings(config), endpoint)
+        return with_endpoints(read_settings(config), endpoint)
 
-    settings = or_refuse(read)
+    settings = read()
     # First of all, as it loads for seconds; so the simulator is imported after this.
     page = launched_panel(config, wanted=panel and is_installed())
     load_entry_points()
@@ -134,10 +131,9 @@ def recorded_line(
     from gateway.recordings.fuse import with_reference
     from gateway.simulator.recorded import in_rounds, replay
 
-    with refusing():
-        files = files_of([name], folder_of(settings), "tables")
-    with progress_of(files) as advance, refusing():
-        options = read_options(settings, columns=read_column_map(columns), progress=advance)
+    files = files_of([name], folder_of(settings), "tables")
+    with progress_of(files) as advance:
+        options = read_options(settings, columns, progress=advance)
         flight = open_flown(files, options)
     aircraft = with_reference(settings.default_aircraft, gps_latency_s=flight.gps_latency_s)
 

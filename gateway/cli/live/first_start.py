@@ -20,10 +20,10 @@ from gateway.cli.live.calibrate import (
     listen,
     poses_from,
 )
-from gateway.cli.support.options import ConfigOption, read_aircraft, read_settings
+from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import unix_time_us
-from gateway.config import GatewaySettings, save_aircraft
+from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.records import GpsFix, LinkReport, NodeStatus, RawRecord
@@ -241,7 +241,7 @@ def _calibrate(
     settings: GatewaySettings, serial: SerialSettings, vehicle: int, bench: Workbench | None
 ) -> None:
     _head("4 of 5: calibration of gyroscope, level and compass")
-    aircraft = read_aircraft(settings).get(vehicle, settings.default_aircraft)
+    aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
     from_receiver = capture_from(serial, vehicle)
 
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:

@@ -10,11 +10,10 @@ from rich.progress import Progress
 from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
-    load_settings,
-    or_refuse,
     read_options,
+    read_settings,
 )
-from gateway.cli.support.recording_options import files_of, refusing
+from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 
 group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")
@@ -60,14 +59,13 @@ def get(
         from gateway.panel.flight_page import read_flight
     except ModuleNotFoundError as error:
         refuse(f"maps belong to the panel, and {error.name} is missing: {how_to_add('panel')}")
-    settings = or_refuse(lambda: load_settings(config))
+    settings = read_settings(config)
     places: list[tuple[float, float]] = []
     if (pair := _coordinates(around)) is not None:
         places = [pair]
     else:
-        with refusing():
-            files = files_of([Path(around)], folder_of(settings), "tlogs")
-            flight = read_flight(files, read_options(settings), around)
+        files = files_of([Path(around)], folder_of(settings), "tlogs")
+        flight = read_flight(files, read_options(settings), around)
         for history in flight.histories.values():
             places += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)
     folder = Path(settings.panel.tiles_folder).expanduser()

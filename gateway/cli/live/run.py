@@ -15,13 +15,11 @@ import typer
 from gateway.cli.live.panel import PanelProcess, launched_panel
 from gateway.cli.support.options import (
     ConfigOption,
-    load_settings,
-    or_refuse,
-    read_aircraft,
+    read_settings,
 )
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
-from gateway.config import ConfigError, GatewaySettings
+from gateway.config import ConfigError, GatewaySettings, load_aircraft
 from gateway.live.daemon import Daemon
 from gateway.live.log_limit import summary_line
 from gateway.live.service import run_event_loop
@@ -64,14 +62,14 @@ def run_gateway(
     """Run the gateway on the receiver's serial port until interrupted."""
 
     def read() -> GatewaySettings:
-        settings = load_settings(config)
+        settings = read_settings(config)
         if port is not None:
             serial = msgspec.structs.replace(settings.serial, port=port)
             settings = msgspec.structs.replace(settings, serial=serial)
         return with_endpoints(settings, endpoint)
 
-    settings = or_refuse(read)
-    aircraft = read_aircraft(settings)
+    settings = read()
+    aircraft = load_aircraft(settings)
     page = launched_panel(config, wanted=panel or settings.panel.enabled)
     load_entry_points()
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)

@@ -22,7 +22,6 @@ from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
     SettingsOption,
-    refusing,
 )
 from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
 from gateway.output import write_new
@@ -120,9 +119,8 @@ def info(
             str(figures["damaged_bytes"]),
         )  # fmt: skip
     console_of().print(grid)
-    with refusing():
-        rows = flight_table(results).to_csv(index=False).encode()
-        write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
+    rows = flight_table(results).to_csv(index=False).encode()
+    write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
     _end(results)
 
 
@@ -175,22 +173,20 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
     console.print(grid)
     if compared is not None:
         _show_versus(compared)
-    with refusing():
-        rows = flight_table(results).to_csv(index=False).encode()
-        write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
-        if _can_make_pages():
-            print(write_season_page(results, output, compared))
-        else:
-            print(output / FLIGHTS_CSV)
-            console.print(f"a page needs the extra mavgate[plot]:\n{how_to_add('plot')}")
+    rows = flight_table(results).to_csv(index=False).encode()
+    write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
+    if _can_make_pages():
+        print(write_season_page(results, output, compared))
+    else:
+        print(output / FLIGHTS_CSV)
+        console.print(f"a page needs the extra mavgate[plot]:\n{how_to_add('plot')}")
     _end(results)
 
 
 def _compare(results: Sequence[FlightResult], against: Path) -> "Versus":
     from gateway.batch.statistics import versus
 
-    with refusing():
-        found = versus(results, read_results(against))
+    found = versus(results, read_results(against))
     if not found.compared:
         refuse(f"{against}: holds no result of any of these recordings")
     return found

@@ -1,15 +1,13 @@
 """`mavgate catalogue`: the catalogue of all recordings under a folder."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from typer.core import TyperGroup
 
-from gateway.batch.catalogue import CatalogueError, Row, find_flights, geojson_of, index_folder
+from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
 from gateway.cli.app import RECORDINGS
@@ -21,14 +19,13 @@ from gateway.cli.support.options import (
 )
 from gateway.cli.support.recording_options import (
     ColumnsOption,
-    read_column_map,
-    refusing,
 )
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,
     console_of,
     print_json,
+    progress_bar,
     refuse,
     table_of,
 )
@@ -90,14 +87,8 @@ def index(
     place = (folder or folder_of(settings)).expanduser()
     if not place.is_dir():
         refuse(f"{place}: is no folder")
-    with refusing():
-        options = read_options(settings, columns=read_column_map(columns))
-    console = console_of(stderr=True)
-    shown = (TextColumn("reading"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(
-        *shown, console=console, transient=True, auto_refresh=False,
-        disable=not console.is_terminal,
-    ) as progress, _asking():  # fmt: skip
+    options = read_options(settings, columns)
+    with progress_bar() as progress:
         task = progress.add_task("reading", total=None)
 
         def show(done: int, total: int) -> None:
@@ -121,11 +112,10 @@ def list_flights(
 ) -> None:
     """List the flights of the catalogue, or those for which a condition holds."""
     place = _place(folder, config)
-    with _asking():
-        if geojson:
-            print_json(geojson_of(place, where))
-            return
-        rows = find_flights(place, where)
+    if geojson:
+        print_json(geojson_of(place, where))
+        return
+    rows = find_flights(place, where)
     if json:
         print_json(rows)
         return
@@ -147,13 +137,12 @@ def show(
         name = find_recording(place, name).name
     quoted = name.replace("'", "''")
     where = f"name = '{quoted}' or path = '{quoted}'"
-    with _asking():
-        rows = find_flights(place, where)
-        if not rows:
-            refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
-        if geojson:
-            print_json(geojson_of(place, where))
-            return
+    rows = find_flights(place, where)
+    if not rows:
+        refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
+    if geojson:
+        print_json(geojson_of(place, where))
+        return
     if json:
         print_json(rows)
         return
@@ -169,15 +158,6 @@ def show(
 
 def _place(folder: Path | None, config: Path | None) -> Path:
     return (folder or folder_of(read_settings(config))).expanduser()
-
-
-@contextmanager
-def _asking() -> Iterator[None]:
-    """End the command with a clear word where the catalogue cannot answer."""
-    try:
-        yield
-    except CatalogueError as error:
-        refuse(str(error))
 
 
 def _show_table(rows: list[Row]) -> None:

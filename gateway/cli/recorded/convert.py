@@ -22,15 +22,12 @@ from gateway.cli.support.recording_options import (
     SettingsOption,
     SmoothOption,
     ToOption,
-    Wanted,
     files_of,
     print_remarks,
     progress_of,
-    read_column_map,
     read_range,
     read_sensors,
     recordings_folder,
-    refusing,
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.estimation.record import IntArray
@@ -88,36 +85,32 @@ def convert(
     write = WRITERS.get(out.suffix)
     if write is None:
         refuse(f"{out}: the output must end in {', '.join(WRITERS)}")
-    with refusing():
-        if smooth and not fuse:
-            refuse("--smooth smooths what --fuse fuses: give both")
-        if message and out.suffix != ONE_KIND:
-            refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
-        of_tlogs = not fuse and (out.suffix in FROM_TLOGS or message)
-        wanted: Wanted = "tlogs" if of_tlogs else "tables"
-        files = files_of(files, recordings_folder(config), wanted)
-    with progress_of(files) as advance, refusing():
+    if smooth and not fuse:
+        refuse("--smooth smooths what --fuse fuses: give both")
+    if message and out.suffix != ONE_KIND:
+        refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
+    of_tlogs = not fuse and (out.suffix in FROM_TLOGS or message)
+    files = files_of(files, recordings_folder(config), "tlogs" if of_tlogs else "tables")
+    with progress_of(files) as advance:
         options = read_options(
             read_settings(config),
+            columns,
             choice=settings,
             position=position,
-            columns=read_column_map(columns),
             system_id=system,
             sensors=read_sensors(sensor),
             progress=advance,
         )
-        limits = read_range(begin, end)
         flight = FlightToWrite(
             files,
             options,
-            limits=limits,
+            limits=read_range(begin, end),
             title=out.stem,
             fuse=fuse,
             smooth=smooth,
             message=message,
         )
-        inputs = [*files, columns, config]
-        size = write_new(out, write(flight), overwrite=force, inputs=inputs)
+        size = write_new(out, write(flight), overwrite=force, inputs=[*files, columns, config])
     print_remarks(flight.remarks)
     lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
     if lacks and message is None:
@@ -171,15 +164,14 @@ def fuse_log(
     manoeuvres, or the default is assumed, with a message.
     """
     current = read_settings(config)
-    with refusing():
-        files = files_of([file], recordings_folder(config), "tables")
+    files = files_of([file], recordings_folder(config), "tables")
     inputs = [*files, columns, config]
-    with progress_of(files) as advance, refusing():
-        check_output(out, inputs, overwrite=force)
+    check_output(out, inputs, overwrite=force)
+    with progress_of(files) as advance:
         options = read_options(
             current,
+            columns,
             choice="current" if config is not None else settings,
-            columns=read_column_map(columns),
             progress=advance,
             sensors=read_sensors(sensor),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -18,9 +17,7 @@ from gateway.cli.support.recording_options import (
     ForceOption,
     files_of,
     progress_of,
-    read_column_map,
     recordings_folder,
-    refusing,
 )
 from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new
@@ -67,11 +64,13 @@ def info(
     config: ConfigOption = None,
 ) -> None:
     """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
-    with refusing():
-        # A file needs no settings, which would import every stage.
-        files = [file] if file.exists() else files_of([file], recordings_folder(config), "all")
-    with progress_of(files) as advance, refusing():
-        options = partial(_read_options, columns, config, advance)
+    # A file needs no settings, which would import every stage.
+    files = [file] if file.exists() else files_of([file], recordings_folder(config), "all")
+    with progress_of(files) as advance:
+
+        def options() -> ReadOptions:
+            return read_options(read_settings(config), columns, progress=advance)
+
         found = [(each, describe(each, advance, options)) for each in files]
     for number, (each, info_of_file) in enumerate(found):
         if json:
@@ -79,11 +78,6 @@ def info(
         else:
             print(end="\n" if number else "")
             _show(each, info_of_file)
-
-
-def _read_options(columns: Path | None, config: Path | None, progress: Progress) -> ReadOptions:
-    columns_of = read_column_map(columns)
-    return read_options(read_settings(config), columns=columns_of, progress=progress)
 
 
 def recover(
@@ -100,7 +94,7 @@ def recover(
     """
     console = console_of()
     left_out: list[str] = []
-    with progress_of([file]) as advance, refusing():
+    with progress_of([file]) as advance:
         is_tlog = kind_of(file) is FileKind.TLOG
         kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
         target = out or file.with_name(f"{file.stem}.recovered{kept}")

@@ -33,15 +33,13 @@ from gateway.cli.support.recording_options import (
     SettingsOption,
     ToOption,
     files_of,
+    print_remarks,
     progress_of,
-    read_column_map,
     read_range,
     recordings_folder,
-    refusing,
 )
-from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of, refuse
+from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
-from gateway.live.control_socket import ControlError
 from gateway.live.player_edge import PlayerStatus
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
 from gateway.player import (
@@ -123,31 +121,20 @@ def play(
     gateway = with_endpoints(read_settings(config), endpoint)
     if with_commands and not yes:
         _ask_for_commands(gateway)
-    with ExitStack() as opened, refusing():
+    with ExitStack() as opened:
         plan = PlayPlan(
             *read_range(begin, end), _speed(speed), skip_gaps, loop, paused,
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
         files = files_of(files, recordings_folder(config), "tlogs")
-        options = read_options(
-            read_settings(config),
-            choice=settings,
-            position=position,
-            columns=read_column_map(columns),
-        )
+        options = read_options(gateway, columns, choice=settings, position=position)
         with progress_of(files) as advance:
             recorded = open_flights(files, replace(options, progress=advance), opened)
             flights = lay_out(recorded, system or [], with_commands=with_commands)
             prepare(flights, plan)
-        for remark in (remark for flight in recorded for remark in flight.remarks):
-            console_of(stderr=True).print(remark)
+        print_remarks(remark for flight in recorded for remark in flight.remarks)
         names = [file.name for file in files]
-        try:
-            asyncio.run(
-                _serve(lambda: PlayerDaemon(gateway, flights, plan, names), attached=attached)
-            )
-        except ControlError as error:
-            refuse(str(error))
+        asyncio.run(_serve(lambda: PlayerDaemon(gateway, flights, plan, names), attached=attached))
 
 
 def _ask_for_commands(settings: GatewaySettings) -> None:
@@ -193,8 +180,7 @@ def step(count: Annotated[int, typer.Argument(min=1, help="Frames.")] = 1) -> No
 @group.command("speed")
 def set_speed(speed: Annotated[str, typer.Argument(help="0.1 to 100, or max.")]) -> None:
     """Set the speed."""
-    with refusing():
-        value = _speed(speed)
+    value = _speed(speed)
     wanted = None if value == AS_FAST_AS_POSSIBLE else value
     _show(ask("play.speed", {"speed": wanted}, of="play"))
 

@@ -6,16 +6,15 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import TimeElapsedColumn
 
 from gateway.analysis.flight import Flight
 from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
-    load_settings,
-    or_refuse,
     read_options,
+    read_settings,
 )
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -31,17 +30,13 @@ from gateway.cli.support.recording_options import (
     load_flight,
     print_remarks,
     progress_of,
-    read_column_map,
-    refusing,
 )
-from gateway.cli.support.terminal import console_of, how_to_add, refuse
+from gateway.cli.support.terminal import how_to_add, progress_bar, refuse
 from gateway.output import check_folder, write_new
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
-
-COLUMNS: Final = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
 
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
@@ -82,23 +77,16 @@ def report(
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
 
-    with refusing():
-        check_folder(output, overwrite=force)
-    loading = Loading(
-        or_refuse(lambda: load_settings(config)), settings, columns, system, reference
-    )
+    check_folder(output, overwrite=force)
+    loading = Loading(read_settings(config), settings, columns, system, reference)
     loaded = load_flight(flight, loading)
     other = loaded if against is None else load_flight(against, replace(loading, reference=None))
     others = None
     if against_config is not None:
-        others = fusion_of(or_refuse(lambda: load_settings(against_config)))
+        others = fusion_of(read_settings(against_config))
         if flight is None:
             others = with_reference(others, gps_latency_s=loaded.latency_s)
-    console = console_of(stderr=True)
-    hidden = not console.is_terminal
-    with Progress(
-        *COLUMNS, console=console, transient=True, auto_refresh=False, disable=hidden
-    ) as progress:
+    with progress_bar(TimeElapsedColumn()) as progress:
         task = progress.add_task("fusing", total=None)
         progress.refresh()
         case = make_case(loaded, smooth=smooth)
@@ -111,8 +99,7 @@ def report(
             progress.advance(task)
             progress.refresh()
 
-        with refusing():
-            page = write_report(made, output, advance)
+        page = write_report(made, output, advance)
     _print_latency(loaded, case.smoothed_latency_s)
     print(page)
 
@@ -160,16 +147,15 @@ def page(
         from gateway.panel.flight_page import compare_estimators, read_flight, render_page
     except ModuleNotFoundError as error:
         refuse(f"the page is made by the panel, and {error.name} is missing: {how_to_add('panel')}")
-    gateway = or_refuse(lambda: load_settings(config))
-    with refusing():
-        files = files_of([flight], folder_of(gateway), "tlogs")
-        options = read_options(gateway, choice=settings, columns=read_column_map(columns))
-        with progress_of(files) as advance:
-            made = read_flight(files, replace(options, progress=advance), flight.name)
-        if compare:
-            tables = files_of([flight], folder_of(gateway), "tables")
-            with progress_of(tables) as advance:
-                compare_estimators(made, tables, replace(options, progress=advance))
-        print_remarks(made.remarks)
-        write_new(output, [render_page(made).encode()], overwrite=force, inputs=files)
+    gateway = read_settings(config)
+    files = files_of([flight], folder_of(gateway), "tlogs")
+    options = read_options(gateway, columns, choice=settings)
+    with progress_of(files) as advance:
+        made = read_flight(files, replace(options, progress=advance), flight.name)
+    if compare:
+        tables = files_of([flight], folder_of(gateway), "tables")
+        with progress_of(tables) as advance:
+            compare_estimators(made, tables, replace(options, progress=advance))
+    print_remarks(made.remarks)
+    write_new(output, [render_page(made).encode()], overwrite=force, inputs=files)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")

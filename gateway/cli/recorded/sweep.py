@@ -10,13 +10,6 @@ import numpy as np
 import pandas as pd
 import typer
 from rich import box
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 
 from gateway.analysis import sweep as sweeping
@@ -42,8 +35,7 @@ from gateway.batch.tasks import FlightResult, SweepTask
 from gateway.cli.support.batch_work import SeasonWork, season_options
 from gateway.cli.support.options import (
     ConfigOption,
-    load_settings,
-    or_refuse,
+    read_settings,
 )
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -54,9 +46,8 @@ from gateway.cli.support.recording_options import (
     SystemOption,
     fusion_of,
     load_flight,
-    refusing,
 )
-from gateway.cli.support.terminal import console_of, refuse, table_of
+from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
 from gateway.recordings.fuse import FusionSettings
@@ -122,7 +113,7 @@ def sweep(
     fixes that are withheld from it. With many flights, the choice is scored by flights of other
     aircraft and days.
     """
-    current = or_refuse(lambda: load_settings(config))
+    current = read_settings(config)
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
     options = SweepOptions(
         named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
@@ -174,27 +165,23 @@ class SweepOptions:
 
 def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
     """Try the settings, show the best, and write it as a settings file."""
-    with refusing():
-        _check_outputs(options, path)
-    try:
-        axes = _parse_axes(options)
-        flight = load_flight(path, loading)
-        contest = sweeping.make_contest(
-            flight,
-            flight.fusion,
-            [axis.key for axis in axes],
-            hold_out=options.hold_out,
-            interval_s=options.gps_interval_s,
-        )
-        _print_idle(contest, axes)
-        with pool(contest, options.jobs) as run:
-            if options.generations:
-                trials = _search(axes, run, options.generations, options.metric)
-            else:
-                trials = _try_all(grid(axes), run)
-        results = sweeping.tabulate(contest.keys, trials, options.metric)
-    except SweepError as error:
-        refuse(str(error))
+    _check_outputs(options, path)
+    axes = _parse_axes(options)
+    flight = load_flight(path, loading)
+    contest = sweeping.make_contest(
+        flight,
+        flight.fusion,
+        [axis.key for axis in axes],
+        hold_out=options.hold_out,
+        interval_s=options.gps_interval_s,
+    )
+    _print_idle(contest, axes)
+    with pool(contest, options.jobs) as run:
+        if options.generations:
+            trials = _search(axes, run, options.generations, options.metric)
+        else:
+            trials = _try_all(grid(axes), run)
+    results = sweeping.tabulate(contest.keys, trials, options.metric)
     _show(results, contest, options.metric)
     best = sweeping.best_of(trials, options.metric)
     _write(options, _merged(loading.settings, contest, best), results, path)
@@ -211,14 +198,11 @@ def _write(
     options: SweepOptions, best: GatewaySettings, table: pd.DataFrame, path: Path | None = None
 ) -> None:
     """Write the best settings, and the table if it is wanted."""
-    with refusing():
-        write_new(
-            options.output, [render(best).encode()], overwrite=options.overwrite, inputs=[path]
-        )
-        print(options.output)
-        if options.table is not None:
-            rows = table.to_csv(index=False).encode()
-            write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
+    write_new(options.output, [render(best).encode()], overwrite=options.overwrite, inputs=[path])
+    print(options.output)
+    if options.table is not None:
+        rows = table.to_csv(index=False).encode()
+        write_new(options.table, [rows], overwrite=options.overwrite, inputs=[path])
 
 
 def _cell(value: object) -> str:
@@ -252,27 +236,19 @@ def _print_idle(contest: Contest, axes: Sequence[Axis]) -> None:
     console_of(stderr=True).print(text, style="yellow")
 
 
-def _progress() -> Progress:
-    console = console_of(stderr=True)
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        console=console, transient=True, disable=not console.is_terminal,
-    )  # fmt: skip
-
-
 def _try_all(points: Sequence[Values], run: Run) -> list[Trial]:
     found: list[Trial] = []
-    with _progress() as progress:
+    with progress_bar() as progress:
         task = progress.add_task("trials", total=len(points))
         for index, scores in run(points):
             found.append((points[index], scores))
-            progress.advance(task)
+            progress.update(task, advance=1, refresh=True)
     return found
 
 
 def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) -> list[Trial]:
     found: list[Trial] = []
-    with _progress() as progress:
+    with progress_bar() as progress:
         task = progress.add_task("generations", total=generations)
 
         def evaluate(points: list[Values]) -> list[float]:
@@ -281,7 +257,8 @@ def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) ->
             return [scores[k][COLUMN_OF[metric]] for k in range(len(points))]
 
         def show_progress(best: float) -> None:
-            progress.update(task, advance=1, description=f"generations, best {best:.3f}")
+            text = f"generations, best {best:.3f}"
+            progress.update(task, advance=1, description=text, refresh=True)
 
         sweeping.optimise(axes, evaluate, generations, show_progress)
     return found
@@ -316,19 +293,15 @@ def run_season_sweep(
     kept: Path | None = None,
 ) -> list[FlightResult]:
     """Score every point on every flight, show what is best for all, and write it."""
-    with refusing():
-        if kept is not None:
-            kept.mkdir(parents=True, exist_ok=True)
-        _check_outputs(options)
+    if kept is not None:
+        kept.mkdir(parents=True, exist_ok=True)
+    _check_outputs(options)
     if options.generations:
         refuse("--optimise searches on one flight; give a grid for many")
     fusion = fusion_of(settings)
-    try:
-        axes = tuple(_parse_axes(options))
-        points, keys = grid(axes), [axis.key for axis in axes]
-        fusion = with_estimator_of(fusion, keys)
-    except SweepError as error:
-        refuse(str(error))
+    axes = tuple(_parse_axes(options))
+    points, keys = grid(axes), [axis.key for axis in axes]
+    fusion = with_estimator_of(fusion, keys)
     column = COLUMN_OF[options.metric]
     task = SweepTask(read, axes, column, options.hold_out, options.gps_interval_s)
     results = work.run(task, work.items(), kept)

@@ -2,16 +2,15 @@
 
 import logging
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from gateway.batch.executors import ClusterError, DaskCluster, Executor, LocalProcesses, has_dask
-from gateway.batch.storage import BatchItem, StorageError, has_fsspec, is_url, items_of
+from gateway.batch.executors import DaskCluster, Executor, LocalProcesses, has_dask
+from gateway.batch.storage import BatchItem, has_fsspec, is_url, items_of
 from gateway.batch.tasks import (
     FlightResult,
     FlightTask,
@@ -23,11 +22,9 @@ from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
     Wanted,
     files_of,
-    read_column_map,
     recordings_folder,
-    refusing,
 )
-from gateway.cli.support.terminal import console_of, how_to_add, refuse
+from gateway.cli.support.terminal import console_of, how_to_add, progress_bar, refuse
 from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice
 from gateway.recordings.reading import ReadOptions
@@ -70,17 +67,15 @@ class SeasonWork:
             _quieten_storages()
         wanted: Wanted = "all" if each_file else "tables"
         names: list[str] = []
-        with refusing():
-            for name in self.names:
-                if is_url(name):
-                    names.append(name)
-                    continue
-                folder = recordings_folder(self.config)
-                found = [*map(str, files_of([Path(name).expanduser()], folder, wanted))]
-                names += found
+        for name in self.names:
+            if is_url(name):
+                names.append(name)
+                continue
+            folder = recordings_folder(self.config)
+            names += map(str, files_of([Path(name).expanduser()], folder, wanted))
         try:
             items = items_of(names, each_file=each_file)
-        except (StorageError, OSError) as error:
+        except OSError as error:
             refuse(str(error))
         if not items:
             refuse(f"{', '.join(self.names)}: no recording is there")
@@ -94,31 +89,19 @@ class SeasonWork:
             return
         if not has_dask():
             refuse(f"--scheduler needs Dask, the extra mavgate[batch]:\n{how_to_add('batch')}")
-        try:
-            cluster = DaskCluster(self.scheduler)
-        except ClusterError as error:
-            refuse(str(error))
-        try:
+        with closing(DaskCluster(self.scheduler)) as cluster:
             yield cluster
-        finally:
-            cluster.close()
 
     def run(
         self, task: FlightTask, items: Sequence[BatchItem], output: Path | None
     ) -> list[FlightResult]:
         """Run a task on all, with a progress bar, and list what failed."""
-        console = console_of(stderr=True)
-        columns = (
-            TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
-            TimeRemainingColumn(),
-        )  # fmt: skip
-        with refusing():
-            folder = None if output is None else ResultFolder(output)
-        # No thread of its own: processes are forked while it shows.
-        with self.executor() as executor, Progress(
-            *columns, console=console, transient=True, auto_refresh=False,
-            disable=not console.is_terminal,
-        ) as progress, refusing(), folder.held() if folder else nullcontext():  # fmt: skip
+        folder = None if output is None else ResultFolder(output)
+        with (
+            self.executor() as executor,
+            progress_bar() as progress,
+            folder.held() if folder else nullcontext(),
+        ):
             bar = progress.add_task(task.name, total=len(items))
 
             def report(what: str, done: int, total: int) -> None:
@@ -129,7 +112,8 @@ class SeasonWork:
                 results = run_season(task, items, executor, folder, report)
             except KeyboardInterrupt:
                 if folder is not None:
-                    console.print("interrupted; what is done is kept: the same command goes on")
+                    text = "interrupted; what is done is kept: the same command goes on"
+                    console_of(stderr=True).print(text)
                 raise
         _print_failures(results)
         return results
@@ -139,14 +123,7 @@ def season_options(
     config: Path | None, columns: Path | None, choice: SettingsChoice
 ) -> ReadOptions:
     """Take what reads a season's flights out of the settings; nothing that must stay secret."""
-    with refusing():
-        return without_secrets(
-            read_options(
-                read_settings(config),
-                choice=choice,
-                columns=read_column_map(columns),
-            )
-        )
+    return without_secrets(read_options(read_settings(config), columns, choice=choice))
 
 
 def _quieten_storages() -> None:

@@ -15,13 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar, cast
 
 import typer
 
-from gateway.cli.support.terminal import refuse
-from gateway.live.control_socket import ControlError, find_socket, live_sockets, request
+from gateway.live.control_socket import find_socket, live_sockets, request
 
 if TYPE_CHECKING:
-    from gateway.aircraft import AircraftSettings
     from gateway.config import GatewaySettings
-    from gateway.pipeline import PipelineSettings
     from gateway.recordings.reading import ReadOptions
 
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
@@ -34,7 +31,7 @@ ConfigOption = Annotated[
 ]
 
 
-def load_settings(file: Path | None) -> GatewaySettings:
+def read_settings(file: Path | None) -> GatewaySettings:
     """Load the given settings, the user's own, or the defaults."""
     from gateway.config import GatewaySettings, load
 
@@ -45,49 +42,23 @@ def load_settings(file: Path | None) -> GatewaySettings:
     return load(file)
 
 
-def or_refuse(read: Callable[[], GatewaySettings]) -> GatewaySettings:
-    """Read settings at the start of a command, which ends if they are wrong."""
-    from gateway.config import ConfigError
-
-    try:
-        return read()
-    except ConfigError as error:
-        refuse(str(error))
-
-
-def read_settings(file: Path | None) -> GatewaySettings:
-    """Load the settings; end the command if they are wrong."""
-    return or_refuse(lambda: load_settings(file))
-
-
 def folder_of(settings: GatewaySettings) -> Path:
     """Return the folder of recordings in these settings."""
     return Path(settings.recording.folder).expanduser()
 
 
-def read_aircraft(settings: GatewaySettings) -> dict[int, AircraftSettings]:
-    """Load the settings of single aircraft."""
-    from gateway.config import ConfigError, load_aircraft
-
-    try:
-        return load_aircraft(settings)
-    except ConfigError as error:
-        refuse(str(error))
-
-
-def read_options(settings: GatewaySettings, **how: Any) -> ReadOptions:
-    """Return how flights are read: the limits of the settings, and further fields by name."""
-    from gateway.recordings.reading import ReadOptions
-
-    current = pipeline_settings(settings)
-    return ReadOptions(current, unpacked_limit=settings.recording.unpacked_limit, **how)
-
-
-def pipeline_settings(settings: GatewaySettings) -> PipelineSettings:
-    """Return the pipeline's settings, the single aircraft's files included."""
+def read_options(settings: GatewaySettings, columns: Path | None = None, **how: Any) -> ReadOptions:
+    """Return how flights are read: by a column map, the limits of the settings, and `how`."""
+    from gateway.config import load_aircraft
     from gateway.pipeline import PipelineSettings
+    from gateway.recordings.reading import ReadOptions, read_column_map
 
-    return PipelineSettings(settings.default_aircraft, read_aircraft(settings))
+    return ReadOptions(
+        PipelineSettings(settings.default_aircraft, load_aircraft(settings)),
+        unpacked_limit=settings.recording.unpacked_limit,
+        columns=None if columns is None else read_column_map(columns),
+        **how,
+    )
 
 
 SocketOption = Annotated[
@@ -110,19 +81,13 @@ def ask(
     of: str = "run",
     wait_s: float | None = None,
 ) -> Any:
-    """Send a request to the running gateway (or player); end the command if that fails."""
-    try:
-        return request(socket_of(of), verb, params, timeout_s=wait_s)
-    except ControlError as error:
-        refuse(str(error))
+    """Send a request to the running gateway, or player."""
+    return request(socket_of(of), verb, params, timeout_s=wait_s)
 
 
 def socket_of(of: str) -> Path:
-    """Return the selected gateway's socket; end the command if there is none."""
-    try:
-        return _named.get() or find_socket(of)
-    except ControlError as error:
-        refuse(str(error))
+    """Return the selected gateway's socket; raises ControlError if there is none."""
+    return _named.get() or find_socket(of)
 
 
 def is_running() -> bool:

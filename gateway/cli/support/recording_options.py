@@ -8,16 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-import msgspec
 import typer
-from rich.progress import (
-    BarColumn,
-    DownloadColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from gateway.cli.support.options import (
     ask,
@@ -26,10 +18,8 @@ from gateway.cli.support.options import (
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import console_of, refuse
-from gateway.printable import reason_of
+from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import FileKind, FlightError, Position, SettingsChoice, kind_of
-from gateway.recordings.formats.csv import ColumnMap
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
 
@@ -37,7 +27,6 @@ if TYPE_CHECKING:
     from gateway.analysis.flight import Flight
     from gateway.config import GatewaySettings
     from gateway.recordings.fuse import FusionSettings
-    from gateway.recordings.reading import ReadOptions
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
 SmoothOption = Annotated[
@@ -72,21 +61,6 @@ PositionOption = Annotated[
     Position,
     typer.Option("--position", help="Position as live, or on straight lines between fixes."),
 ]
-
-
-def read_column_map(path: Path | None) -> ColumnMap | None:
-    """Read a column map; raises FlightError if it is invalid."""
-    if path is None:
-        return None
-    try:
-        return msgspec.toml.decode(path.read_text(encoding="utf-8-sig"), type=ColumnMap)
-    except UnicodeDecodeError as error:
-        line = 1 + error.object.count(b"\n", 0, error.start)
-        raise FlightError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
-    except OSError as error:
-        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise FlightError(f"{path}: is no column map: {error}") from error
 
 
 def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
@@ -125,14 +99,8 @@ def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Momen
 def progress_of(files: Iterable[Path]) -> Iterator[Callable[[int], None]]:
     """Show the progress of reading, and that the command computes after that, on a terminal."""
     total = sum(file.stat().st_size for file in files if file.exists())
-    columns = (
-        *(TextColumn("{task.description}"), BarColumn(), DownloadColumn()),
-        *(TimeElapsedColumn(), TimeRemainingColumn()),
-    )
-    console = console_of(stderr=True)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
+    columns = (DownloadColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with progress_bar(*columns, auto_refresh=True) as progress:
         task = progress.add_task("reading", total=total)
 
         def advance(count: int) -> None:
@@ -147,20 +115,6 @@ def print_remarks(remarks: Iterable[str]) -> None:
     """Print remarks about a file to stderr."""
     for remark in remarks:
         console_of(stderr=True).print(remark)
-
-
-@contextmanager
-def refusing() -> Iterator[None]:
-    """End the command with a clear error if a file is not as it should be."""
-    try:
-        yield
-    except FileExistsError as error:
-        refuse(f"{error.filename}: is there already; --force overwrites it")
-    except OSError as error:
-        file = str(error.filename or "disk").removesuffix(".partial")
-        refuse(f"{file}: {error.strerror or reason_of(error)}")
-    except FlightError as error:
-        refuse(str(error))
 
 
 Wanted = Literal["tlogs", "tables", "all"]
@@ -241,7 +195,7 @@ def fusion_of(settings: GatewaySettings) -> FusionSettings:
 
 
 def load_flight(path: Path | None, loading: Loading) -> Flight:
-    """Read a recording, or the simulated flight; a file without one ends the command."""
+    """Read a recording, or the simulated flight; raises FlightError if a file holds none."""
     # Imported here: they import all stages, for which commands that fuse nothing must not wait.
     from gateway.analysis.flight import flight_of_files, judged_by
     from gateway.analysis.simulated import simulated_flight
@@ -250,11 +204,16 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
     settings = loading.settings
     if path is None:
         return simulated_flight(settings.simulator, fusion_of(settings))
-    with refusing():
-        parts = files_of([path], folder_of(settings), "tables")
+    parts = files_of([path], folder_of(settings), "tables")
     files = [*parts, loading.reference] if loading.reference is not None else parts
-    with progress_of(files) as advance, refusing():
-        options = _read_options(loading, advance)
+    with progress_of(files) as advance:
+        options = read_options(
+            settings,
+            loading.columns,
+            choice=loading.choice,
+            system_id=loading.system,
+            progress=advance,
+        )
         story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
         try:
             flight, table, _ = flight_of_files(
@@ -268,13 +227,3 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         return judged_by(
             flight, open_rows(loading.reference, options).blocks, loading.reference.name
         )
-
-
-def _read_options(loading: Loading, advance: Callable[[int], None]) -> ReadOptions:
-    return read_options(
-        loading.settings,
-        choice=loading.choice,
-        columns=read_column_map(loading.columns),
-        system_id=loading.system,
-        progress=advance,
-    )

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
 
-from gateway.printable import printable, printable_json
+from gateway.printable import UserError, printable, printable_json, reason_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from rich.console import Console, ConsoleOptions, RenderableType
+    from rich.progress import Progress, ProgressColumn
     from rich.segment import Segment
     from rich.table import Table
     from rich.text import Text
@@ -77,6 +78,28 @@ def table_of(*columns: str, left: int = 1) -> Table:
     return table
 
 
+def progress_bar(*columns: ProgressColumn, auto_refresh: bool = False) -> Progress:
+    """Make a progress bar on stderr, which is hidden where that is no terminal.
+
+    `auto_refresh` starts a thread, which must not be where processes are forked meanwhile.
+    """
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeRemainingColumn,
+    )
+
+    console = console_of(stderr=True)
+    return Progress(
+        TextColumn("{task.description}", markup=False), BarColumn(),
+        *(columns or (MofNCompleteColumn(), TimeRemainingColumn())),
+        console=console, transient=True, auto_refresh=auto_refresh,
+        disable=not console.is_terminal,
+    )  # fmt: skip
+
+
 DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
 """Where `make deb` puts all; what is installed by pip is not found from there."""
 
@@ -86,6 +109,22 @@ def refuse(text: str) -> NoReturn:
     console = console_of(stderr=True)
     console.print(text, style="red")
     raise typer.Exit(2)
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """End the command with a clear error where the user or a file is at fault."""
+    try:
+        yield
+    except UserError as error:
+        refuse(str(error))
+    except FileExistsError as error:
+        refuse(f"{error.filename}: already exists; use --force to overwrite")
+    except OSError as error:
+        # Without a name it is the output that fails.
+        if error.filename is None:
+            raise
+        refuse(f"{error.filename}: {error.strerror or reason_of(error)}")
 
 
 def how_to_add(extra: str) -> str:

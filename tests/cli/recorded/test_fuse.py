@@ -121,7 +121,7 @@ def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
     out.write_text("precious")
     result = invoke("fuse", log, "-o", out)
     assert result.exit_code == 2
-    assert "--force overwrites it" in result.output
+    assert "use --force to overwrite" in result.output
     assert out.read_text() == "precious"
 
 

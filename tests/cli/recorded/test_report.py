@@ -75,5 +75,5 @@ def test_a_folder_that_holds_something_is_not_written_into_unasked(tmp_path: Pat
     (tmp_path / "index.html").write_text("mine")
     result = invoke("report", "-o", tmp_path)
     assert result.exit_code == 2
-    assert "--force overwrites it" in result.output
+    assert "use --force to overwrite" in result.output
     assert (tmp_path / "index.html").read_text() == "mine"

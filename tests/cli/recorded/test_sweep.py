@@ -106,5 +106,5 @@ def test_settings_that_are_there_are_not_replaced_unasked(recording: Path, tmp_p
     arguments = ["--beta", "0.1,0.9", "-o", str(best), "--jobs", "1"]
     result = invoke("sweep", recording, *arguments)
     assert result.exit_code == 2
-    assert "--force overwrites it" in result.output
+    assert "use --force to overwrite" in result.output
     assert best.read_text() == "# mine"
