@@ -21,6 +21,17 @@ WAIT_MS = 60_000
 """What is on the page by then, or not: a busy machine is slow, and nothing here sleeps."""
 DESKTOP = {"width": 1080, "height": 680}
 """Small: the processor draws every pixel."""
+FEW_FRAMES = """
+const next_frame = requestAnimationFrame.bind(window);
+const waiting = new Set();
+window.requestAnimationFrame = (draw) => {
+  const id = setTimeout(() => next_frame((now_ms) => waiting.delete(id) && draw(now_ms)), 80);
+  waiting.add(id);
+  return id;
+};
+window.cancelAnimationFrame = (id) => waiting.delete(id);
+"""
+"""Lets a page draw about ten frames a second, since the processor draws them."""
 
 CONFIG = """
 aircraft_folder = "{folder}/aircraft"
@@ -34,12 +45,18 @@ vehicles = 2
 gps_first_fix_s = 0.5
 imu_rate_hz = 25
 baro_rate_hz = 5
+[vehicle.rates]
+attitude_quaternion_hz = 5
+attitude_hz = 5
+global_position_int_hz = 5
+vfr_hud_hz = 5
+highres_imu_hz = 5
 [panel]
 port = 0
 tiles_folder = "{folder}/tiles"
 map_styles = [
-  {{name = "Field", url = "{folder}/field.mbtiles", max_zoom = 4}},
-  {{name = "Other", url = "{folder}/other.mbtiles", max_zoom = 4}},
+  {{name = "Field", url = "{folder}/field.mbtiles", max_zoom = 18}},
+  {{name = "Other", url = "{folder}/other.mbtiles", max_zoom = 18}},
 ]
 """
 
@@ -62,10 +79,11 @@ class Process(process.Process):
         super().__init__(folder, *arguments, config=config.format(folder=folder))
 
 
-def open_page(browser: Browser, link: str, view: str = "flight", **options: object) -> Page:
-    """Open the page, wait for an aircraft, and show a view."""
-    page = browser.new_page(viewport=DESKTOP, **options)  # type: ignore[arg-type]
+def open_page(browser: Browser, link: str, view: str = "flight", script: str = "") -> Page:
+    """Open the page, wait for an aircraft, and show a view; a script runs before those of it."""
+    page = browser.new_page(viewport=DESKTOP)  # type: ignore[arg-type]
     page.set_default_timeout(WAIT_MS)
+    page.add_init_script(FEW_FRAMES + script)
     page.goto(link)
     # A click before the handshake waits for it, and may come after a later one.
     page.wait_for_function(

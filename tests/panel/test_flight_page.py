@@ -19,7 +19,7 @@ from gateway.panel.flight_page import PageFlight, read_flight, render_page
 from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
 from tests.kit.cli import invoke
-from tests.panel.browsing import needs_chromium
+from tests.panel.browsing import FEW_FRAMES, needs_chromium
 
 BEGIN_US = 1_750_000_000_000_000
 HOSTILE = "</script><script>window.ran = 1</script><img src=x onerror=window.ran=1>"
@@ -128,8 +128,9 @@ def test_page_opens_offline_and_moves(
     browser: Browser, page_file: Path, width: int, scheme: Any
 ) -> None:
     context = browser.new_context(
-        viewport={"width": width, "height": 900}, color_scheme=scheme, offline=True
+        viewport={"width": width, "height": 600}, color_scheme=scheme, offline=True
     )
+    context.add_init_script(FEW_FRAMES)
     page = context.new_page()
     troubles: list[str] = []
     page.on("console", lambda message: message.type == "error" and troubles.append(message.text))

@@ -1,12 +1,13 @@
 """Tiles from files, from a server on loopback, and from the disk when that is gone."""
 
 import gzip
+import math
 import os
 import sqlite3
 import struct
 import threading
 import zlib
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Iterable, Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
@@ -24,12 +25,6 @@ from gateway.panel.panel_settings import MapStyle, PanelSettings
 
 pytestmark = pytest.mark.io
 
-EVERYWHERE = """
-    with recursive n(i) as (select 0 union all select i + 1 from n where i < 15)
-    select 4, a.i, b.i from n a, n b
-"""
-"""All tiles of zoom 4; a map shows them larger when it looks closer."""
-
 
 def picture(shade: int = 0) -> bytes:
     def part(name: bytes, data: bytes) -> bytes:
@@ -45,15 +40,26 @@ def picture(shade: int = 0) -> bytes:
     )
 
 
-def write_mbtiles(file: Path, data: bytes, places: str = EVERYWHERE) -> None:
-    """Write a file that has the same picture at some places."""
+def write_mbtiles(file: Path, data: bytes, places: Iterable[tuple[int, int, int]]) -> None:
+    """Write a file that has the same picture at some places: zoom, column, row from the south."""
     with sqlite3.connect(file) as database:
         database.execute("create table places (zoom_level, tile_column, tile_row)")
-        database.execute(f"insert into places {places}")
+        database.executemany("insert into places values (?, ?, ?)", places)
         database.execute("create table picture (tile_data)")
         database.execute("insert into picture values (?)", (data,))
         database.execute("create view tiles as select * from places, picture")
     database.close()
+
+
+def tiles_around(lat_deg: float, lon_deg: float) -> Iterator[tuple[int, int, int]]:
+    """Return the places of the tiles around a position, in every zoom, as MBTiles counts them."""
+    north = math.asinh(math.tan(math.radians(lat_deg))) / math.pi
+    for zoom in range(19):
+        size = 1 << zoom
+        column, row = int((lon_deg / 360 + 0.5) * size), int((north + 1) / 2 * size)
+        for x in range(max(column - 12, 0), min(column + 13, size)):
+            for y in range(max(row - 12, 0), min(row + 13, size)):
+                yield zoom, x, y
 
 
 class _Owner(BaseHTTPRequestHandler):
@@ -126,7 +132,7 @@ async def test_tiles_beyond_the_world_are_not_asked_for(
 
 async def test_mbtiles_counts_rows_from_the_south(tmp_path: Path) -> None:
     file = tmp_path / "field.mbtiles"
-    write_mbtiles(file, picture(), "select 2, 1, 0")
+    write_mbtiles(file, picture(), [(2, 1, 0)])
     tiles = tiles_of(tmp_path, str(file))
     assert await tiles.tile(0, 2, 1, 3) == picture()
     assert await tiles.tile(0, 2, 1, 0) is None

@@ -1,9 +1,13 @@
-"""The views of a page with a gateway that the test feeds: what each does, seen on the page."""
+"""The views of a page with a gateway that the test feeds: what each does, seen on the page.
+
+In the end a viewer looks over TLS, and the gateway dies.
+"""
 
 import csv
 import re
 import signal
 import socket
+import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,12 +18,15 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from gateway.estimation.select import ESTIMATORS
 from gateway.live.control_socket import request
+from gateway.panel.access import hash_password
 from gateway.panel.estimator_trial import LEAST_S
 from gateway.units import US_PER_S
 from tests.kit.process import wait_for
 from tests.panel.bench_receiver import RATE_HZ, BenchReceiver
 from tests.panel.browsing import (
     CONFIG,
+    DESKTOP,
+    FEW_FRAMES,
     START_LIMIT_MS,
     WAIT_MS,
     Process,
@@ -46,6 +53,18 @@ OFFLINE = (
 )
 """A style whose tiles cannot be fetched."""
 PNG = b"\x89PNG\r\n\x1a\n"
+DESK = CONFIG.partition("map_styles")[0].replace(
+    "highres_imu_hz = 5", f"highres_imu_hz = {RATE_HZ}"
+)
+LOCKED = CONFIG.replace(
+    "[panel]",
+    f"""[panel]
+password = "{hash_password("tower")}"
+viewer_password = "{hash_password("look")}"
+certificate = "{{folder}}/panel.pem"
+certificate_key = "{{folder}}/panel.key"
+""",
+)
 
 
 @dataclass
@@ -70,8 +89,14 @@ class Desk:
     @property
     def home(self) -> tuple[float, float]:
         """As the gateway has it."""
-        home = self.status["aircraft"][0]["home"]
-        return home["lat_deg"], home["lon_deg"]
+        return self.chosen_places["home"]
+
+    @property
+    def chosen_places(self) -> dict[str, tuple[float, float]]:
+        """Home and mark, if there is one, as the gateway has them."""
+        aircraft = self.status["aircraft"][0]
+        known = {name: place for name in ("home", "mark") if (place := aircraft[name])}
+        return {name: (place["lat_deg"], place["lon_deg"]) for name, place in known.items()}
 
     def let_pass(self, duration_s: float) -> None:
         """Wait until the aircraft has flown on for so long, and the view has been refreshed."""
@@ -85,19 +110,23 @@ class Desk:
         return "".join(file.read_text() for file in files)
 
 
+def start_gateway(folder: Path, receiver: BenchReceiver, panel_settings: str = "") -> Process:
+    config = DESK + panel_settings
+    return Process(folder, "run", "--plain", "--port", receiver.port, config=config)
+
+
 @pytest.fixture(scope="module")
 def desk(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     folder, receiver = tmp_path_factory.mktemp("desk"), BenchReceiver()
     receiver.start()
-    config = CONFIG.partition("map_styles")[0] + f"enabled = true\nmap_styles = [{OFFLINE}]\n"
-    config += f"[vehicle.rates]\nhighres_imu_hz = {RATE_HZ:.1f}\n"
-    gateway = Process(folder, "run", "--plain", "--port", receiver.port, config=config)
+    gateway = start_gateway(folder, receiver, f"enabled = true\nmap_styles = [{OFFLINE}]\n")
     page = open_page(browser, gateway.link())
     troubles: list[str] = []
     page.on("pageerror", lambda error: troubles.append(str(error)))
-    yield Desk(folder, gateway, receiver, page, page.evaluate("mavgate.state.time_us"))
+    made = Desk(folder, gateway, receiver, page, page.evaluate("mavgate.state.time_us"))
+    yield made
     page.close()
-    gateway.end()
+    made.gateway.end()
     receiver.end()
     assert troubles == []
 
@@ -364,3 +393,72 @@ def test_units_are_those_that_were_chosen(desk: Desk) -> None:
     page.get_by_role("option", name="aviation").click()
     page.wait_for_function("mavgate.show('speed', 100)[1] === 'kt'")
     expect(view.locator(".key.circle")).to_contain_text("ft")
+
+
+@pytest.fixture(scope="module")
+def viewers_page(browser: Browser, desk: Desk) -> Iterator[Page]:
+    """The page of a viewer, over TLS, of a panel that is a process of its own."""
+    desk.page.close()
+    write_certificate(desk.folder / "panel.pem", desk.folder / "panel.key")
+    panel = Process(desk.folder, "panel", config=LOCKED)
+    opened = browser.new_page(viewport=DESKTOP, ignore_https_errors=True)  # type: ignore[arg-type]
+    opened.set_default_timeout(WAIT_MS)
+    opened.add_init_script(FEW_FRAMES)
+    opened.goto(panel.link())
+    yield opened
+    opened.close()
+    panel.end()
+
+
+def write_certificate(certificate: Path, key: Path) -> None:
+    """Make a certificate that vouches for itself."""
+    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256"]
+    command += ["-nodes", "-days", "1", "-subj", "/CN=127.0.0.1"]
+    subprocess.run(
+        [*command, "-out", str(certificate), "-keyout", str(key)], check=True, capture_output=True
+    )
+
+
+def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page) -> None:
+    page, before = viewers_page, desk.chosen_places
+    assert page.url.startswith("https://")
+    page.get_by_label("Password").fill("wrong")
+    page.get_by_text("Open the panel").click()
+    expect(page.get_by_role("alert")).to_contain_text("not the password")
+    page.get_by_label("Password").fill("look")
+    page.get_by_text("Open the panel").click()
+    expect(page.locator(".head").get_by_text("viewer")).to_be_visible()
+    page.wait_for_function("mavgate.state && mavgate.state.lat_deg !== null")
+    show(page, "recordings")
+    recorder = page.locator("section[data-view='recordings'] [data-role='recorder']")
+    expect(recorder).to_have_text("idle")
+    expect(page.get_by_label("Start recording")).to_have_count(0)
+    show(page, "map")
+    expect(page.get_by_label("Upload a PMTiles file")).to_have_count(0)
+    page.locator("section[data-view='map'] .map-canvas").click(position={"x": 300, "y": 300})
+    expect(page.get_by_text("Mark this place")).to_have_count(0)
+    show(page, "link")
+    expect(page.locator("section[data-view='link'] [data-role='receiver']")).to_be_visible()
+    expect(page.get_by_label("Serial port")).to_have_count(0)
+    # A request that a page hides can be sent all the same.
+    for path in ("/recordings/forged", "/maps/forged"):
+        status = page.evaluate(
+            "(path) => fetch(path, {method: 'PUT', body: 'x'}).then((answer) => answer.status)",
+            path,
+        )
+        assert status == 403
+    assert desk.chosen_places == before
+
+
+def test_page_finds_a_gateway_that_was_killed_and_started_again(
+    desk: Desk, viewers_page: Page
+) -> None:
+    page = viewers_page
+    chips = page.locator(".chips")
+    expect(chips.get_by_text("link", exact=True)).to_be_visible()
+    desk.gateway.end(signal.SIGKILL)
+    expect(chips.get_by_text(re.compile(r"silent for \d+ s"))).to_be_visible()
+    desk.gateway = start_gateway(desk.folder, desk.receiver)
+    expect(chips.get_by_text("link", exact=True)).to_be_visible(timeout=START_LIMIT_MS)
+    before = page.evaluate("mavgate.state.time_us")
+    page.wait_for_function(f"mavgate.state.time_us > {before}")

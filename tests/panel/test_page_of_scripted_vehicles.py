@@ -1,0 +1,216 @@
+"""A panel of two vehicles by UDP: one of exact figures, one whose names and texts are scripts."""
+
+import contextlib
+import math
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Locator, Page, expect
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.geometry.quaternion import to_euler
+from tests.panel.browsing import WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.scripted_vehicle import HOSTILE_MARKUP, HOSTILE_NAMES, ScriptedVehicle
+from tests.panel.test_recording_files import flight
+
+pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
+expect.set_options(timeout=WAIT_MS)
+
+CONFIG = """
+[recording]
+folder = "{folder}/recordings"
+[panel]
+port = 0
+tiles_folder = "{folder}/tiles"
+map_styles = []
+"""
+VIEWS = (
+    "flight", "map", "link", "recordings", "calibration", "tuning", "plots", "events",
+)  # fmt: skip
+LISTEN = """
+window.drawn = [];
+const write = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+  if (this.canvas.closest(".flight-display")) {
+    window.drawn.push(String(text));
+    window.drawn.splice(0, window.drawn.length - 200);
+  }
+  return write.call(this, text, ...rest);
+};
+"""
+"""Notes the words and figures that the flight display draws, the newest last."""
+LOOKS = """
+([places, expected]) => {
+  const canvas = document.querySelector(".flight-display canvas");
+  const pen = canvas.getContext("2d");
+  const colours = places.map(([right, down]) => {
+    const [red, , blue] = pen.getImageData(right * canvas.width, down * canvas.height, 1, 1).data;
+    return blue > red ? "sky" : "ground";
+  });
+  return String(colours) === String(expected);
+}
+"""
+"""Whether sky or ground is drawn as expected, at places that are shares of the flight display."""
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Iterator[ScriptedVehicle]:
+    started = ScriptedVehicle()
+    started.start()
+    yield started
+    started.end()
+
+
+@pytest.fixture(scope="module")
+def troubles() -> list[str]:
+    """Errors of the page, and whatever a script of others would say."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def page(
+    browser: Browser,
+    vehicle: ScriptedVehicle,
+    troubles: list[str],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Page]:
+    folder = tmp_path_factory.mktemp("scripted")
+    (folder / "recordings").mkdir()
+    for name in HOSTILE_NAMES:
+        with contextlib.suppress(OSError):
+            (folder / "recordings" / f"{name.replace('/', '')}_01.tlog").write_bytes(flight())
+    connect = f"udp-listen:127.0.0.1:{vehicle.port}"
+    panel = Process(folder, "panel", "--connect", connect, config=CONFIG)
+    opened = open_page(browser, panel.link(), script=LISTEN)
+    opened.on("console", lambda message: message.type == "error" and troubles.append(message.text))
+    opened.on("pageerror", lambda error: troubles.append(str(error)))
+    opened.on("dialog", lambda dialog: troubles.append(dialog.message))
+    yield opened
+    opened.close()
+    panel.end()
+
+
+def until_drawn(page: Page, *texts: str) -> None:
+    """Wait until the flight display has drawn all of these since the last such wait.
+
+    `window.seen` is then all that it has drawn in that time.
+    """
+    page.wait_for_function(
+        "(texts) => texts.every((text) => window.drawn.includes(text))", arg=list(texts)
+    )
+    page.evaluate("window.seen = window.drawn.splice(0)")
+
+
+def display_of(page: Page) -> Locator:
+    return page.locator(".flight-display")
+
+
+def test_row_horizon(page: Page, vehicle: ScriptedVehicle) -> None:
+    places = [(0.25, 0.5), (0.72, 0.5), (0.25, 0.62)]
+    for roll, pitch, expected in (
+        (30, 0, ("sky", "ground", "sky")),
+        (-30, 0, ("ground", "sky", "ground")),
+        (0, 15, ("sky", "sky", "sky")),
+        (0, -15, ("ground", "ground", "ground")),
+    ):
+        vehicle.roll_deg, vehicle.pitch_deg = roll, pitch
+        spoken = re.compile(f"^Roll {roll}.0°, pitch {pitch}.0°,")
+        expect(display_of(page)).to_have_attribute("aria-label", spoken)
+        page.wait_for_function(LOOKS, arg=[places, expected])
+    vehicle.roll_deg = vehicle.pitch_deg = 0.0
+
+
+def test_row_compass(page: Page, vehicle: ScriptedVehicle) -> None:
+    vehicle.heading_deg = 272.0
+    until_drawn(page, "272°", "W", "300")
+    expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"heading 272.0°"))
+    vehicle.heading_deg = 3.0
+    until_drawn(page, "003°", "N", "030")
+    until_drawn(page, "003°", "N", "030")
+    assert "W" not in page.evaluate("window.seen")
+
+
+def test_row_altitude(page: Page, vehicle: ScriptedVehicle) -> None:
+    vehicle.alt_home_m, vehicle.climb_mps = 123.0, -2.5
+    until_drawn(page, "HOME  m", "123", "AMSL 554", "-2.5")
+    expect(display_of(page)).to_have_attribute(
+        "aria-label", re.compile(r"altitude 123.0 m, climb -2.5 m/s$")
+    )
+
+
+def test_row_speed(page: Page, vehicle: ScriptedVehicle) -> None:
+    vehicle.airspeed_mps, vehicle.groundspeed_mps = 21.5, 19.3
+    until_drawn(page, "AS  m/s", "21.5", "GS 19.3")
+    vehicle.airspeed_mps = 0.0
+    until_drawn(page, "GS  m/s", "19.3")
+    expect(display_of(page)).to_have_attribute("aria-label", re.compile(r"speed 19.3 m/s"))
+    vehicle.airspeed_mps = 18.2
+    until_drawn(page, "AS  m/s", "18.2", "GS 19.3")
+    vehicle.airspeed_mps = vehicle.groundspeed_mps
+    until_drawn(page, "GS  m/s", "19.3")
+
+
+def test_row_roll_pitch_and_yaw(page: Page, vehicle: ScriptedVehicle) -> None:
+    vehicle.roll_deg, vehicle.pitch_deg, vehicle.heading_deg = -17.5, 8.3, 123.4
+    spoken = re.compile(r"^Roll -17.5°, pitch 8.3°, heading 123.4°,")
+    expect(display_of(page)).to_have_attribute("aria-label", spoken)
+    drawn = to_euler(tuple(page.evaluate("mavgate.state.q_nb")))
+    assert [math.degrees(angle) for angle in drawn] == pytest.approx([-17.5, 8.3, 123.4], abs=0.01)
+
+
+def test_model_in_3d_is_that_of_the_vehicle_type(page: Page, vehicle: ScriptedVehicle) -> None:
+    scene = page.locator(".scene")
+    expect(scene).to_have_attribute("data-model", "plane")
+    vehicle.kind = mavlink.MAV_TYPE_QUADROTOR
+    expect(scene).to_have_attribute("data-model", "copter")
+    expect(page.get_by_label("Aircraft", exact=True)).to_have_value("Copter 1")
+    expect(page.locator(".chips").get_by_text("MAVLink")).to_be_visible()
+
+
+def test_no_name_or_text_of_others_runs_as_a_script(page: Page, troubles: list[str]) -> None:
+    page.get_by_label("Aircraft", exact=True).click()
+    page.get_by_role("option", name="Plane 2").click()
+    for view in VIEWS:
+        show(page, view)
+        page.locator(f"section[data-view='{view}'] > *").first.wait_for()
+        # Two messages of each kind have come and were drawn.
+        page.evaluate("window.begun_us = mavgate.now_us")
+        page.wait_for_function("mavgate.now_us > window.begun_us + 4e5")
+        assert page.evaluate("typeof q") == "undefined"
+    show(page, "tuning")
+    names = page.locator(".parameter .name")
+    page.wait_for_function(
+        f"document.querySelectorAll('.parameter').length === {len(HOSTILE_NAMES)}"
+    )
+    shown = set(names.all_inner_texts())
+    assert {'B :a="q=1"', "<img/onerror=q>", "{{q=1}}"} <= shown
+    rows = page.locator(".parameter").evaluate_all("rows => rows.map(row => row.dataset.name)")
+    assert set(rows) >= {name for name in HOSTILE_NAMES if name.isascii()}
+    show(page, "events")
+    page.locator(".events").get_by_text(HOSTILE_MARKUP[:24]).first.wait_for()
+    show(page, "recordings")
+    page.locator("tr[data-key='{{q=1}}']").wait_for()
+    page.locator("tr[data-key='{{q=1}}']").get_by_label("Delete").click()
+    page.get_by_role("dialog").get_by_text("{{q=1}}").first.wait_for()
+    page.keyboard.press("Escape")
+    assert page.evaluate("typeof q") == "undefined"
+    assert troubles == []
+
+
+def test_policy_of_the_page_stops_an_injected_script(page: Page) -> None:
+    policy = page.request.get(page.url).headers["content-security-policy"]
+    assert "'nonce-" in policy
+    page.evaluate(
+        """() => {
+            const script = document.createElement('script');
+            script.textContent = 'window.ran = 1';
+            window.refused = [];
+            document.addEventListener('securitypolicyviolation',
+                (event) => window.refused.push(event.violatedDirective));
+            document.body.append(script);
+            document.body.insertAdjacentHTML('beforeend', '<img src=x onerror="window.ran = 2">');
+        }"""
+    )
+    page.wait_for_function("window.refused.length >= 2")
+    assert page.evaluate("typeof ran") == "undefined"
