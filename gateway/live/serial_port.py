@@ -26,7 +26,7 @@ from serial.tools import list_ports
 from gateway.printable import UserError, reason_of
 from gateway.settings import Settings, setting
 from gateway.units import US_PER_S
-from gateway.wire.framing import Frame, FrameDecoder
+from gateway.wire.framing import Fault, FrameDecoder
 
 log = logging.getLogger(__name__)
 
@@ -236,7 +236,7 @@ class ReceiverSearch:
             self._release(device).close()
             return
         self._answers[device] = f"{device}: sends no frames at {self._baud} baud"
-        if any(isinstance(event, Frame) for event in decoder.feed(data)):
+        if not all(isinstance(event, Fault) for event in decoder.feed(data)):
             found = self._release(device)
             self.close()
             self._on_end(found, data, "")

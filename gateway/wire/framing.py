@@ -2,12 +2,8 @@
 
 Theory of operation. The receiver sends `COBS(content + crc) 0x00`. COBS removes every zero from
 the content, so a zero on the line can only be a frame's end: after any damage the next zero brings
-the decoder back into step, and no length field can mislead it. The decoder has two states:
-
-| state     | byte is zero                             | byte is not zero                        |
-| --------- | ---------------------------------------- | --------------------------------------- |
-| gathering | frame complete: check it, start again    | keep it; at the bound go to `skipping`  |
-| skipping  | one `TOO_LONG` fault, back to gathering  | count it and drop it                    |
+the decoder back into step, and no length field can mislead it. Of a frame beyond the bound, which
+ends as one `TOO_LONG` fault, only the number of its bytes is kept.
 
 The first frame after opening a port is usually cut; it comes out as one fault and nothing more.
 """
@@ -17,7 +13,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-import msgspec
 from cobs import cobs
 
 CRC_START: Final = 0xFFFF
@@ -41,12 +36,6 @@ class FaultKind(StrEnum):
     KIND = "kind"
     PAYLOAD = "payload"
     VALUE = "value"
-
-
-class Frame(msgspec.Struct, frozen=True, gc=False):
-    """The checked content of one frame, CRC removed."""
-
-    content: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,13 +79,15 @@ def encode_frame(content: bytes) -> bytes:
 
 
 class FrameDecoder:
-    """Turn any chunks of bytes into frames and faults."""
+    """Turn any chunks of bytes into the checked contents of frames, and faults."""
 
     def __init__(self) -> None:
         self._partial = b""
+        """The frame that is not complete yet; one byte more than the bound if it is too long."""
         self._skipped = 0
+        """Bytes of it that were dropped, because it is too long."""
 
-    def feed(self, data: bytes) -> list[Frame | Fault]:
+    def feed(self, data: bytes) -> list[bytes | Fault]:
         """Take the next bytes from the line.
 
         Parameters
@@ -106,19 +97,22 @@ class FrameDecoder:
 
         Returns
         -------
-        list of Frame or Fault
-            Every frame that the chunk completes and every fault it reveals, in order. Never
-            raises on data.
+        list of bytes or Fault
+            The content of every frame that the chunk completes, without its CRC, and every fault
+            it reveals, in order. Never raises on data.
         """
-        *complete, rest = data.split(DELIMITER)
-        events: list[Frame | Fault] = []
-        for piece in complete:
-            if self._partial or self._skipped or len(piece) > MAX_ENCODED:
-                events += self._finish(piece)
+        pieces = (self._partial + data).split(DELIMITER)
+        rest = self._partial = pieces.pop()
+        events: list[bytes | Fault] = []
+        for piece in pieces:
+            if len(piece) > MAX_ENCODED:
+                events.append(Fault(FaultKind.TOO_LONG, len(piece) + self._skipped))
+                self._skipped = 0
             elif piece:
                 events.append(_open(piece))
-        if rest:
-            self._keep(rest)
+        if len(rest) > MAX_ENCODED:
+            self._skipped += len(rest) - MAX_ENCODED - 1
+            self._partial = rest[: MAX_ENCODED + 1]
         return events
 
     def reset(self) -> None:
@@ -126,24 +120,9 @@ class FrameDecoder:
         self._partial = b""
         self._skipped = 0
 
-    def _keep(self, piece: bytes) -> None:
-        if self._skipped or len(self._partial) + len(piece) > MAX_ENCODED:
-            self._skipped += len(self._partial) + len(piece)
-            self._partial = b""
-        else:
-            self._partial += piece
 
-    def _finish(self, piece: bytes) -> list[Frame | Fault]:
-        """End a frame that came in several pieces, or is too long."""
-        self._keep(piece)
-        whole, self._partial = self._partial, b""
-        skipped, self._skipped = self._skipped, 0
-        if skipped:
-            return [Fault(FaultKind.TOO_LONG, skipped)]
-        return [_open(whole)] if whole else []
-
-
-def _open(stuffed: bytes) -> Frame | Fault:
+def _open(stuffed: bytes) -> bytes | Fault:
+    """Return the content of one frame if it is whole."""
     try:
         checked: bytes = cobs.decode(stuffed)
     except cobs.DecodeError:
@@ -153,4 +132,4 @@ def _open(stuffed: bytes) -> Frame | Fault:
     content = checked[:-CRC_SIZE]
     if binascii.crc_hqx(content, CRC_START) != checked[-2] | checked[-1] << 8:
         return Fault(FaultKind.CRC, len(stuffed))
-    return Frame(content)
+    return content

@@ -30,6 +30,7 @@ from gateway.wire.timesync import WRAP_US, ClockTracker
 
 UINT16_MAX: Final = 65_535
 
+FRAME_SEQ_MASK: Final = 0xFF
 SEQUENCE_MODULUS: Final = 1 << 16
 LATE_WINDOW: Final = 64
 """Payloads further back than any retry queue belong to another run of the node."""
@@ -106,9 +107,11 @@ class SequenceCounter:
 
 @dataclass(slots=True)
 class _Node:
-    """What the link knows of one node."""
+    """State of the link to one node."""
 
     clock: ClockTracker = field(default_factory=ClockTracker)
+    restarts: int = 0
+    """Those of its clock that were taken into account."""
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     pipe: int = 0
     last_time_us: int = 0
@@ -117,6 +120,15 @@ class _Node:
     quality: payloads.GpsQualityPayload | None = None
     faults: Counter[str] = field(default_factory=Counter)
     arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
+
+    def begin_run(self) -> None:
+        """Begin a new sequence where the clock has restarted, and not only been halted."""
+        if self.clock.restarts == self.restarts and self.sequence.has_begun_again:
+            self.clock.restarts += 1
+        if self.clock.restarts != self.restarts:
+            self.restarts = self.clock.restarts
+            self.sequence.reset()
+            self.last_stamp_us = None
 
 
 class Link:
@@ -133,7 +145,7 @@ class Link:
         self._bytes_received = 0
         self._frames = 0
         self._frames_lost = 0
-        self._last_frame_seq: int | None = None
+        self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
         """Take the next bytes from the line.
@@ -153,24 +165,35 @@ class Link:
         """
         self._bytes_received += len(data)
         records: list[RawRecord] = []
+        clock = self._receiver_clock
         for event in self._decoder.feed(data):
-            frame = event if isinstance(event, Fault) else payloads.decode_content(event.content)
+            frame = event if isinstance(event, Fault) else payloads.decode_content(event)
             if isinstance(frame, Fault):
                 self._faults[frame.kind] += 1
                 continue
-            heard_us = self._hear(frame, arrival_us)
+            restarts = clock.restarts
+            heard_us = clock.observe(frame.receiver_time_us, arrival_us)
+            if frame.frame_seq != self._next_frame_seq:
+                self._count_gap(frame.frame_seq, is_known=clock.restarts == restarts)
+            self._next_frame_seq = frame.frame_seq + 1 & FRAME_SEQ_MASK
+            self._frames += 1
             if isinstance(frame, payloads.ReceiverStatusFrame):
                 self._receiver_status = _receiver_status(frame, heard_us)
             elif (node := self._nodes.get(frame.header.node)) is None:
-                records += self._hear_new_node(frame, heard_us, arrival_us)
-            elif (record := _hear_node(node, frame, heard_us, arrival_us)) is not None:
+                records += self._receive_new_node(frame, heard_us, arrival_us)
+            elif (record := _receive(node, frame, heard_us, arrival_us)) is not None:
                 records.append(record)
         return records
+
+    def _count_gap(self, frame_seq: int, *, is_known: bool) -> None:
+        """Count the frames before this one that are missing, unless the receiver has restarted."""
+        if self._next_frame_seq is not None and is_known:
+            self._frames_lost += frame_seq - self._next_frame_seq & FRAME_SEQ_MASK
 
     def reopened(self) -> None:
         """Discard the cut frame and the frame sequence after the port was opened again."""
         self._decoder.reset()
-        self._last_frame_seq = None
+        self._next_frame_seq = None
 
     def report(self, now_us: int, *, connected: bool, port: str) -> LinkReport:
         """Sum up the line and every node behind it."""
@@ -190,30 +213,17 @@ class Link:
         nodes = [*self._nodes.values(), *(node for node, _ in self._unproven.values())]
         return sum((node.faults for node in nodes), self._faults)
 
-    def _hear(
-        self, frame: payloads.RadioFrame | payloads.ReceiverStatusFrame, arrival_us: int
-    ) -> int:
-        """Count a frame and return when the receiver received it, on the gateway clock."""
-        clock, last = self._receiver_clock, self._last_frame_seq
-        restarts = clock.restarts
-        heard_us = clock.observe(frame.receiver_time_us, arrival_us)
-        if last is not None and clock.restarts == restarts:
-            self._frames_lost += (frame.frame_seq - last - 1) % 256
-        self._last_frame_seq = frame.frame_seq
-        self._frames += 1
-        return heard_us
-
-    def _hear_new_node(
+    def _receive_new_node(
         self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
     ) -> list[RawRecord]:
         """Return a payload's records; a node is accepted from the second one that agrees."""
         header = frame.header
         node, first = self._unproven.pop(header.node, (_Node(), None))
-        second = _hear_node(node, frame, heard_us, arrival_us)
+        second = _receive(node, frame, heard_us, arrival_us)
         if node.clock.restarts:
             # Their stamps do not agree with their arrivals: the first was false, or this one is.
             node = _Node()
-            first, second = None, _hear_node(node, frame, heard_us, arrival_us)
+            first, second = None, _receive(node, frame, heard_us, arrival_us)
         elif node.sequence.received > 1:
             self._nodes[header.node] = node
             return [record for record in (first, second) if record is not None]
@@ -221,18 +231,15 @@ class Link:
         return []
 
 
-def _hear_node(
+def _receive(
     node: _Node, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
 ) -> RawRecord | None:
     """Count a payload of a node, and return its record if it is new."""
-    header, clock = frame.header, node.clock
-    stamp_us, restarts, resumptions = header.node_time_us, clock.restarts, clock.resumptions
+    header, payload, clock = frame.header, frame.payload, node.clock
+    stamp_us, runs = header.node_time_us, clock.runs
     time_us = clock.observe(stamp_us, heard_us)
-    if clock.resumptions != resumptions and node.sequence.has_begun_again:
-        clock.restarts += 1
-    if clock.restarts != restarts:
-        node.sequence.reset()
-        node.last_stamp_us = None
+    if clock.runs != runs:
+        node.begin_run()
     # A late payload is counted but not used: every stage behind relies on growing times.
     if node.sequence.count(header.seq) is not Arrival.NEW:
         node.faults["sequence"] += _is_later(stamp_us, node.last_stamp_us)
@@ -241,10 +248,21 @@ def _hear_node(
     node.arrivals_us.append(arrival_us)
     node.last_time_us = time_us = _never_back(node, stamp_us, time_us)
     node.last_stamp_us = stamp_us
-    payload = frame.payload
-    if isinstance(payload, payloads.ImuPayload):
-        return _imu(header, payload, time_us)
-    return _to_record(header, payload, node)
+    if not isinstance(payload, payloads.ImuPayload):
+        return _to_record(header, payload, node)
+    return ImuRaw(
+        time_us,
+        header.node,
+        stamp_us,
+        payload.accel,
+        payload.gyro,
+        payload.mag,
+        payload.temperature,
+        payloads.ACCEL_RANGES_G[payload.accel_range],
+        payloads.GYRO_RANGES_DPS[payload.gyro_range],
+        payloads.MAG_LSB_PER_GAUSS[payload.mag_gain],
+        payload.flags,
+    )
 
 
 def _is_later(stamp_us: int, last_us: int | None) -> bool:
@@ -292,22 +310,6 @@ def _to_record(
             return None
         case payloads.NodeStatusPayload():
             return _node_status(header, payload, node.last_time_us)
-
-
-def _imu(header: payloads.Header, payload: payloads.ImuPayload, time_us: int) -> ImuRaw:
-    return ImuRaw(
-        time_us=time_us,
-        node=header.node,
-        node_time_us=header.node_time_us,
-        accel_raw=payload.accel,
-        gyro_raw=payload.gyro,
-        mag_raw=payload.mag,
-        temperature_raw=payload.temperature,
-        accel_range_g=payloads.ACCEL_RANGES_G[payload.accel_range],
-        gyro_range_dps=payloads.GYRO_RANGES_DPS[payload.gyro_range],
-        mag_lsb_per_gauss=payloads.MAG_LSB_PER_GAUSS[payload.mag_gain],
-        flags=payload.flags,
-    )
 
 
 def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) -> GpsFix:

@@ -24,6 +24,7 @@ References
    measurements", INFOCOM 1999.
 """
 
+from bisect import bisect_left, bisect_right
 from collections import deque
 from statistics import median_low
 from typing import Final
@@ -32,6 +33,7 @@ import msgspec
 
 WRAP_US: Final = 1 << 32
 HALF_WRAP_US: Final = WRAP_US // 2
+WRAP_MASK: Final = WRAP_US - 1
 BUCKET_US: Final = 250_000
 """Only the soonest packet of a bucket is kept: at any rate a window costs the same."""
 MAX_BUCKETS: Final = 120
@@ -68,13 +70,20 @@ class ClockTracker:
         self.restarts = 0
         self.resumptions = 0
         """How often the remote clock went on after it had been halted."""
+        self.runs = 0
+        """How often the line was begun: restarts, resumptions and the start."""
         self._reset()
 
     def _reset(self) -> None:
-        self._last_remote_us: int | None = None
-        self._last_arrival_us = 0
+        self.runs += 1
+        self._last_us = self._last_arrival_us = 0
+        """The newest stamp, without its wraps, and its arrival."""
         self._buckets: list[_Point] = []
-        self._line = _Point(0, 0)
+        self._hull: list[_Point] = []
+        """Lower hull of all buckets but the newest, which may still get a sooner packet."""
+        self._line = self._soonest = _Point(0, 0)
+        self._bucket_end_us = 0
+        """On the remote clock, of the newest bucket."""
         self._skew = 0.0
         self._suspect_us: int | None = None
         self._late_since_us: int | None = None
@@ -99,11 +108,24 @@ class ClockTracker:
         int
             The stamp on the local clock, in µs; never later than the arrival.
         """
+        last_us, line, soonest, skew = self._last_us, self._line, self._soonest, self._skew
+        remote_us = last_us + (remote_u32 - last_us & WRAP_MASK)
+        local_us = remote_us + round(line.delta_us + skew * (remote_us - line.remote_us))
+        if (
+            # Nearly every packet: this runs twice for each payload.
+            last_us < remote_us < self._bucket_end_us
+            and -AHEAD_US <= arrival_us - local_us <= RESTART_JUMP_US
+            and arrival_us - remote_us >= soonest.delta_us + skew * (remote_us - soonest.remote_us)
+        ):
+            self._suspect_us = self._late_since_us = None
+            self._last_us, self._last_arrival_us = remote_us, arrival_us
+            return local_us if local_us < arrival_us else arrival_us
+        return self._observe_unusual(remote_u32, arrival_us)
+
+    def _observe_unusual(self, remote_u32: int, arrival_us: int) -> int:
+        """Do the same for a packet that may restart the clock, or move the line."""
         remote_us = self._unwrap(remote_u32, arrival_us)
-        local_us, line = arrival_us, self._line
-        if self._buckets:
-            # `_to_local` without the call: this runs twice for every payload.
-            local_us = remote_us + round(line.delta_us + self._skew * (remote_us - line.remote_us))
+        local_us = self._to_local(remote_us) if self._buckets else arrival_us
         late_us = arrival_us - local_us
         if -AHEAD_US <= late_us <= RESTART_JUMP_US:
             self._suspect_us = self._late_since_us = None
@@ -115,12 +137,12 @@ class ClockTracker:
                 remote_us, local_us = remote_u32, arrival_us
         elif self._is_unconfirmed(arrival_us - remote_us):
             return arrival_us
-        if self._last_remote_us is None or remote_us > self._last_remote_us:
-            self._last_remote_us, self._last_arrival_us = remote_us, arrival_us
+        if not self._buckets or remote_us > self._last_us:
+            self._last_us, self._last_arrival_us = remote_us, arrival_us
         if self._is_soonest(remote_us, arrival_us - remote_us):
-            self._add(remote_us, arrival_us - remote_us)
+            self._add(_Point(remote_us, arrival_us - remote_us))
             local_us = self._to_local(remote_us)
-        return local_us if local_us < arrival_us else arrival_us
+        return min(local_us, arrival_us)
 
     def _is_unconfirmed(self, delta_us: int) -> bool:
         """Return whether a packet is far too early, and no other has confirmed its offset yet."""
@@ -131,26 +153,22 @@ class ClockTracker:
         return True
 
     def _unwrap(self, remote_u32: int, arrival_us: int) -> int:
-        if self._last_remote_us is not None:
+        if self._buckets:
             elapsed_us = arrival_us - self._last_arrival_us
-            expected_us = self._last_remote_us + elapsed_us
+            expected_us = self._last_us + elapsed_us
             error_us = (remote_u32 - expected_us + HALF_WRAP_US) % WRAP_US - HALF_WRAP_US
             remote_us = expected_us + error_us
             slack_us = RESTART_JUMP_US + MAX_SKEW * elapsed_us
             if -slack_us <= error_us <= slack_us or self._goes_on(remote_us, arrival_us, slack_us):
                 return remote_us
-            self._restart()
+            self._reset()
+            self.restarts += 1
         return remote_u32
-
-    def _restart(self) -> None:
-        self._reset()
-        self.restarts += 1
 
     def _goes_on(self, remote_us: int, arrival_us: int, slack_us: float) -> bool:
         """Return whether a stamp continues the last one on the known line, though read late."""
-        assert self._last_remote_us is not None
         late_us = arrival_us - self._to_local(remote_us)
-        return remote_us > self._last_remote_us and -slack_us <= late_us <= MAX_STALL_US
+        return remote_us > self._last_us and -slack_us <= late_us <= MAX_STALL_US
 
     def _is_stale(self, arrival_us: int) -> bool:
         """Return whether stamps have been too late for longer than buffers explain."""
@@ -160,33 +178,43 @@ class ClockTracker:
 
     def _is_soonest(self, remote_us: int, delta_us: int) -> bool:
         """Return whether a point is the soonest of its bucket so far, drift removed."""
-        if not self._buckets:
+        if not self._buckets or remote_us >= self._bucket_end_us:
             return True
-        soonest = self._buckets[-1]
-        bucket, newest = remote_us // BUCKET_US, soonest.remote_us // BUCKET_US
-        if bucket != newest:
-            return bucket > newest
+        soonest = self._soonest
+        if remote_us < self._bucket_end_us - BUCKET_US:
+            return False
         # Of a clock that runs fast, each packet alone seems to come sooner than the last.
         return delta_us < soonest.delta_us + self._skew * (remote_us - soonest.remote_us)
 
-    def _add(self, remote_us: int, delta_us: int) -> None:
-        """Add the soonest point of its bucket."""
-        buckets = self._buckets
-        if buckets and buckets[-1].remote_us // BUCKET_US == remote_us // BUCKET_US:
+    def _add(self, point: _Point) -> None:
+        """Add the soonest point of its bucket, and fit the line again."""
+        buckets, hull = self._buckets, self._hull
+        if buckets and point.remote_us < self._bucket_end_us:
             buckets.pop()
-        buckets.append(_Point(remote_us, delta_us))
-        del buckets[:-MAX_BUCKETS]
-        self._fit()
+        elif buckets:
+            _extend_hull(hull, buckets[-1])
+        buckets.append(point)
+        if len(buckets) > MAX_BUCKETS:
+            del buckets[0]
+            # The later points of the hull stay in it; those up to its second one may enter it.
+            until = bisect_right(buckets, hull[1].remote_us, key=_remote_us)
+            begun: list[_Point] = []
+            for each in buckets[:until]:
+                _extend_hull(begun, each)
+            hull[:2] = begun
+        self._soonest = point
+        self._bucket_end_us = (point.remote_us // BUCKET_US + 1) * BUCKET_US
+        self._fit(buckets[0], point)
 
-    def _fit(self) -> None:
-        first, last = self._buckets[0], self._buckets[-1]
+    def _fit(self, first: _Point, last: _Point) -> None:
         if last.remote_us - first.remote_us < MIN_SKEW_SPAN_US:
             self._line = min(self._buckets, key=lambda p: p.delta_us)
             self._skew = 0.0
             return
-        hull = _lower_hull(self._buckets)
+        hull = self._hull.copy()
+        _extend_hull(hull, last)
         middle_us = (first.remote_us + last.remote_us) // 2
-        right = next(i for i in range(1, len(hull)) if hull[i].remote_us >= middle_us)
+        right = max(1, bisect_left(hull, middle_us, key=_remote_us))
         a, b = hull[right - 1], hull[right]
         skew = (b.delta_us - a.delta_us) / (b.remote_us - a.remote_us)
         moved_us = abs(last.delta_us - first.delta_us)
@@ -199,20 +227,21 @@ class ClockTracker:
         return remote_us + round(line.delta_us + self._skew * (remote_us - line.remote_us))
 
 
-def _lower_hull(points: list[_Point]) -> list[_Point]:
-    """Keep the points of the lower convex hull (Andrew's monotone chain); x is ascending."""
-    hull: list[_Point] = []
-    for p in points:
-        while len(hull) >= 2 and _turn(hull[-2], hull[-1], p) <= 0:
-            hull.pop()
-        hull.append(p)
-    return hull
+def _extend_hull(hull: list[_Point], point: _Point) -> None:
+    """Add a later point to a lower convex hull (Andrew's monotone chain)."""
+    while len(hull) >= 2 and _turn(hull[-2], hull[-1], point) <= 0:
+        hull.pop()
+    hull.append(point)
 
 
 def _turn(a: _Point, b: _Point, c: _Point) -> int:
     return (b.remote_us - a.remote_us) * (c.delta_us - a.delta_us) - (b.delta_us - a.delta_us) * (
         c.remote_us - a.remote_us
     )
+
+
+def _remote_us(point: _Point) -> int:
+    return point.remote_us
 
 
 RECENT: Final = 15

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from firmware.rig.bench import PS_PER_S
 from firmware.rig.boards import Board, GpsNode, ImuNode, Receiver, Setup
-from gateway.wire.framing import Fault, Frame, FrameDecoder
+from gateway.wire.framing import Fault, FrameDecoder
 from gateway.wire.payloads import (
     Header,
     NodeStatusPayload,
@@ -91,8 +91,8 @@ class Bench:
         ]
         return sum((b - a) % 65536 - 1 for a, b in itertools.pairwise(seqs))
 
-    def _take(self, event: Frame | Fault, time_s: float) -> None:
-        content = decode_content(event.content) if isinstance(event, Frame) else event
+    def _take(self, event: bytes | Fault, time_s: float) -> None:
+        content = event if isinstance(event, Fault) else decode_content(event)
         if isinstance(content, Fault):
             self.faults.append(content)
         elif isinstance(content, ReceiverStatusFrame):

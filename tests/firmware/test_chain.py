@@ -23,7 +23,7 @@ from gateway.records import Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import START_UNIX_US
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.wire.framing import Frame, FrameDecoder
+from gateway.wire.framing import FrameDecoder
 from gateway.wire.payloads import GpsFixPayload, RadioFrame, decode_content
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
@@ -106,7 +106,7 @@ def fly(programs: Path, parts: Parts, disturb: Disturb = lambda _tracker, _time_
 
 
 def count_fixes(decoder: FrameDecoder, data: bytes) -> int:
-    frames = [decode_content(e.content) for e in decoder.feed(data) if isinstance(e, Frame)]
+    frames = [decode_content(e) for e in decoder.feed(data) if isinstance(e, bytes)]
     return sum(
         isinstance(frame, RadioFrame) and isinstance(frame.payload, GpsFixPayload)
         for frame in frames

@@ -19,7 +19,7 @@ from gateway.simulator.receiver import damage, simulate
 from gateway.simulator.sensors import BaroSampler, ImuSampler
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.wire.framing import FaultKind, Frame, FrameDecoder, encode_frame
+from gateway.wire.framing import Fault, FaultKind, FrameDecoder, encode_frame
 from gateway.wire.link import Link
 from gateway.wire.payloads import RadioFrame, ReceiverStatusFrame, decode_content
 
@@ -36,7 +36,7 @@ def frames(seconds: float = SECONDS, **changes: object) -> list[TimedFrame]:
 
 def decoded(line: list[TimedFrame]) -> list[RadioFrame | ReceiverStatusFrame]:
     events = FrameDecoder().feed(b"".join(frame.data for frame in line))
-    contents = [decode_content(event.content) for event in events if isinstance(event, Frame)]
+    contents = [decode_content(event) for event in events if isinstance(event, bytes)]
     assert len(contents) == len(line)
     return [c for c in contents if isinstance(c, RadioFrame | ReceiverStatusFrame)]
 
@@ -242,11 +242,11 @@ class TestDamage:
             expected += delimiter and frame.damaged == 0
             delimiter = frame.data[-1] == 0
         events = FrameDecoder().feed(b"".join(frame.data for frame in hit))
-        good = [event for event in events if isinstance(event, Frame)]
+        good = [event for event in events if isinstance(event, bytes)]
         assert len(good) == expected
-        contents = {encode_frame(frame.content) for frame in good}
+        contents = {encode_frame(content) for content in good}
         assert contents <= {frame.data for frame in clean}
-        assert any(event.kind is FaultKind.CRC for event in events if not isinstance(event, Frame))
+        assert any(event.kind is FaultKind.CRC for event in events if isinstance(event, Fault))
 
 
 @pytest.mark.slow
