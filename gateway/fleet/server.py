@@ -81,8 +81,7 @@ class SiteClient(Client):
         data, size = payload
         now_us = self.context.now_us()
         if not data:
-            self.counters.bytes_received += size
-            self.counters.bytes_garbage += size
+            self.count_garbage(size)
             return
         if self.state != "open":
             self.become("open")

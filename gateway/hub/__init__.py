@@ -12,7 +12,7 @@ Theory of operation
 
 1. A transport turns bytes into `MavFrame`s with the splitter. A frame's header is read once, there;
    after that everything uses the fields of the record, and the bytes are sent on unchanged.
-2. `fanout.RouteCache` holds, for each source and kind of frame, the clients that get it. A hit is
+2. `fanout.Fanout` keeps, for each source and kind of frame, the clients that get it. A hit is
    one dictionary look-up and one send per client. The one rule: any change on which a route depends
    (clients, options, requested intervals, bandwidths, paths to a system, our vehicles) clears the
    cache, and the next frame of each kind is routed again.

@@ -11,7 +11,7 @@ from typing import Any, Final
 import msgspec
 
 from gateway.hub.endpoint import parse_endpoint
-from gateway.hub.fanout import Fanout, Route, recipient_of
+from gateway.hub.fanout import Fanout
 from gateway.hub.limits import TokenBucket
 from gateway.hub.round_trip import RoundTrip
 from gateway.hub.router import Router
@@ -222,7 +222,7 @@ class Hub:
             self._fanout.answer(frame, sequence, self._router.group(client_id), now_us)
             return
         if self._vehicles.register(frame, now_us):
-            self._fanout.cache.clear()
+            self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
 
     def set_interval(self, request: ClientInterval) -> None:
@@ -284,7 +284,7 @@ class Hub:
 
     def clients(self) -> tuple[ClientStats, ...]:
         """Return the present figures of every client, in the order of their ids."""
-        self._fanout.cache.settle()
+        self._fanout.settle()
         return tuple(
             self._clients[key].stats(self._router.origins(key)) for key in sorted(self._clients)
         )
@@ -332,10 +332,6 @@ class Hub:
         """Return whether a system and component is one of our vehicles."""
         return self._vehicles.is_own(origin, self.now_us())
 
-    def routes_from(self, client_id: int) -> dict[bytes, Route]:
-        """Return the cached routes of frames from a client, by `MavFrame.key`."""
-        return self._fanout.cache.of(client_id)
-
     def appear(self, client: Client) -> None:
         """Add a client."""
         self._clients[client.client_id] = client
@@ -351,7 +347,7 @@ class Hub:
         self._fanout.reconfigure(client)
         self._router.reconfigure(client)
 
-    def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
+    def flush_soon(self, wait_s: float, flush: Callable[[], None]) -> None:
         """Call back after the present events are handled, or after a wait.
 
         One handle of the loop serves all clients: a timer for each would cost more than it saves.
@@ -393,15 +389,13 @@ class Hub:
                 passing = [each for each in greeting if client.endpoint.passes(each.message_id)]
                 for before, each in zip(range(len(passing), 0, -1), passing, strict=True):
                     number = sequence - before & 0xFF
-                    recipient_of(client).transmit(
-                        self.signer.sequence_and_sign(each, number, now_us)
-                    )
+                    client.send(self.signer.sequence_and_sign(each, number, now_us))
 
     def _tick(self) -> None:
         # First, so that the next tick follows whatever happens below.
         self._timer = asyncio.get_running_loop().call_later(TICK_S, self._tick)
         now_us = self.now_us()
-        self._fanout.cache.settle()
+        self._fanout.settle()
         for endpoint in list(self._endpoints.values()):
             if not isinstance(endpoint, Client):
                 self._tick_one(endpoint, now_us)
@@ -453,4 +447,4 @@ class Hub:
         for client in asked:
             for frame in requests:
                 if client.endpoint.passes(frame.message_id):
-                    recipient_of(client).transmit(frame)
+                    client.send(frame)

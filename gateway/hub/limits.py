@@ -1,4 +1,4 @@
-"""Quotas of answers, and which clients a full listening port serves.
+"""Quotas of answers, rates of messages, and which clients a full listening port serves.
 
 Theory of operation. Requests wait in a bounded queue for each client and are taken in turn: a
 client that asks a thousand times a second delays only itself. Answers are limited by a token
@@ -20,7 +20,7 @@ client of a host that holds more than its share, for a host that holds less.
 from collections import Counter, deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, Protocol, TypeVar
 
 from gateway.records import Incoming
 from gateway.units import US_PER_S
@@ -39,24 +39,16 @@ MAX_WAITING: Final = 64
 
 @dataclass(slots=True)
 class TokenBucket:
-    """A token bucket, in bytes: a negative level blocks until the bucket has refilled.
-
-    Parameters
-    ----------
-    rate : int
-        Bytes a second added.
-    burst : int
-        Most that it holds.
-    level : float
-        Present content; may be negative.
-    filled_us : int
-        Time of the last refill.
-    """
+    """A token bucket, in bytes: a negative level blocks until the bucket has refilled."""
 
     rate: int
+    """Bytes a second added."""
     burst: int
+    """Most that it holds."""
     level: float
+    """Present content; may be negative."""
     filled_us: int = 0
+    """Time of the last refill."""
 
     def refill(self, now_us: int) -> None:
         """Add the tokens since the last refill."""
@@ -134,130 +126,98 @@ class RequestQueue:
         return incoming
 
 
+SLACK_SHIFT: Final = 2
+"""A limited frame may be a quarter of its interval early, or jitter would halve the rate."""
+
+
+@dataclass(slots=True)
+class RateLimit:
+    """Least time between two frames of one kind to one client."""
+
+    interval_us: int
+    due_us: int = 0
+
+    def is_due(self, now_us: int) -> bool:
+        """Return whether a frame may be sent now, and count it as sent."""
+        slack_us = self.interval_us >> SLACK_SHIFT
+        if now_us < self.due_us - slack_us:
+            return False
+        self.due_us = max(self.due_us, now_us - slack_us) + self.interval_us
+        return True
+
+    def change(self, interval_us: int) -> None:
+        """Apply another interval to the next frame already."""
+        if self.due_us:
+            self.due_us += interval_us - self.interval_us
+        self.interval_us = interval_us
+
+
 SILENT_AFTER_US: Final = 3 * US_PER_S
-"""Three missed heartbeats: a client so silent may be replaced."""
+"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
 SHARE: Final = 4
 """One host is left a quarter of the clients when others want them,"""
 FEW: Final = 4
 """and at least these: a ground station, a script and a display."""
 
 
-@dataclass(slots=True)
-class Presence:
+class PortClient(Protocol):
     """A client of a listening port."""
 
-    client_id: int
-    address: tuple[str, int]
-    """Host and port of the peer."""
-    heard_us: int
-    identity: tuple[int, int] | None = None
+    @property
+    def host(self) -> str:
+        """The peer's host."""
+
+    @property
+    def last_us(self) -> int:
+        """When it was received last, or else appeared."""
+
+
+class UdpPortClient(PortClient, Protocol):
+    """A client that is identified by its address and by its first frame."""
+
+    identity: tuple[int, int]
     """System and component of its first frame."""
 
 
-class ClientTable:
-    """The clients of one listening port.
+Present = TypeVar("Present", bound=PortClient)
+UdpPresent = TypeVar("UdpPresent", bound=UdpPortClient)
 
-    Parameters
-    ----------
-    max_clients : int
-        Most clients at once.
-    idle_timeout_us : int
-        Time without a frame after which a client is gone.
-    """
 
-    def __init__(self, max_clients: int, idle_timeout_us: int) -> None:
-        self.max_clients = max_clients
-        self.idle_timeout_us = idle_timeout_us
-        self._by_address: dict[tuple[str, int], Presence] = {}
-        self._full_until_us = 0
-        """Until then no client of a full table can have been silent for long enough."""
-
-    def __len__(self) -> int:
-        return len(self._by_address)
-
-    def is_full(self, now_us: int) -> bool:
-        """Return whether the table is full of live clients; cheaper than `admit`."""
-        return len(self) >= self.max_clients and now_us < self._full_until_us
-
-    def presences(self) -> tuple[Presence, ...]:
-        """Return all clients."""
-        return tuple(self._by_address.values())
-
-    def find(self, address: tuple[str, int]) -> Presence | None:
-        """Return the client at an address."""
-        return self._by_address.get(address)
-
-    def admit(
-        self, address: tuple[str, int], client_id: int, now_us: int
-    ) -> tuple[Presence | None, Presence | None]:
-        """Admit a client at a new address; return it, None if full, and the one removed for it."""
-        removed = None
-        if len(self._by_address) >= self.max_clients:
-            present = self._by_address.values()
-            removed = client_to_remove(present, address[0], self.max_clients, now_us)
-            if removed is None:
-                if crowded_host(present, self.max_clients) is None:
-                    stalest = min(present, key=lambda presence: presence.heard_us)
-                    self._full_until_us = stalest.heard_us + SILENT_AFTER_US
-                return None, None
-            self.remove(removed)
-        presence = Presence(client_id, address, now_us)
-        self._by_address[address] = presence
-        return presence, removed
-
-    def remove(self, presence: Presence) -> None:
-        """Remove a client."""
-        self._by_address.pop(presence.address, None)
-
-    def expire(self, now_us: int) -> list[Presence]:
-        """Remove and return the clients that have gone or have come back on another port."""
-        newest: dict[tuple[str, tuple[int, int]], Presence] = {}
-        for presence in self._by_address.values():
-            if presence.identity:
-                key = (presence.address[0], presence.identity)
-                if key not in newest or presence.heard_us > newest[key].heard_us:
-                    newest[key] = presence
-        gone = [
-            presence
-            for presence in self._by_address.values()
-            if self._has_gone(presence, newest, now_us)
-        ]
-        for presence in gone:
-            self.remove(presence)
-        return gone
-
-    def _has_gone(
-        self,
-        presence: Presence,
-        newest: dict[tuple[str, tuple[int, int]], Presence],
-        now_us: int,
-    ) -> bool:
-        silent_us = now_us - presence.heard_us
-        if silent_us >= self.idle_timeout_us:
-            return True
-        if silent_us < SILENT_AFTER_US or presence.identity is None:
-            return False
-        return newest[presence.address[0], presence.identity] is not presence
+def gone_clients(
+    present: Collection[UdpPresent], idle_timeout_us: int, now_us: int
+) -> list[UdpPresent]:
+    """Return the clients that have gone or have come back on another port."""
+    newest: dict[tuple[str, tuple[int, int]], UdpPresent] = {}
+    for client in present:
+        key = (client.host, client.identity)
+        if key not in newest or client.last_us > newest[key].last_us:
+            newest[key] = client
+    return [
+        client
+        for client in present
+        if (idle_us := now_us - client.last_us) >= idle_timeout_us
+        or (idle_us >= SILENT_AFTER_US and newest[client.host, client.identity] is not client)
+    ]
 
 
 def client_to_remove(
-    present: Collection[Presence], host: str, max_clients: int, now_us: int
-) -> Presence | None:
+    present: Collection[Present], host: str, max_clients: int, now_us: int
+) -> Present | None:
     """Choose the client to remove from a full port for a new one from `host`.
 
-    It is the one that has been silent longest, else the newest of the host that holds more than its
-    share; None if all are alive and no host, or only the new client's, holds more.
+    It is the one that has sent nothing for longest, else the newest of the host that holds more
+    than its share; None if all are alive and no host, or only the new client's, holds more.
     """
-    stalest = min(present, key=lambda presence: presence.heard_us)
-    if now_us - stalest.heard_us >= SILENT_AFTER_US:
+    stalest = min(present, key=lambda client: client.last_us)
+    if now_us - stalest.last_us >= SILENT_AFTER_US:
         return stalest
     crowded = crowded_host(present, max_clients)
     if crowded in (None, host):
         return None
-    return [presence for presence in present if presence.address[0] == crowded][-1]
+    return [client for client in present if client.host == crowded][-1]
 
 
-def crowded_host(present: Collection[Presence], max_clients: int) -> str | None:
+def crowded_host(present: Collection[PortClient], max_clients: int) -> str | None:
     """Return the host with the most clients if those are more than its share."""
-    host, count = Counter(presence.address[0] for presence in present).most_common(1)[0]
+    host, count = Counter(client.host for client in present).most_common(1)[0]
     return host if count > max(FEW, max_clients // SHARE) else None

@@ -11,7 +11,7 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as dialect
 
-from gateway.hub.fanout import Fanout, recipient_of
+from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
 from gateway.hub.round_trip import RoundTrip, is_of_gateway
 from gateway.hub.routing_table import (
@@ -21,9 +21,9 @@ from gateway.hub.routing_table import (
     DuplicateFilter,
     Origin,
     OwnVehicles,
-    Path,
     RedundantLinks,
     RoutingTable,
+    SystemPath,
 )
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.base import Client
@@ -85,7 +85,7 @@ class Router:
         self._on_foreign = on_foreign
         self._rejects = rejects
         self._now_us = now_us
-        self._table = RoutingTable(fanout.cache.clear)
+        self._table = RoutingTable(fanout.clear)
         self._claims = RoutingTable(max_origins=MAX_CLAIMS)
         self._duplicates = DuplicateFilter()
         self._links = RedundantLinks()
@@ -102,8 +102,8 @@ class Router:
     @property
     def forwarded(self) -> int:
         """Frames of other systems that were forwarded."""
-        self._fanout.cache.settle()
-        return self._forwarded + self._fanout.cache.forwarded
+        self._fanout.settle()
+        return self._forwarded + self._fanout.forwarded
 
     def origins(self, client_id: int) -> tuple[Origin, ...]:
         """Return the systems and components received from a client."""
@@ -175,7 +175,7 @@ class Router:
         else:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
 
-    def _is_rejected(self, client: Client, path: Path, frame: MavFrame, now_us: int) -> bool:
+    def _is_rejected(self, client: Client, path: SystemPath, frame: MavFrame, now_us: int) -> bool:
         """Return whether a frame is a copy, or late; only one with several paths can be."""
         client_id = client.client_id
         if not client.trusted:
@@ -220,7 +220,12 @@ class Router:
             self._fanout.deliver(frame, clients, client.client_id)
 
     def _route_broadcast(
-        self, client: Client, path: Path | None, frame: MavFrame, from_station: bool, now_us: int
+        self,
+        client: Client,
+        path: SystemPath | None,
+        frame: MavFrame,
+        from_station: bool,
+        now_us: int,
     ) -> None:
         message_id = frame.message_id
         telemetry = message_id not in TARGET_OFFSETS and message_id not in UNADDRESSED_REQUESTS
@@ -234,16 +239,16 @@ class Router:
             self._fanout.deliver(frame, clients, client.client_id)
             return
         source_id, key = client.client_id, frame.key
-        route = self._fanout.cache.others.get((source_id, key))
+        route = self._fanout.others.get((source_id, key))
         if route is None:
-            path = path or Path(now_us, now_us)
+            path = path or SystemPath(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
             route = self._fanout.make_route(frame, client, path, rejects, self._on_foreign)
             if telemetry and (self._rejects is None or not client.may_return):
-                self._fanout.cache.of(source_id)[key] = route
+                client.routes[key] = route
             else:
-                self._fanout.cache.others[source_id, key] = route
+                self._fanout.others[source_id, key] = route
         route.forward(frame, now_us, is_checked=True)
 
     def _count(self, frame: MavFrame) -> None:
@@ -291,4 +296,4 @@ class Router:
             answer = self._round_trip.answer(frame, systems[0], now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
-                recipient_of(client).transmit(answer)
+                client.send(answer)

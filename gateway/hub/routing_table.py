@@ -84,7 +84,7 @@ class FrameStream:
 
 
 @dataclass(slots=True)
-class Path:
+class SystemPath:
     """One system as one client brings it."""
 
     since_us: int
@@ -131,14 +131,14 @@ class RoutingTable:
     ) -> None:
         self._changed = changed
         self._max_origins = max_origins
-        self._of_client: dict[int, dict[Origin, Path]] = {}
-        self._to: dict[Origin, dict[int, Path]] = {}
+        self._of_client: dict[int, dict[Origin, SystemPath]] = {}
+        self._to: dict[Origin, dict[int, SystemPath]] = {}
         """The same paths by system and component."""
         self._components: dict[int, set[Origin]] = {}
         """By system."""
         self._streams: dict[Origin, FrameStream] = {}
 
-    def hear(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
+    def hear(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
         """Register a client's frame of a system; return the path, or None without room for it."""
         paths = self._to.get(origin)
         path = paths.get(client_id) if paths else None
@@ -201,7 +201,7 @@ class RoutingTable:
                 return sorted(key for key, fresh in found.items() if fresh) or sorted(found)
         return []
 
-    def _discover(self, client_id: int, origin: Origin, now_us: int) -> Path | None:
+    def _discover(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
         known = self._of_client.setdefault(client_id, {})
         if len(known) >= self._max_origins:
             stalest = min(known, key=lambda each: known[each].heard_us)
@@ -211,7 +211,7 @@ class RoutingTable:
             del known[stalest]
             self._drop(client_id, stalest)
         stream = self._streams.setdefault(origin, FrameStream())
-        known[origin] = path = Path(now_us, now_us, stream)
+        known[origin] = path = SystemPath(now_us, now_us, stream)
         self._to.setdefault(origin, {})[client_id] = path
         self._components.setdefault(origin[0], set()).add(origin)
         return path
@@ -285,7 +285,9 @@ class DuplicateFilter:
         """When a frame was sent and received, by which client, as which of its stream, and whether
         its bytes were accepted before."""
 
-    def check(self, frame: MavFrame, client_id: int, path: Path, now_us: int, limit_us: int) -> int:
+    def check(
+        self, frame: MavFrame, client_id: int, path: SystemPath, now_us: int, limit_us: int
+    ) -> int:
         """Return `NEW`, `LATE`, or the id of the client that brought the same bytes first.
 
         A frame older than the newest of its stream by more than `limit_us` is late.

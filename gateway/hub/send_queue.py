@@ -345,33 +345,45 @@ class SendQueue:
 
 
 class Packer:
-    """Gather frames into datagrams.
+    """Gather frames into datagrams of at most `max_bytes`; a single longer frame goes alone.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Largest datagram; a single longer frame still goes, alone.
+    `send` is called with the frames of a datagram when it is full, and when `flush` is called:
+    `flush_soon` is asked for that with the first frame of each datagram.
     """
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(
+        self,
+        max_bytes: int,
+        send: Callable[[list[bytes]], None],
+        flush_soon: Callable[[Callable[[], None]], None],
+    ) -> None:
         self._max_bytes = max_bytes
+        self._send = send
+        self._flush_soon = flush_soon
         self._frames: list[bytes] = []
         self._size = 0
+        self._is_flush_due = False
 
-    def add(self, frame: bytes) -> list[bytes]:
-        """Add a frame; return the frames of the datagram that is full now, or none."""
-        full: list[bytes] = []
+    def add(self, frame: bytes) -> None:
+        """Add a frame."""
         if self._size + len(frame) > self._max_bytes:
-            full = self.flush()
+            self._send_frames()
         self._frames.append(frame)
         self._size += len(frame)
-        return full
+        if not self._is_flush_due:
+            self._is_flush_due = True
+            self._flush_soon(self.flush)
 
-    def flush(self) -> list[bytes]:
-        """Return the gathered frames."""
+    def flush(self) -> None:
+        """Send the gathered frames."""
+        self._is_flush_due = False
+        self._send_frames()
+
+    def _send_frames(self) -> None:
         frames, self._frames = self._frames, []
         self._size = 0
-        return frames
+        if frames:
+            self._send(frames)
 
 
 class Pacer:

@@ -8,10 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
+from gateway.hub.stats import ClientCounters
+from gateway.hub.transports.base import Client
 from gateway.records import Incoming, Outgoing
 from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit.mavlink import STATION, Sender, outgoing
 from tests.ports import free_port
 
@@ -56,6 +60,36 @@ class Station:
     def say(self, data: bytes) -> None:
         assert self.target
         self.socket.sendto(data, self.target)
+
+
+class KeepingClient(Client):
+    """A client without a transport that keeps the frames that it is sent, with their times."""
+
+    def __init__(self, client_id: int, url: str = "udp:h:1", *, direct: bool = False) -> None:
+        self.client_id = client_id
+        self.endpoint = parse_endpoint(url)
+        self.counters = ClientCounters()
+        self.routes = {}
+        self.heard_us = None
+        self.now_us = 0
+        self.sent: list[tuple[int, MavFrame]] = []
+        self.write = lambda data: self.transmit(frame_of(data))
+        self._direct = direct
+
+    @property
+    def is_direct(self) -> bool:
+        return self._direct
+
+    @property
+    def frames(self) -> list[bytes]:
+        return [frame.data for _, frame in self.sent]
+
+    def since(self, since_us: int) -> list[bytes]:
+        return [frame.data for us, frame in self.sent if us >= since_us]
+
+    def transmit(self, frame: MavFrame) -> None:
+        assert frame == frame_of(frame.data)
+        self.sent.append((self.now_us, frame))
 
 
 class Rig:

@@ -3,48 +3,32 @@
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import MAX_ROUTES, Fanout
-from gateway.hub.routing_table import Path
-from gateway.hub.stats import ClientCounters
+from gateway.hub.routing_table import SystemPath
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
-from tests.kit.mavlink import Sender, frames_in
+from tests.hub.conftest import KeepingClient
+from tests.kit.mavlink import Sender
 
 ATTITUDE_ID = 30
 
 
-class Peer:
-    """A client that keeps the frames that it is sent."""
+class Peer(KeepingClient):
+    """A client of a fan-out."""
 
-    is_direct = False
-    is_mavlink1 = False
-
-    def __init__(self, fanout: Fanout, client_id: int, options: str = "") -> None:
-        self.sent: list[MavFrame] = []
-        self.client_id = client_id
-        self.endpoint = parse_endpoint(f"udp:h:1{options}")
-        self.counters = ClientCounters()
+    def __init__(
+        self, fanout: Fanout, client_id: int, options: str = "", *, direct: bool = False
+    ) -> None:
+        super().__init__(client_id, f"udp:h:1{options}", direct=direct)
         fanout.add(self)
 
     @property
-    def frames(self) -> list[bytes]:
-        return [frame.data for frame in self.sent]
-
-    @property
     def message_ids(self) -> list[int]:
-        return [frame.message_id for frame in self.sent]
-
-    def transmit(self, frame: MavFrame) -> None:
-        assert frames_in(frame.data) == [frame.data]
-        self.sent.append(frame)
-
-    def count_received(self, frames: int, size: int, heard_us: int) -> None:
-        self.counters.received += frames
+        return [frame.message_id for _, frame in self.sent]
 
     def sequences(self) -> list[int]:
-        return [frame.sequence for frame in self.sent]
+        return [frame.sequence for _, frame in self.sent]
 
 
 def publish(fanout: Fanout, data: bytes, now_us: int = 0) -> None:
@@ -57,13 +41,12 @@ def answer(fanout: Fanout, data: bytes, client_ids: list[int]) -> None:
     fanout.answer(frame, frame.sequence, client_ids, 0)
 
 
-def forward(fanout: Fanout, data: bytes, source_id: int, now_us: int = 0) -> None:
+def forward(fanout: Fanout, data: bytes, source: KeepingClient, now_us: int = 0) -> None:
     frame = frame_of(data)
-    routes = fanout.cache.of(source_id)
-    if frame.key not in routes:
-        source = Peer(Fanout(FrameSigner()), source_id)
-        routes[frame.key] = fanout.make_route(frame, source, Path(0, 0), None, None)
-    routes[frame.key].forward(frame, now_us)
+    if frame.key not in source.routes:
+        path = SystemPath(0, 0)
+        source.routes[frame.key] = fanout.make_route(frame, source, path, None, None)
+    source.routes[frame.key].forward(frame, now_us)
 
 
 @pytest.fixture
@@ -81,7 +64,7 @@ def test_all_clients_get_the_same_bytes(fanout: Fanout, vehicle: Sender) -> None
     frame = vehicle.attitude()
     publish(fanout, frame, 0)
     assert all(peer.frames == [frame] for peer in peers)
-    assert len({id(peer.sent[0]) for peer in peers}) == 1
+    assert len({id(peer.sent[0][1]) for peer in peers}) == 1
     assert peers[0].message_ids == [ATTITUDE_ID]
 
 
@@ -108,8 +91,8 @@ def test_clients_with_the_same_number_share_one_signed_copy(vehicle: Sender) -> 
     publish(fanout, vehicle.heartbeat())
     publish(fanout, vehicle.attitude())
     assert [peer.sequences() for peer in peers] == [[0]] * 3
-    assert len({id(peer.sent[0]) for peer in peers}) == 1
-    assert peers[0].sent[0].signed
+    assert len({id(peer.sent[0][1]) for peer in peers}) == 1
+    assert peers[0].sent[0][1].signed
 
 
 def test_a_client_may_leave_while_a_frame_is_sent_to_it(fanout: Fanout, vehicle: Sender) -> None:
@@ -221,7 +204,7 @@ class TestForeignFrames:
         foreign = Sender(9)
         frames = [foreign.heartbeat(), foreign.attitude(), foreign.attitude()]
         for frame in frames:
-            forward(fanout, frame, 1, 0)
+            forward(fanout, frame, source, 0)
         assert source.frames == []
         assert plain.frames == frames
         assert picky.frames == [frames[1]]
@@ -248,6 +231,7 @@ def test_a_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sende
 
 def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
     Peer(fanout, 1)
+    source = Peer(fanout, 99)
     for system in range(1, 200):
         for component in range(1, 60):
             frame = bytes(
@@ -255,20 +239,15 @@ def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
                     dialect.MAVLink(None, system, component)
                 )
             )
-            forward(fanout, frame, 99, 0)
-    assert len(fanout.cache.of(99)) <= MAX_ROUTES
+            forward(fanout, frame, source)
+    assert len(source.routes) <= MAX_ROUTES
 
 
 def test_datagrams_of_a_cached_route_are_counted_when_it_is_settled(
     fanout: Fanout, vehicle: Sender
 ) -> None:
-    class DirectPeer(Peer):
-        is_direct = True
-
-        def write(self, data: bytes) -> None:
-            self.sent.append(frame_of(data))
-
-    peer, source, path = DirectPeer(fanout, 1), DirectPeer(fanout, 2), Path(0, 0)
+    peer, source = (Peer(fanout, number, direct=True) for number in (1, 2))
+    path = SystemPath(0, 0)
     frames = [vehicle.attitude() for _ in range(3)]
     route = fanout.make_route(frame_of(frames[0]), source, path, None, None)
     assert all(route.forward_datagram(frame, 70 + i) for i, frame in enumerate(frames))

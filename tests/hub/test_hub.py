@@ -5,12 +5,15 @@ import os
 import resource
 import socket
 from typing import Any
+from unittest.mock import Mock
 
 import msgspec
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.hub.limits import SILENT_AFTER_US
+from gateway.hub.transports import base
 from gateway.hub.transports import stream as accepting
 from gateway.wire.mavlink_splitter import frame_of
 
@@ -459,13 +462,26 @@ class TestListeningPorts:
         (port,) = hub.listeners()
         assert (port.state, port.reason, port.port) == ("open", "", taken.port)
 
-    async def test_clients_without_room_are_counted(self, rig: Any) -> None:
+    async def test_full_port_counts_refused_clients_and_looks_for_a_silent_one_only_when_due(
+        self, rig: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        search = Mock(wraps=base.client_to_remove)
+        monkeypatch.setattr(base, "client_to_remove", search)
         hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=1)
-        for turned_away in (0, 1, 2):
+
+        async def call(turned_away: int) -> None:
             caller = rig.station(hub.listening_ports()[0])
             caller.say(caller.sender.heartbeat())
-            await rig.until(lambda n=turned_away: hub.listeners()[0].turned_away == n)
+            await rig.until(lambda: hub.listeners()[0].turned_away == turned_away)
             await rig.until(lambda: hub.listeners()[0].clients == 1)
+
+        for turned_away in (0, 1, 2, 3):
+            await call(turned_away)
+        assert search.call_count == 1
+        rig.clock.us += SILENT_AFTER_US
+        await call(3)
+        await rig.until(lambda: [client.client_id for client in hub.clients()] == [2])
+        assert search.call_count == 2
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
     async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(

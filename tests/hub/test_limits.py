@@ -1,13 +1,20 @@
-"""Requests in turns, answers within each client's means; on the manual clock."""
+"""Requests in turns, answers within quotas, and room in full ports; on the manual clock."""
+
+from dataclasses import dataclass
+
+import pytest
 
 from gateway.hub.limits import (
     CLIENT_BURST,
     CLIENT_RATE,
     MAX_WAITING,
     REQUEST_COST,
+    SILENT_AFTER_US,
     UNTRUSTED_BURST,
     UNTRUSTED_RATE,
     RequestQueue,
+    client_to_remove,
+    gone_clients,
 )
 from gateway.records import Incoming
 from gateway.units import US_PER_S
@@ -104,3 +111,61 @@ def test_who_has_gone_leaves_nothing() -> None:
         queue.remove(client_id)
     assert queue.take(0) is None
     assert (queue._lines, queue._turns) == ({}, {})
+
+
+S = US_PER_S
+GCS = (255, 190)
+
+
+@dataclass
+class Present:
+    """A client of a listening port."""
+
+    host: str
+    last_us: int = 0
+    identity: tuple[int, int] = GCS
+
+
+@pytest.mark.parametrize(
+    ("clients", "now_us", "gone"),
+    [
+        pytest.param([("a", 0, GCS)], 30 * S - 1, [], id="before the timeout"),
+        pytest.param([("a", 0, GCS)], 30 * S, [0], id="timeout"),
+        pytest.param([("a", 0, GCS), ("a", S, GCS)], SILENT_AFTER_US, [0], id="another port"),
+        pytest.param([("a", 0, GCS), ("a", S, GCS)], SILENT_AFTER_US - 1, [], id="both alive"),
+        pytest.param([("a", 0, GCS), ("a", S, (254, 190))], 6 * S, [], id="another system"),
+        pytest.param([("a", 0, GCS), ("b", S, GCS)], 6 * S, [], id="another host"),
+    ],
+)
+def test_clients_go_after_a_timeout_or_when_they_return_on_another_port(
+    clients: list[tuple[str, int, tuple[int, int]]], now_us: int, gone: list[int]
+) -> None:
+    present = [Present(*each) for each in clients]
+    assert gone_clients(present, 30 * S, now_us) == [present[number] for number in gone]
+
+
+def removed(hosts: list[str], newcomer: str) -> int | None:
+    present = [Present(host) for host in hosts]
+    found = client_to_remove(present, newcomer, len(present), 1)
+    return None if found is None else next(i for i, each in enumerate(present) if each is found)
+
+
+def test_full_port_gives_up_the_client_that_sent_nothing_for_longest() -> None:
+    present = [Present("a", S), Present("a", 0), Present("a", S)]
+    assert client_to_remove(present, "b", 3, SILENT_AFTER_US) is present[1]
+    assert client_to_remove(present, "b", 3, SILENT_AFTER_US - 1) is None
+
+
+def test_host_with_all_of_a_port_makes_room_down_to_its_share() -> None:
+    hosts, admitted = ["a"] * 32, 0
+    for number in range(30):
+        assert removed(hosts, "a") is None
+        if (place := removed(hosts, f"b{number}")) is not None:
+            assert place > 0, "the first client stays"
+            hosts[place:] = [*hosts[place + 1 :], f"b{number}"]
+            admitted += 1
+    assert admitted == 24
+
+
+def test_client_within_the_share_of_its_host_is_not_removed_for_a_new_one() -> None:
+    assert removed(["a", "a", *(f"b{number}" for number in range(6))], "c") is None

@@ -13,9 +13,9 @@ from gateway.hub.routing_table import (
     ROUTE_FRESH_US,
     DuplicateFilter,
     FrameStream,
-    Path,
     RedundantLinks,
     RoutingTable,
+    SystemPath,
 )
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
@@ -146,7 +146,7 @@ class Links:
     def __init__(self) -> None:
         self.filter = DuplicateFilter()
         stream = FrameStream()
-        self.paths = {FAST: Path(0, 0, stream), SLOW: Path(0, 0, stream)}
+        self.paths = {FAST: SystemPath(0, 0, stream), SLOW: SystemPath(0, 0, stream)}
 
     def check(self, client_id: int, number: int, now_us: int, content: bytes | None = None) -> int:
         return self.filter.check(

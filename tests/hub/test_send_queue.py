@@ -1,6 +1,7 @@
 """Queues in front of slow links: order, bounds, numbers, on the manual clock."""
 
 import random
+from collections.abc import Callable
 
 import pytest
 
@@ -152,19 +153,19 @@ class TestLinkEncoder:
             assert encoder.encode(frame, encoder.enter(frame), 0) is frame.data
 
 
-class TestPacker:
-    def test_full_datagrams_leave_and_the_rest_waits(self) -> None:
-        packer = Packer(100)
-        assert packer.add(b"a" * 60) == []
-        assert packer.add(b"b" * 40) == []
-        assert packer.add(b"c" * 1) == [b"a" * 60, b"b" * 40]
-        assert packer.flush() == [b"c"]
-        assert packer.flush() == []
-
-    def test_an_overlong_frame_goes_alone(self) -> None:
-        packer = Packer(100)
-        assert packer.add(b"a" * 200) == []
-        assert packer.add(b"b") == [b"a" * 200]
+def test_packer_sends_full_datagrams_and_the_rest_when_it_is_flushed() -> None:
+    sent: list[list[bytes]] = []
+    due: list[Callable[[], None]] = []
+    packer = Packer(100, sent.append, due.append)
+    for frame in (b"a" * 60, b"b" * 40, b"c", b"d" * 200, b"e"):
+        packer.add(frame)
+    assert sent == [[b"a" * 60, b"b" * 40], [b"c"], [b"d" * 200]]
+    (flush,) = due
+    flush()
+    flush()
+    assert sent[3:] == [[b"e"]]
+    packer.add(b"f")
+    assert due == [flush, flush]
 
 
 def test_pacer_keeps_the_line_busy_but_its_buffer_short() -> None:

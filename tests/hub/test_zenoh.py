@@ -202,7 +202,8 @@ class TestSite:
         hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
         far = visit("mavlink/field/*/out")
         await until_heard(rig, hub, far)
-        await until(rig, hub, lambda: not hub._clients[1]._is_gathering)
+        (packer,) = hub._clients[1]._packers.values()
+        await until(rig, hub, lambda: not packer._is_flush_due)
         for _ in range(5):
             hub.send(rig.out(rig.vehicle.raw_imu()))
             hub.send(rig.out(rig.vehicle.attitude()))

@@ -1,23 +1,32 @@
-"""Base of all transports: a client with its counters, and a listening port with its clients."""
+"""Base of all transports: a client, the cached routes of its frames, and a listening port."""
 
 import asyncio
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
-from gateway.hub.fanout import Route
-from gateway.hub.limits import TokenBucket
-from gateway.hub.routing_table import Origin
+from gateway.hub.limits import RateLimit, TokenBucket, client_to_remove
+from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import START_V2, Event, MavFrame, SplitFault
+from gateway.wire.mavlink_splitter import (
+    SEQUENCE_V2,
+    START_V2,
+    Event,
+    MavFrame,
+    SplitFault,
+    frame_of,
+    is_whole_frame,
+)
+from gateway.wire.mavlink_version1 import to_mavlink1
 
 log = logging.getLogger(__name__)
 
@@ -43,37 +52,24 @@ def not_open(data: bytes) -> int:
 class HubContext(Protocol):
     """The part of the hub that a transport uses."""
 
-    @property
-    def recordings(self) -> Path | None:
-        """Folder of the recordings that a fleet may fetch, if any."""
-
-    @property
-    def settings(self) -> HubSettings:
-        """The present settings."""
+    settings: HubSettings
+    now_us: Callable[[], int]
+    signer: FrameSigner
+    """Numbers and signs our own frames."""
+    untrusted_reads: TokenBucket
+    """Bytes that may still be read from all untrusted clients together."""
+    recordings: Path | None
+    """Folder of the recordings that a fleet may fetch, if any."""
 
     @property
     def read_bytes(self) -> int:
         """Bytes to read from one client at one wake-up, before others get their turn."""
-
-    @property
-    def untrusted_reads(self) -> TokenBucket:
-        """Bytes that may still be read from all untrusted clients together."""
-
-    @property
-    def signer(self) -> FrameSigner:
-        """Numbers and signs our own frames."""
-
-    def now_us(self) -> int:
-        """Return the gateway time."""
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
 
     def is_own(self, origin: Origin) -> bool:
         """Return whether a system and component is one of our vehicles."""
-
-    def routes_from(self, client_id: int) -> dict[bytes, Route]:
-        """Return the cached routes of frames from a client, by `MavFrame.key`."""
 
     def deliver(self, client: "Client", frame: MavFrame, now_us: int) -> None:
         """Route one received frame for which there is no cached route."""
@@ -87,7 +83,7 @@ class HubContext(Protocol):
     def reconfigure(self, client: "Client") -> None:
         """Apply a client's changed options."""
 
-    def flush_soon(self, flush: Callable[[], None], wait_s: float) -> None:
+    def flush_soon(self, wait_s: float, flush: Callable[[], None]) -> None:
         """Call back after the present events are handled, or after a wait."""
 
     def update_buffer(self, client: "Client", free_percent: int) -> None:
@@ -97,12 +93,118 @@ class HubContext(Protocol):
         """Remove a client and close it."""
 
 
+class Route:
+    """The clients that get one kind of frame from one client.
+
+    `targets` are those clients, and how often each gets a frame; `source` brings the frames of a
+    system by `path`. `rejects` returns whether a frame is dropped as a copy, `on_foreign` is called
+    with each forwarded one.
+    """
+
+    __slots__ = (
+        "_datagram_bytes", "_datagrams", "_direct", "_extra", "_heard_us", "_limited",
+        "_on_foreign", "_others", "_path", "_rejects", "_sent_us", "_source",
+        "frames", "message_id", "size",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        message_id: int,
+        targets: "Sequence[tuple[Client, RateLimit | None]]",
+        source: "Client",
+        path: SystemPath,
+        rejects: Callable[[MavFrame, int], bool] | None,
+        on_foreign: Callable[[bytes], None] | None,
+    ) -> None:
+        self.message_id = message_id
+        self.frames = self.size = 0
+        """Not yet in the counters of the direct clients."""
+        self._datagrams = self._datagram_bytes = self._heard_us = 0
+        """Not yet in the figures of the source and of the path either."""
+        self._source = source
+        self._path = path
+        self._sent_us = path.stream.sent_us
+        self._rejects = rejects
+        self._on_foreign = on_foreign
+        free = [client for client, limit in targets if limit is None]
+        self._direct = [client for client in free if client.is_direct]
+        self._others = [client.send for client in free if not client.is_direct]
+        self._limited = [(client.send, limit) for client, limit in targets if limit is not None]
+        needs_frame = bool(self._others or self._limited or rejects is not None)
+        self._extra = None if needs_frame else CRC_EXTRA.get(message_id)
+
+    def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
+        """Send a frame to every client; a rejected one to none."""
+        self._path.heard_us = now_us
+        if not is_checked:
+            if self._rejects is None:
+                self._path.stream.accept(frame.sequence, self._source.client_id, now_us)
+            elif self._rejects(frame, now_us):
+                return
+        for send in self._others:
+            send(frame)
+        for send, limit in self._limited:
+            if limit.is_due(now_us):
+                send(frame)
+        self.frames += 1
+        self.size += len(frame.data)
+        self._write(frame.data)
+
+    def forward_datagram(self, data: bytes, now_us: int) -> bool:
+        """Send a datagram of this kind to every client, and count it in bulk; see `settle`.
+
+        Return False if it is not one valid frame, or the route needs more of the frame than its
+        bytes and its sequence number: then `forward` does it.
+        """
+        extra = self._extra
+        if extra is None or not is_whole_frame(data, extra):
+            return False
+        self._datagrams += 1
+        self._datagram_bytes += len(data)
+        self._heard_us = now_us
+        self._sent_us[data[SEQUENCE_V2]] = now_us
+        # As `_write` does: a call more would cost as much as all that is above.
+        for client in self._direct:
+            write = client.write
+            try:
+                write(data)
+            except OSError as error:
+                client.recover_uncounted(data, error)
+        if self._on_foreign is not None:
+            self._on_foreign(data)
+        return True
+
+    def _write(self, data: bytes) -> None:
+        for client in self._direct:
+            try:
+                client.write(data)
+            except OSError as error:
+                client.recover_uncounted(data, error)
+        if self._on_foreign is not None:
+            self._on_foreign(data)
+
+    def settle(self) -> tuple[int, int]:
+        """Add the common counts to the clients' counters; return the frames and bytes."""
+        frames, size = self.frames, self.size
+        if datagrams := self._datagrams:
+            self._source.count_received(datagrams, self._datagram_bytes, self._heard_us)
+            self._path.count(datagrams, self._source.client_id, self._heard_us)
+            frames, size = frames + datagrams, size + self._datagram_bytes
+        self.frames = self.size = self._datagrams = self._datagram_bytes = 0
+        if frames:
+            for client in self._direct:
+                client.counters.sent += frames
+                client.counters.bytes_sent += size
+        return frames, size
+
+
 @dataclass(eq=False)
 class Client:
     """One peer that frames are sent to; the base of every transport."""
 
     context: HubContext
     client_id: int
+    """Unique for the lifetime of the hub."""
     endpoint: Endpoint
     remote: str = ""
     """Address of the peer; by default the endpoint's."""
@@ -116,17 +218,17 @@ class Client:
     heard_us: int | None = None
     round_trip_us: int | None = None
     counters: ClientCounters = field(default_factory=ClientCounters)
-    version1_since_us: int | None = None
-    """When it began to send MAVLink 1."""
-    sends_version2: bool = False
-    _only_version1: bool = False
     routes: dict[bytes, Route] = field(default_factory=dict)
-    """Cached routes of frames from here."""
+    """Cached routes of frames from here, by `MavFrame.key`; the fan-out clears them."""
     write: Write = field(default=not_open)
     """Sends one datagram at once or raises OSError; only of a client that is direct."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
     may_return: ClassVar[bool] = True
     """Whether each frame from here may be one that was sent elsewhere and has returned."""
+    _version1_since_us: int | None = None
+    """When it began to send MAVLink 1."""
+    _sends_version2: bool = False
+    _only_version1: bool = False
 
     def __post_init__(self) -> None:
         """Fill in the remaining fields."""
@@ -134,7 +236,6 @@ class Client:
         self.trusted = _is_trusted(self.endpoint, self.host)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
-        self.routes = self.context.routes_from(self.client_id)
 
     def become(self, state: str, error: Exception | None = None) -> None:
         """Set the state, and remember its reason."""
@@ -144,6 +245,16 @@ class Client:
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame now or queue it; never block, never raise."""
         raise NotImplementedError
+
+    @property
+    def send(self) -> Callable[[MavFrame], None]:
+        """The function that sends a frame in the version of MAVLink that the client needs."""
+        return self._transmit_version1 if self.is_mavlink1 else self.transmit
+
+    def _transmit_version1(self, frame: MavFrame) -> None:
+        data = to_mavlink1(frame.data)
+        if data is not None:
+            self.transmit(frame if data is frame.data else frame_of(data))
 
     def close(self) -> None:
         """Close the transport."""
@@ -176,6 +287,11 @@ class Client:
         return self.remote.rpartition(":")[0].strip("[]")
 
     @property
+    def last_us(self) -> int:
+        """When it was received last, or else appeared."""
+        return self.since_us if self.heard_us is None else self.heard_us
+
+    @property
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
         return False
@@ -193,15 +309,15 @@ class Client:
         Programs that know both versions begin with 1, and change to 2 when they receive 2: so 2 is
         sent for `VERSION_PROBE_US` to a client that sends 1.
         """
-        if self.sends_version2:
+        if self._sends_version2:
             return False
         before = self.is_mavlink1
         if frame.data[0] == START_V2:
-            self.sends_version2, self._only_version1 = True, False
-        elif self.version1_since_us is None:
-            self.version1_since_us = now_us
+            self._sends_version2, self._only_version1 = True, False
+        elif self._version1_since_us is None:
+            self._version1_since_us = now_us
         else:
-            self._only_version1 = now_us - self.version1_since_us >= VERSION_PROBE_US
+            self._only_version1 = now_us - self._version1_since_us >= VERSION_PROBE_US
         return self.is_mavlink1 != before
 
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
@@ -238,6 +354,11 @@ class Client:
         self.counters.bytes_received += size
         self.heard_us = max(self.heard_us or 0, heard_us)
 
+    def count_garbage(self, size: int) -> None:
+        """Count received bytes that are not MAVLink."""
+        self.counters.bytes_received += size
+        self.counters.bytes_garbage += size
+
     def limit_reads(self, sock: socket.socket, read: Callable[[], None], size: int) -> None:
         """Stop reading for a while from an untrusted client, if all such sent too much."""
         if self.trusted:
@@ -264,27 +385,21 @@ class Client:
 
     def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
         """Return the client's present figures; the hub passes the systems behind it."""
-        counters = self.counters
+        counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(
             client_id=self.client_id,
             name=self.name,
             endpoint=self.endpoint.url,
             remote=self.remote,
             state=self.state,
+            reason=self.reason,
             trusted=self.trusted,
             systems=systems,
-            sent=counters.sent,
-            dropped=counters.dropped,
-            bytes_sent=counters.bytes_sent,
-            received=counters.received,
-            bytes_received=counters.bytes_received,
-            bytes_garbage=counters.bytes_garbage,
             queued=self.queued,
             since_us=self.since_us,
             heard_us=self.heard_us,
             round_trip_us=self.round_trip_us,
-            reason=self.reason,
-            unheard=counters.unheard,
+            **counters,
         )
 
 
@@ -292,15 +407,7 @@ Peer = TypeVar("Peer", bound=Client)
 
 
 class Listener(Generic[Peer]):
-    """An endpoint that makes a client of every peer that connects.
-
-    Parameters
-    ----------
-    context : HubContext
-        The hub.
-    endpoint : Endpoint
-        Where to listen.
-    """
+    """An endpoint that makes a client of every peer that connects."""
 
     def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
         self.endpoint = endpoint
@@ -352,6 +459,16 @@ class Listener(Generic[Peer]):
         """Remove one client."""
         self._clients.pop(client.client_id, None)
         self._context.vanish(client)
+
+    def _has_room(self, host: str, now_us: int) -> bool:
+        """Return whether there is room for a new client, after removing another if needed."""
+        most = self._context.settings.max_clients
+        if len(self._clients) < most:
+            return True
+        removed = client_to_remove(self._clients.values(), host, most, now_us)
+        if removed is not None:
+            self.leave(removed)
+        return removed is not None
 
     def stats(self) -> ListenerStats:
         """Return the port's present figures."""

@@ -5,10 +5,12 @@ import socket
 import struct
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.limits import SILENT_AFTER_US
+from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import RETRY_US, Client, Write, not_open
 from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram
@@ -29,6 +31,8 @@ IP_PKTINFO: Final = 8
 BACKLOG_DATAGRAMS: Final = 256
 """Most datagrams that wait for a full socket buffer: older ones are of no use."""
 
+Address = tuple[str | int, ...]
+
 
 class DatagramClient(Client):
     """A peer behind a datagram socket; base of unicast, broadcast and multicast."""
@@ -36,19 +40,18 @@ class DatagramClient(Client):
     refused_us: int | None = None
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
-    _is_gathering = False
     _read: Callable[[], None]
 
     def __post_init__(self) -> None:
         """Start without a socket."""
         super().__post_init__()
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
-        self._packer = _packer(self.endpoint)
+        self._packer = self._packer_of(self.endpoint)
 
     @property
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
-        return self._packer is None
+        return self._packer is None and not self.is_mavlink1
 
     @property
     def queued(self) -> int:
@@ -59,7 +62,7 @@ class DatagramClient(Client):
         """Send one frame; count it as dropped if the network refuses it."""
         data = frame.data
         if self._packer is not None:
-            self._pack(data)
+            self._packer.add(data)
             return
         try:
             self.write(data)
@@ -83,8 +86,9 @@ class DatagramClient(Client):
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Apply changed options, packing included."""
-        self._flush()
-        self._packer = _packer(endpoint)
+        if self._packer is not None:
+            self._packer.flush()
+        self._packer = self._packer_of(endpoint)
         super().reconfigure(endpoint)
 
     def adopt(self, sock: socket.socket, write: Write) -> None:
@@ -116,21 +120,13 @@ class DatagramClient(Client):
         self._count_sent(-1, -len(data))
         self._recover(data, 1, error)
 
-    def _pack(self, frame: bytes) -> None:
-        assert self._packer is not None
-        self._send_packed(self._packer.add(frame))
-        if not self._is_gathering:
-            self._is_gathering = True
-            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
-
-    def _flush(self) -> None:
-        self._is_gathering = False
-        if self._packer is not None:
-            self._send_packed(self._packer.flush())
+    def _packer_of(self, endpoint: Endpoint) -> Packer | None:
+        if not endpoint.pack_bytes:
+            return None
+        flush_soon = partial(self.context.flush_soon, endpoint.pack_wait_s)
+        return Packer(endpoint.pack_bytes, self._send_packed, flush_soon)
 
     def _send_packed(self, frames: list[bytes]) -> None:
-        if not frames:
-            return
         data = b"".join(frames)
         try:
             self.write(data)
@@ -242,6 +238,11 @@ class DatagramClient(Client):
 class DatagramPeer(DatagramClient):
     """A client of a listening port."""
 
+    identity: Origin
+    """System and component of its first frame."""
+    address: Address
+    """Host and port of the peer."""
+
     def revive(self) -> None:
         """Note that the client is reachable after all."""
         self._end_hold()
@@ -274,12 +275,7 @@ class DatagramPeer(DatagramClient):
         """Return whether it failed, or is silent and its machine reports a closed port."""
         if self._socket is None:
             return True
-        heard_us = self.heard_us if self.heard_us is not None else self.since_us
-        return self.refused_us is not None and now_us - heard_us >= SILENT_AFTER_US
-
-
-def _packer(endpoint: Endpoint) -> Packer | None:
-    return Packer(endpoint.pack_bytes) if endpoint.pack_bytes else None
+        return self.refused_us is not None and now_us - self.last_us >= SILENT_AFTER_US
 
 
 def bound_socket(address: tuple[str, int], *, shared: bool) -> socket.socket:

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port
-from gateway.hub.limits import Presence, client_to_remove
 from gateway.hub.send_queue import LinkEncoder, SendQueue
 from gateway.hub.transports.base import Client, Listener, Peer
 from gateway.units import US_PER_S
@@ -277,26 +276,11 @@ class StreamListener(Listener[Peer]):
         accept_each(sock, self._on_connection, self._report)
 
     def _on_connection(self, connection: socket.socket, address: tuple[Any, ...]) -> None:
-        if self._has_room(str(address[0])):
+        if self._has_room(str(address[0]), self._context.now_us()):
             self._admit(connection, host_and_port(*address[:2]))
         else:
             self.turned_away += 1
             connection.close()
-
-    def _has_room(self, host: str) -> bool:
-        """Return whether there is room for a new client, after removing another if needed."""
-        most = self._context.settings.max_clients
-        if len(self._clients) < most:
-            return True
-        present = [
-            Presence(client.client_id, (client.host, 0), client.heard_us or client.since_us)
-            for client in self._clients.values()
-        ]
-        removed = client_to_remove(present, host, most, self._context.now_us())
-        if removed is None:
-            return False
-        self.leave(self._clients[removed.client_id])
-        return True
 
     def _admit(self, connection: socket.socket, peer: str) -> None:
         """Make a client of a connection."""

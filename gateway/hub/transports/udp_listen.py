@@ -10,12 +10,13 @@ import socket
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint, host_and_port
-from gateway.hub.limits import ClientTable, Presence
-from gateway.hub.transports.base import READ_BYTES, RETRY_US, HubContext, Listener
+from gateway.hub.limits import SILENT_AFTER_US, crowded_host, gone_clients
+from gateway.hub.transports.base import READ_BYTES, RETRY_US, Client, HubContext, Listener
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,
     MAX_DATAGRAM,
     READS,
+    Address,
     DatagramPeer,
     bound_socket,
     local_host_of,
@@ -27,16 +28,15 @@ ANCILLARY_BYTES: Final = 64
 REMOVALS: Final = 32
 """Dead clients removed at one tick; they cost nothing until then."""
 
-Address = tuple[str | int, ...]
-
 
 class UdpListener(Listener[DatagramPeer]):
     """The listening port and its clients."""
 
     def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
-        settings = context.settings
-        self.table = ClientTable(settings.max_clients, round(settings.idle_timeout_s * US_PER_S))
         super().__init__(context, endpoint)
+        self._by_address: dict[Address, DatagramPeer] = {}
+        self._full_until_us = 0
+        """Until then no client of a full port can have been silent for long enough."""
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
@@ -44,16 +44,19 @@ class UdpListener(Listener[DatagramPeer]):
         if self._socket is not None and now_us >= self._retry_us:
             # Whether the next one can be admitted shows only when it comes.
             self.reason, self._retry_us = "", now_us + RETRY_US
-        settings = self._context.settings
-        self.table.max_clients = settings.max_clients
-        self.table.idle_timeout_us = round(settings.idle_timeout_s * US_PER_S)
-        self._update_table()
-        dead = (p for p in self.table.presences() if self._clients[p.client_id].has_died(now_us))
-        for presence in itertools.islice(dead, REMOVALS):
-            self.table.remove(presence)
-            self._leave(presence)
-        for presence in self.table.expire(now_us):
-            self._leave(presence)
+        clients = self._by_address.values()
+        idle_us = round(self._context.settings.idle_timeout_s * US_PER_S)
+        dead = list(itertools.islice((each for each in clients if each.has_died(now_us)), REMOVALS))
+        for client in dead:
+            self.leave(client)
+        for client in gone_clients(clients, idle_us, now_us):
+            self.leave(client)
+
+    def leave(self, client: Client) -> None:
+        """Remove one client."""
+        assert isinstance(client, DatagramPeer)
+        self._by_address.pop(client.address, None)
+        super().leave(client)
 
     def _bind(self) -> socket.socket:
         sock = bound_socket((self.endpoint.host, self.endpoint.port), shared=False)
@@ -75,59 +78,54 @@ class UdpListener(Listener[DatagramPeer]):
         self._accept(data, address, local_host_of(ancillary))
 
     def _accept(self, data: bytes, address: Address, local_host: str) -> None:
-        presence = self.table.find((str(address[0]), int(address[1])))
-        if presence is None:
-            presence = self._admit(data, address, local_host)
-        if presence is not None:
-            self._clients[presence.client_id].accept(data, self._context.now_us())
+        client = self._by_address.get(address[:2]) or self._admit(data, address, local_host)
+        if client is not None:
+            client.accept(data, self._context.now_us())
 
-    def _admit(self, data: bytes, address: Address, local_host: str) -> Presence | None:
+    def _admit(self, data: bytes, address: Address, local_host: str) -> DatagramPeer | None:
         """Admit a new client if it sends MAVLink and there is room."""
         first = next((event for event in split_datagram(data) if isinstance(event, MavFrame)), None)
         if first is None:
             return None
         now_us = self._context.now_us()
-        if self.table.is_full(now_us):
-            self.turned_away += 1
-            return None
-        host, port = str(address[0]), int(address[1])
-        self._update_table()
-        presence, removed = self.table.admit((host, port), self._context.new_client_id(), now_us)
-        if removed is not None:
-            self._leave(removed)
-        if presence is None:
+        if not self._has_room(str(address[0]), now_us):
             self.turned_away += 1
             return None
         try:
             sock = bound_socket((local_host, self.port), shared=True)
         except OSError as error:
             self._report(error)
-            self.table.remove(presence)
             return None
         try:
             sock.connect(address)
         except OSError:
             # There is no route to the address that it claims.
             sock.close()
-            self.table.remove(presence)
             return None
         self._report(None)
-        presence.identity = first.origin
-        peer = host_and_port(host, port)
+        peer, client_id = host_and_port(*address[:2]), self._context.new_client_id()
         client = DatagramPeer(
-            self._context, presence.client_id, self.endpoint, peer, self.endpoint.name_of(peer)
+            self._context, client_id, self.endpoint, peer, self.endpoint.name_of(peer)
         )
-        self._clients[presence.client_id] = client
+        client.identity, client.address = first.origin, address[:2]
+        self._clients[client_id] = self._by_address[client.address] = client
         client.adopt(sock, sock.send)
         self._context.appear(client)
         self._context.greet(client)
         self._pass_on_others(sock, address, local_host)
-        return presence
+        return client
 
-    def _update_table(self) -> None:
-        """Update the table with when its clients, which have their own sockets, were last heard."""
-        for presence in self.table.presences():
-            presence.heard_us = self._clients[presence.client_id].heard_us or presence.heard_us
+    def _has_room(self, host: str, now_us: int) -> bool:
+        """Return whether there is room; cheap while the port is full of live clients."""
+        most = self._context.settings.max_clients
+        is_full = len(self._clients) >= most
+        if is_full and now_us < self._full_until_us:
+            return False
+        has_room = super()._has_room(host, now_us)
+        if not has_room and crowded_host(self._clients.values(), most) is None:
+            stalest_us = min(client.last_us for client in self._clients.values())
+            self._full_until_us = stalest_us + SILENT_AFTER_US
+        return has_room
 
     def _pass_on_others(self, sock: socket.socket, peer: Address, local_host: str) -> None:
         """Process datagrams of others that arrived between bind and connect of a socket."""
@@ -140,6 +138,3 @@ class UdpListener(Listener[DatagramPeer]):
             if size < READ_BYTES:
                 self._accept(data, address or peer, local_host)
             size += len(data)
-
-    def _leave(self, presence: Presence) -> None:
-        self.leave(self._clients[presence.client_id])

@@ -94,7 +94,7 @@ class WebStream(StreamClient):
             self._flush()
         elif not self._is_gathering:
             self._is_gathering = True
-            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
+            self.context.flush_soon(self.endpoint.pack_wait_s, self._flush)
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""

@@ -6,6 +6,7 @@ queued, so that old data never arrives as new.
 
 import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
@@ -49,8 +50,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOCAL: Final = ("tcp/127.", "tcp/[::1]", "tcp/localhost:", "unixsock-stream/")
-MAX_NAMESAKES: Final = 16
-"""Other sessions under this site's name that are remembered; more are forged."""
+MAX_DUPLICATE_SESSIONS: Final = 16
+"""Other sessions with this site's name that are remembered; more are forged."""
 
 
 class _Topic(NamedTuple):
@@ -67,12 +68,11 @@ class ZenohClient(Client):
     _task: asyncio.Task[None] | None = None
     _publishers: Publishers | None = None
     _retry_us = 0
-    _is_gathering = False
 
     def __post_init__(self) -> None:
         """Begin without a session; the first tick opens it."""
         super().__post_init__()
-        self._namesakes: set[str] = set()
+        self._duplicate_sessions: set[str] = set()
         self._packers: dict[_Topic, Packer] = {}
         self._queues: list[LoopQueue[Any]] = []
         self._declared: list[object] = []
@@ -117,7 +117,7 @@ class ZenohClient(Client):
         elif not is_linked and self.state == "open":
             self.become("connecting")
             self._packers.clear()
-        self._report_namesakes()
+        self._report_duplicates()
 
     def close(self) -> None:
         """End the session; a thread closes it, which may take a moment."""
@@ -133,7 +133,8 @@ class ZenohClient(Client):
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Apply changed options; another site or file needs the endpoint to be added again."""
-        self._flush()
+        for packer in self._packers.values():
+            packer.flush()
         self._packers.clear()
         super().reconfigure(endpoint)
 
@@ -173,7 +174,7 @@ class ZenohClient(Client):
         )
         presence: LoopQueue[tuple[bool, str]] = LoopQueue(self._handle_presence)
         self._queues = [frames, presence]
-        self._namesakes.clear()
+        self._duplicate_sessions.clear()
         keys = {RAW_KEYS: RAW_IN, JSON_KEYS: JSON_IN}
         wanted = keys.get(self.endpoint.keys) or in_key(self.endpoint.site, ALL_SYSTEMS)
         self._declared = [
@@ -200,16 +201,11 @@ class ZenohClient(Client):
         data, size = payload
         if not self.trusted:
             self.context.untrusted_reads.level -= min(size, MAX_MESSAGE)
-        if not data:
-            self.counters.bytes_received += size
-            self.counters.bytes_garbage += size
-            return
-        if self.endpoint.keys == JSON_KEYS:
+        if data and self.endpoint.keys == JSON_KEYS:
             data = frame_from_json(data)
-            if not data:
-                self.counters.bytes_received += size
-                self.counters.bytes_garbage += size
-                return
+        if not data:
+            self.count_garbage(size)
+            return
         self.receive(split_datagram(data), size, self.context.now_us())
 
     def _handle_presence(self, news: tuple[bool, str]) -> None:
@@ -217,15 +213,17 @@ class ZenohClient(Client):
         session = key.rpartition("/")[2]
         if self._session is None or session == str(self._session.zid()):
             return
-        if is_here and len(self._namesakes) < MAX_NAMESAKES:
-            self._namesakes.add(session)
+        if is_here and len(self._duplicate_sessions) < MAX_DUPLICATE_SESSIONS:
+            self._duplicate_sessions.add(session)
         elif not is_here:
-            self._namesakes.discard(session)
-        self._report_namesakes()
+            self._duplicate_sessions.discard(session)
+        self._report_duplicates()
 
-    def _report_namesakes(self) -> None:
+    def _report_duplicates(self) -> None:
         """Report, for as long as it lasts, that another session uses this site's name."""
-        text = f"another site is called {self.endpoint.site!r} too" if self._namesakes else ""
+        text = (
+            f"another site is called {self.endpoint.site!r} too" if self._duplicate_sessions else ""
+        )
         if self.state != "open" or text == self.reason:
             return
         self.reason = text
@@ -234,48 +232,43 @@ class ZenohClient(Client):
 
     def _publish_json(self, frame: MavFrame) -> None:
         """Publish a message as mavlink-server does: as a whole, by its name, and by its fields."""
-        if self._publishers is None or (found := json_from_frame(frame.data)) is None:
+        assert self._publishers is not None
+        if (found := json_from_frame(frame.data)) is None:
             self.counters.dropped += 1
             return
         name, whole, fields = found
         system_id, component_id = frame.origin
         key = f"{ROOT}/{system_id}/{component_id}/{name}"
-        self._publish_json_text(JSON_OUT, whole, reliable=frame.message_id in RELIABLE_IDS)
+        reliable = frame.message_id in RELIABLE_IDS
+        self._publish(_Topic(JSON_OUT, None), [whole], reliable=reliable)
         self._publishers.put_once(key, whole)
         for field, value in fields.items():
             self._publishers.put_once(f"{key}/{field}", value)
 
-    def _publish_json_text(self, key: str, text: bytes, *, reliable: bool) -> None:
-        if self._publishers is not None and self._publishers.publish(key, text, reliable=reliable):
-            self.counters.sent += 1
-            self.counters.bytes_sent += len(text)
-        else:
-            self.counters.dropped += 1
-
     def _pack(self, topic: _Topic, frame: bytes) -> None:
-        packer = self._packers.setdefault(topic, Packer(self.endpoint.pack_bytes))
-        self._publish(topic, packer.add(frame), reliable=False)
-        if not self._is_gathering:
-            self._is_gathering = True
-            self.context.flush_soon(self._flush, self.endpoint.pack_wait_s)
-
-    def _flush(self) -> None:
-        self._is_gathering = False
-        for topic, packer in self._packers.items():
-            self._publish(topic, packer.flush(), reliable=False)
+        packer = self._packers.get(topic)
+        if packer is None:
+            publish = partial(self._publish, topic, reliable=False)
+            flush_soon = partial(self.context.flush_soon, self.endpoint.pack_wait_s)
+            packer = self._packers[topic] = Packer(self.endpoint.pack_bytes, publish, flush_soon)
+        packer.add(frame)
 
     def _publish(self, topic: _Topic, frames: list[bytes], *, reliable: bool) -> None:
-        if not frames or self._publishers is None:
+        if self._publishers is None or self.state != "open":
+            self.counters.dropped += len(frames)
             return
         data = b"".join(frames)
         published = self._publishers.publish(
             topic.key, data, reliable=reliable, attachment=topic.attachment
         )
+        self._count(len(frames), len(data), published=published)
+
+    def _count(self, frames: int, size: int, *, published: bool) -> None:
         if published:
-            self.counters.sent += len(frames)
-            self.counters.bytes_sent += len(data)
+            self.counters.sent += frames
+            self.counters.bytes_sent += size
         else:
-            self.counters.dropped += len(frames)
+            self.counters.dropped += frames
 
 
 def _cost_of(payload: Payload) -> float:
