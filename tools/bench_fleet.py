@@ -11,6 +11,7 @@ nothing. `--fleets 2` splits the sites between two fleets on one router.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import select
@@ -19,7 +20,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +31,7 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.live.control_socket import request
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
 from tools.bench_hub import cpu_ns, resident_kib, udp_socket
 
 SITES = (1, 10, 50, 200)
@@ -149,32 +151,33 @@ class Processes:
     """Where the fleets can be asked."""
 
 
-class GroundStation:
-    """Reads frames and notes how late they are."""
+@dataclass
+class Station:
+    """A ground station: the time in each frame of one message, and when the frame was read."""
 
-    def __init__(self) -> None:
-        self._sock = udp_socket()
-        self.port: int = self._sock.getsockname()[1]
-        self.late_us: list[int] = []
+    message_id: int
+    clock: Callable[[], int] = time.monotonic_ns
+    sock: socket.socket = field(default_factory=udp_socket)
+    splitter: MavlinkSplitter = field(default_factory=MavlinkSplitter)
+    got: list[tuple[int, int]] = field(default_factory=list)
+    """The time in the first four bytes of a frame's payload, and that of the clock in ns."""
 
-    def read(self, wait_s: float) -> bool:
-        """Take what comes within some time; return whether anything came."""
-        if not select.select([self._sock], [], [], wait_s)[0]:
+    @property
+    def port(self) -> int:
+        """Its port."""
+        return int(self.sock.getsockname()[1])
+
+    def read(self, wait_s: float = 0.0) -> bool:
+        """Take all that has arrived; return whether anything arrived within a time."""
+        if not select.select([self.sock], [], [], wait_s)[0]:
             return False
-        try:
-            while True:
-                # A frame a datagram, so that the reader costs little of the measured time.
-                frame = self._sock.recv(2048)
-                now_us = time.time_ns() // 1000
-                if message_id_of(frame) == ATTITUDE:
-                    sent_us = int.from_bytes(frame[10:14], "little")
-                    self.late_us.append((now_us - sent_us) % (1 << 32))
-        except BlockingIOError:
-            return True
-
-    def close(self) -> None:
-        """Close the socket."""
-        self._sock.close()
+        with contextlib.suppress(BlockingIOError):
+            while data := self.sock.recv(65536):
+                now_ns = self.clock()
+                for frame in self.splitter.feed(data):
+                    if isinstance(frame, MavFrame) and frame.message_id == self.message_id:
+                        self.got.append((int.from_bytes(frame.payload[:4], "little"), now_ns))
+        return True
 
 
 def free_place() -> str:
@@ -195,6 +198,14 @@ def start(*words: str, home: Path | None = None) -> "subprocess.Popen[str]":
         text=True,
         env=env,
     )
+
+
+def start_router(place: str) -> "subprocess.Popen[str]":
+    """Start a Zenoh router, and wait until it is open."""
+    router = start("-c", ROUTER, place)
+    assert router.stdout is not None
+    router.stdout.readline()
+    return router
 
 
 def wait_for(file: Path) -> None:
@@ -219,12 +230,9 @@ def generators(
 
 def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float) -> FleetRun:
     """Measure one number of sites."""
-    place, station = free_place(), GroundStation()
+    place, station = free_place(), Station(ATTITUDE, time.time_ns)
     with tempfile.TemporaryDirectory() as folder:
-        router = start("-c", ROUTER, place)
-        assert router.stdout is not None
-        router.stdout.readline()
-        watched, sockets = [router], []
+        watched, sockets = [start_router(place)], []
         for number in range(fleets):
             home = Path(folder) / str(number)
             home.mkdir()
@@ -247,7 +255,7 @@ def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float
 
 def run_plain(rate_hz: int, seconds: float) -> FleetRun:
     """Measure one site that comes to a plain hub over TCP."""
-    station = GroundStation()
+    station = Station(ATTITUDE, time.time_ns)
     hub = start("-c", HUB, str(station.port))
     assert hub.stdout is not None
     port = hub.stdout.readline().strip()
@@ -259,25 +267,30 @@ def run_plain(rate_hz: int, seconds: float) -> FleetRun:
         end_all(processes, station)
 
 
-def end_all(processes: Processes, station: GroundStation) -> None:
-    """End what was started."""
+def end(process: "subprocess.Popen[str]") -> None:
+    """End a process."""
+    process.kill()
+    process.communicate()
+
+
+def end_all(processes: Processes, station: Station) -> None:
+    """End all processes of a run."""
     for each in (*processes.watched, *processes.loads):
-        each.kill()
-        each.communicate()
-    station.close()
+        end(each)
+    station.sock.close()
 
 
 def _measure(
-    sites: int, way: str, station: GroundStation, processes: Processes, expected: float
+    sites: int, way: str, station: Station, processes: Processes, expected: float
 ) -> FleetRun:
     limit = time.monotonic() + START_S
-    while not station.late_us:
+    while not station.got:
         station.read(0.1)
         if time.monotonic() > limit:
             raise RuntimeError("nothing comes")
     watched = processes.watched
     begin_ns, before = time.monotonic_ns(), [cpu_ns(process.pid) for process in watched]
-    while station.read(0.2) or len(station.late_us) < expected * MOST:
+    while station.read(0.2) or len(station.got) < expected * MOST:
         if all(load.poll() is not None for load in processes.loads):
             break
     elapsed_ns = time.monotonic_ns() - begin_ns
@@ -285,6 +298,7 @@ def _measure(
     while station.read(0.3):
         pass
     sent = round(expected)
+    late_us = [(ns // 1000 - sent_us) % (1 << 32) for sent_us, ns in station.got]
     missed, shed = np.sum([(0, 0), *map(lost_in, processes.sockets)], axis=0).tolist()
     shares = [100 * ns / elapsed_ns for ns in used]
     memory = [resident_kib(process.pid) for process in watched]
@@ -294,11 +308,11 @@ def _measure(
         sites=sites,
         way=way,
         sent=sent,
-        lost=sent - len(station.late_us),
+        lost=sent - len(station.got),
         lost_before=missed,
         shed=shed,
-        p50_us=float(np.percentile(station.late_us, 50)),
-        p99_us=float(np.percentile(station.late_us, 99)),
+        p50_us=float(np.percentile(late_us, 50)),
+        p99_us=float(np.percentile(late_us, 99)),
         router_cpu_percent=shares[0],
         fleet_cpu_percent=max(shares[1:]),
         router_kib=memory[0],

@@ -17,13 +17,12 @@ import os
 import select
 import signal
 import socket
-import subprocess
 import sys
 import tempfile
 import time
 import tty
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +31,8 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
-from tools.bench_fleet import ROUTER, SETTLE_S, free_place, start, wait_for
-from tools.bench_hub import resident_kib, udp_socket
+from tools.bench_fleet import SETTLE_S, Station, end, free_place, start, start_router, wait_for
+from tools.bench_hub import resident_kib
 from tools.bench_latency import frames
 
 WAYS = ("UDP, plain hub", "TCP, plain hub", "fleet")
@@ -65,28 +63,6 @@ attitude_quaternion_hz = 1000
 """
 
 
-@dataclass
-class Station:
-    """A ground station: the times at which it got each frame of the site."""
-
-    sock: socket.socket
-    splitter: MavlinkSplitter = field(default_factory=MavlinkSplitter)
-    got: list[tuple[int, int]] = field(default_factory=list)
-    """The vehicle's time of a frame in ms, and when it came in ns."""
-
-    def read(self) -> None:
-        """Take what has come."""
-        with contextlib.suppress(BlockingIOError):
-            while data := self.sock.recv(65536):
-                now_ns = time.monotonic_ns()
-                for frame in self.splitter.feed(data):
-                    if (
-                        isinstance(frame, bytes)
-                        and message_id_of(frame) == mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
-                    ):
-                        self.got.append((int.from_bytes(frame[10:14], "little"), now_ns))
-
-
 @dataclass(frozen=True)
 class WayFigures:
     """What one ground station got in one part."""
@@ -110,12 +86,12 @@ class Field:
         self._line, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._line, False)
-        self.router = self.start_router()
+        self.router = start_router(self.place)
         stack.callback(lambda: end(self.router))
-        direct, far = udp_socket(), udp_socket()
+        direct, far = (Station(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION) for _ in range(2))
         self.fleet = start(
             *("-m", "gateway.cli", "fleet", "--connect", self.place, "--site", "field"),
-            *("--endpoint", f"udp:127.0.0.1:{far.getsockname()[1]}"),
+            *("--endpoint", f"udp:127.0.0.1:{far.port}"),
             home=folder,
         )
         stack.callback(end, self.fleet)
@@ -127,26 +103,17 @@ class Field:
         tcp = int(free_place().rpartition(":")[2])
         config = folder / "bench.toml"
         config.write_text(
-            CONFIG.format(
-                udp=direct.getsockname()[1], tcp=tcp, place=self.place, recordings=recordings
-            )
+            CONFIG.format(udp=direct.port, tcp=tcp, place=self.place, recordings=recordings)
         )
         words = ("run", "--plain", "--config", str(config), "--port", os.ttyname(slave))
         self.site = start("-m", "gateway.cli", *words)
         stack.callback(end, self.site)
-        self.stations = {DIRECT: Station(direct), FLEET: Station(far)}
+        self.stations = {DIRECT: direct, FLEET: far}
         self._await([DIRECT])
         near = socket.create_connection(("127.0.0.1", tcp))
         near.setblocking(False)
-        self.stations[WAYS[1]] = Station(near)
+        self.stations[WAYS[1]] = Station(direct.message_id, sock=near)
         self._await(list(WAYS))
-
-    def start_router(self) -> "subprocess.Popen[str]":
-        """Start a router at its place."""
-        router = start("-c", ROUTER, self.place)
-        assert router.stdout is not None
-        router.stdout.readline()
-        return router
 
     def feed(
         self, part: str, seconds: float, events: list[tuple[float, Callable[[], None]]]
@@ -207,12 +174,6 @@ def figures(part: str, way: str, written: dict[int, int], got: list[tuple[int, i
     )
 
 
-def end(process: "subprocess.Popen[str]") -> None:
-    """End what was started."""
-    process.kill()
-    process.communicate()
-
-
 def with_fetch(site: Field, seconds: float) -> tuple[list[WayFigures], float]:
     """Measure while a recording is fetched; return its rate in bytes a second too."""
     words = ("fleet", "recordings", "get", "field", "bench", "--to", str(site.home / "fetched"))
@@ -244,7 +205,7 @@ def through_an_outage(site: Field, outage_s: float) -> tuple[list[WayFigures], l
 
     def restart() -> None:
         end(site.router)
-        site.router = start("-c", ROUTER, site.place)
+        site.router = start_router(site.place)
         returned.append(time.monotonic_ns())
 
     whole_s = BEFORE_S + outage_s + AFTER_S
