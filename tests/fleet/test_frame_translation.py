@@ -1,4 +1,4 @@
-"""Frames with other ids: header, target, checksum and signature, read back by pymavlink."""
+"""Frames with other ids, and the signatures of a site with a passphrase."""
 
 import random
 from typing import Any
@@ -6,11 +6,16 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.fleet.frame_translation import FrameTranslation, SiteSignatures
+from gateway.fleet.frame_translation import (
+    MAX_STREAMS,
+    WINDOW_TICKS,
+    FrameTranslation,
+    SiteSignatures,
+)
 from gateway.fleet.id_map import IdMap
-from gateway.vehicle.requests import EPOCH_2015_US
+from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, TICKS_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import frame_of, target_of
+from gateway.wire.mavlink_splitter import MavFrame, frame_of, target_of
 from tests.kit import mavlink as kit
 from tests.kit.mavlink import frames_in
 
@@ -130,48 +135,6 @@ def test_target_within_the_site_is_translated() -> None:
     """As an autopilot its gimbal, or one aircraft the next."""
     got = read(from_site(translation(), packed(command(1), 30)) or b"")
     assert (got.get_srcSystem(), got.target_system) == (30, 2)
-
-
-ASKED: list[Any] = [
-    mavlink.MAVLink_param_request_list_message(2, 1),
-    mavlink.MAVLink_param_request_read_message(2, 1, b"GPS_LAG", -1),
-    mavlink.MAVLink_param_set_message(2, 1, b"GPS_LAG", 0.25, 9),
-    mavlink.MAVLink_mission_count_message(2, 1, 3),
-    mavlink.MAVLink_mission_item_int_message(2, 1, 2, 3, 16, 0, 1, 0, 2, 0, 0, 5, 6, 7),
-    mavlink.MAVLink_mission_request_list_message(2, 1),
-    mavlink.MAVLink_mission_request_int_message(2, 1, 2),
-]
-ANSWERED: list[Any] = [
-    mavlink.MAVLink_param_value_message(b"GPS_LAG", 0.25, 9, 40, 7),
-    mavlink.MAVLink_mission_request_int_message(255, 190, 2),
-    mavlink.MAVLink_mission_count_message(255, 190, 3),
-    mavlink.MAVLink_mission_item_int_message(255, 190, 2, 3, 16, 0, 1, 0, 2, 0, 0, 5, 6, 7),
-    mavlink.MAVLink_mission_ack_message(255, 190, 0),
-]
-
-
-@pytest.mark.parametrize("message", ASKED, ids=lambda each: each.get_type())
-def test_parameter_and_mission_requests_reach_the_vehicle(message: Any) -> None:
-    system_id, frame = to_site(translation(), packed(message, 255)) or (0, b"")
-    got = read(frame)
-    assert (system_id, got.get_srcSystem(), got.target_system) == (1, 255, 1)
-    assert got.to_dict() == message.to_dict() | {"target_system": 1}
-
-
-@pytest.mark.parametrize("message", ANSWERED, ids=lambda each: each.get_type())
-def test_parameter_and_mission_answers_reach_the_station(message: Any) -> None:
-    got = read(from_site(translation(), packed(message, 1)) or b"")
-    assert got.get_srcSystem() == 2
-    assert got.to_dict() == message.to_dict()
-
-
-@pytest.mark.parametrize("unix_us", [0, 946_684_800_000_000, 4_102_444_800_000_000])
-def test_wrong_time_in_a_message_is_unchanged(unix_us: int) -> None:
-    message = mavlink.MAVLink_system_time_message(unix_us, 5)
-    frame = packed(message, 1)
-    given = from_site(translation(), frame) or b""
-    assert read(given).time_unix_usec == unix_us
-    assert given[6:-2] == frame[6:-2], "all but the sender and the checksum"
 
 
 def test_broadcast_of_a_station_is_unchanged() -> None:
@@ -302,3 +265,86 @@ def test_target_of_every_message_is_translated(message_id: int) -> None:
     assert target_of(back)[0] == 2
     differing = sum(a != b for a, b in zip(changed, frame, strict=True))
     assert differing <= 3
+
+
+NOW_TICKS = 1_000_000_000
+NOW_US = NOW_TICKS * TICK_US
+MINUTE_TICKS = 60 * 100_000
+"""In units of 10 us."""
+
+
+def signed(timestamp: int, *, link: int = 1, system: int = 1, key: bytes = KEY) -> MavFrame:
+    message = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
+    return frame_of(kit.packed(message, system, signing=(key, link, timestamp)))
+
+
+@pytest.fixture
+def site() -> SiteSignatures:
+    return SiteSignatures(KEY, EPOCH_2015_US)
+
+
+def test_unsigned_frame_is_rejected(site: SiteSignatures) -> None:
+    message: Any = mavlink.MAVLink_attitude_message(5, 0, 0, 0, 0, 0, 0)
+    for version in (1, 2):
+        assert site.check(frame_of(kit.packed(message, version=version)), NOW_US) == "unsigned"
+
+
+def test_frame_of_another_passphrase_is_rejected_and_begins_no_stream(site: SiteSignatures) -> None:
+    assert site.check(signed(NOW_TICKS + 9, key=bytes(32)), NOW_US) == "forged"
+    assert site.check(signed(NOW_TICKS), NOW_US) == ""
+
+
+@pytest.mark.parametrize("age_s", [0, 1, 4, 60, 86_400])
+def test_recorded_frame_is_rejected_at_any_later_time(site: SiteSignatures, age_s: int) -> None:
+    frame = signed(NOW_TICKS)
+    assert site.check(frame, NOW_US) == ""
+    later_ticks = NOW_TICKS + age_s * TICKS_PER_S
+    assert site.check(signed(later_ticks + 1), later_ticks * TICK_US) == ""
+    assert site.check(frame, later_ticks * TICK_US) == "replayed"
+
+
+@pytest.mark.parametrize(
+    ("age_ticks", "rejection"),
+    [(MINUTE_TICKS, ""), (MINUTE_TICKS + 1, "replayed"), (-(10**9), "")],
+)
+def test_first_frame_of_a_stream_is_at_most_a_minute_old(
+    site: SiteSignatures, age_ticks: int, rejection: str
+) -> None:
+    """A recorded frame is rejected after a restart of the fleet, too."""
+    assert site.check(signed(NOW_TICKS - age_ticks), NOW_US) == rejection
+
+
+def test_frame_overtaken_by_newer_ones_is_accepted_once_within_the_window(
+    site: SiteSignatures,
+) -> None:
+    assert site.check(signed(NOW_TICKS), NOW_US) == ""
+    late = signed(NOW_TICKS - WINDOW_TICKS + 1)
+    assert site.check(late, NOW_US) == ""
+    assert site.check(late, NOW_US) == "replayed"
+    assert site.check(signed(NOW_TICKS - WINDOW_TICKS), NOW_US) == "replayed"
+
+
+def test_streams_are_independent_and_bounded(site: SiteSignatures) -> None:
+    for link in range(4):
+        assert site.check(signed(NOW_TICKS, link=link), NOW_US) == ""
+    assert site.check(signed(NOW_TICKS, system=2), NOW_US) == ""
+    for number in range(MAX_STREAMS - 5):
+        frame = signed(NOW_TICKS, link=4 + number % 250, system=3 + number // 250)
+        assert site.check(frame, NOW_US) == ""
+    assert site.check(signed(NOW_TICKS, link=3, system=200), NOW_US) == "replayed"
+
+
+def test_memory_of_a_window_is_bounded(site: SiteSignatures) -> None:
+    for second in range(100):
+        for step in range(10):
+            ticks = NOW_TICKS + second * TICKS_PER_S + step
+            assert site.check(signed(ticks), NOW_US) == ""
+    [window] = site._windows.values()
+    assert len(window.seen) <= 2 * 10 * (WINDOW_TICKS // TICKS_PER_S + 1)
+
+
+def test_renewed_signature_is_genuine_and_keeps_link_and_timestamp(site: SiteSignatures) -> None:
+    frame = signed(NOW_TICKS, link=7)
+    changed = site.renewed(frame.data[:-13], frame)
+    assert changed == frame.data
+    assert site.is_genuine(frame_of(changed))

@@ -10,7 +10,7 @@ from gateway.analysis.reporting.raw_sensors import timing
 from gateway.cli.recorded import report
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import TableHeader, encode_head
-from tests.analysis.test_sources import rows
+from tests.analysis.test_flight import rows
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io

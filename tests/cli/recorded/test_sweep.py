@@ -7,7 +7,7 @@ import pytest
 from gateway.config import load
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.table import TableHeader, encode_head
-from tests.analysis.test_sources import rows
+from tests.analysis.test_flight import rows
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io

@@ -1,29 +1,100 @@
+"""A flight for the analysis: its arrays, its sources, its fused tracks."""
+
+import math
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
-from gateway.analysis.case import make_case
+from gateway.analysis.case import ESTIMATORS, make_case, with_estimator
 from gateway.analysis.flight import (
     FlightTrack,
+    LocalFrame,
     at_times,
     fixes_of,
     flight_of_blocks,
     fuse_track,
     judged_by,
+    local_frame,
 )
+from gateway.analysis.metrics import position_error_m, rms
 from gateway.analysis.reporting.compose import make_report
 from gateway.analysis.simulated import ideal_calibration
 from gateway.estimation.select import make_estimator
+from gateway.geometry.geodesy import displacement_m
 from gateway.recordings.columns import TableRow
+from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.table import block_of
-from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuRaw
+from gateway.records import (
+    BaroRaw,
+    BaroSample,
+    GpsFix,
+    ImuCalibrated,
+    ImuFlags,
+    ImuRaw,
+    NavFlags,
+    NodeId,
+)
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.analysis.flights import short_case, short_flight, with_imu
+from tests.analysis.flights import DURATION_S, short_case, short_flight, with_imu
+
+
+def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:
+    flight = short_flight()
+    assert flight.rate_hz == pytest.approx(50.0, rel=0.01)
+    assert flight.duration_s == pytest.approx(DURATION_S, abs=0.1)
+    rest = flight.imu.accel_b_mps2[: round(5 * flight.rate_hz)].mean(axis=0)
+    assert rest == pytest.approx([0.0, 0.0, -9.80665], abs=0.03)
+    assert flight.reference is not None
+    assert flight.reference.is_exact
+    assert len(flight.reference.track.lat_deg) == len(flight.time_us)
+    assert np.linalg.norm(flight.imu.gyro_b_radps[:200].mean(axis=0)) < math.radians(0.3)
+
+
+def test_the_magnetometer_is_there_before_and_after_calibration() -> None:
+    flight = short_flight()
+    assert flight.mag_uncalibrated_b_ut is not None
+    before = np.linalg.norm(flight.mag_uncalibrated_b_ut, axis=1)
+    after = np.linalg.norm(flight.imu.mag_b_ut, axis=1)
+    assert np.nanstd(after) < 0.2 * np.nanstd(before)
+
+
+def test_only_usable_fixes_are_laid_out() -> None:
+    flight = short_flight()
+    fixes = fixes_of(flight)
+    assert 0 < len(fixes) < len(flight.fixes)
+    assert (fixes.arrival_us - fixes.valid_us == round(flight.latency_s * 1e6)).all()
+
+
+def test_the_start_up_does_not_count() -> None:
+    flight = short_flight()
+    first_us = fixes_of(flight).arrival_us[0]
+    assert flight.time_us[np.argmax(flight.scored)] == pytest.approx(first_us + 5e6, abs=3e4)
+
+
+def test_the_local_frame_measures_metres() -> None:
+    frame = LocalFrame(-7.0, 179.9999, 100.0)
+    place = frame.place(np.array([-6.999]), np.array([-179.9999]))
+    expected = displacement_m(-7.0, 179.9999, -6.999, -179.9999, 100.0)
+    assert place[0] == pytest.approx(expected)
+
+
+def test_a_flight_without_fixes_has_no_frame() -> None:
+    assert local_frame(short_flight().with_fixes([False] * len(short_flight().fixes))) is None
+
+
+def test_too_few_samples_are_no_flight() -> None:
+    zero = (0.0, 0.0, 0.0)
+    row = TableRow(0, imu=ImuCalibrated(0, NodeId(1, 0), zero, zero, None, 20.0, ImuFlags(0)))
+    with pytest.raises(ValueError, match="1 IMU samples are no flight"):
+        flight_of_blocks([block_of([row])], NodeCalibration(), FusionSettings(), name="x", story="")
+
 
 SIMULATED: SimulatedFlight = fly(
     SimulatorSettings(imu_rate_hz=50, gps_outages_s=((40.0, 3.0),)), duration_s=30.0
@@ -135,3 +206,51 @@ def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> No
     bare = with_imu(bare, mag_b_ut=np.full_like(flight.imu.mag_b_ut, np.nan))
     titles = [section.title for section in make_report(make_case(bare)).sections]
     assert titles == ["Acceleration filters", "Noise", "Timing and loss"]
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_a_whole_flight_at_once_equals_sample_by_sample(name: str) -> None:
+    flight, case = short_flight(), short_case()
+    estimator = make_estimator(with_estimator(case.fusion, name).estimation)
+    waiting = deque(flight.samples.aiding)
+    for k, sample in enumerate(flight.samples.imu.samples()[:1500]):
+        while waiting and waiting[0][0] <= k:
+            _, record = waiting.popleft()
+            if isinstance(record, BaroSample):
+                estimator.update_baro(record)
+            else:
+                estimator.update_gps(record)
+        state = estimator.update_imu(sample)
+        if k % 300 == 299:
+            track, valid = case.tracks[name], NavFlags.POSITION_VALID in state.flags
+            assert state.q_nb == tuple(track.q_nb[k])
+            assert np.isfinite(track.lat_deg[k]) == valid
+            if valid:
+                assert (state.lat_deg, state.lon_deg) == (track.lat_deg[k], track.lon_deg[k])
+                assert state.vel_n_mps == tuple(track.vel_n_mps[k])
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_the_fused_track_is_near_the_truth(name: str) -> None:
+    flight = short_flight()
+    assert flight.reference is not None
+    error = position_error_m(short_case().tracks[name], flight.reference.track)[flight.scored]
+    assert rms(np.hypot(error[:, 0], error[:, 1])) < 4.0
+
+
+def test_values_without_a_validity_flag_are_unknown() -> None:
+    track: FlightTrack = short_case().tracks["paper"]
+    first_s = short_flight().seconds(
+        np.array([f.time_us for f in short_flight().fixes if f.fix_ok])
+    )
+    unknown = short_flight().time_s < first_s[0]
+    assert np.isnan(track.lat_deg[unknown]).all()
+    assert np.isfinite(track.lat_deg[~unknown]).all()
+
+
+def test_another_cutoff_gives_another_track() -> None:
+    flight, fusion = short_flight(), with_estimator(short_case().fusion, "paper")
+    paper = msgspec.structs.replace(fusion.estimation.paper, accel_cutoff_hz=2.0)
+    estimation = msgspec.structs.replace(fusion.estimation, paper=paper)
+    changed = fuse_track(flight, msgspec.structs.replace(fusion, estimation=estimation))
+    assert not np.array_equal(changed.q_nb, short_case().tracks["paper"].q_nb)
