@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from gateway.cli.live import fleet as fleet_command
-from gateway.cli.live.fleet import FetchError, PiecePace, RecordingFetch
+from gateway.cli.live.fleet import FetchError, RecordingFetch
 from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.hub.transports.zenoh import site_queries
 from gateway.hub.transports.zenoh.site_queries import (
@@ -321,25 +321,22 @@ class TestFetch:
         with pytest.raises(FetchError, match="not a file of a recording"):
             one.fetch(name, 10, lambda _: None)
 
-    def test_piece_size_follows_the_speed_of_the_link(self) -> None:
-        pace = PiecePace()
-        sizes = []
-        for took_s in [0.01] * 8 + [0.1] + [0.5] * 3:
-            pace.note(took_s)
-            sizes.append(pace.size)
-        assert sizes[4:9] == [MAX_PIECE] * 5
-        assert sizes[-1] == MAX_PIECE // 8
-        assert fleet_command.LARGEST == MAX_PIECE
-        for _ in range(10):
-            pace.note(5.0)
-        assert pace.size == fleet_command.SMALLEST
-
-    @pytest.mark.parametrize(("took_s", "waited_s"), [(0.1, 0.1), (3.0, fleet_command.SLOW_S)])
-    def test_pauses_leave_half_of_the_link_to_telemetry(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float
-    ) -> None:
+    @pytest.mark.parametrize(
+        ("took_s", "waited_s", "kib"),
+        [
+            (0.01, 0.01, [4, 8, 16, 32, 64, 128]),
+            (0.1, 0.1, [16, 16, 16, 16]),
+            (3.0, fleet_command.SLOW_S, [16, 8, 4, 4]),
+        ],
+        ids=["fast", "fitting", "slow"],
+    )
+    def test_pieces_and_pauses_leave_half_of_the_link_to_telemetry(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float,
+        kib: list[int],
+    ) -> None:  # fmt: skip
         now_s = 0.0
         waits: list[float] = []
+        sizes: list[int] = []
 
         def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
             nonlocal now_s
@@ -347,9 +344,13 @@ class TestFetch:
             if verb == "fleet.digest":
                 return {"sha256": hashlib.sha256(CONTENT[: params["size"]]).hexdigest()}
             begin = params["offset"]
+            sizes.append(params["size"])
             return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
 
         monkeypatch.setattr(fleet_command.time, "monotonic", lambda: now_s)
         one = RecordingFetch("site", tmp_path, ask, wait=waits.append)
-        assert one.fetch(NAME, 3 * fleet_command.SMALLEST, lambda _: None)
-        assert waits == pytest.approx([waited_s] * 3)
+        one.piece_size = kib[0] << 10
+        assert one.fetch(NAME, sum(kib) << 10, lambda _: None)
+        assert sizes == [size << 10 for size in kib]
+        assert waits == pytest.approx([waited_s] * len(kib))
+        assert fleet_command.LARGEST == MAX_PIECE

@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import partial
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -74,13 +76,11 @@ class Diagnosis:
     """The result, and how to fix it."""
 
 
+good: Final = partial(Diagnosis, Grade.GOOD)
+note: Final = partial(Diagnosis, Grade.NOTE)
+wrong: Final = partial(Diagnosis, Grade.WRONG)
+
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
-
-
-def check_machine(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check everything that a gateway with these settings needs, one after another."""
-    for check in CHECKS:
-        yield from check(settings)
 
 
 def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
@@ -89,7 +89,7 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         found = load_aircraft(settings)
     except ConfigError as error:
-        yield Diagnosis(Grade.WRONG, "aircraft", str(error))
+        yield wrong("aircraft", str(error))
         return
     yield _writable("aircraft", folder, f"{len(found)} with settings of their own in {folder}")
 
@@ -99,11 +99,11 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         fitting = fitting_ports(settings.serial.port, list_serial_ports())
     except PortNotFoundError as error:
-        yield Diagnosis(Grade.WRONG, "receiver", f"{error}; plug it in, or set serial.port")
+        yield wrong("receiver", f"{error}; plug it in, or set serial.port")
         return
     if len(fitting) > 1:
         text = f"several adapters fit, the gateway asks each: {', '.join(fitting)}"
-        yield Diagnosis(Grade.NOTE, "receiver", text)
+        yield note("receiver", text)
     for device in fitting:
         yield from _check_port(device)
 
@@ -111,13 +111,11 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def _check_port(device: str) -> Iterator[Diagnosis]:
     path = Path(device)
     if not path.exists():
-        yield Diagnosis(
-            Grade.WRONG, "receiver", f"{device} is not there; `mavgate ports` lists all"
-        )
+        yield wrong("receiver", f"{device} is not there; `mavgate ports` lists all")
     elif not os.access(path, os.R_OK | os.W_OK):
-        yield Diagnosis(Grade.WRONG, "receiver", f"{device} may not be opened: {_membership(path)}")
+        yield wrong("receiver", f"{device} may not be opened: {_membership(path)}")
     else:
-        yield Diagnosis(Grade.GOOD, "receiver", device)
+        yield good("receiver", device)
     yield from _latency(path)
 
 
@@ -139,10 +137,9 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
     except (OSError, ValueError):
         return
     if latency_ms <= SLOW_LATENCY_MS:
-        yield Diagnosis(Grade.GOOD, "latency timer", f"{latency_ms} ms")
+        yield good("latency timer", f"{latency_ms} ms")
     else:
-        yield Diagnosis(
-            Grade.WRONG,
+        yield wrong(
             "latency timer",
             f"the adapter holds bytes back for {latency_ms} ms: `echo 1 | sudo tee {timer}`, and "
             "for good the rule of tools/debian/60-mavgate.rules",
@@ -154,23 +151,23 @@ def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         load_entry_points()
     except LibraryError as error:
-        yield Diagnosis(Grade.WRONG, "kernels", str(error))
+        yield wrong("kernels", str(error))
     else:
-        yield Diagnosis(Grade.GOOD, "kernels", "compiled")
+        yield good("kernels", "compiled")
 
 
 def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether the system time is right, after which recordings are named."""
     if not shutil.which("timedatectl"):
-        yield Diagnosis(Grade.NOTE, "clock", "unknown whether it is right")
+        yield note("clock", "unknown whether it is right")
         return
     asked = ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
     said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=10)
     if said.stdout.strip() == "yes":
-        yield Diagnosis(Grade.GOOD, "clock", "synchronised")
+        yield good("clock", "synchronised")
     else:
         text = "not synchronised: recordings get their right times from GPS"
-        yield Diagnosis(Grade.NOTE, "clock", text)
+        yield note("clock", text)
 
 
 def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
@@ -179,16 +176,14 @@ def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         free_mb = free_bytes_near(folder) / 1e6
     except OSError as error:
-        yield Diagnosis(Grade.WRONG, "recordings", f"{folder}: {reason_of(error)}")
+        yield wrong("recordings", f"{folder}: {reason_of(error)}")
         return
     room = free_mb - settings.recording.free_floor_mb
     if room < ENOUGH_HOURS * MB_PER_HOUR:
         text = (
             f"{folder}: {max(room, 0.0):.0f} MB of room, for {max(room, 0.0) / MB_PER_HOUR:.1f} h"
         )
-        yield Diagnosis(
-            Grade.WRONG, "recordings", f"{text}; delete old ones or set recording.folder"
-        )
+        yield wrong("recordings", f"{text}; delete old ones or set recording.folder")
     else:
         yield _writable("recordings", folder, f"{folder}: {room / 1e3:.1f} GB of room")
 
@@ -196,28 +191,24 @@ def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def _writable(what: str, folder: Path, text: str) -> Diagnosis:
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
-        return Diagnosis(Grade.WRONG, what, f"{existing} is no folder")
+        return wrong(what, f"{existing} is no folder")
     if os.access(existing, os.W_OK):
-        return Diagnosis(Grade.GOOD, what, text)
-    return Diagnosis(
-        Grade.WRONG, what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}"
-    )
+        return good(what, text)
+    return wrong(what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}")
 
 
 def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether a gateway runs already, and otherwise whether its ports are free."""
     if running := live_sockets("run"):
-        yield Diagnosis(
-            Grade.GOOD, "gateway", f"runs, and listens at {', '.join(map(str, running))}"
-        )
+        yield good("gateway", f"runs, and listens at {', '.join(map(str, running))}")
         return
     taken = False
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if reason := _trouble_of(endpoint):
             taken = True
-            yield Diagnosis(Grade.WRONG, "ports", f"{endpoint.location}: {reason}")
+            yield wrong("ports", f"{endpoint.location}: {reason}")
     if not taken:
-        yield Diagnosis(Grade.GOOD, "ports", "free")
+        yield good("ports", "free")
 
 
 def _trouble_of(endpoint: Endpoint) -> str:
@@ -256,9 +247,9 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
         try:
             end_s = valid_until_s(file, Path(key).expanduser() if key else file)
         except ssl.SSLCertVerificationError as error:
-            yield Diagnosis(Grade.WRONG, what, f"{file}: {error.verify_message}")
+            yield wrong(what, f"{file}: {error.verify_message}")
         except OSError as error:
-            yield Diagnosis(Grade.WRONG, what, f"{file}: {reason_of(error)}")
+            yield wrong(what, f"{file}: {reason_of(error)}")
         else:
             grade = Grade.GOOD if end_s - time.time() > SOON_S else Grade.NOTE
             until = datetime.fromtimestamp(end_s, UTC)
@@ -270,7 +261,7 @@ def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
     for extra, modules in EXTRAS.items():
         missing = [name for name in modules if find_spec(name) is None]
         if missing:
-            yield Diagnosis(Grade.NOTE, f"extra {extra}", f"not installed: {how_to_add(extra)}")
+            yield note(f"extra {extra}", f"not installed: {how_to_add(extra)}")
 
 
 CHECKS: Final[tuple[Check, ...]] = (
@@ -294,12 +285,13 @@ def doctor(*, config: ConfigOption = None) -> None:
     It changes nothing. The exit code is 1 if something is wrong.
     """
     console = console_of()
-    wrong = 0
-    for finding in check_machine(read_settings(config)):
-        wrong += finding.grade is Grade.WRONG
+    failed = False
+    settings = read_settings(config)
+    for finding in chain.from_iterable(check(settings) for check in CHECKS):
+        failed |= finding.grade is Grade.WRONG
         console.print(f"{finding.grade:5} ", style=STYLES[finding.grade], end="")
         console.print(f"{finding.what}: {finding.text}")
-    if wrong:
+    if failed:
         raise typer.Exit(1)
 
 

@@ -133,7 +133,10 @@ def flash(
         refuse(f"--clock {clock}: 16 or 8")
     try:
         if show:
-            _show(port)
+            device = find_port(port, list_serial_ports())
+            with reserved(device):
+                block = block_of(read_flash(device, require_bootloader(device)))
+            _print(device, block)
         elif board is None:
             _list()
         else:
@@ -182,14 +185,6 @@ def _bootloader_text(device: str) -> str:
     return "no answer" if loader is None else f"{loader.name}, {loader.baud} baud"
 
 
-def _show(port: str) -> None:
-    """Print the program, version and settings of a board."""
-    device = find_port(port, list_serial_ports())
-    with reserved(device):
-        block = block_of(read_flash(device, require_bootloader(device)))
-    _print(device, block)
-
-
 def _write(
     program: Program, image: IntelHex, changes: dict[str, Any], *, port: str, keep: bool
 ) -> None:
@@ -199,17 +194,14 @@ def _write(
         loader = require_bootloader(device)
         before = block_of(image).settings
         if keep:
-            before = _kept(block_of(read_flash(device, loader)), program)
+            kept = block_of(read_flash(device, loader))
+            if kept.program is not program:
+                refuse(f"--keep: the board holds the program {kept.program.name.lower()}")
+            before = kept.settings
         before = msgspec.structs.replace(before, soft_restart=loader.leaves_watchdog_on)
         settings = _changed(program, before, changes)
         write_flash(device, loader, with_settings(image, settings))
     _print(device, block_of(image))
-
-
-def _kept(block: SettingsBlock, program: Program) -> BoardSettings:
-    if block.program is not program:
-        refuse(f"--keep: the board holds the program {block.program.name.lower()}")
-    return block.settings
 
 
 def _check(program: Program, changes: dict[str, Any]) -> None:

@@ -74,24 +74,6 @@ class FetchError(Exception):
     """A file that cannot be fetched; the text says why, and what to do."""
 
 
-class PiecePace:
-    """Size of a piece, so that it takes about a tenth of a second.
-
-    On a narrow link telemetry waits behind a piece, so pieces are small there; on a fast link they
-    grow.
-    """
-
-    def __init__(self) -> None:
-        self.size = SMALLEST
-
-    def note(self, took_s: float) -> None:
-        """Adapt the size to the duration of the last piece."""
-        if took_s < FAST_S:
-            self.size = min(self.size * 2, LARGEST)
-        elif took_s > SLOW_S:
-            self.size = max(self.size // 2, SMALLEST)
-
-
 class RecordingFetch:
     """Fetch files of one site into a folder."""
 
@@ -109,7 +91,8 @@ class RecordingFetch:
         self._ask = ask
         self._force = force
         self._wait = wait
-        self._pace = PiecePace()
+        self.piece_size = SMALLEST
+        """Adapted so that a piece takes about a tenth of a second: telemetry waits behind it."""
 
     def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
         """Fetch one file, or the rest of it; return whether anything had to be fetched."""
@@ -117,10 +100,11 @@ class RecordingFetch:
             raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
         target, part = self._folder / name, self._folder / f".{name}.part"
         if target.exists():
-            if self._is_same(target, size, name):
+            is_beginning = target.stat().st_size <= size and self._is_beginning(target, name)
+            if is_beginning and target.stat().st_size == size:
                 advance(size)
                 return False
-            if not self._force and not self._has_grown(target, size, name):
+            if not (self._force or is_beginning):
                 raise FetchError(f"{target} exists and differs; use --force to replace it")
         self._folder.mkdir(parents=True, exist_ok=True)
         with part.open("a+b") as file:
@@ -139,12 +123,6 @@ class RecordingFetch:
         sync_folder(self._folder)
         return True
 
-    def _is_same(self, target: Path, size: int, name: str) -> bool:
-        return target.stat().st_size == size and self._is_beginning(target, name)
-
-    def _has_grown(self, target: Path, size: int, name: str) -> bool:
-        return target.stat().st_size < size and self._is_beginning(target, name)
-
     def _is_beginning(self, target: Path, name: str) -> bool:
         with target.open("rb") as file:
             digest = _digest_of(file).hexdigest()
@@ -159,7 +137,7 @@ class RecordingFetch:
             digest, have = hashlib.sha256(), 0
         advance(have)
         while have < size:
-            piece = self._piece(name, have, min(self._pace.size, size - have))
+            piece = self._piece(name, have, min(self.piece_size, size - have))
             if not piece:
                 raise FetchError(f"{name} has become shorter at the site; fetch it again")
             file.write(piece)
@@ -175,7 +153,10 @@ class RecordingFetch:
         begin_s = time.monotonic()
         data = base64.b64decode(self._persist("fleet.piece", params, "data", PIECE_WAIT_S))
         took_s = time.monotonic() - begin_s
-        self._pace.note(took_s)
+        if took_s < FAST_S:
+            self.piece_size = min(self.piece_size * 2, LARGEST)
+        elif took_s > SLOW_S:
+            self.piece_size = max(self.piece_size // 2, SMALLEST)
         # Leave the other half of the time to telemetry.
         self._wait(min(took_s, SLOW_S))
         return data
@@ -243,13 +224,12 @@ def fleet(
     if context.invoked_subcommand is not None:
         return
     settings = with_endpoints(read_settings(config), endpoint)
-    wanted = settings.fleet
-    if listen is not None:
-        wanted = msgspec.structs.replace(wanted, listen=listen, router="")
-    if connect is not None:
-        wanted = msgspec.structs.replace(wanted, router=connect)
-    if site:
-        wanted = msgspec.structs.replace(wanted, sites=tuple(site))
+    changes = {
+        **({} if listen is None else {"listen": listen, "router": ""}),
+        **({} if connect is None else {"router": connect}),
+        **({"sites": tuple(site)} if site else {}),
+    }
+    wanted = msgspec.structs.replace(settings.fleet, **changes)
     run_event_loop(_serve(wanted, settings.hub), settings.hub.event_loop)
 
 
@@ -275,26 +255,15 @@ def status(*, json: JsonOption = False) -> None:
         console.print(f"excluded: {', '.join(found['left_out'])}")
     if found["overflowed"]:
         console.print(f"{counted(found['overflowed'], 'message')} dropped: they arrived too fast")
-    for text in _rejections(found["sites"]):
-        console.print(text)
-    loops = [
-        f"{site['looped']} through {site['name']}" for site in found["sites"] if site["looped"]
-    ]
-    if found["looped"]:
-        loops.append(f"{found['looped']} through clients here")
+    for site in found["sites"]:
+        # Those that its passphrase has rejected.
+        counts = [f"{site[k]} {k}" for k in ("unsigned", "forged", "replayed") if site[k]]
+        if counts:
+            console.print(f"frames of {site['name']} dropped: {', '.join(counts)}")
+    ways = [*found["sites"], {"name": "clients here", "looped": found["looped"]}]
+    loops = [f"{way['looped']} through {way['name']}" for way in ways if way["looped"]]
     if loops:
         console.print(f"looped frames dropped: {', '.join(loops)}")
-
-
-def _rejections(sites: list[dict[str, Any]]) -> list[str]:
-    """Describe the frames of each site that its passphrase has rejected."""
-    found = []
-    for site in sites:
-        kinds = ("unsigned", "forged", "replayed")
-        counts = [f"{site[kind]} {kind}" for kind in kinds if site[kind]]
-        if counts:
-            found.append(f"frames of {site['name']} dropped: {', '.join(counts)}")
-    return found
 
 
 @group.command("id")
@@ -317,22 +286,17 @@ def _add_site(table: Any, site: Mapping[str, Any]) -> None:
         state = f"{site['sessions']} of this name"
     trip_s = site["round_trip_s"]
     trip = "" if trip_s is None else f"{trip_s * 1000:.1f}"
-    for vehicle in site["vehicles"] or [None]:
-        cells = ["", "", "", "", ""]
-        if vehicle is not None:
-            cells = [
-                str(vehicle["system_id"]),
-                str(vehicle["id"] or "none"),
-                f"{vehicle['rate_hz']:.1f}",
-                f"{vehicle['age_s']:.1f}",
-                str(vehicle["lost"]),
-            ]
-        table.add_row(site["name"], state, trip, *cells)
+    if not site["vehicles"]:
+        table.add_row(site["name"], state, trip)
+    for vehicle in site["vehicles"]:
+        table.add_row(
+            site["name"], state, trip, str(vehicle["system_id"]), str(vehicle["id"] or "none"),
+            f"{vehicle['rate_hz']:.1f}", f"{vehicle['age_s']:.1f}", str(vehicle["lost"]),
+        )  # fmt: skip
 
 
 async def _serve(settings: Any, hub_settings: Any) -> None:
     from gateway.fleet.server import FleetServer
-    from gateway.live.control_socket import ControlError
 
     stopped = asyncio.Event()
     on_end_signals(stopped.set)
@@ -397,18 +361,18 @@ def get(
     listed = ask("fleet.recordings", {"site": site}, of="fleet").get(site)
     if listed is None:
         refuse(f"site {site} does not answer for recordings; see `mavgate fleet status`")
-    recording = _find(listed, name)
+    recording = next((each for each in listed if each["name"] == name), None)
+    if recording is None and name == NEWEST and listed:
+        recording = listed[-1]
     if recording is None:
         refuse(f"site {site} has no recording {name!r}; `mavgate fleet recordings` lists them")
-    socket = socket_of("fleet")
-    fetch = RecordingFetch(
-        site,
-        to or Path(site),
-        lambda verb, params, wait_s: request(socket, verb, params, timeout_s=wait_s),
-        force=force,
-    )
+    socket, folder = socket_of("fleet"), to or Path(site)
+
+    def send(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+        return request(socket, verb, params, timeout_s=wait_s)
+
     try:
-        _fetch_all(fetch, recording, to or Path(site))
+        _fetch_all(RecordingFetch(site, folder, send, force=force), recording, folder)
     except (FetchError, ControlError, OSError) as error:
         refuse(str(error))
 
@@ -427,13 +391,6 @@ def _fetch_all(fetch: RecordingFetch, recording: dict[str, Any], folder: Path) -
             lines.append(f"{folder / file['name']} {state}")
     for line in lines:
         console_of().print(line)
-
-
-def _find(listed: list[dict[str, Any]], name: str) -> dict[str, Any] | None:
-    found = next((each for each in listed if each["name"] == name), None)
-    if found is None and name == NEWEST and listed:
-        return listed[-1]
-    return found
 
 
 def _size_of(recording: dict[str, Any]) -> int:

@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Final
 
 import typer
@@ -74,7 +73,7 @@ def panel(
     if attached:
         # Its important lines come into the gateway's own log, which stamps them; so does the
         # traceback of what ends it.
-        sys.excepthook = _log_uncaught
+        sys.excepthook = lambda *failed: log.critical("the panel failed", exc_info=failed)
         logging.getLogger().setLevel(logging.WARNING)
         for handler in logging.getLogger().handlers:
             handler.setFormatter(OneLineFormatter("%(message)s"))
@@ -86,22 +85,16 @@ def panel(
     settings = read_settings(config)
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = folder_of(settings)
+
+    def show_link(link: str) -> None:
+        print(f"{LINK}{link}", flush=True)
+
     try:
         if connect is not None:
             parse_endpoint(connect)
-        run_panel(wanted, folder, connect, socket, _show_link, attached=attached)
+        run_panel(wanted, folder, connect, socket, show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))
-
-
-def _log_uncaught(
-    kind: type[BaseException], error: BaseException, trace: TracebackType | None
-) -> None:
-    log.critical("the panel failed", exc_info=(kind, error, trace))
-
-
-def _show_link(link: str) -> None:
-    print(f"{LINK}{link}", flush=True)
 
 
 LINK: Final = "panel: "
@@ -159,12 +152,9 @@ class PanelProcess:
     def launch(self) -> None:
         """Start the process; it loads its libraries, then waits for the control socket's path."""
         log.info("the panel is loading; its address follows")
+        pipe = subprocess.PIPE
         self._child = subprocess.Popen(
-            self._command,
-            bufsize=0,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            self._command, bufsize=0, stdin=pipe, stdout=pipe, stderr=subprocess.STDOUT
         )
 
     def start(self, control_socket: Callable[[], Awaitable[Path]]) -> None:

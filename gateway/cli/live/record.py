@@ -16,6 +16,7 @@ from gateway.cli.support.options import (
     read_options,
     read_settings,
 )
+from gateway.cli.support.recording_options import recordings_folder
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,
@@ -118,22 +119,20 @@ def delete(
             what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
             typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
         if running:
-            deleted = _recording(ask("record.delete", {"name": found.name}))
+            deleted = ask("record.delete", {"name": found.name})["files"]
         else:
-            deleted = delete_recording(folder, found.name)
+            deleted = delete_recording(folder, found.name).files
     except RecordingError as error:
         refuse(str(error))
-    for path in deleted.files:
+    for path in deleted:
         console_of().print(f"deleted {path}")
 
 
 @group.command("list")
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
-    if config is None and is_running():
-        found = [_recording(fields) for fields in ask("record.list")]
-    else:
-        found = list_recordings(_folder(config))
+    folder = recordings_folder(config)
+    found = list_recordings(folder)
     if json:
         figures = _figures(found) if found else {}
         listed = [
@@ -146,8 +145,6 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     elif found:
         _list(found)
     else:
-        running = config is None and is_running()
-        folder = ask("record.status")["folder"] if running else _folder(config)
         console_of().print(f"no recordings in {folder}")
 
 
@@ -155,10 +152,6 @@ def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
 def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None:
     """Add a remark to the recording at this moment, and send it to the ground stations."""
     _show(ask("record.note", {"text": text}))
-
-
-def _recording(fields: dict[str, Any]) -> Recording:
-    return Recording(**{**fields, "files": tuple(Path(file) for file in fields["files"])})
 
 
 def _folder(config: Path | None) -> Path:
