@@ -150,8 +150,8 @@ def test_no_table_where_no_fix_judges() -> None:
     assert weights(replace(case, flight=blind)) is None
 
 
-IN_FLIGHT = slice(15_000, 27_000)
-"""Lines of the log: four minutes of the flight."""
+IN_FLIGHT = slice(15_000, 21_000)
+"""Lines of the log: two minutes of the flight."""
 
 
 @pytest.mark.io
