@@ -6,15 +6,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from gateway.estimation.columns import (
-    GPS_ALT,
     GPS_COLUMNS,
-    GPS_DECLINATION,
-    GPS_LAT,
-    GPS_USABLE,
-    GPS_VEL,
 )
 from gateway.estimation.kernel import SampleLog
-from gateway.geometry.geodesy import radii_m
 from gateway.records import GpsFix, GpsFixType, ImuFlags, ImuSample, NodeId, Vec3
 
 G = 9.80665
@@ -73,23 +67,8 @@ def times(seconds: float, rate_hz: int = 100) -> Iterator[int]:
     yield from range(0, round(seconds * 1e6), 1_000_000 // rate_hz)
 
 
-def fix_rows(place_n_m: np.ndarray, vel_n_mps: np.ndarray) -> np.ndarray:
-    """Lay out fixes at places NED of shape (m, 3), from the usual one, where north is true."""
-    rows = np.full((len(place_n_m), GPS_COLUMNS), math.nan)
-    rows[:, GPS_USABLE], rows[:, GPS_DECLINATION] = 1.0, 0.0
-    rows[:, GPS_LAT : GPS_LAT + 2] = (LAT_DEG, LON_DEG)
-    rows[:, GPS_LAT : GPS_LAT + 2] += np.degrees(place_n_m[:, :2] / radii_m(LAT_DEG, ALT_M))
-    rows[:, GPS_ALT] = ALT_M - place_n_m[:, 2]
-    rows[:, GPS_VEL : GPS_VEL + 3] = vel_n_mps
-    return rows
-
-
-def log_of(
-    imu: np.ndarray, rate_hz: int, at: np.ndarray | None = None, fixes: np.ndarray | None = None
-) -> SampleLog:
-    """Make a log of IMU rows, and of fixes that come with the rows `at`, if there are any."""
+def log_of(imu: np.ndarray, rate_hz: int) -> SampleLog:
+    """Make a log of IMU rows alone."""
     us = np.round(np.arange(len(imu)) / rate_hz * 1e6).astype(np.int64)
     none = np.empty(0, np.int64)
-    if at is None or fixes is None:
-        return SampleLog(us, imu, none, np.empty(0), none, np.empty((0, GPS_COLUMNS)))
-    return SampleLog(us, imu, none, np.empty(0), us[at], fixes)
+    return SampleLog(us, imu, none, np.empty(0), none, np.empty((0, GPS_COLUMNS)))

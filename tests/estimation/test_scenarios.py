@@ -24,7 +24,7 @@ from gateway.estimation.columns import (
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import G, log_of
-from tools.flights import Flight, simulated_flight
+from tools.flights import Flight
 from tools.score_estimators import (
     attitude_scores,
     position_errors_m,
@@ -35,13 +35,6 @@ from tools.score_estimators import (
 from tools.spoil_flight import RECOVERY_S, SPOILS, Spoilt, gps_jump, wrong_latency
 
 Change = Callable[[Flight], Spoilt]
-
-SEED = 21
-
-
-@pytest.fixture(scope="module")
-def flight() -> Flight:
-    return simulated_flight(SEED, calibrated=True)
 
 
 def with_imu(flight: Flight, change: Callable[[np.ndarray, np.ndarray], None]) -> Flight:

@@ -6,7 +6,6 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     FLAG,
@@ -19,11 +18,10 @@ from gateway.estimation.columns import (
     NAV_POS_STD,
 )
 from gateway.estimation.eskf.state import STATES
-from gateway.estimation.kernel import SampleLog
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoother import AXES_RAD, _backward, smooth
-from tools.flights import Flight, read_flight, simulated_flight
+from tools.flights import Flight, read_flight
 from tools.score_estimators import (
     attitude_scores,
     estimator_of,
@@ -35,9 +33,6 @@ from tools.score_estimators import (
     share_scores,
 )
 from tools.spoil_flight import no_mag
-
-BROAD_15 = "broad_15_undisturbed_fast_translation_A"
-BROAD_30 = "broad_30_disturbed_stationary_magnet_C"
 
 
 def test_backward_pass_equals_joint_least_squares() -> None:
@@ -63,31 +58,6 @@ def test_backward_pass_equals_joint_least_squares() -> None:
     expected = np.linalg.solve(joint, z / r)
     np.testing.assert_allclose(np.array(means) + begins[:, 0], expected, atol=1e-6)
     np.testing.assert_allclose(variances[:, 0], np.diag(np.linalg.inv(joint)), rtol=1e-6)
-
-
-def smoothed_off(log: SampleLog, true: Rotation, seconds: float) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of the attitude in degrees, shape (n, 3), without the first seconds, and sigmas."""
-    out = smooth(make_estimator(EstimationSettings(estimator="eskf")), log)[0]
-    late = log.imu_time_us > seconds * 1e6
-    found = Rotation.from_quat(out[late, :4], scalar_first=True)
-    std = out[late, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
-    return np.degrees((true[late] * found.inv()).as_rotvec()), np.degrees(std)
-
-
-def rolled(time_s: np.ndarray) -> np.ndarray:
-    """Roll over and back, and swing about the other axes; angles of shape (n, 3)."""
-    return np.column_stack(
-        [
-            3.0 * np.sin(0.9 * time_s) + 0.5 * np.sin(2.3 * time_s),
-            0.9 * np.sin(1.1 * time_s),
-            1.5 * np.sin(0.53 * time_s) + 0.4 * np.sin(1.7 * time_s),
-        ]
-    )
-
-
-@pytest.fixture(scope="module")
-def flight() -> Flight:
-    return simulated_flight(21, calibrated=True)
 
 
 @pytest.mark.slow
