@@ -31,28 +31,28 @@ STORE = mavlink.MAVLink_command_long_message(
 )
 
 
+def make_daemon(folder: Path, passphrase: str = "") -> Daemon:
+    settings = GatewaySettings(
+        aircraft_folder=str(folder),
+        hub=HubSettings(endpoints=()),
+        vehicle=VehicleSettings(signing_passphrase=passphrase),
+    )
+    made = Daemon(settings, {}, lambda: settings)
+    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
+    return made
+
+
 @pytest.fixture
 def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    settings = GatewaySettings(aircraft_folder=str(tmp_path), hub=HubSettings(endpoints=()))
-    made = Daemon(settings, {}, lambda: settings)
-    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
-    return made
-
-
-def signing_daemon(folder: Path) -> Daemon:
-    vehicle = VehicleSettings(signing_passphrase="correct horse")
-    settings = GatewaySettings(aircraft_folder=str(folder), vehicle=vehicle)
-    made = Daemon(settings, {}, lambda: settings)
-    made._perform(made._pipeline.take(BaroRaw(0, NodeId(1, 0), 0, 1e5, 20.0), 0))
-    return made
+    return make_daemon(tmp_path)
 
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_a_signed_frame_is_taken_once_whatever_restarts(tmp_path: Path, orderly: bool) -> None:
     # First, since it may compile for more than the minute in which a stamp is new.
-    first = signing_daemon(tmp_path)
+    first = make_daemon(tmp_path, "correct horse")
     mav = mavlink.MAVLink(None, 255, 190)
     mav.signing.secret_key = key_from_passphrase("correct horse")
     mav.signing.sign_outgoing = True
@@ -61,7 +61,7 @@ def test_a_signed_frame_is_taken_once_whatever_restarts(tmp_path: Path, orderly:
     first._on_frame(signed)
     first._stamps.close(first._pipeline.newest_stamps() if orderly else {})
     assert first._pipeline.forged == 0
-    second = signing_daemon(tmp_path)
+    second = make_daemon(tmp_path, "correct horse")
     second._on_frame(signed)
     assert second._pipeline.forged == 1
 
@@ -156,8 +156,6 @@ async def test_reload_reports_settings_that_need_a_restart(
     status = await daemon.reload()
     assert status.startswith("settings of the hub and of signing applied")
     assert ("others need a new start" in status) == (estimator != now.estimation.estimator)
-    daemon._metrics.close()
-    daemon._hub.close()
 
 
 @pytest.mark.parametrize("is_full", [False, True])
@@ -192,8 +190,6 @@ async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
     else:
         assert (result, text) == (mavlink.MAV_RESULT_ACCEPTED, "Settings saved: 1.toml")
         assert "gyro_bias" in stored
-    daemon._metrics.close()
-    daemon._hub.close()
 
 
 async def test_files_of_settings_are_read_and_written_off_the_loop(
@@ -220,5 +216,3 @@ async def test_files_of_settings_are_read_and_written_off_the_loop(
     assert (await outcome).result() == tmp_path / "1.toml"
     assert len(threads) == 3
     assert threading.get_ident() not in threads
-    daemon._metrics.close()
-    daemon._hub.close()

@@ -88,14 +88,3 @@ async def test_a_disk_that_turns_read_only(bench: Bench, disk: Path) -> None:
     assert bench.recorder.recording
     assert [len(r.files) for r in list_recordings(bench.recorder.folder)] == [1, 1]
     assert frames_of(bench.recorder.folder)[5:] == FRAMES[8:]
-
-
-async def test_a_folder_that_is_removed(bench: Bench) -> None:
-    shutil.rmtree(bench.recorder.folder)
-    bench.send(FRAMES[5:8])
-    await bench.turn()
-    assert bench.troubles == ["Recording stopped: folder has vanished"]
-    await bench.turn(RETRY_S)
-    bench.send(FRAMES[8:])
-    await bench.turn()
-    assert frames_of(bench.recorder.folder) == FRAMES[8:]

@@ -3,7 +3,7 @@
 import asyncio
 import os
 import tty
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -60,17 +60,22 @@ def test_find_port_says_what_there_is(wanted: str, ports: list[Port], message: s
 
 
 @pytest.mark.parametrize(
-    ("ports", "hint"),
+    ("device", "ports", "reason"),
     [
-        ([], ""),
-        ([MODEM], ""),
-        ([CH340, MODEM], "; /dev/ttyUSB0 is there, always found as usb:1a86:7523"),
+        ("/dev/ttyUSB99", [], "No such file or directory"),
+        ("/dev/ttyUSB99", [MODEM], "No such file or directory"),
+        (
+            "/dev/ttyUSB99",
+            [CH340, MODEM],
+            "No such file or directory; /dev/ttyUSB0 is there, always found as usb:1a86:7523",
+        ),
+        ("/dev/null", [CH340], "not a serial port"),
     ],
 )
-def test_an_adapter_under_another_name_is_named(ports: list[Port], hint: str) -> None:
+def test_reason_of_a_failed_opening(device: str, ports: list[Port], reason: str) -> None:
     with pytest.raises(serial.SerialException) as raised:
-        serial.Serial("/dev/ttyUSB99")
-    assert why_not_open(raised.value, ports) == "No such file or directory" + hint
+        serial.Serial(device, timeout=0)
+    assert why_not_open(raised.value, ports) == reason
 
 
 def test_a_port_that_another_program_holds_is_said_to_be_so() -> None:
@@ -83,12 +88,6 @@ def test_a_port_that_another_program_holds_is_said_to_be_so() -> None:
     finally:
         os.close(master)
         os.close(slave)
-
-
-def test_what_is_no_serial_port_is_said_to_be_none() -> None:
-    with pytest.raises(serial.SerialException) as raised:
-        serial.Serial("/dev/null", timeout=0)
-    assert why_not_open(raised.value, [CH340]) == "not a serial port"
 
 
 class Bench:
@@ -121,14 +120,15 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
 class Listener:
     def __init__(self) -> None:
         self.data = b""
+        self.sizes: list[int] = []
         self.opened = 0
         self.devices: list[str] = []
         self.lost: list[str] = []
         self.changed = asyncio.Event()
 
     def on_bytes(self, data: bytes, now_us: int) -> None:
-        assert now_us == 42
         self.data += data
+        self.sizes.append(len(data))
         self.changed.set()
 
     def on_open(self, device: str) -> None:
@@ -138,6 +138,10 @@ class Listener:
 
     def on_lost(self, device: str) -> None:
         self.lost.append(device)
+
+    def port(self, wanted: str = "auto", now_us: Callable[[], int] = lambda: 42) -> SerialPort:
+        settings = SerialSettings(port=wanted)
+        return SerialPort(settings, self.on_bytes, self.on_open, self.on_lost, now_us)
 
     async def until(self, *, opened: int = 0, data: bytes = b"") -> None:
         async with asyncio.timeout(60):
@@ -161,8 +165,7 @@ def fast_retry(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_unplugged_and_plugged_again(
     bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
-    settings = SerialSettings(port=str(bench.link))
-    link = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    link = listener.port(str(bench.link))
     link.start()
     assert not link.connected
     bench.plug()
@@ -200,13 +203,7 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
         return asyncio.TimerHandle(0.0, lambda: None, (), loop)
 
     monkeypatch.setattr(loop, "call_later", call_later)
-    link = SerialPort(
-        SerialSettings(port="/dev/does-not-exist"),
-        listener.on_bytes,
-        listener.on_open,
-        listener.on_lost,
-        lambda: 42,
-    )
+    link = listener.port("/dev/does-not-exist")
     link.start()
     for _ in range(7):
         pending.pop()()
@@ -233,25 +230,17 @@ async def test_the_adapter_is_asked_to_hold_no_bytes_back(
 
     monkeypatch.setattr("serial.Serial.set_low_latency_mode", ask)
     bench.plug()
-    settings = SerialSettings(port=str(bench.link))
-    link = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    link = listener.port(str(bench.link))
     link.start()
     assert (asked, link.connected) == ([True], True)
     assert not caplog.records, "an adapter that cannot is used as it is, without a word"
     link.close()
 
 
-def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
+def test_a_backlog_is_read_as_fast_as_the_line_brings_more(listener: Listener) -> None:
     """Samples are lost where turns of the loop are long and each reads no more than one sample."""
     times_us = (0, 300, 40_300, 40_600, 60_600, 90_000)
-    sizes: list[int] = []
-    link = SerialPort(
-        SerialSettings(baud=500_000),
-        lambda data, _: sizes.append(len(data)),
-        lambda _: None,
-        lambda _: None,
-        iter(times_us).__next__,
-    )
+    link = listener.port(now_us=iter(times_us).__next__)
     line, end = os.pipe()
     os.set_blocking(line, False)
     os.write(end, bytes(3000))
@@ -260,7 +249,7 @@ def test_a_backlog_is_read_as_fast_as_the_line_brings_more() -> None:
     os.close(line)
     os.close(end)
     # 40 ms of the line are 2000 bytes; the last two reads find the rest, and nothing.
-    assert sizes == [48, 48, 2000, 48, 856]
+    assert listener.sizes == [48, 48, 2000, 48, 856]
 
 
 class Adapters:
@@ -300,8 +289,7 @@ NOISE = bytes([0x55, 0x00, 0xFF]) * 40
 
 async def found_receiver(adapters: Adapters, listener: Listener, receiver: str) -> SerialPort:
     """Open a port that searches, and send frames to one adapter until it is found."""
-    settings = SerialSettings(port="auto")
-    port = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    port = listener.port()
     port.start()
     while not listener.opened:
         os.write(adapters.masters[receiver], FRAME)
@@ -368,8 +356,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
 ) -> None:
     monkeypatch.setattr("gateway.live.control_verbs.list_serial_ports", adapters.ports)
     first, second = adapters.plug(), adapters.plug()
-    settings = SerialSettings(port=first)
-    port = SerialPort(settings, listener.on_bytes, listener.on_open, listener.on_lost, lambda: 42)
+    port = listener.port(first)
     server = ControlServer(tmp_path / "s", SerialVerbs(port, is_simulated=False).verbs())
     port.start()
     status = (await ask(server, "serial.status"))["result"]
@@ -396,8 +383,8 @@ async def test_serial_port_is_changed_closed_and_opened_again(
 async def test_port_of_a_simulated_receiver_is_not_changed(
     listener: Listener, tmp_path: Path
 ) -> None:
-    port = SerialPort(SerialSettings(), listener.on_bytes, print, print, lambda: 42)
-    server = ControlServer(tmp_path / "s", SerialVerbs(port, is_simulated=True).verbs())
+    verbs = SerialVerbs(listener.port(), is_simulated=True).verbs()
+    server = ControlServer(tmp_path / "s", verbs)
     assert (await ask(server, "serial.status"))["result"]["is_fixed"]
     for verb, params in (("serial.connect", {"port": "auto"}), ("serial.disconnect", {})):
         assert "simulated" in (await ask(server, verb, **params))["error"]

@@ -1,8 +1,9 @@
-"""Files of places: written completely or not at all, failures reported, broken ones kept."""
+"""Kept files: written completely or not at all, failures reported, broken ones left alone."""
 
 import asyncio
 import errno
 import os
+import stat
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.live import kept_files
-from gateway.live.kept_files import PlaceFiles
+from gateway.live.kept_files import STAMPS_NAME, PlaceFiles, StampFile
 from gateway.vehicle.plan import Location, StoredPlan
 
 pytestmark = pytest.mark.io
@@ -160,3 +161,41 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     fsync: Callable[[int], None] = os.fsync
     monkeypatch.setattr(os, "fsync", lambda fd: (calls.append(fd), fsync(fd))[1])
     return calls
+
+
+STAMPS = {1: {"0123456789abcdef": {"0.255.190": 36_000_000_000_000}}, 31: {"ff": {"1.2.3": 7}}}
+
+
+def test_saved_stamps_are_loaded_again(tmp_path: Path) -> None:
+    file = StampFile(tmp_path / "new")
+    assert file.load() == {}
+    file.save({1: {}})
+    file.close(STAMPS)
+    assert StampFile(tmp_path / "new").load() == STAMPS
+    assert stat.S_IMODE((tmp_path / "new" / STAMPS_NAME).stat().st_mode) == 0o600
+
+
+def test_no_stamps_leave_the_file_as_it_is(tmp_path: Path) -> None:
+    StampFile(tmp_path).close(STAMPS)
+    StampFile(tmp_path).close({})
+    assert StampFile(tmp_path).load() == STAMPS
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"1":{"k":{"0.1":3}}}', '{"1":{"k":{"0.1.1":-3}}}'])
+def test_a_broken_file_of_stamps_is_reported(
+    tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / STAMPS_NAME).write_text(text)
+    assert StampFile(tmp_path).load() == {}
+    assert "cannot be read" in caplog.text
+
+
+def test_stamps_that_cannot_be_written_are_reported_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / STAMPS_NAME).mkdir()
+    file = StampFile(tmp_path)
+    file._write()
+    file._write()
+    file.close({})
+    assert caplog.text.count("cannot be written") == 1
