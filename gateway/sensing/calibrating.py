@@ -119,15 +119,6 @@ class SphereFit:
 
 
 @dataclass(frozen=True, slots=True)
-class RestFit:
-    """A mean over samples at rest."""
-
-    mean: Vec3
-    residual: float
-    """Standard deviation of the worst axis."""
-
-
-@dataclass(frozen=True, slots=True)
 class NodeSamples:
     """Samples of one node in SI; in sensor axes and uncorrected, or in body axes."""
 
@@ -178,11 +169,6 @@ def distinct_poses(accel: FloatArray, windows: list[slice]) -> FloatArray:
     return np.array([np.mean(pose, axis=0) for pose in poses]).reshape(-1, 3)
 
 
-def solve_rest(samples: FloatArray) -> RestFit:
-    """Average samples at rest, shape (n, 3): a gyroscope's bias, the direction of gravity."""
-    return RestFit(_vec3(samples.mean(axis=0)), float(samples.std(axis=0).max()))
-
-
 def solve_accelerometer(poses: FloatArray) -> SphereFit:
     """Fit bias and scale so that every pose reads one gravity [1]_."""
     if len(poses) < MIN_POSES:
@@ -207,11 +193,6 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
         uT, sensor axes, while the aircraft was turned about all its axes.
     strength_ut : float, optional
         Strength to scale to; the mean of the samples about their centre if not known.
-
-    Returns
-    -------
-    SphereFit
-        In uT.
 
     Raises
     ------
@@ -411,9 +392,11 @@ def _turns(samples: NodeSamples, span: slice) -> bool:
 
 def calibrate_gyro(samples: NodeSamples, calibration: NodeCalibration) -> NodeCalibration:
     """Take the mean rate at rest as the gyroscope's bias."""
-    fit = solve_rest(gyro_at_rest(samples))
+    gyro = gyro_at_rest(samples)
     return msgspec.structs.replace(
-        calibration, gyro_bias_radps=fit.mean, gyro_residual_radps=fit.residual
+        calibration,
+        gyro_bias_radps=_vec3(gyro.mean(axis=0)),
+        gyro_residual_radps=float(gyro.std(axis=0).max()),
     )
 
 
@@ -484,18 +467,9 @@ def calibrate_accelerometer_level(
 def calibrate_magnetometer_by_yaw(
     samples: NodeSamples, calibration: NodeCalibration, yaw_rad: float, field: MagneticField
 ) -> NodeCalibration:
-    """Take the field at rest, at a known heading, that is not the Earth's as hard iron.
+    """Take the field at rest, at a known heading from true north, beyond the Earth's as hard iron.
 
-    Parameters
-    ----------
-    samples : NodeSamples
-        Calibrated already, in body axes, at rest.
-    calibration : NodeCalibration
-        `IN_BODY_AXES`.
-    yaw_rad : float
-        Heading from true north.
-    field : MagneticField
-        Of the Earth there.
+    The samples are calibrated already, in body axes; `calibration` is `IN_BODY_AXES`.
     """
     windows = still_windows(samples)
     if not windows or len(samples.mag) < MIN_FIELD_SAMPLES:
@@ -571,11 +545,6 @@ def field_sides(samples: NodeSamples) -> int:
     return int(sides * min(1.0, spread / FIELD_SPREAD))
 
 
-def is_still(samples: NodeSamples) -> bool:
-    """Return whether the node lay still for at least one window."""
-    return bool(still_windows(samples))
-
-
 def _distinct(poses: FloatArray) -> FloatArray:
     return distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))])
 
@@ -585,7 +554,7 @@ def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:
     parts = [samples.accel[window] for window in still_windows(samples)]
     if not parts:
         raise CalibrationError(NOT_STILL)
-    mean = solve_rest(np.vstack(parts)).mean
+    mean = _vec3(np.vstack(parts).mean(axis=0))
     return Correction(IDENTITY3, calibration.accel_matrix, calibration.accel_bias_mps2).apply(mean)
 
 

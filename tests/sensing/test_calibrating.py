@@ -30,7 +30,6 @@ from gateway.sensing.calibrating import (
     distinct_poses,
     field_sides,
     gyro_at_rest,
-    is_still,
     node_samples,
     remove_tilt,
     rest_spans,
@@ -38,7 +37,6 @@ from gateway.sensing.calibrating import (
     solve_accelerometer,
     solve_magnetometer,
     solve_mounting,
-    solve_rest,
     still_windows,
 )
 from gateway.sensing.calibration import FACE_UP, IDENTITY3, Correction, NodeCalibration
@@ -132,12 +130,6 @@ def test_nose_that_was_not_raised_is_refused() -> None:
         solve_mounting((0, 0, G), (0.1, 0, G))
 
 
-def test_rest() -> None:
-    fit = solve_rest(np.random.default_rng(2).normal((0.01, -0.02, 0.03), 0.001, (500, 3)))
-    assert fit.mean == pytest.approx((0.01, -0.02, 0.03), abs=2e-4)
-    assert fit.residual == pytest.approx(0.001, rel=0.2)
-
-
 @pytest.mark.parametrize(
     ("poses", "reason"),
     [
@@ -187,6 +179,18 @@ def pose(force: np.ndarray, seed: int = 0, rate: float = 0.0, shaking: float = 0
     )
 
 
+def joined(*parts: NodeSamples) -> NodeSamples:
+    begins = np.cumsum([0.0, *(part.time_s[-1] + 0.01 for part in parts)])
+    return NodeSamples(
+        time_s=np.concatenate([p.time_s + t for p, t in zip(parts, begins, strict=False)]),
+        accel=np.vstack([p.accel for p in parts]),
+        gyro=np.vstack([p.gyro for p in parts]),
+        mag_time_s=np.concatenate([p.mag_time_s + t for p, t in zip(parts, begins, strict=False)]),
+        mag=np.vstack([p.mag for p in parts]),
+        moving=np.concatenate([p.moving for p in parts]),
+    )
+
+
 def test_gyro_bias_at_rest() -> None:
     after = calibrate_gyro(pose(SIDES[4], rate=0.05), NodeCalibration())
     assert after.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
@@ -210,15 +214,7 @@ def test_six_poses_one_by_one() -> None:
 
 
 def test_six_poses_in_one_log() -> None:
-    parts = [pose(side, k) for k, side in enumerate(SIDES)]
-    whole = NodeSamples(
-        time_s=np.arange(len(parts) * 500) * 0.01,
-        accel=np.vstack([p.accel for p in parts]),
-        gyro=np.vstack([p.gyro for p in parts]),
-        mag_time_s=np.empty(0),
-        mag=np.empty((0, 3)),
-        moving=np.zeros(len(parts) * 500, np.bool_),
-    )
+    whole = joined(*(pose(side, k) for k, side in enumerate(SIDES)))
     after = calibrate_accelerometer([whole], NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
 
@@ -230,7 +226,7 @@ def test_a_tilted_pose_is_no_side() -> None:
 
 def test_a_pose_that_moved_does_not_count() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
-    assert not is_still(shaken)
+    assert not still_windows(shaken)
     assert sides_of([shaken, pose(SIDES[1])]) == {1}
     with pytest.raises(CalibrationError, match="1 pose where 6 are needed"):
         calibrate_accelerometer([shaken, pose(SIDES[1])], NodeCalibration())
@@ -316,18 +312,6 @@ def lying(
     )
 
 
-def joined(*parts: NodeSamples) -> NodeSamples:
-    begins = np.cumsum([0.0, *(part.time_s[-1] + 0.01 for part in parts)])
-    return NodeSamples(
-        time_s=np.concatenate([p.time_s + t for p, t in zip(parts, begins, strict=False)]),
-        accel=np.vstack([p.accel for p in parts]),
-        gyro=np.vstack([p.gyro for p in parts]),
-        mag_time_s=np.concatenate([p.mag_time_s + t for p, t in zip(parts, begins, strict=False)]),
-        mag=np.vstack([p.mag for p in parts]),
-        moving=np.concatenate([p.moving for p in parts]),
-    )
-
-
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("mag_hz", [0.0, 15.0, 75.0])
 def test_the_bias_of_a_rest(seed: int, mag_hz: float) -> None:
@@ -376,12 +360,6 @@ def test_samples_in_motion_by_gps_are_no_rest() -> None:
 )
 def test_the_limits_of_stillness(shape: dict[str, float], is_still: bool) -> None:
     assert bool(still_windows(lying(5.0, **shape))) == is_still
-
-
-@pytest.mark.parametrize(("limit", "most"), [(STILL_GYRO_RADPS, 0.03), (STILL_ACCEL_MPS2, 0.5)])
-def test_a_hand_that_trembles_is_not_still(limit: float, most: float) -> None:
-    """About 2 deg/s and a twentieth of gravity: no table trembles so."""
-    assert limit < most
 
 
 @pytest.mark.parametrize(("scale", "is_still"), [(1.0, True), (1.14, True), (1.17, False)])

@@ -44,9 +44,9 @@ from gateway.sensing.calibrating import (
     calibrate_magnetometer,
     calibrate_mounting,
     field_sides,
-    is_still,
     node_samples,
     sides_of,
+    still_windows,
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
@@ -255,7 +255,7 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
             f"go: {', '.join(missing)}."
         )
         samples = capture(POSE_S)
-        if not is_still(samples):
+        if not still_windows(samples):
             console.print("It moved; once more.")
         elif _missing([*held, samples]) == missing:
             console.print("That side was done before, or it is too far from upright; once more.")
