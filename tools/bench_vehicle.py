@@ -26,7 +26,7 @@ from gateway.records import Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from tests.vehicle.samples import FIX, STATE, sample_at, state_at
+from tests.kit.records import FIX, STATE, sample_at, state_at
 from tools.bench_latency import frames
 
 RATES_HZ = (60, 200, 1000)

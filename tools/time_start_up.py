@@ -48,8 +48,8 @@ from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
 from tests.end_to_end.processes import Client, Gateway, MavProxy
 from tests.end_to_end.station import Station
 from tests.end_to_end.test_ground_stations import CONFIG
+from tests.kit.ground_station import qgroundcontrol
 from tests.kit.process import START_LIMIT_S
-from tests.vehicle.test_start_up import qgroundcontrol
 
 REPEATS = 5
 START_UNIX_US = 1_781_187_930_000_000

@@ -6,8 +6,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from tests.kit.ground_station import OWN_MESSAGES, Foreign
 from tests.kit.process import START_LIMIT_S
-from tests.vehicle.ground_station import OWN_MESSAGES, Foreign
 
 HEARTBEAT_INTERVAL_S = 1.0
 

@@ -28,8 +28,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.end_to_end.processes import Gateway, MavProxy
 from tests.end_to_end.station import Station
+from tests.kit.ground_station import qgroundcontrol
 from tests.kit.process import START_LIMIT_S
-from tests.vehicle.test_start_up import qgroundcontrol
 
 HOME = SimulatorSettings()
 

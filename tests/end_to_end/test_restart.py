@@ -15,16 +15,9 @@ from gateway.live.daemon import Daemon
 from gateway.simulator.receiver import simulate
 from tests.end_to_end.processes import Client
 from tests.end_to_end.station import Station
+from tests.kit.ground_station import MISSION, RALLY, content, download, item, upload
 from tests.kit.process import START_LIMIT_S
 from tests.ports import free_port
-from tests.vehicle.services.test_missions import (
-    MISSION,
-    RALLY,
-    content,
-    download,
-    item,
-    upload,
-)
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

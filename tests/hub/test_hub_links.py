@@ -13,8 +13,8 @@ from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of
+from tests.kit.records import sample_at, state_at
 from tests.ports import free_ports
-from tests.vehicle.samples import sample_at, state_at
 
 pytestmark = pytest.mark.io
 

@@ -36,7 +36,7 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from tests.hub.conftest import Rig, Station
-from tests.vehicle.samples import sample_at, state_at
+from tests.kit.records import sample_at, state_at
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

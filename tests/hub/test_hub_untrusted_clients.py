@@ -19,7 +19,7 @@ from gateway.hub.settings import HubSettings
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from tests.vehicle.samples import FIX, sample_at, state_at
+from tests.kit.records import FIX, sample_at, state_at
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

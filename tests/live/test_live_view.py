@@ -26,7 +26,7 @@ from gateway.records import (
 )
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
 from tests.client_stats import TABLET
-from tests.vehicle.samples import FIX
+from tests.kit.records import FIX
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
 RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)

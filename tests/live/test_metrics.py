@@ -15,8 +15,8 @@ from gateway.live.metrics_server import MetricsServer
 from gateway.records import LinkReport, NodeId, NodeLink, NodeStatus
 from gateway.status import AircraftStatus, Snapshot, Way
 from tests.client_stats import TABLET
+from tests.kit.records import FIX, NOTHING, STATE
 from tests.ports import free_port
-from tests.vehicle.samples import FIX, NOTHING, STATE
 
 NODE = NodeLink(
     node=NodeId(1, 2),

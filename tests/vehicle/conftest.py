@@ -7,8 +7,8 @@ from gateway.settings import Settings, setting
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import BARO, FIX, sample_at, state_at
+from tests.kit.ground_station import GroundStation
+from tests.kit.records import BARO, FIX, sample_at, state_at
 
 
 class InnerSettings(Settings, frozen=True):

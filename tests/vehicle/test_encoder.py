@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.encoding import Encoder, MessagePacker
-from tests.vehicle.samples import decode
+from tests.kit.records import decode
 
 
 def test_frames_are_numbered_in_one_sequence_per_system() -> None:

@@ -18,7 +18,7 @@ from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
-from tests.vehicle.samples import (
+from tests.kit.records import (
     BARO,
     FIX,
     NO_FIX,

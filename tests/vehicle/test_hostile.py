@@ -9,8 +9,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming
 from gateway.vehicle.vehicle import Vehicle
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import sample_at, state_at
+from tests.kit.ground_station import GroundStation
+from tests.kit.records import sample_at, state_at
 
 
 def every_message(rng: np.random.Generator) -> list[bytes]:

@@ -19,7 +19,7 @@ from gateway.vehicle.requests import (
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation
+from tests.kit.ground_station import GroundStation
 
 NOW_UNIX_US = 1_790_000_000_000_000
 KEY = key_from_passphrase("correct horse")

@@ -14,9 +14,8 @@ from gateway.vehicle.requests import SavePlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import FIX, sample_at, state_at
-from tests.vehicle.services.test_missions import content, download, item, upload
+from tests.kit.ground_station import GroundStation, content, count, download, item, upload
+from tests.kit.records import FIX, sample_at, state_at
 
 NAN = math.nan
 ITEM = Item(3, 16, 1, (0.0, NAN, -math.inf, 0.1), 471_234_567, -87_654_321, 50.5)
@@ -32,28 +31,26 @@ FULL = StoredPlan(
 )
 
 
-@pytest.mark.parametrize("places", [StoredPlan(), FULL])
-def test_round_trip(places: StoredPlan) -> None:
-    again = decode_plan(encode_plan(places))
-    # NaN is not equal to itself.
-    assert repr(again) == repr(places)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_round_trip_of_random_items(seed: int) -> None:
+def random_plan(seed: int) -> StoredPlan:
     rng = np.random.default_rng(seed)
-    numbers = rng.integers(-900_000_000, 900_000_000, (MAX_ITEMS[0], 2))
-    floats = rng.standard_normal((MAX_ITEMS[0], 5)).astype(np.float32).astype(float)
-    items = tuple(
-        Item(3, 16, 1, tuple(f[:4]), int(x), int(y), float(f[4]))
-        for (x, y), f in zip(numbers, floats.tolist(), strict=True)
-    )
-    places = StoredPlan(mission=items)
-    assert decode_plan(encode_plan(places)) == places
+    numbers = rng.integers(-900_000_000, 900_000_000, (MAX_ITEMS[0], 2)).tolist()
+    floats = rng.standard_normal((MAX_ITEMS[0], 5)).astype(np.float32).astype(float).tolist()
+    items = [Item(3, 16, 1, (*f[:4],), *xy, f[4]) for xy, f in zip(numbers, floats, strict=True)]
+    return StoredPlan(mission=tuple(items))
+
+
+@pytest.mark.parametrize("plan", [StoredPlan(), FULL, *map(random_plan, range(2))])
+def test_round_trip(plan: StoredPlan) -> None:
+    # NaN is not equal to itself.
+    assert repr(decode_plan(encode_plan(plan))) == repr(plan)
 
 
 def changed(**values: object) -> str:
     return json.dumps(msgspec.to_builtins(FULL) | values)
+
+
+def location(lat_deg: float, alt_amsl_m: float = 0.0) -> dict[str, float]:
+    return {"lat_deg": lat_deg, "lon_deg": 0.0, "alt_amsl_m": alt_amsl_m}
 
 
 @pytest.mark.parametrize(
@@ -65,9 +62,9 @@ def changed(**values: object) -> str:
         ("[" * 100_000, "recursion"),
         (changed(version=2), "version"),
         (changed(extra=1), "unknown field `extra`"),
-        (changed(home={"lat_deg": 91.0, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "home: latitude"),
-        (changed(home={"lat_deg": 9.0, "lon_deg": 0.0, "alt_amsl_m": NAN}), "home: the height"),
-        (changed(mark={"lat_deg": NAN, "lon_deg": 0.0, "alt_amsl_m": 0.0}), "mark: latitude"),
+        (changed(home=location(91.0)), "home: latitude"),
+        (changed(home=location(9.0, NAN)), "home: the height"),
+        (changed(mark=location(NAN)), "mark: latitude"),
         (changed(current=2), "no item 2"),
         (changed(current=-1), "no item -1"),
         (changed(mission=[{"frame": 3}]), "missing required field"),
@@ -93,18 +90,15 @@ def restarted(station: GroundStation) -> GroundStation:
 @pytest.mark.parametrize("kind", [0, 1, 2])
 def test_items_survive_a_restart(station: GroundStation, kind: int) -> None:
     items = [item(seq, kind) for seq in range(5)]
+    station.send(count(5))
+    for seq in range(4):
+        station.send(item(seq))
+    assert station.of(SavePlan) == [], "an upload that is not complete"
     upload(station, items, kind)
     [save] = station.of(SavePlan)
     assert save.vehicle_id == 1
     found = download(restarted(station), kind)
     assert list(map(content, found)) == list(map(content, items))
-
-
-def test_nothing_is_kept_of_an_upload_that_is_not_complete(station: GroundStation) -> None:
-    station.send(mavlink.MAVLink_mission_count_message(1, 1, 5, 0))
-    for seq in range(4):
-        station.send(item(seq))
-    assert station.of(SavePlan) == []
 
 
 def test_the_current_item_and_its_mark_survive(station: GroundStation) -> None:
@@ -119,19 +113,12 @@ def test_the_current_item_and_its_mark_survive(station: GroundStation) -> None:
     assert restarted(after).vehicle.plan.missions.items[0] == ()
 
 
-def test_a_mark_of_its_own_survives_and_a_cleared_one_does_not(station: GroundStation) -> None:
+def test_home_and_a_mark_that_were_set_survive(station: GroundStation) -> None:
+    station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
     station.receive(station.vehicle.put_mark(Location(47.0, 8.0, NAN), 0))
     after = restarted(station)
     assert repr(after.vehicle.plan.mark.location) == repr(Location(47.0, 8.0, NAN))
+    [_, home] = after.request(242)
+    assert (home.latitude, home.longitude, home.altitude) == (475_000_000, -85_000_000, 400_000)
     after.receive(after.vehicle.put_mark(None, 0))
     assert restarted(after).vehicle.plan.mark.location is None
-
-
-def test_a_home_that_was_set_survives(station: GroundStation, clock: ManualClock) -> None:
-    station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
-    [_, reported] = restarted(station).request(242)
-    assert (reported.latitude, reported.longitude, reported.altitude) == (
-        475_000_000,
-        -85_000_000,
-        400_000,
-    )

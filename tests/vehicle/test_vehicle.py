@@ -11,8 +11,8 @@ from gateway.vehicle.requests import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import (
+from tests.kit.ground_station import GroundStation
+from tests.kit.records import (
     BARO,
     FIX,
     GPS_NODE,

@@ -20,7 +20,7 @@ from gateway.units import US_PER_S
 from gateway.vehicle.services.calibrator import SIDES as VEHICLE_SIDES
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
-from tests.vehicle.samples import sample_at, state_at
+from tests.kit.records import sample_at, state_at
 
 G = 9.80665
 

@@ -12,8 +12,8 @@ from gateway.sensing.calibrating import fit_sphere
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.requests import CalibrationKind, CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import sample_at, state_at
+from tests.kit.ground_station import GroundStation
+from tests.kit.records import sample_at, state_at
 
 G = 9.80665
 CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION

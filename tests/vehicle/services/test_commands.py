@@ -1,20 +1,36 @@
+"""Commands: home, the mark and the recording; refusals; and the log of failed requests.
+
+No acknowledgement of a recording says more than is true.
+"""
+
 import math
+from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gateway.vehicle.plan import Location
+from gateway.vehicle.requests import MAX_ENTRIES, RecordingRequest
+from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation, kinds
-from tests.vehicle.samples import STATE
+from tests.kit.ground_station import (
+    GroundStation,
+    command,
+    command_int,
+    ftp_request,
+    kinds,
+    of_kind,
+    results,
+    texts,
+)
+from tests.kit.records import STATE
 
-ACCEPTED, NOT_NOW, DENIED, UNSUPPORTED = 0, 1, 2, 3
+ACCEPTED, NOT_NOW, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 2, 3, 4, 5
 SET_HOME = mavlink.MAV_CMD_DO_SET_HOME
-
-
-def results(messages: list) -> list[int]:
-    return [m.result for m in messages if m.get_type() == "COMMAND_ACK"]
+START, STOP = mavlink.MAV_CMD_LOGGING_START, mavlink.MAV_CMD_LOGGING_STOP
+CHANGING = (179, 195, 197, 201, 224, 241, 245, 246, START, STOP, 400, 176)
+"""Commands that only trusted clients may give."""
 
 
 @pytest.mark.parametrize("component_id", [191, 230, 240])
@@ -27,28 +43,20 @@ def test_companion_that_shares_the_system_id_is_answered(
     assert version.get_type() == "AUTOPILOT_VERSION"
     station.mav.srcComponent = 1
     assert station.request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == []
-    assert station.vehicle.faults["own id"] == 1
+    assert station.send(mavlink.MAVLink_param_request_list_message(1, 1)) == []
+    assert station.vehicle.faults["own id"] == 2
 
 
-def test_home_is_set_to_a_place_and_sent_to_all(station: GroundStation) -> None:
+def test_home_is_set_to_a_location_and_sent_to_all(station: GroundStation) -> None:
     found = station.command(SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
     assert kinds(found) == ["COMMAND_ACK", "HOME_POSITION", "STATUSTEXT"]
     assert (found[1].latitude, found[1].altitude) == (475_000_000, 400_000)
     [_, position] = station.request(33)
     assert position.relative_alt == pytest.approx(123_456, abs=1)
     assert station.vehicle.plan.mark.location == pytest.approx(Location(47.5, -8.5, 400.0))
-
-
-def test_home_by_integers_relative_to_the_old_one(station: GroundStation) -> None:
-    command = mavlink.MAVLink_command_int_message(
-        1, 1, 6, SET_HOME, 0, 0, 0, 0, 0, 0, 475_000_000, -85_000_000, -20.0
-    )
-    assert station.send(command)[1].altitude == 500_250
-
-
-def test_home_is_set_to_where_the_vehicle_is(station: GroundStation) -> None:
-    found = station.command(SET_HOME, 1)
-    assert found[1].latitude == round(STATE.lat_deg * 1e7)
+    relative = command_int(SET_HOME, 475_000_000, -85_000_000, -20.0, frame=6)
+    assert station.send(relative)[1].altitude == 380_000
+    assert station.command(SET_HOME, 1)[1].latitude == round(STATE.lat_deg * 1e7), "here"
 
 
 def test_home_cannot_be_here_without_a_position(vehicle: Vehicle, clock: ManualClock) -> None:
@@ -56,80 +64,161 @@ def test_home_cannot_be_here_without_a_position(vehicle: Vehicle, clock: ManualC
 
 
 @pytest.mark.parametrize(
-    "place", [(91.0, 0.0, 0.0), (0.0, 181.0, 0.0), (math.nan, 0.0, 0.0), (47.0, 8.0, math.nan)]
+    "message",
+    [
+        command(SET_HOME, 0, 0, 0, 0, 91.0, 0.0, 0.0),
+        command(SET_HOME, 0, 0, 0, 0, 0.0, 181.0, 0.0),
+        command(SET_HOME, 0, 0, 0, 0, math.nan, 0.0, 0.0),
+        command(SET_HOME, 0, 0, 0, 0, 47.0, 8.0, math.nan),
+        command_int(SET_HOME, 1, 2, 3, frame=mavlink.MAV_FRAME_LOCAL_NED),
+    ],
 )
-def test_home_with_invalid_coordinates_is_denied(
-    station: GroundStation, place: tuple[float, ...]
-) -> None:
+def test_home_with_invalid_coordinates_is_denied(station: GroundStation, message: Any) -> None:
     before = station.vehicle.telemetry.home
-    assert results(station.command(SET_HOME, 0, 0, 0, 0, *place)) == [DENIED]
+    assert results(station.send(message)) == [DENIED]
     assert station.vehicle.telemetry.home == before
 
 
-def test_a_local_frame_is_no_place(station: GroundStation) -> None:
-    command = mavlink.MAVLink_command_int_message(1, 1, 1, SET_HOME, 0, 0, 0, 0, 0, 0, 1, 2, 3)
-    assert results(station.send(command)) == [DENIED]
-
-
-@pytest.mark.parametrize(
-    "number",
-    [
-        mavlink.MAV_CMD_DO_SET_HOME,
-        mavlink.MAV_CMD_DO_SET_ROI,
-        mavlink.MAV_CMD_DO_SET_ROI_LOCATION,
-        mavlink.MAV_CMD_DO_SET_ROI_NONE,
-        mavlink.MAV_CMD_DO_SET_MISSION_CURRENT,
-        mavlink.MAV_CMD_PREFLIGHT_CALIBRATION,
-        mavlink.MAV_CMD_PREFLIGHT_STORAGE,
-        mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
-        mavlink.MAV_CMD_LOGGING_START,
-        mavlink.MAV_CMD_LOGGING_STOP,
-        mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
-        mavlink.MAV_CMD_DO_SET_MODE,
-    ],
-)
+@pytest.mark.parametrize("number", CHANGING)
 def test_an_untrusted_client_commands_nothing(station: GroundStation, number: int) -> None:
     station.trusted = False
-    found = station.command(number, 1)
-    assert results(found) == [DENIED]
+    assert results(station.command(number, 1)) == [DENIED]
     assert station.actions == []
     assert station.vehicle.refusals == 1
 
 
-def test_refusals_are_reported_but_cannot_flood(station: GroundStation) -> None:
-    station.trusted = False
-    found = [m for _ in range(200) for m in station.command(mavlink.MAV_CMD_LOGGING_START)]
-    assert len(results(found)) == 200
-    reported = [m.text for m in found if m.get_type() == "STATUSTEXT"]
-    assert 1 <= len(reported) <= 20
-    assert set(reported) == {"Refused LOGGING_START of system 255"}
-
-
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])
-@pytest.mark.parametrize(
-    "number", [512, 511, 510, 179, 195, 201, 241, 245, 224, 2510, 400, 410, 519, 520]
-)
-def test_odd_parameters_do_no_harm(station: GroundStation, number: int, bad: float) -> None:
-    found = station.command(number, *[bad] * 7)
-    assert len(results(found)) == 1
+def test_odd_parameters_do_no_harm(station: GroundStation, bad: float) -> None:
+    for number in (512, 511, 510, 410, 519, 520, *CHANGING):
+        answered = [n for n, _ in acks(station.command(number, *[bad] * 7))]
+        assert answered.count(number) == 1
 
 
-@pytest.mark.parametrize("place", [(90.1, 0.0), (0.0, 180.1), (math.nan, 8.0)])
-def test_a_mark_that_is_nowhere_is_a_fault_of_the_caller(
-    vehicle: Vehicle, place: tuple[float, float]
+@pytest.mark.parametrize("coordinates", [(90.1, 0.0), (0.0, 180.1), (math.nan, 8.0)])
+def test_a_mark_beyond_the_earth_is_a_fault_of_the_caller(
+    vehicle: Vehicle, coordinates: tuple[float, float]
 ) -> None:
     with pytest.raises(ValueError, match="must be between"):
-        vehicle.put_mark(Location(*place, 0.0), 0)
-
-
-def test_a_mark_on_the_other_side_of_the_earth(station: GroundStation) -> None:
-    state = station.vehicle.telemetry.state
-    opposite = Location(-state.lat_deg, state.lon_deg + 180.0, 0.0)
-    station.vehicle.put_mark(opposite, 0)
-    assert results(station.request(62)) in ([ACCEPTED], [NOT_NOW])
+        vehicle.put_mark(Location(*coordinates, 0.0), 0)
 
 
 def test_the_mark_of_the_command_line(station: GroundStation) -> None:
     found = station.receive(station.vehicle.put_mark(Location(47.0, 8.0, math.nan), 0))
-    assert [m.text for m in found] == ["Marked 47.000000, 8.000000"]
+    assert texts(found) == ["Marked 47.000000, 8.000000"]
     assert results(station.request(62)) == [ACCEPTED]
+    opposite = Location(-STATE.lat_deg, STATE.lon_deg + 180.0, 0.0)
+    station.vehicle.put_mark(opposite, 0)
+    assert results(station.request(62)) == [ACCEPTED]
+
+
+def acks(messages: list[Any]) -> list[tuple[int, int]]:
+    return [(m.command, m.result) for m in of_kind(messages, "COMMAND_ACK")]
+
+
+def recorder(station: GroundStation, trouble: str = "", *, recording: bool = False) -> list[Any]:
+    now_us = station.clock.now_us
+    return station.receive(station.vehicle.on_recorder(trouble, now_us, recording=recording))
+
+
+def test_a_start_is_accepted_once_the_files_are_open(station: GroundStation) -> None:
+    for _ in range(3):
+        assert acks(station.command(START)) == [(START, IN_PROGRESS)]
+    assert station.of(RecordingRequest) == [RecordingRequest(start=True)] * 3
+    assert recorder(station) == []
+    assert acks(recorder(station, recording=True)) == [(START, ACCEPTED)]
+    assert recorder(station, recording=True) == []
+    assert acks(station.wait(20.0)) == []
+    assert acks(station.command(START)) == [(START, ACCEPTED)], "it records already"
+    assert station.of(RecordingRequest)[3:] == [RecordingRequest(start=True)]
+
+
+def test_a_start_that_fails_is_reported_and_why(station: GroundStation) -> None:
+    assert recorder(station, "Read-only file system") == [], "not requested"
+    station.command(START)
+    found = recorder(station, "Read-only file system")
+    assert acks(found) == [(START, FAILED)]
+    assert texts(found) == ["Cannot record: Read-only file system"]
+    assert recorder(station, "Read-only file system") == []
+
+
+def test_a_disk_that_never_answers(station: GroundStation) -> None:
+    station.command(START)
+    assert acks(station.wait(RECORDER_TIMEOUT_US / 1e6 - 0.001)) == []
+    found = station.wait(0.002)
+    assert acks(found) == [(START, FAILED)]
+    assert texts(found) == ["Cannot record: no answer from the disk"]
+
+
+def test_a_stop_is_accepted_and_ends_a_start(station: GroundStation) -> None:
+    assert acks(station.command(STOP)) == [(STOP, ACCEPTED)]
+    station.command(START)
+    assert acks(station.command(STOP)) == [(STOP, ACCEPTED), (START, FAILED)]
+    assert station.of(RecordingRequest)[-1] == RecordingRequest(start=False)
+    assert recorder(station, recording=True) == []
+
+
+def test_each_station_gets_its_own_answer(station: GroundStation) -> None:
+    stations = [station.other(100 + n) for n in range(MAX_WAITING + 1)]
+    found = [results(each.command(START)) for each in stations]
+    assert found == [[IN_PROGRESS]] * MAX_WAITING + [[NOT_NOW]]
+    station.vehicle.remove_client(100)
+    actions = station.vehicle.on_recorder("", station.clock.now_us, recording=True)
+    assert [results(each.receive(actions)) for each in stations[:3]] == [[], [ACCEPTED], [ACCEPTED]]
+
+
+@pytest.mark.parametrize(
+    ("message", "request_text", "outcome"),
+    [
+        (command(512, 12_345), "COMMAND_LONG REQUEST_MESSAGE 12345", "UNSUPPORTED"),
+        (
+            mavlink.MAVLink_param_request_read_message(1, 1, b"[red]\x1b\n", -1),
+            "PARAM_REQUEST_READ ?red??",
+            "DOES_NOT_EXIST",
+        ),
+        (
+            mavlink.MAVLink_mission_request_list_message(1, 1, 7),
+            "MISSION_REQUEST_LIST",
+            "UNSUPPORTED",
+        ),
+        (
+            ftp_request(4, b"/nothing"),
+            "FILE_TRANSFER_PROTOCOL opcode 4 /nothing",
+            "FTP error 10",
+        ),
+        (
+            mavlink.MAVLink_set_home_position_message(1, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
+            "SET_HOME_POSITION",
+            "no answer",
+        ),
+        (command(400, 1), "COMMAND_LONG COMPONENT_ARM_DISARM", "DENIED"),
+    ],
+)
+def test_failed_request_is_logged_once_with_a_count(
+    station: GroundStation, message: Any, request_text: str, outcome: str
+) -> None:
+    for _ in range(3):
+        station.clock.advance(1.0)
+        station.send(message)
+    [entry] = station.vehicle.requests.entries
+    assert (entry.request, entry.outcome, entry.count) == (request_text, outcome, 3)
+    assert (entry.vehicle_id, entry.system_id, entry.component_id) == (1, 255, 190)
+    assert entry.time_us == station.clock.now_us
+
+
+def test_only_failed_requests_are_logged(station: GroundStation) -> None:
+    station.request(148)
+    station.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+    station.send(mavlink.MAVLink_param_request_read_message(1, 1, b"RATE_ATT", -1))
+    assert station.vehicle.requests.entries == ()
+    station.trusted = False
+    station.set_parameter("RATE_ATT", 7.0)
+    [entry] = station.vehicle.requests.entries
+    assert (entry.request, entry.outcome) == ("PARAM_SET RATE_ATT", "refused: not trusted")
+
+
+def test_log_is_bounded_and_keeps_the_newest(station: GroundStation) -> None:
+    for number in range(2 * MAX_ENTRIES):
+        station.request(30_000 + number)
+    entries = station.vehicle.requests.entries
+    assert len(entries) == MAX_ENTRIES
+    assert entries[-1].request.endswith(str(30_000 + 2 * MAX_ENTRIES - 1))

@@ -4,8 +4,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ClientInterval
-from tests.vehicle.ground_station import GroundStation, kinds
-from tests.vehicle.samples import sample_at, state_at
+from tests.kit.ground_station import GroundStation, kinds
+from tests.kit.records import sample_at, state_at
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
 SET, GET = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAV_CMD_GET_MESSAGE_INTERVAL

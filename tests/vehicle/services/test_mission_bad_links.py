@@ -7,83 +7,68 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.services.test_missions import ACCEPTED, count, item
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
+from tests.conftest import ManualClock
+from tests.kit.ground_station import GroundStation, count, item, of_kind
 
 STEP_S = 0.05
 COUNTED_TO = 5
 """MAVSDK's `retries`."""
 ITEMS = [item(seq) for seq in range(20)]
+NO_TELEMETRY = RateSettings(**dict.fromkeys(RateSettings.__struct_fields__, 0.0))
 
 
-class Link:
-    """A link to a station that has none of its own.
+class Uploader:
+    """What MAVSDK 4 does with the answers, over a link with a loss and a range of delays in s."""
 
-    Parameters
-    ----------
-    station : GroundStation
-    loss : float
-        Share of frames, each way.
-    delay_s : tuple of float
-        Shortest and longest, each way.
-    """
-
-    def __init__(self, station: GroundStation, loss: float, *delay_s: float) -> None:
-        self.station, self.loss, self.delay_s = station, loss, delay_s
-        self.rng = np.random.default_rng(1)
+    def __init__(
+        self, station: GroundStation, rng: np.random.Generator, loss: float, *delay_s: float
+    ) -> None:
+        self.station, self.rng, self.loss, self.delay_s = station, rng, loss, delay_s
         self.now_s = 0.0
-        self._number = count_up()
-        self._on_the_way: list[tuple[float, int, bool, Any]] = []
+        self.number = count_up()
+        self.under_way: list[tuple[float, int, bool, Any]] = []
+
+    def run(self) -> str:
+        """Upload once; what is under way from the last upload arrives late."""
+        self.next, self.counted, self.waited = 0, 0, 0
+        self.asked = False
+        self.result: str | None = None
+        self.begin()
+        while self.result is None:
+            for message in self.step():
+                if self.result is None:
+                    self.handle(message)
+            self.wait()
+        return self.result
 
     def put(self, message: Any, *, up: bool = True) -> None:
         if self.rng.random() >= self.loss:
             due_s = self.now_s + self.rng.uniform(*self.delay_s)
-            heapq.heappush(self._on_the_way, (due_s, next(self._number), up, message))
+            heapq.heappush(self.under_way, (due_s, next(self.number), up, message))
 
     def step(self) -> list[Any]:
         """Let a step of time pass; what arrives in it."""
         self.now_s += STEP_S
-        self._answered(self.station.wait(STEP_S))
-        arrived = []
-        while self._on_the_way and self._on_the_way[0][0] <= self.now_s:
-            _, _, up, message = heapq.heappop(self._on_the_way)
+        answers, arrived = self.station.wait(STEP_S), []
+        while self.under_way and self.under_way[0][0] <= self.now_s:
+            _, _, up, message = heapq.heappop(self.under_way)
             if up:
-                self._answered(self.station.send(message))
+                answers += self.station.send(message)
             else:
                 arrived.append(message)
+        for message in of_kind(answers, "MISSION_REQUEST_INT", "MISSION_ACK"):
+            self.put(message, up=False)
         return arrived
 
-    def _answered(self, messages: list[Any]) -> None:
-        for message in messages:
-            if message.get_type() in ("MISSION_REQUEST_INT", "MISSION_ACK"):
-                self.put(message, up=False)
-
-
-class Upload:
-    """What MAVSDK 4 does with the answers."""
-
-    def __init__(self, link: Link) -> None:
-        self.link = link
-        self.next, self.counted, self.waited = 0, 0, 0
-        self.asked = False
-        self.result: str | None = None
-
-    def run(self) -> str:
-        self._begin()
-        while self.result is None:
-            for message in self.link.step():
-                if self.result is None:
-                    self._hear(message)
-            self._wait()
-        return self.result
-
-    def _begin(self) -> None:
-        self.link.put(count(len(ITEMS)))
+    def begin(self) -> None:
+        self.put(count(len(ITEMS)))
         self.counted += 1
 
-    def _hear(self, message: Any) -> None:
+    def handle(self, message: Any) -> None:
         if message.get_type() == "MISSION_ACK":
-            whole = message.type == ACCEPTED and self.next == len(ITEMS)
+            whole = message.type == 0 and self.next == len(ITEMS)
             self.result = "stored" if whole else f"ended by {message.type}"
             return
         self.asked = True
@@ -95,11 +80,11 @@ class Upload:
             self.result = "asked for too often"
             return
         self.waited = 0
-        self.link.put(ITEMS[message.seq])
+        self.put(ITEMS[message.seq])
         self.next = message.seq + 1
         self.counted += 1
 
-    def _wait(self) -> None:
+    def wait(self) -> None:
         self.waited += 1
         if self.waited * STEP_S < 0.5 or self.result is not None:
             return
@@ -109,7 +94,7 @@ class Upload:
         elif self.asked:
             self.counted += 1
         else:
-            self._begin()
+            self.begin()
 
 
 @pytest.mark.parametrize(
@@ -123,8 +108,9 @@ class Upload:
     ],
 )
 def test_of_twenty_uploads_one_after_the_other(
-    station: GroundStation, loss: float, shortest_s: float, longest_s: float, stored: int
+    clock: ManualClock, loss: float, shortest_s: float, longest_s: float, stored: int
 ) -> None:
-    link = Link(station, loss, shortest_s, longest_s)
-    reported = [Upload(link).run() for _ in range(20)]
+    station = GroundStation(Vehicle(VehicleSettings(rates=NO_TELEMETRY), 1), clock)
+    client = Uploader(station, np.random.default_rng(1), loss, shortest_s, longest_s)
+    reported = [client.run() for _ in range(20)]
     assert reported.count("stored") >= stored, reported

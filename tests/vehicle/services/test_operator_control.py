@@ -1,18 +1,13 @@
 """Operator control: which station may change things, and how control passes on."""
 
-import struct
-
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
-from pymavlink.generator.mavcrc import x25crc
 
-from gateway.records import Incoming, Outgoing
-from gateway.vehicle.encoding import ControlStatus
+from gateway.records import Incoming
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
-from tests.vehicle.ground_station import GroundStation, kinds
-from tests.vehicle.services.test_parameters import set_message
+from tests.kit.ground_station import GroundStation, command, decode, kinds, results, texts
 
 REQUEST_CONTROL = 32100
 ACCEPTED, DENIED, FAILED = 0, 2, 4
@@ -27,39 +22,23 @@ def first(clock: ManualClock) -> GroundStation:
 
 @pytest.fixture
 def second(first: GroundStation) -> GroundStation:
-    return GroundStation(first.vehicle, first.clock, client_id=8, system_id=254)
+    return first.other(system_id=254)
 
 
 def control(station: GroundStation, action: int = REQUEST, takeover: int = 0) -> int:
     """Send the command as QGroundControl does; return the result."""
     found = station.command(REQUEST_CONTROL, action, takeover, 10, station.mav.srcSystem)
-    return next(m.result for m in found if m.get_type() == "COMMAND_ACK")
+    return results(found)[0]
 
 
 def changes(station: GroundStation) -> bool:
-    found = station.send(set_message("RATE_ATT", 7.0))
-    return "PARAM_ERROR" not in kinds(found)
+    return "PARAM_ERROR" not in kinds(station.set_parameter("RATE_ATT", 7.0))
 
 
 def statuses(station: GroundStation, since: int = 0) -> list[tuple[int, int]]:
     """Return flags and controlling system of every CONTROL_STATUS that was sent."""
     frames = [f.frame for f in station.frames[since:] if f.message_id == 512]
     return [(frame[10], frame[11] if frame[1] > 1 else 0) for frame in frames]
-
-
-def test_control_status_is_laid_out_as_the_xml_defines_it() -> None:
-    """The CRC is computed from the definition by the rule of the generator."""
-    crc = x25crc()
-    crc.accumulate_str("CONTROL_STATUS ")
-    for kind, name, length in (
-        ("uint8_t", "flags", 0),
-        ("uint8_t", "gcs_main", 0),
-        ("uint8_t", "gcs_secondary", 10),
-    ):
-        crc.accumulate_str(f"{kind} {name} ")
-        crc.accumulate([length] if length else [])
-    assert ControlStatus.crc_extra == (crc.crc & 0xFF) ^ (crc.crc >> 8)
-    assert struct.calcsize(ControlStatus.unpacker.format) == 12
 
 
 def test_station_without_control_changes_nothing(
@@ -69,8 +48,8 @@ def test_station_without_control_changes_nothing(
     assert control(first) == ACCEPTED
     assert changes(first)
     assert not changes(second)
-    texts = "".join(m.text for m in second.inbox if m.get_type() == "STATUSTEXT")
-    assert "Refused PARAM_SET of system 254: system 255 is in control" in texts
+    reported = "".join(texts(second.inbox))
+    assert "Refused PARAM_SET of system 254: system 255 is in control" in reported
     assert second.command(512, 148)[0].result == ACCEPTED, "reading stays free"
 
 
@@ -78,12 +57,9 @@ def test_takeover_needs_the_consent_of_the_station_in_control(
     first: GroundStation, second: GroundStation
 ) -> None:
     control(first)
-    actions = second.vehicle.handle(incoming(second, REQUEST_CONTROL, REQUEST, 1, 10, 254), 0)
-    [notice] = [
-        first.decode(a.frame)
-        for a in actions
-        if isinstance(a, Outgoing) and a.client_id == first.client_id
-    ]
+    frame = second.frame(command(REQUEST_CONTROL, REQUEST, 1, 10, 254))
+    actions = second.vehicle.handle(Incoming(second.client_id, frame, trusted=True), 0)
+    [notice] = decode(a for a in actions if a.client_id == first.client_id)
     assert (notice.get_type(), notice.command) == ("COMMAND_LONG", REQUEST_CONTROL)
     assert (notice.target_system, notice.target_component) == (255, 190)
     assert (notice.param1, notice.param2, notice.param3, notice.param4) == (1, 1, 10, 254)
@@ -92,12 +68,6 @@ def test_takeover_needs_the_consent_of_the_station_in_control(
     assert control(second) == ACCEPTED
     assert changes(second)
     assert not changes(first)
-
-
-def incoming(station: GroundStation, number: int, *params: float) -> Incoming:
-    padded = [*params, *[0.0] * (7 - len(params))]
-    frame = station.frame(mavlink.MAVLink_command_long_message(1, 1, number, 0, *padded))
-    return Incoming(station.client_id, frame, station.trusted)
 
 
 def test_release_is_for_the_station_in_control(first: GroundStation, second: GroundStation) -> None:
@@ -115,10 +85,7 @@ def test_control_ends_with_the_link_of_the_station(
     if how == "gone":
         first.vehicle.remove_client(first.client_id)
     else:
-        second.wait(33.0)
-        assert "System 255 lost control: timeout" in [
-            m.text for m in second.inbox if m.get_type() == "STATUSTEXT"
-        ]
+        assert "System 255 lost control: timeout" in texts(second.wait(33.0))
     assert control(second) == ACCEPTED
 
 
@@ -171,5 +138,4 @@ def test_untrusted_client_cannot_take_control_or_act_for_another(
     second.trusted = False
     assert control(second) == DENIED
     second.trusted = True
-    found = second.command(REQUEST_CONTROL, REQUEST, 0, 10, 255)
-    assert found[0].result == DENIED
+    assert results(second.command(REQUEST_CONTROL, REQUEST, 0, 10, 255)) == [DENIED]

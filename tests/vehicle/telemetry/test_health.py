@@ -14,7 +14,7 @@ from gateway.vehicle.telemetry.health import (
     PRESSURE,
     Health,
 )
-from tests.vehicle.samples import (
+from tests.kit.records import (
     BARO,
     FIX,
     GPS_NODE,

@@ -10,8 +10,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.records import GpsFix, GpsFixType, NavState
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.messages import high_latency2
-from tests.vehicle.ground_station import GroundStation
-from tests.vehicle.samples import BARO, FIX, NOTHING, SAMPLE, STATE
+from tests.kit.ground_station import GroundStation
+from tests.kit.records import BARO, FIX, NOTHING, SAMPLE, STATE
 
 
 @pytest.fixture

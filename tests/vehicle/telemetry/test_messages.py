@@ -12,7 +12,7 @@ from gateway.records import GpsFixType, NavFlags
 from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import Home, Location
 from gateway.vehicle.telemetry import messages
-from tests.vehicle.samples import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
+from tests.kit.records import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
 
 
 def through_the_wire(message: Any) -> Any:

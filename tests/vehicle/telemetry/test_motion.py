@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from gateway.records import NavFlags
 from gateway.vehicle.telemetry.telemetry import IN_AIR, ON_GROUND, UNDEFINED, Motion
-from tests.vehicle.samples import STATE, state_at
+from tests.kit.records import STATE, state_at
 
 
 def run(motion: Motion, start_s: float, seconds: float, speed: float, height: float) -> int:

@@ -12,7 +12,7 @@ from gateway.vehicle.telemetry.announcements import HOLD_US
 from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
-from tests.vehicle.samples import decode
+from tests.kit.records import decode
 
 SECOND_US = 1_000_000
 WELL = NodeStatus(

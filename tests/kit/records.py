@@ -1,10 +1,9 @@
-"""Records for the vehicle's tests, and an independent decoder of what it sends."""
+"""Records of one aircraft, as its stages exchange them."""
 
 import math
 from typing import Any
 
 from msgspec.structs import replace
-from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler
 from gateway.records import (
@@ -19,7 +18,6 @@ from gateway.records import (
     NodeId,
     NodeLink,
     NodeStatus,
-    Outgoing,
 )
 
 IMU_NODE = NodeId(1, 0)
@@ -154,23 +152,3 @@ def report(*nodes: NodeLink, time_us: int = 1_000_000, connected: bool = True) -
         nodes=nodes,
         receiver=None,
     )
-
-
-def decode(frames: list[Outgoing] | list[Any]) -> list[Any]:
-    """Decode with a parser of its own; every frame must be whole and well."""
-    parser = mavlink.MAVLink(None)
-    found = []
-    for outgoing in frames:
-        message = parser.parse_char(outgoing.frame)
-        assert message is not None
-        assert message.get_msgId() == outgoing.message_id
-        found.append(message)
-    return found
-
-
-def texts(frames: list[Outgoing] | list[Any]) -> list[str]:
-    return [m.text for m in decode(frames) if m.get_type() == "STATUSTEXT"]
-
-
-def names(frames: list[Outgoing] | list[Any]) -> list[str]:
-    return [m.get_type() for m in decode(frames)]
