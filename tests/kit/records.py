@@ -140,10 +140,10 @@ def link(node: NodeId = IMU_NODE, **changes: Any) -> NodeLink:
     return replace(plain, **changes)
 
 
-def report(*nodes: NodeLink, time_us: int = 1_000_000, connected: bool = True) -> LinkReport:
-    return LinkReport(
+def report(*nodes: NodeLink, time_us: int = 1_000_000, **changes: Any) -> LinkReport:
+    plain = LinkReport(
         time_us=time_us,
-        connected=connected,
+        connected=True,
         port="/dev/ttyUSB0",
         bytes_received=0,
         frames=0,
@@ -152,3 +152,4 @@ def report(*nodes: NodeLink, time_us: int = 1_000_000, connected: bool = True) -
         nodes=nodes,
         receiver=None,
     )
+    return replace(plain, **changes)

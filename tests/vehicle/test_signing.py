@@ -19,7 +19,8 @@ from gateway.vehicle.requests import (
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
-from tests.kit.ground_station import GroundStation
+from tests.kit.ground_station import GroundStation, of_kind
+from tests.kit.mavlink import packed
 
 NOW_UNIX_US = 1_790_000_000_000_000
 KEY = key_from_passphrase("correct horse")
@@ -42,7 +43,7 @@ def sign(station: GroundStation, key: bytes = KEY, at_us: int = NOW_UNIX_US) -> 
 
 
 def changed(found: list[Any]) -> bool:
-    return [m.param_value for m in found if m.get_type() == "PARAM_VALUE"] == [5.0]
+    return [m.param_value for m in of_kind(found, "PARAM_VALUE")] == [5.0]
 
 
 def test_the_key_is_the_hash_of_the_passphrase() -> None:
@@ -110,40 +111,31 @@ def test_without_a_key_signed_frames_are_taken_as_they_are(clock: ManualClock) -
     assert changed(station.send(SET))
 
 
-def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
-    def change(passphrase: str) -> None:
-        settings = VehicleSettings(signing_passphrase=passphrase)
-        station.vehicle.take_settings("vehicle", settings)
+def change(station: GroundStation, passphrase: str) -> None:
+    settings = VehicleSettings(signing_passphrase=passphrase)
+    station.vehicle.take_settings("vehicle", settings)
 
+
+def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
     sign(station)
     old = station.frame(SET)
-    change("another horse")
+    change(station, "another horse")
     assert station.send_bytes(old) == []
     sign(station, key_from_passphrase("another horse"))
     assert changed(station.send(SET))
     assert station.vehicle.signing_key == key_from_passphrase("another horse")
-    change("")
+    change(station, "")
     station.mav.signing.sign_outgoing = False
     assert changed(station.send(SET))
     assert station.vehicle.signing_key is None
 
 
-def test_change_of_another_setting_keeps_the_replay_protection(station: GroundStation) -> None:
-    sign(station)
-    frame = station.frame(SET)
-    assert changed(station.send_bytes(frame)), "which is a change of the vehicle's settings"
-    assert station.send_bytes(frame) == []
-
-
 def test_streams_are_bounded() -> None:
     verifier = Verifier(KEY, SigningClock(NOW_UNIX_US))
-    mav = mavlink.MAVLink(None, 9, 1)
-    mav.signing.secret_key, mav.signing.sign_outgoing = KEY, True
-    mav.signing.timestamp = ticks(NOW_UNIX_US)
-    accepted = 0
-    for number in range(2 * MAX_STREAMS):
-        mav.srcSystem, mav.srcComponent = number % 256, 1 + number // 256
-        accepted += verifier.accepts(mavlink.MAVLink_ping_message(0, 0, 0, 0).pack(mav), 0)
+    accepted = sum(
+        verifier.accepts(ping(sender=(number % 256, 1 + number // 256)), 0)
+        for number in range(2 * MAX_STREAMS)
+    )
     assert accepted == MAX_STREAMS
 
 
@@ -152,11 +144,9 @@ def test_a_short_key_is_a_fault_of_the_caller() -> None:
         Verifier(bytes(31), SigningClock(0))
 
 
-def ping(at_us: int = NOW_UNIX_US, key: bytes = KEY) -> bytes:
-    mav = mavlink.MAVLink(None, 255, 190)
-    mav.signing.secret_key, mav.signing.sign_outgoing = key, True
-    mav.signing.timestamp = ticks(at_us)
-    return bytes(mavlink.MAVLink_ping_message(0, 0, 0, 0).pack(mav))
+def ping(at_us: int = NOW_UNIX_US, sender: tuple[int, int] = (255, 190)) -> bytes:
+    message = mavlink.MAVLink_ping_message(0, 0, 0, 0)
+    return packed(message, *sender, signing=(KEY, 0, ticks(at_us)))
 
 
 @pytest.mark.parametrize("orderly", [True, False])
@@ -187,15 +177,12 @@ def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
 
 
 def test_another_passphrase_and_back_keeps_the_replay_protection(station: GroundStation) -> None:
-    def change(passphrase: str) -> None:
-        settings = VehicleSettings(signing_passphrase=passphrase)
-        station.vehicle.take_settings("vehicle", settings)
-
     sign(station)
     frame = station.frame(SET)
-    assert changed(station.send_bytes(frame))
-    change("another horse")
-    change("correct horse")
+    assert changed(station.send_bytes(frame)), "which is a change of the vehicle's settings"
+    assert station.send_bytes(frame) == []
+    change(station, "another horse")
+    change(station, "correct horse")
     assert station.send_bytes(frame) == []
 
 

@@ -5,28 +5,25 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.records import ImuFlags, Incoming, NavFlags, Outgoing
+from gateway.records import ImuFlags, NavFlags, Outgoing
 from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.requests import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock
-from tests.kit.ground_station import GroundStation
+from tests.kit.ground_station import GroundStation, decode, kinds, of_kind, texts
 from tests.kit.records import (
     BARO,
     FIX,
     GPS_NODE,
     NO_FIX,
     NOTHING,
-    decode,
     fix_at,
     link,
-    names,
     report,
     sample_at,
     state_at,
     status,
-    texts,
 )
 
 ONE_S = 1_000_000
@@ -53,21 +50,13 @@ def fly(vehicle: Vehicle, start_s: int, seconds: int, **state: Any) -> list[Outg
 def test_every_message_at_its_own_rate() -> None:
     vehicle = make()
     fly(vehicle, 0, 2)
-    counted = Counter(names(fly(vehicle, 2, 10)))
+    counted = Counter(kinds(fly(vehicle, 2, 10)))
     expected = {
-        "ATTITUDE_QUATERNION": 500,
-        "ATTITUDE": 500,
-        "GLOBAL_POSITION_INT": 100,
-        "VFR_HUD": 100,
-        "HIGHRES_IMU": 100,
-        "GPS_RAW_INT": 50,
-        "SCALED_PRESSURE": 50,
-        "SYS_STATUS": 20,
-        "EXTENDED_SYS_STATE": 20,
-        "HEARTBEAT": 10,
-        "SYSTEM_TIME": 10,
-        "HOME_POSITION": 10,
-        "ESTIMATOR_STATUS": 10,
+        **dict.fromkeys(("ATTITUDE_QUATERNION", "ATTITUDE"), 500),
+        **dict.fromkeys(("GLOBAL_POSITION_INT", "VFR_HUD", "HIGHRES_IMU"), 100),
+        **dict.fromkeys(("GPS_RAW_INT", "SCALED_PRESSURE"), 50),
+        **dict.fromkeys(("SYS_STATUS", "EXTENDED_SYS_STATE"), 20),
+        **dict.fromkeys(("HEARTBEAT", "SYSTEM_TIME", "HOME_POSITION", "ESTIMATOR_STATUS"), 10),
     }
     assert {name: counted[name] for name in expected} == pytest.approx(expected, abs=1)
 
@@ -77,12 +66,11 @@ def test_messages_are_not_due_all_at_once() -> None:
     reported = []
     # A minute is missing, after which all that was missed is due.
     for start_s in (0, 60):
-        for ms in range(start_s * 1000, (start_s + 10) * 1000, 10):
-            time_us = 1000 * ms
-            reported.append(names(vehicle.on_state(state_at(time_us), sample_at(time_us), time_us)))
-            if ms % 200 == 0:
+        for time_us in range(start_s * ONE_S, (start_s + 10) * ONE_S, 10_000):
+            reported.append(kinds(vehicle.on_state(state_at(time_us), sample_at(time_us), time_us)))
+            if time_us % 200_000 == 0:
                 vehicle.on_gps(fix_at(time_us), time_us)
-            reported.append(names(vehicle.poll(time_us)))
+            reported.append(kinds(vehicle.poll(time_us)))
         reported[-2000:-1900] = []
     assert max(map(len, reported)) <= 2
     assert len({name for each in reported for name in each}) > 12
@@ -90,24 +78,23 @@ def test_messages_are_not_due_all_at_once() -> None:
 
 def test_rate_of_zero_disables_a_message() -> None:
     vehicle = make(rates=RateSettings(attitude_hz=0.0, gps_raw_int_hz=0.0, sys_status_hz=0.0))
-    found = set(names(fly(vehicle, 0, 2)))
+    found = set(kinds(fly(vehicle, 0, 2)))
     assert not found & {"ATTITUDE", "GPS_RAW_INT", "SYS_STATUS"}
 
 
-def test_attitude_goes_on_without_any_position_and_no_place_is_made_up() -> None:
+def test_attitude_goes_on_without_any_position_and_none_is_made_up() -> None:
     vehicle = make()
     found = []
     for time_us in range(0, 10 * ONE_S, 5_000):
         state = replace(NOTHING, time_us=time_us)
         found += vehicle.on_state(state, sample_at(time_us, mag_b_ut=None), time_us)
         found += vehicle.poll(time_us)
-    counted = Counter(names(found))
+    counted = Counter(kinds(found))
     assert counted["ATTITUDE_QUATERNION"] == pytest.approx(500, abs=1)
     assert counted["VFR_HUD"] == pytest.approx(100, abs=1)
     assert not {"GLOBAL_POSITION_INT", "HOME_POSITION"} & set(counted)
     assert counted["GPS_RAW_INT"] == counted["HEARTBEAT"] == 10
-    gps = [m for m in decode(found) if m.get_type() == "GPS_RAW_INT"]
-    assert {m.fix_type for m in gps} == {mavlink.GPS_FIX_TYPE_NO_GPS}
+    assert {m.fix_type for m in of_kind(found, "GPS_RAW_INT")} == {mavlink.GPS_FIX_TYPE_NO_GPS}
 
 
 def test_position_goes_on_while_dead_reckoned() -> None:
@@ -117,7 +104,7 @@ def test_position_goes_on_while_dead_reckoned() -> None:
     found = []
     for time_us in range(2 * ONE_S, 12 * ONE_S, 5_000):
         found += vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)
-    assert names(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
+    assert kinds(found).count("GLOBAL_POSITION_INT") == pytest.approx(100, abs=1)
 
 
 @pytest.mark.parametrize(
@@ -132,7 +119,7 @@ def test_autopilot_of_the_settings_is_reported(
     clock: ManualClock, name: str, autopilot: int, custom_mode: int, capability: int
 ) -> None:
     station = GroundStation(make(autopilot=name), clock)
-    beat = next(m for m in station.wait(1.0) if m.get_type() == "HEARTBEAT")
+    beat = of_kind(station.wait(1.0), "HEARTBEAT")[0]
     assert (beat.autopilot, beat.custom_mode) == (autopilot, custom_mode)
     assert bool(beat.base_mode & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED) == (autopilot != 0)
     [_, version] = station.request(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
@@ -154,8 +141,8 @@ def test_last_position_is_repeated_when_gps_is_lost() -> None:
         *vehicle.on_gps(replace(lost, time_us=3 * ONE_S), 3 * ONE_S),
         *vehicle.poll(9 * ONE_S),
     ]
-    gps = [m for m in decode(found) if m.get_type() == "GPS_RAW_INT"]
-    assert [m.fix_type for m in gps][-1] == mavlink.GPS_FIX_TYPE_NO_GPS
+    gps = of_kind(found, "GPS_RAW_INT")
+    assert gps[-1].fix_type == mavlink.GPS_FIX_TYPE_NO_GPS
     assert mavlink.GPS_FIX_TYPE_NO_FIX in {m.fix_type for m in gps}
     assert {(m.lat, m.lon) for m in gps} == {(FIX.lat_dege7, FIX.lon_dege7)}
 
@@ -163,16 +150,17 @@ def test_last_position_is_repeated_when_gps_is_lost() -> None:
 def test_home_is_the_first_good_fix() -> None:
     vehicle = make()
     vehicle.on_gps(replace(NO_FIX, time_us=0), 0)
-    vehicle.on_gps(fix_at(200_000, satellites=5), 200_000)
-    vehicle.on_gps(fix_at(400_000, h_acc_m=20.0), 400_000)
-    vehicle.on_gps(fix_at(500_000, lat_dege7=0, lon_dege7=0), 500_000)
+    for changes in ({"satellites": 5}, {"h_acc_m": 20.0}, {"lat_dege7": 0, "lon_dege7": 0}):
+        vehicle.on_gps(fix_at(200_000, **changes), 200_000)
     assert vehicle.telemetry.home is None
     found = vehicle.on_gps(fix_at(600_000), 600_000)
-    [home] = [m for m in decode(found) if m.get_type() == "HOME_POSITION"]
+    [home] = of_kind(found, "HOME_POSITION")
     assert (home.latitude, home.longitude, home.altitude) == (471_234_567, -87_654_321, 520_250)
     assert "Home set by GPS" in texts(found)
     found = vehicle.on_gps(fix_at(800_000, lat_dege7=0), 800_000)
-    assert "HOME_POSITION" not in names(found)
+    assert "HOME_POSITION" not in kinds(found)
+    found = of_kind(fly(vehicle, 2, 1), "GLOBAL_POSITION_INT")
+    assert {m.relative_alt for m in found} == {523_456 - 520_250}
 
 
 def test_a_home_elsewhere_does_not_make_it_fly() -> None:
@@ -181,13 +169,6 @@ def test_a_home_elsewhere_does_not_make_it_fly() -> None:
     vehicle = Vehicle(VehicleSettings(), 1, stored=stored)
     fly(vehicle, 0, 10, vel_n_mps=(0.0, 0.0, 0.0))
     assert vehicle.telemetry.motion.landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
-
-
-def test_relative_altitude_refers_to_home() -> None:
-    vehicle = make()
-    fly(vehicle, 0, 2)
-    found = [m for m in decode(fly(vehicle, 2, 1)) if m.get_type() == "GLOBAL_POSITION_INT"]
-    assert {m.relative_alt for m in found} == {523_456 - 520_250}
 
 
 @pytest.mark.parametrize(
@@ -210,20 +191,19 @@ def test_the_armed_bit_follows_the_rule(
     vehicle = make(armed_when=rule)
     vehicle.on_recorder("", 0, recording=recording)
     found = fly(vehicle, 0, 4, vel_n_mps=(speed, 0.0, 0.0), alt_amsl_m=521.0)
-    last = [m for m in decode(found) if m.get_type() == "HEARTBEAT"][-1]
+    last = of_kind(found, "HEARTBEAT")[-1]
     assert bool(last.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED) is armed
     assert last.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
     assert last.type == mavlink.MAV_TYPE_FIXED_WING
-    flying = speed > 0.0
-    expected = mavlink.MAV_STATE_ACTIVE if flying else mavlink.MAV_STATE_STANDBY
+    expected = mavlink.MAV_STATE_ACTIVE if speed > 0.0 else mavlink.MAV_STATE_STANDBY
     assert last.system_status == expected
 
 
-def test_heartbeats_go_on_when_everything_is_silent() -> None:
+def test_heartbeats_go_on_when_nothing_is_received() -> None:
     vehicle = make()
     fly(vehicle, 0, 2)
     found = [o for now in range(2 * ONE_S, 12 * ONE_S, 20_000) for o in vehicle.poll(now)]
-    beats = [m for m in decode(found) if m.get_type() == "HEARTBEAT"]
+    beats = of_kind(found, "HEARTBEAT")
     assert len(beats) == 10
     assert beats[-1].system_status == mavlink.MAV_STATE_CRITICAL
     assert "GPS fix lost" in texts(found)
@@ -233,14 +213,14 @@ def test_link_and_nodes_are_reported() -> None:
     vehicle = make()
     both = link(), link(GPS_NODE)
     vehicle.on_node_status(status(GPS_NODE, sensors_present=0b1000), 0)
-    assert texts(vehicle.on_link(report(*both), ONE_S)) == ["Receiver connected: /dev/ttyUSB0"]
-    found = vehicle.on_link(report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), 9 * ONE_S)
-    assert texts(found) == ["GPS node 1 silent"]
-    found = vehicle.on_link(report(*both, connected=False), 20 * ONE_S)
-    assert texts(found) == ["Receiver lost: /dev/ttyUSB0"]
     alive = link(last_time_us=30 * ONE_S), link(GPS_NODE, last_time_us=30 * ONE_S)
-    found = vehicle.on_link(report(*alive), 30 * ONE_S)
-    assert texts(found) == ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"]
+    for time_s, found, expected in (
+        (1, report(*both), ["Receiver connected: /dev/ttyUSB0"]),
+        (9, report(link(last_time_us=9 * ONE_S), link(GPS_NODE)), ["GPS node 1 silent"]),
+        (20, report(*both, connected=False), ["Receiver lost: /dev/ttyUSB0"]),
+        (30, report(*alive), ["Receiver connected: /dev/ttyUSB0", "GPS node 1 is back"]),
+    ):
+        assert texts(vehicle.on_link(found, time_s * ONE_S)) == expected
 
 
 def test_good_news_is_info() -> None:
@@ -248,7 +228,7 @@ def test_good_news_is_info() -> None:
     vehicle = make()
     said = fly(vehicle, 0, 2) + vehicle.on_link(report(link(), connected=False), ONE_S)
     said += vehicle.on_link(report(link(last_time_us=30 * ONE_S)), 30 * ONE_S)
-    severities = {m.text: m.severity for m in decode(said) if m.get_type() == "STATUSTEXT"}
+    severities = {m.text: m.severity for m in of_kind(said, "STATUSTEXT")}
     assert {"GPS fix", "Receiver connected: /dev/ttyUSB0"} <= severities.keys()
     trouble = {text for text, severity in severities.items() if severity < INFO}
     assert trouble == {"Receiver lost: /dev/ttyUSB0"}
@@ -264,9 +244,8 @@ def test_a_node_that_keeps_restarting_is_reported_once() -> None:
     """As with two trackers of one id, whose stamps disagree with each sample."""
     vehicle, reported = make(), []
     for second in range(60):
-        restarts = 100 * min(second, 20)
         now_us = (second + 1) * ONE_S
-        alive = link(restarts=restarts, last_time_us=now_us)
+        alive = link(restarts=100 * min(second, 20), last_time_us=now_us)
         reported += texts(vehicle.on_link(report(alive), now_us))
     assert reported == [
         "Receiver connected: /dev/ttyUSB0",
@@ -288,10 +267,7 @@ def test_compass_with_wrong_axes_is_reported_once_with_the_remedy() -> None:
 
 @pytest.mark.parametrize(
     ("flag", "sensor"),
-    [
-        (ImuFlags.MAG_UNCALIBRATED, "Compass"),
-        (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
-    ],
+    [(ImuFlags.MAG_UNCALIBRATED, "Compass"), (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer")],
 )
 def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
     flag: ImuFlags, sensor: str
@@ -300,7 +276,7 @@ def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
     for time_us in range(0, 20 * ONE_S, ONE_S // 10):
         flags = flag if time_us < 10 * ONE_S else ImuFlags(0)
         field = None if time_us % ONE_S else (20.0, 0.0, 43.0)
-        sample = replace(sample_at(time_us), flags=flags, mag_b_ut=field)
+        sample = sample_at(time_us, flags=flags, mag_b_ut=field)
         reported += texts(vehicle.on_state(state_at(time_us, flags=NavFlags(0)), sample, time_us))
     assert reported == [f"{sensor} not calibrated", f"{sensor} calibrated"]
 
@@ -330,32 +306,25 @@ def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
 
 def test_system_time_follows_gps() -> None:
     vehicle = make()
-    reported = decode([*vehicle.poll(0), *vehicle.poll(ONE_S)])
-    before = [m for m in reported if m.get_type() == "SYSTEM_TIME"]
+    before = of_kind([*vehicle.poll(0), *vehicle.poll(ONE_S)], "SYSTEM_TIME")
     assert before[0].time_unix_usec == 0
     vehicle.on_gps(fix_at(ONE_S, utc_us=1_790_000_000_000_000), ONE_S)
-    after = [m for m in decode(vehicle.poll(3 * ONE_S)) if m.get_type() == "SYSTEM_TIME"]
+    after = of_kind(vehicle.poll(3 * ONE_S), "SYSTEM_TIME")
     assert after[0].time_unix_usec == 1_790_000_002_000_000
 
 
-def test_each_aircraft_answers_for_itself() -> None:
-    mav = mavlink.MAVLink(None, 255, 190)
+def test_each_aircraft_answers_for_itself(clock: ManualClock) -> None:
+    one = GroundStation(Vehicle(VehicleSettings(), 1), clock)
+    two = GroundStation(Vehicle(VehicleSettings(rates=RateSettings(attitude_hz=7.0)), 2), clock)
 
-    def ask(vehicle: Vehicle, target: int) -> list[Any]:
+    def ask(station: GroundStation, target: int) -> list[float]:
         message = mavlink.MAVLink_param_request_read_message(target, 1, b"RATE_ATT", -1)
-        return decode(vehicle.handle(Incoming(7, message.pack(mav), trusted=True), 0))
+        found = station.send(message)
+        assert {m.get_srcSystem() for m in found} <= {station.vehicle.system_id}
+        return [m.param_value for m in found]
 
-    one = Vehicle(VehicleSettings(), 1)
-    two = Vehicle(VehicleSettings(rates=RateSettings(attitude_hz=7.0)), 2)
-    assert [m.param_value for m in ask(one, 1)] == [50.0]
-    assert [m.param_value for m in ask(two, 2)] == [7.0]
-    assert ask(one, 2) == ask(two, 1) == []
-    assert {m.get_srcSystem() for v in (one, two) for m in ask(v, 0)} == {1, 2}
-
-
-def test_two_aircraft_keep_apart() -> None:
-    one, two = make(), Vehicle(VehicleSettings(), system_id=2)
-    fly(one, 0, 2)
-    found = decode(two.poll(0))
-    assert {m.get_srcSystem() for m in found} == {2}
-    assert two.telemetry.home is None
+    assert (ask(one, 1), ask(one, 2), ask(one, 0)) == ([50.0], [], [50.0])
+    assert (ask(two, 1), ask(two, 2), ask(two, 0)) == ([], [7.0], [7.0])
+    fly(one.vehicle, 0, 2)
+    assert {m.get_srcSystem() for m in decode(two.vehicle.poll(0))} == {2}
+    assert two.vehicle.telemetry.home is None

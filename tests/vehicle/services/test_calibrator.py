@@ -7,15 +7,16 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler, rotate_inverse
-from gateway.records import Vec3
+from gateway.records import Outgoing, Vec3
 from gateway.sensing.calibrating import fit_sphere
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.requests import CalibrationKind, CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
-from tests.kit.ground_station import GroundStation
+from tests.kit.ground_station import GroundStation, of_kind, results, texts
 from tests.kit.records import sample_at, state_at
 
 G = 9.80665
+DOWN = np.array((0.0, 0.0, -G))
 CALIBRATE = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
 ACCEPTED, NOT_NOW, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 2, 3, 4, 5
 GYRO, MAG = (1,), (0, 1)
@@ -24,24 +25,27 @@ SIX_SIDES, LEVEL, SIMPLE = (0, 0, 0, 0, 1), (0, 0, 0, 0, 2), (0, 0, 0, 0, 4)
 Motion = Callable[[float], dict[str, Any]]
 
 
-def run(station: GroundStation, seconds: float, motion: Motion) -> list[Any]:
+def run(
+    station: GroundStation, seconds: float, motion: Motion, vel_n_mps: Vec3 = (0.0, 0.0, 0.0)
+) -> list[Any]:
     """Feed samples at 100 Hz; acknowledgements and texts."""
     found = []
     for _ in range(round(seconds * 100)):
         now_us = station.clock.advance(0.01)
         sample = sample_at(now_us, **motion(now_us * 1e-6))
-        found += station.receive(station.vehicle.on_state(state_at(now_us), sample, now_us))
-        found += station.receive(station.vehicle.poll(now_us))
-    return [m for m in found if m.get_type() in ("COMMAND_ACK", "STATUSTEXT")]
+        state = state_at(now_us, vel_n_mps=vel_n_mps)
+        found += station.vehicle.on_state(state, sample, now_us) + station.vehicle.poll(now_us)
+    messages = (mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_STATUSTEXT)
+    others = [f for f in found if not isinstance(f, Outgoing) or f.message_id in messages]
+    return station.receive(others)
 
 
-def acks(found: list[Any]) -> list[int]:
-    return [m.result for m in found if m.get_type() == "COMMAND_ACK"]
+def fly(station: GroundStation) -> list[Any]:
+    return run(station, 3.0, lambda _: {}, vel_n_mps=(20.0, 0.0, 0.0))
 
 
 def cal_texts(found: list[Any]) -> list[str]:
-    texts = [m.text for m in found if m.get_type() == "STATUSTEXT"]
-    return [text.removeprefix("[cal] ") for text in texts if text.startswith("[cal] ")]
+    return [t.removeprefix("[cal] ") for t in texts(found) if t.startswith("[cal] ")]
 
 
 def rest(gyro: Vec3 = (0.0, 0.0, 0.0), accel: Vec3 = (0.0, 0.0, -G), noise: float = 0.01) -> Motion:
@@ -66,13 +70,19 @@ def correction(station: GroundStation) -> NodeCalibration:
     return measured(station).correction
 
 
+def assert_failed(station: GroundStation, found: list[Any], why: str = "") -> None:
+    assert results(found)[-1] == FAILED
+    assert cal_texts(found)[-1].startswith(f"calibration failed: {why}")
+    assert station.of(CalibrationMeasured) == []
+
+
 def test_gyro(station: GroundStation) -> None:
     found = station.command(CALIBRATE, *GYRO)
-    assert acks(found) == [IN_PROGRESS]
+    assert results(found) == [IN_PROGRESS]
     assert cal_texts(found) == ["calibration started: 2 gyro"]
     found = run(station, 4.0, rest(gyro=(0.02, -0.03, 0.01)))
-    assert acks(found) == [IN_PROGRESS] * 9 + [ACCEPTED]
-    progress = [m.progress for m in found if m.get_type() == "COMMAND_ACK"][:-1]
+    assert results(found) == [IN_PROGRESS] * 9 + [ACCEPTED]
+    progress = [m.progress for m in of_kind(found, "COMMAND_ACK")][:-1]
     assert progress == [10, 20, 30, 40, 50, 60, 70, 80, 90]
     assert cal_texts(found)[-1] == "calibration done: gyro"
     assert (measured(station).vehicle_id, measured(station).kind) == (1, CalibrationKind.GYRO)
@@ -95,37 +105,26 @@ def test_simple_accelerometer(station: GroundStation) -> None:
     assert correction(station).accel_bias_mps2 == pytest.approx((0.3, -0.2, 0.1), abs=0.005)
 
 
-@pytest.mark.parametrize(
-    ("roll_deg", "pitch_deg", "below"),
-    [
-        (0, 0, "down"), (180, 0, "up"), (-90, 0, "left"), (90, 0, "right"),
-        (0, -90, "front"), (0, 90, "back"),
-    ],
-)  # fmt: skip
-def test_a_side_is_named_by_what_lies_below(
-    station: GroundStation, roll_deg: float, pitch_deg: float, below: str
-) -> None:
-    """As the pictures of QGroundControl are named: level is "down", a bank to the left "left"."""
-    q_nb = from_euler(math.radians(roll_deg), math.radians(pitch_deg), 0.0)
-    station.command(CALIBRATE, *SIX_SIDES)
-    found = run(station, 2.5, rest(accel=rotate_inverse(q_nb, (0.0, 0.0, -G))))
-    assert [text.split()[0] for text in cal_texts(found) if "side done" in text] == [below]
-
-
 def test_accelerometer_on_six_sides(station: GroundStation) -> None:
     bias = np.array((0.3, -0.2, 0.1))
-    assert acks(station.command(CALIBRATE, *SIX_SIDES)) == [IN_PROGRESS]
+    assert results(station.command(CALIBRATE, *SIX_SIDES)) == [IN_PROGRESS]
     found = []
     for axis in range(3):
         for sign in (1.0, -1.0):
             side = bias + sign * G * np.eye(3)[axis]
             found += run(station, 2.5, rest(accel=tuple(side.tolist())))
             found += run(station, 0.5, lambda t: {"gyro_b_radps": (3.0 * math.sin(9.0 * t),) * 3})
-    assert acks(found)[-1] == ACCEPTED
+    assert results(found)[-1] == ACCEPTED
     sides = [text.split()[0] for text in cal_texts(found) if "side done" in text]
     # Specific force points away from the ground: along +x the tail lies below, along -z the belly.
+    # As the pictures of QGroundControl are named: a bank to the left is "left".
     assert sides == ["back", "front", "left", "right", "up"]
     assert correction(station).accel_bias_mps2 == pytest.approx(tuple(bias), abs=0.005)
+
+
+def test_level_side_is_named_down(station: GroundStation) -> None:
+    station.command(CALIBRATE, *SIX_SIDES)
+    assert "down side done, rotate to a different side" in cal_texts(run(station, 2.5, rest()))
 
 
 def tumble(centre: Vec3, radius: float) -> Motion:
@@ -140,19 +139,9 @@ def tumble(centre: Vec3, radius: float) -> Motion:
 def test_magnetometer(station: GroundStation) -> None:
     station.command(CALIBRATE, *MAG)
     found = run(station, 30.0, tumble((12.0, -7.0, 30.0), 48.0))
-    assert acks(found)[-1] == ACCEPTED
+    assert results(found)[-1] == ACCEPTED
     assert measured(station).kind is CalibrationKind.MAG
     assert correction(station).mag_hard_iron_ut == pytest.approx((12.0, -7.0, 30.0), abs=0.1)
-
-
-def test_magnetometer_that_is_not_turned_enough(station: GroundStation) -> None:
-    def flat(time_s: float) -> dict[str, Any]:
-        return {"mag_b_ut": (20.0 * math.cos(time_s), 20.0 * math.sin(time_s), 40.0)}
-
-    station.command(CALIBRATE, *MAG)
-    found = run(station, 70.0, flat)
-    assert acks(found)[-1] == FAILED
-    assert station.of(CalibrationMeasured) == []
 
 
 def test_magnetometer_fit_corrects_soft_iron_too(station: GroundStation) -> None:
@@ -164,9 +153,8 @@ def test_magnetometer_fit_corrects_soft_iron_too(station: GroundStation) -> None
 
 
 def test_fixed_yaw_sets_the_hard_iron(station: GroundStation) -> None:
-    place = (0.0, 0.0, 47.4, 8.5)
-    found = station.command(FIXED_MAG_CAL_YAW, 90.0, 0.0, 0.0, 0.0, *place[2:])
-    assert acks(found) == [IN_PROGRESS]
+    found = station.command(FIXED_MAG_CAL_YAW, 90.0, 0.0, 0.0, 0.0, 47.4, 8.5)
+    assert results(found) == [IN_PROGRESS]
     lying = rest()
     # Facing east, north is to the left; 21 uT level and 43 uT down, declination 3 deg.
     run(station, 4.0, lambda t: {**lying(t), "mag_b_ut": (1.1 + 5.0, -21.2, 43.1)})
@@ -177,124 +165,109 @@ def test_fixed_yaw_sets_the_hard_iron(station: GroundStation) -> None:
 def test_movement_fails(station: GroundStation, params: tuple[int, ...]) -> None:
     station.command(CALIBRATE, *params)
     found = run(station, 4.0, lambda t: {"gyro_b_radps": (math.sin(5.0 * t), 0.0, 0.0)})
-    assert acks(found)[-1] == FAILED
-    assert cal_texts(found)[-1] == "calibration failed: it was moved"
-    assert station.of(CalibrationMeasured) == []
-
-
-@pytest.mark.parametrize(("noise_radps", "result"), [(0.015, ACCEPTED), (0.04, FAILED)])
-def test_trembling_of_a_hand_is_no_rest(
-    station: GroundStation, noise_radps: float, result: int
-) -> None:
-    station.command(CALIBRATE, *GYRO)
-    assert acks(run(station, 4.0, rest(noise=noise_radps)))[-1] == result
-
-
-def fly(station: GroundStation, seconds: float) -> list[Any]:
-    found = []
-    for _ in range(round(seconds * 100)):
-        now_us = station.clock.advance(0.01)
-        state = state_at(now_us, vel_n_mps=(20.0, 0.0, 0.0))
-        found += station.receive(station.vehicle.on_state(state, sample_at(now_us), now_us))
-    return found
+    assert_failed(station, found, "it was moved")
 
 
 @pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES, LEVEL, SIMPLE])
 def test_none_is_begun_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
-    fly(station, 3.0)
+    fly(station)
     found = station.command(CALIBRATE, *params)
-    assert (acks(found), cal_texts(found)) == ([DENIED], ["calibration failed: in flight"])
-    assert acks(station.command(CALIBRATE)) == [ACCEPTED], "what runs may be cancelled"
+    assert (results(found), cal_texts(found)) == ([DENIED], ["calibration failed: in flight"])
+    assert results(station.command(CALIBRATE)) == [ACCEPTED], "what runs may be cancelled"
 
 
 @pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES])
 def test_none_goes_on_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
     station.command(CALIBRATE, *params)
-    found = fly(station, 3.0)
-    assert acks(found)[-1] == FAILED
-    assert cal_texts(found)[-1] == "calibration failed: in flight"
-    assert station.of(CalibrationMeasured) == []
+    assert_failed(station, fly(station), "in flight")
+
+
+def turned_level(time_s: float) -> dict[str, Any]:
+    return {"mag_b_ut": (20.0 * math.cos(time_s), 20.0 * math.sin(time_s), 40.0)}
 
 
 @pytest.mark.parametrize(
-    ("params", "motion"),
+    ("params", "seconds", "motion"),
     [
-        (GYRO, rest(gyro=(0.0, 0.0, 0.36))),
-        (SIMPLE, rest(accel=(2.1, 0.0, -9.5))),
-        (LEVEL, rest(accel=(5.2, 0.0, -8.3))),
-        (MAG, lambda t: tumble((0.0, 210.0, 0.0), 48.0)(t)),
-        (MAG, lambda t: tumble((0.0, 0.0, 0.0), 110.0)(t)),
-        (MAG, lambda t: tumble((0.0, 0.0, 0.0), 48.0 * (1.0 + 0.3 * math.sin(50.0 * t)))(t)),
+        (GYRO, 4.0, rest(gyro=(0.0, 0.0, 0.36))),
+        (SIMPLE, 4.0, rest(accel=(2.1, 0.0, -9.5))),
+        (LEVEL, 4.0, rest(accel=(5.2, 0.0, -8.3))),
+        (MAG, 40.0, lambda t: tumble((0.0, 210.0, 0.0), 48.0)(t)),
+        (MAG, 40.0, lambda t: tumble((0.0, 0.0, 0.0), 110.0)(t)),
+        (MAG, 40.0, lambda t: tumble((0.0, 0.0, 0.0), 48.0 * (1.0 + 0.3 * math.sin(50.0 * t)))(t)),
+        (MAG, 61.0, turned_level),
     ],
 )
 def test_calibration_without_evidence_fails(
-    station: GroundStation, params: tuple[int, ...], motion: Motion
+    station: GroundStation, params: tuple[int, ...], seconds: float, motion: Motion
 ) -> None:
     station.command(CALIBRATE, *params)
-    assert acks(run(station, 60.0, motion))[-1] == FAILED
-    assert station.of(CalibrationMeasured) == []
+    assert_failed(station, run(station, seconds, motion))
 
 
-@pytest.mark.parametrize(("turn_degps", "result"), [(0.0, ACCEPTED), (2.8, FAILED)])
-def test_a_steady_turn_is_no_rest(station: GroundStation, turn_degps: float, result: int) -> None:
-    """The gyroscope's noise is that of rest; only the magnetic field shows the turn."""
-    rate = math.radians(turn_degps)
-    lying = rest(gyro=(0.0, 0.0, rate))
-    noise = np.random.default_rng(5)
+def turn(rate_degps: float) -> Motion:
+    """Turn steadily: the gyroscope's noise is that of rest; only the magnetic field shows it."""
+    rate = math.radians(rate_degps)
+    lying, noise = rest(gyro=(0.0, 0.0, rate)), np.random.default_rng(5)
 
-    def turning(time_s: float) -> dict[str, Any]:
+    def motion(time_s: float) -> dict[str, Any]:
         field = (20.0 * math.cos(rate * time_s), -20.0 * math.sin(rate * time_s), 40.0)
         return {**lying(time_s), "mag_b_ut": tuple(field + noise.normal(0, 0.5, 3))}
 
-    station.command(CALIBRATE, *GYRO)
-    assert acks(run(station, 4.0, turning))[-1] == result
+    return motion
 
 
-@pytest.mark.parametrize(("shaking_mps2", "result"), [(0.25, ACCEPTED), (0.4, FAILED)])
-def test_shaking_is_no_rest(station: GroundStation, shaking_mps2: float, result: int) -> None:
+def shake(noise_mps2: float) -> Motion:
     noise = np.random.default_rng(3)
+    still = {"gyro_b_radps": (0.0, 0.0, 0.0)}
+    return lambda _: (
+        still | {"accel_b_mps2": tuple((DOWN + noise.normal(0, noise_mps2, 3)).tolist())}
+    )
 
-    def shaken(_time_s: float) -> dict[str, Any]:
-        return {
-            "gyro_b_radps": (0.0, 0.0, 0.0),
-            "accel_b_mps2": tuple(
-                (np.array((0, 0, -G)) + noise.normal(0, shaking_mps2, 3)).tolist()
-            ),
-        }
 
+@pytest.mark.parametrize(
+    ("motion", "result"),
+    [
+        # A hand that trembles, a steady turn, and shaking.
+        *((rest(noise=0.015), ACCEPTED), (rest(noise=0.04), FAILED)),
+        *((turn(0.0), ACCEPTED), (turn(2.8), FAILED)),
+        *((shake(0.25), ACCEPTED), (shake(0.4), FAILED)),
+    ],
+)
+def test_small_motion_is_no_rest(station: GroundStation, motion: Motion, result: int) -> None:
     station.command(CALIBRATE, *GYRO)
-    assert acks(run(station, 4.0, shaken))[-1] == result
+    assert results(run(station, 4.0, motion))[-1] == result
 
 
 def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
-    assert acks([m for m in station.wait(61.0) if m.get_type() == "COMMAND_ACK"]) == [FAILED]
+    assert results(station.wait(61.0)) == [FAILED]
 
 
 def test_cancelling(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     found = station.command(CALIBRATE)
-    assert (acks(found), cal_texts(found)) == ([ACCEPTED], ["calibration cancelled"])
-    assert acks(run(station, 4.0, rest())) == []
-    assert acks(station.command(CALIBRATE)) == [ACCEPTED], "nothing to cancel is no fault"
+    assert (results(found), cal_texts(found)) == ([ACCEPTED], ["calibration cancelled"])
+    assert results(run(station, 4.0, rest())) == []
+    assert results(station.command(CALIBRATE)) == [ACCEPTED], "nothing to cancel is no fault"
 
 
 def test_one_at_a_time(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
-    assert acks(station.command(CALIBRATE, *GYRO)) == [IN_PROGRESS], "sent again for a lost ACK"
-    assert acks(station.command(CALIBRATE, *MAG)) == [NOT_NOW]
+    assert results(station.command(CALIBRATE, *GYRO)) == [IN_PROGRESS], "sent again for a lost ACK"
+    assert results(station.command(CALIBRATE, *MAG)) == [NOT_NOW]
 
 
 @pytest.mark.parametrize(
     "params", [(1, 1), (2,), (0, 0, 1), (0, 0, 0, 1), (0,) * 6 + (1,), (1, 0, 0, 0, 2)]
 )
 def test_unknown_calibrations_are_refused(station: GroundStation, params: tuple[int, ...]) -> None:
-    assert acks(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
+    assert results(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
 
 
 def test_heartbeat_reports_a_running_calibration(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
-    beats = [m for m in station.wait(1.5) if m.get_type() == "HEARTBEAT"]
+    beats = of_kind(station.wait(1.5), "HEARTBEAT")
     assert beats[-1].system_status == mavlink.MAV_STATE_CALIBRATING
 
 

@@ -4,7 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ClientInterval
-from tests.kit.ground_station import GroundStation, kinds
+from tests.kit.ground_station import GroundStation, kinds, results
 from tests.kit.records import sample_at, state_at
 
 ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
@@ -13,7 +13,7 @@ ATTITUDE, QUATERNION, HOME = 30, 31, 242
 
 
 def fly(station: GroundStation, seconds: float) -> Counter:
-    """IMU samples at 200 Hz, and what of them reaches this client past the hub's thinning."""
+    """Feed IMU samples at 200 Hz; count the messages that reach this client."""
     found = []
     for _ in range(round(seconds * 200)):
         now_us = station.clock.advance(0.005)
@@ -23,26 +23,22 @@ def fly(station: GroundStation, seconds: float) -> Counter:
     return Counter(kinds(found))
 
 
-def test_a_slower_rate_is_the_hubs_work(station: GroundStation) -> None:
-    [ack] = station.command(SET, ATTITUDE, 200_000)
-    assert ack.result == ACCEPTED
-    assert station.requested_intervals == [ClientInterval(7, 1, ATTITUDE, 200_000)]
+@pytest.mark.parametrize(
+    ("requested_us", "reported_us"), [(200_000, 200_000), (-1, -1), (0, 20_000)]
+)
+def test_a_slower_rate_is_the_hubs_work(
+    station: GroundStation, requested_us: int, reported_us: int
+) -> None:
+    """Also none at all, and that of the settings."""
+    assert results(station.command(SET, ATTITUDE, 50_000)) == [ACCEPTED]
+    assert results(station.command(SET, ATTITUDE, requested_us)) == [ACCEPTED]
+    assert station.requested_intervals[1:] == [ClientInterval(7, 1, ATTITUDE, requested_us)]
     [_, reported] = station.command(GET, ATTITUDE)
-    assert (reported.message_id, reported.interval_us) == (ATTITUDE, 200_000)
-
-
-def test_off_and_back_to_the_settings_rate(station: GroundStation) -> None:
-    station.command(SET, ATTITUDE, -1)
-    [_, reported] = station.command(GET, ATTITUDE)
-    assert reported.interval_us == -1
-    station.command(SET, ATTITUDE, 0)
-    [_, reported] = station.command(GET, ATTITUDE)
-    assert reported.interval_us == 20_000
-    assert [requested.interval_us for requested in station.requested_intervals] == [-1, 0]
+    assert (reported.message_id, reported.interval_us) == (ATTITUDE, reported_us)
 
 
 def test_faster_rate_is_sent_to_the_requesting_client_only(station: GroundStation) -> None:
-    other = GroundStation(station.vehicle, station.clock, client_id=8)
+    other = station.other()
     station.command(SET, QUATERNION, 10_000)
     assert station.requested_intervals == [ClientInterval(7, 1, QUATERNION, -1)]
     common = fly(other, 2.0)["ATTITUDE_QUATERNION"]
@@ -56,7 +52,7 @@ def test_derived_message_is_sent_only_to_the_client_that_requested_it(
     station: GroundStation, message_id: int
 ) -> None:
     name = mavlink.mavlink_map[message_id].msgname
-    other = GroundStation(station.vehicle, station.clock, client_id=8)
+    other = station.other()
     assert name not in fly(station, 2.0)
     [ack] = station.command(SET, message_id, 50_000)
     assert ack.result == ACCEPTED
@@ -75,21 +71,19 @@ def test_origin_of_the_local_frame_does_not_move_with_home(station: GroundStatio
     assert (origin.latitude, origin.altitude) == (471_234_567, 520_250)
 
 
-def test_a_faster_rate_of_a_timed_message(station: GroundStation) -> None:
-    station.command(SET, HOME, 100_000)
-    assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(20 + 2, abs=2)
+@pytest.mark.parametrize(("requested_us", "sent"), [(100_000, 20), (1, 100)])
+def test_a_faster_rate_of_a_message_that_no_sample_carries_is_bounded(
+    station: GroundStation, requested_us: int, sent: int
+) -> None:
+    station.command(SET, HOME, requested_us)
+    assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(sent + 2, abs=4)
 
 
 def test_a_faster_rate_is_not_for_every_client(station: GroundStation) -> None:
     station.trusted = False
-    assert station.command(SET, QUATERNION, 10_000)[0].result == DENIED
+    assert results(station.command(SET, QUATERNION, 10_000)) == [DENIED]
     assert station.command(SET, QUATERNION, 100_000)[0].result == ACCEPTED
     assert station.requested_intervals == [ClientInterval(7, 1, QUATERNION, 100_000)]
-
-
-def test_messages_that_no_sample_carries_are_bounded(station: GroundStation) -> None:
-    station.command(SET, HOME, 1)
-    assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(100 + 2, abs=4)
 
 
 def test_requested_intervals_end_with_the_client(station: GroundStation) -> None:
@@ -111,41 +105,28 @@ def test_messages_that_are_not_streamed(station: GroundStation, message_id: int)
     assert reported.interval_us == 0
 
 
-def test_the_interval_by_request_message(station: GroundStation) -> None:
-    [ack, reported] = station.request(244, ATTITUDE)
-    assert (ack.result, reported.message_id, reported.interval_us) == (ACCEPTED, ATTITUDE, 20_000)
-
-
-def stream_request(
-    stream: int, rate: int, start: int
-) -> mavlink.MAVLink_request_data_stream_message:
-    return mavlink.MAVLink_request_data_stream_message(1, 1, stream, rate, start)
-
-
-def test_data_streams_thin_their_groups_for_one_client(station: GroundStation) -> None:
-    assert station.send(stream_request(10, 4, 1)) == []
-    assert {(w.message_id, w.interval_us) for w in station.requested_intervals} == {
-        (ATTITUDE, 250_000),
-        (QUATERNION, 250_000),
-    }
-
-
-def test_all_data_streams_never_make_anything_faster(station: GroundStation) -> None:
-    station.send(stream_request(0, 4, 1))
+@pytest.mark.parametrize(
+    ("stream", "rate", "start", "expected"),
+    [
+        (10, 4, 1, {ATTITUDE: 250_000, QUATERNION: 250_000}),
+        # SYS_STATUS is slower than that by itself, and nothing is made faster.
+        (0, 4, 1, {33: 250_000, 74: 250_000, 1: 0}),
+        (6, 4, 0, {33: -1}),
+    ],
+)
+def test_data_streams_thin_their_groups_for_one_client(
+    station: GroundStation, stream: int, rate: int, start: int, expected: dict[int, int]
+) -> None:
+    request = mavlink.MAVLink_request_data_stream_message(1, 1, stream, rate, start)
+    assert station.send(request) == []
     intervals = {w.message_id: w.interval_us for w in station.requested_intervals}
-    assert intervals[33] == intervals[74] == 250_000
-    assert intervals[1] == 0, "SYS_STATUS is slower than that by itself"
+    assert intervals == (intervals if stream == 0 else {}) | expected
     assert 0 not in intervals
 
 
-def test_data_streams_stop(station: GroundStation) -> None:
-    station.send(stream_request(6, 4, 0))
-    assert [(w.message_id, w.interval_us) for w in station.requested_intervals] == [(33, -1)]
-
-
 def test_requested_intervals_are_bounded(station: GroundStation) -> None:
-    for client_id in range(6000):
-        client = GroundStation(station.vehicle, station.clock, client_id=client_id)
-        client.send(mavlink.MAVLink_command_long_message(1, 1, SET, 0, QUATERNION, 9000, *[0] * 5))
+    for client_id in range(3000):
+        station.client_id = client_id
+        station.command(SET, QUATERNION, 9000)
     found = station.vehicle.on_state(state_at(2_000_000), sample_at(2_000_000), 2_000_000)
     assert len(found) < 100

@@ -8,11 +8,13 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.records import GpsFixType, NavFlags
+from gateway.records import GpsFix, GpsFixType, NavFlags, NavState
 from gateway.vehicle.encoding import Encoder
 from gateway.vehicle.plan import Home, Location
 from gateway.vehicle.telemetry import messages
-from tests.kit.records import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE, decode
+from gateway.vehicle.telemetry.health import Health
+from tests.kit.ground_station import GroundStation, decode, kinds
+from tests.kit.records import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE
 
 
 def through_the_wire(message: Any) -> Any:
@@ -271,3 +273,73 @@ def test_system_time() -> None:
 
 def test_boot_time_wraps_after_49_days() -> None:
     assert messages.boot_ms(2**32 * 1000 + 5_000) == 5
+
+
+@pytest.fixture
+def well() -> Health:
+    health = Health(1, 2.0)
+    health.on_state(STATE, SAMPLE)
+    health.on_baro(BARO)
+    health.on_gps(FIX)
+    return health
+
+
+def summary(
+    state: NavState | None, fix: GpsFix | None, health: Health, now_us: int = 1_500_000
+) -> Any:
+    kind = mavlink.MAV_TYPE_FIXED_WING
+    return through_the_wire(messages.high_latency2(kind, 0, state, fix, health, now_us))
+
+
+def test_high_latency2(well: Health) -> None:
+    message = summary(STATE, FIX, well)
+    assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
+    assert (message.altitude, message.heading * 2) == (523, 272)
+    assert message.groundspeed / 5 == 5.0
+    assert message.climb_rate / 10 == pytest.approx(1.25, abs=0.06)
+    assert message.eph == round(FIX.h_acc_m * 10)
+    assert (message.timestamp, message.battery) == (1500, -1)
+    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_3D_GYRO == 0
+
+
+SEARCHING = replace(
+    FIX, fix_type=GpsFixType.NONE, fix_ok=False, h_acc_m=4_294_967.295, v_acc_m=3_750_000.0
+)
+"""A u-blox receiver before its first fix."""
+
+
+@pytest.mark.parametrize("state", [None, NOTHING])
+@pytest.mark.parametrize("fix", [None, SEARCHING, replace(FIX, fix_ok=False)])
+def test_no_position_is_reported_before_the_first_fix(
+    state: NavState | None, fix: GpsFix | None
+) -> None:
+    health = Health(1, 2.0)
+    if fix is not None:
+        health.on_gps(fix)
+    message = summary(state, fix, health)
+    assert (message.latitude, message.longitude, message.groundspeed) == (0, 0, 0)
+    assert (message.eph, message.epv) == (255, 255)
+    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_GPS
+    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_3D_ACCEL
+
+
+def test_barometric_altitude_is_reported_before_the_first_fix(well: Health) -> None:
+    message = summary(replace(NOTHING, alt_amsl_m=523.456), SEARCHING, well)
+    assert (message.latitude, message.longitude, message.altitude) == (0, 0, 523)
+
+
+def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(well: Health) -> None:
+    message = summary(STATE, FIX, well, now_us=FIX.time_us + 60_000_000)
+    assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
+    assert (message.eph, message.epv) == (255, 255)
+    assert message.failure_flags & mavlink.HL_FAILURE_FLAG_GPS
+
+
+@pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e30])
+def test_wild_values_are_saturated(well: Health, value: float) -> None:
+    wild = replace(STATE, lat_deg=value, alt_amsl_m=value, vel_n_mps=(value, value, value))
+    assert summary(wild, replace(FIX, h_acc_m=abs(value)), well)
+
+
+def test_high_latency2_is_sent_every_five_seconds(station: GroundStation) -> None:
+    assert 11 <= kinds(station.wait(60.0)).count("HIGH_LATENCY2") <= 13
