@@ -36,7 +36,6 @@ from gateway.compiled.entry_point import (
 KERNEL_MODULES: Final = (
     "gateway.estimation.eskf.filter",
     "gateway.estimation.smoother",
-    "gateway.recordings.stream_clock",
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",
 )

@@ -17,14 +17,14 @@ a real vehicle with the same id on the link that it is played to.
 
 import struct
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Callable, Set
 from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx
 
-from gateway.recordings.tlog import Batch, payload_of, readdress
+from gateway.recordings.tlog import Batch, fields_of, payload_of, readdress
 from gateway.recordings.tlog_scan import IntArray
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of, target_of
@@ -122,13 +122,6 @@ MISSION_ITEM_INT_ID: Final = 73
 
 _VALUE: Final = struct.Struct("<4sHH16sB")
 """PARAM_VALUE: value, count, index, name, type."""
-_COUNT: Final = struct.Struct("<HBBB")
-"""MISSION_COUNT: count, target system and component, mission type."""
-_ITEM: Final = struct.Struct("<28sHHBBBBBB")
-"""MISSION_ITEM and MISSION_ITEM_INT; the sequence number is the second, the type the last."""
-_ACK: Final = struct.Struct("<BBBB")
-"""MISSION_ACK: target system and component, result, mission type."""
-_CLEAR: Final = struct.Struct("<BBB")
 
 _SAME: Final = {HOME_POSITION_ID: 52}
 """How much of the payload must be equal to be no change; the rest is the time of sending."""
@@ -181,17 +174,20 @@ class LogAnswers:
     """The answers in one recording, of any number of parts."""
 
     def __init__(self) -> None:
-        self._frames: dict[tuple[int, int, bytes], _Course[bytes]] = {}
-        self._missions: dict[tuple[int, int], _Course[Items]] = {}
+        self.frames: dict[tuple[int, int, bytes], _Course[bytes]] = {}
+        """By system, message id, and key of the item."""
+        self.missions: dict[tuple[int, int], _Course[Items]] = {}
+        """By system and kind."""
+        self.seen: set[tuple[int, int]] = set()
+        """System and id of each message."""
         self._transfers: dict[tuple[int, int, bool], _Transfer] = {}
-        self._seen: set[tuple[int, int]] = set()
         self._kept = 0
 
     def note(self, batch: Batch, stations: Set[int]) -> None:
         """Take in the next records."""
         systems = batch.origins >> 8
         pairs = np.unique(systems << 32 | batch.message_ids)
-        self._seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
+        self.seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
         for i in np.flatnonzero(np.isin(batch.message_ids, _READ)).tolist():
             if self._kept < MAX_KEPT:
                 self.note_frame(batch.frame(i), int(batch.time_us[i]), stations)
@@ -199,48 +195,32 @@ class LogAnswers:
     def note_frame(self, frame: bytes, time_us: int, stations: Set[int] = frozenset()) -> None:
         """Take in one frame: an answer or a part of a mission; others are ignored."""
         message_id, (system, component) = message_id_of(frame), origin_of(frame)
-        self._seen.add((system, message_id))
+        self.seen.add((system, message_id))
         if message_id in _MISSION:
             self._note_mission(frame, time_us, is_station(system << 8 | component, stations))
         elif message_id in _KEPT and component == AUTOPILOT:
-            course = self._frames.setdefault((system, message_id, _key_of(frame)), _Course())
+            course = self.frames.setdefault((system, message_id, _key_of(frame)), _Course())
             if not course.values or _content_of(course.values[-1]) != _content_of(frame):
                 course.add(time_us, frame)
                 self._kept += 1
 
-    def has_message(self, system: int, message_id: int) -> bool:
-        """Return whether a vehicle sent a message at all."""
-        return (system, message_id) in self._seen
-
-    def frames_at(self, system: int, message_id: int, time_us: int) -> Iterator[bytes]:
-        """Yield the frames that a vehicle sent last before a time, or else first after it."""
-        for (sender, kind, _), course in self._frames.items():
-            if (sender, kind) == (system, message_id):
-                yield course.at(time_us)
-
-    def mission_at(self, system: int, kind: int, time_us: int) -> Items | None:
-        """Return the items of a mission, a fence or rally points; None if none are recorded."""
-        course = self._missions.get((system, kind))
-        return None if course is None else course.at(time_us)
-
     def _note_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
         vehicle = target_of(frame)[0] if is_upload else origin_of(frame)[0]
-        message_id = message_id_of(frame)
+        message_id, message = message_id_of(frame), fields_of(frame)
+        kind = message["mission_type"]
+        kinds = KINDS if kind == ALL_KINDS else (kind,)
         if message_id == MISSION_COUNT_ID:
-            count, _, _, kind = _COUNT.unpack(payload_of(frame, _COUNT.size))
-            self._begin(vehicle, kind, is_upload, count, time_us)
+            self._begin(vehicle, kind, is_upload, message["count"], time_us)
         elif message_id == MISSION_CLEAR_ALL_ID and is_upload:
-            kind = _CLEAR.unpack(payload_of(frame, _CLEAR.size))[-1]
-            for each in KINDS if kind == ALL_KINDS else (kind,):
+            for each in kinds:
                 self._begin(vehicle, each, is_upload, 0, time_us)
         elif message_id == MISSION_ACK_ID and not is_upload:
-            result, kind = _ACK.unpack(payload_of(frame, _ACK.size))[2:]
-            for each in KINDS if kind == ALL_KINDS else (kind,):
+            for each in kinds:
                 transfer = self._transfers.pop((vehicle, each, True), None)
-                if transfer is not None and not result:
+                if transfer is not None and not message["type"]:
                     self._store(vehicle, each, transfer, time_us)
         elif message_id in (MISSION_ITEM_ID, MISSION_ITEM_INT_ID):
-            _, sequence, *_, kind = _ITEM.unpack(payload_of(frame, _ITEM.size))
+            sequence = message["seq"]
             transfer = self._transfers.get((vehicle, kind, is_upload))
             if transfer is not None and sequence < transfer.count:
                 self._kept += sequence not in transfer.items
@@ -258,7 +238,7 @@ class LogAnswers:
         if kind not in KINDS or len(transfer.items) < transfer.count:
             return
         items = tuple(transfer.items[i] for i in range(transfer.count))
-        course = self._missions.setdefault((vehicle, kind), _Course())
+        course = self.missions.setdefault((vehicle, kind), _Course())
         contents = [payload_of(frame, 255) for frame in items]
         if not course.values or [payload_of(f, 255) for f in course.values[-1]] != contents:
             course.add(time_us, items)
@@ -277,16 +257,20 @@ class VehicleAnswers:
 
     def has_message(self, message_id: int) -> bool:
         """Return whether the vehicle sent a message at all."""
-        return self._log.has_message(self._system_id, message_id)
+        return (self._system_id, message_id) in self._log.seen
 
     def frames(self, message_id: int) -> list[bytes]:
-        """Return the frames that answer a request for a message; none if there is no answer."""
-        found = self._log.frames_at(self._system_id, message_id, self._position_us())
-        return [readdress(frame, self.played_as) for frame in found]
+        """Return the frames that were sent last before the moment, or else first after it."""
+        return [
+            readdress(course.at(self._position_us()), self.played_as)
+            for (system, kind, _), course in self._log.frames.items()
+            if (system, kind) == (self._system_id, message_id)
+        ]
 
     def mission(self, kind: int) -> Items | None:
         """Return the frames of the items of a mission; None if the recording has none."""
-        return self._log.mission_at(self._system_id, kind, self._position_us())
+        course = self._log.missions.get((self._system_id, kind))
+        return None if course is None else course.at(self._position_us())
 
     def parameters(self) -> dict[str, bytes]:
         """Return the parameters by name, in their order, numbered so that the list is complete."""

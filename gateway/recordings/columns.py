@@ -264,13 +264,6 @@ def row_of_cells(cells: Sequence[float], vehicle_id: int) -> TableRow:
     )
 
 
-def check_times(row: TableRow) -> None:
-    """Check that all times of a row are possible; raises ValueError if not."""
-    for record in (row, row.baro, row.gps, row.state):
-        if record is not None and abs(record.time_us) > LARGEST_WHOLE:
-            raise ValueError(f"{record.time_us} us is no time of a flight")
-
-
 Imported = ImuCalibrated | BaroRaw | GpsFix | NavState
 """Records of another program's log."""
 

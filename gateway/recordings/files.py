@@ -26,7 +26,6 @@ from typing import IO, Any, BinaryIO, Final, Literal, cast
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.printable import UserError
-from gateway.recordings.formats.mavlink import layout_of
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
 from gateway.recordings.tlog import (
     DAY_US,
@@ -35,6 +34,7 @@ from gateway.recordings.tlog import (
     Timeline,
     TlogScanner,
     encode_record,
+    layout_of,
     payload_of,
 )
 from gateway.recordings.tlog_scan import TIME_SIZE

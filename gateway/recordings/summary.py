@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import struct
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -45,7 +44,7 @@ from gateway.recordings.tlog import (
     HEARTBEAT_ID,
     Batch,
     TlogIndex,
-    payload_of,
+    fields_of,
 )
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
@@ -65,7 +64,6 @@ LEAST_STEP_M: Final = 1.0
 
 MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
 GLOBAL_POSITION_INT_ID: Final = 33
-_POSITION: Final = struct.Struct("<Iii")
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,8 +239,8 @@ class TlogSummary:
         for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
             system_id, component_id = divmod(int(batch.origins[i]), 256)
             if component_id == 1 and system_id not in self._kinds:
-                payload = payload_of(batch.frame(i), 6)
-                self._kinds[system_id] = (payload[4], payload[5])
+                heartbeat = fields_of(batch.frame(i))
+                self._kinds[system_id] = (heartbeat["type"], heartbeat["autopilot"])
         for i in np.flatnonzero(batch.message_ids == GLOBAL_POSITION_INT_ID).tolist():
             self._add_position(batch, i)
 
@@ -273,9 +271,9 @@ class TlogSummary:
         time_us = int(batch.time_us[i])
         if not way.is_due(time_us):
             return
-        _, lat, lon = _POSITION.unpack(payload_of(batch.frame(i), _POSITION.size))
-        if lat or lon:
-            way.add(time_us, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+        m = fields_of(batch.frame(i))
+        if m["lat"] or m["lon"]:
+            way.add(time_us, m["lat"] * DEG_PER_DEGE7, m["lon"] * DEG_PER_DEGE7)
 
     def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
         mav_type, autopilot = self._kinds.get(system_id, (None, None))

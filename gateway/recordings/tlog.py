@@ -9,11 +9,13 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from functools import cache
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.tlog_scan import (
     COLUMNS,
@@ -87,6 +89,27 @@ def payload_of(frame: bytes, size: int) -> bytes:
     """Return the first bytes of a frame's payload, with the zeros that version 2 cuts off."""
     begin = 10 if frame[0] == START_V2 else 6
     return frame[begin : begin + min(frame[1], size)].ljust(size, b"\0")
+
+
+@cache
+def layout_of(kind: Any) -> np.dtype[np.void]:
+    """Return a message's fields as they lie in its payload."""
+    fields = []
+    for name, code, length in zip(
+        kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
+    ):
+        if chr(code) == "c":
+            fields.append((name, f"S{max(1, length)}"))
+        else:
+            fields.append((name, f"({length},)<{chr(code)}" if length else f"<{chr(code)}"))
+    return np.dtype(fields)
+
+
+def fields_of(frame: bytes) -> dict[str, Any]:
+    """Return the fields of a frame of the dialect, as Python's own values."""
+    layout = layout_of(mavlink.mavlink_map[message_id_of(frame)])
+    values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
+    return dict(zip(layout.names or (), values, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

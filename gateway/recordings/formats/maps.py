@@ -3,8 +3,7 @@
 import json
 import math
 import re
-import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
@@ -18,7 +17,7 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.reading import RecordedTable
 from gateway.recordings.summary import GLOBAL_POSITION_INT_ID
 from gateway.recordings.table import REMARK, TableMark
-from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, payload_of
+from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, fields_of
 from gateway.records import FusionState, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 from gateway.vehicle.plan import is_good_enough, location_of
@@ -262,13 +261,12 @@ def _position(point: TrackPoint) -> list[float]:
 ATTITUDE_ID: Final = 30
 ATTITUDE_QUATERNION_ID: Final = 31
 STATUSTEXT_ID: Final = 253
-
-_ATTITUDE: Final = struct.Struct("<Ifff")
-_QUATERNION: Final = struct.Struct("<Iffff")
-_POSITION: Final = struct.Struct("<Iiii")
-_HOME: Final = struct.Struct("<iii")
-_TEXT: Final = struct.Struct("<B50sHB")
-"""STATUSTEXT: severity, text, and of a long one its number and which chunk of it."""
+_READ: Final = frozenset(
+    {
+        ATTITUDE_ID, ATTITUDE_QUATERNION_ID, GLOBAL_POSITION_INT_ID, HOME_POSITION_ID,
+        STATUSTEXT_ID,
+    }
+)  # fmt: skip
 INFO: Final = 6
 """MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
@@ -337,37 +335,33 @@ def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> li
 
 
 def _take(one: _Drawn, record: TlogRecord) -> None:
-    frame, time_us = record.frame, record.time_us
-    message_id = message_id_of(frame)
+    message_id, time_us = message_id_of(record.frame), record.time_us
+    if message_id not in _READ:
+        return
+    m = fields_of(record.frame)
     if message_id == ATTITUDE_ID:
-        _, roll, pitch, yaw = _ATTITUDE.unpack(payload_of(frame, _ATTITUDE.size))
-        one.attitude_deg = _finite(roll, pitch, yaw)
+        one.attitude_deg = _finite(m["roll"], m["pitch"], m["yaw"])
     elif message_id == ATTITUDE_QUATERNION_ID:
-        _, w, x, y, z = _QUATERNION.unpack(payload_of(frame, _QUATERNION.size))
-        one.attitude_deg = _angles((w, x, y, z))
+        one.attitude_deg = _angles((m["q1"], m["q2"], m["q3"], m["q4"]))
     elif message_id == GLOBAL_POSITION_INT_ID:
-        _, lat, lon, alt = _POSITION.unpack(payload_of(frame, _POSITION.size))
-        if lat or lon:
-            one.add(_point(time_us, lat, lon, alt, one.attitude_deg))
+        if m["lat"] or m["lon"]:
+            one.add(_point(time_us, m["lat"], m["lon"], m["alt"], one.attitude_deg))
     elif message_id == HOME_POSITION_ID:
-        lat, lon, alt = _HOME.unpack(payload_of(frame, _HOME.size))
+        lat, lon = m["latitude"], m["longitude"]
         if (lat or lon) and one.home != (lat, lon):
             one.home = (lat, lon)
-            one.put(PlaceKind.HOME, "Home", _point(time_us, lat, lon, alt, None))
-    elif message_id == STATUSTEXT_ID:
-        _take_text(one, frame, time_us)
+            one.put(PlaceKind.HOME, "Home", _point(time_us, lat, lon, m["altitude"], None))
+    elif m["severity"] <= INFO:
+        _take_text(one, m, time_us)
 
 
-def _take_text(one: _Drawn, frame: bytes, time_us: int) -> None:
-    severity, raw, number, chunk = _TEXT.unpack(payload_of(frame, _TEXT.size))
-    text = raw.split(b"\0", 1)[0].decode("ascii", "replace")
-    if severity > INFO:
-        return
-    if number and chunk:
+def _take_text(one: _Drawn, m: Mapping[str, Any], time_us: int) -> None:
+    text, number = m["text"].split(b"\0", 1)[0].decode("ascii", "replace"), m["id"]
+    if number and m["chunk_seq"]:
         places = one.track.places
         if number == one.text_id and places and places[-1].kind is PlaceKind.EVENT:
             last = places.pop()
-            places.append(MapPlace(last.kind, last.name + text, last.at))
+            places.append(replace(last, name=last.name + text))
         return
     one.text_id = number
     one.add_event(time_us, text)

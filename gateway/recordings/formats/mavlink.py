@@ -12,7 +12,7 @@ estimates (ATTITUDE, with the position known then) the last before each sample i
 """
 
 import math
-from functools import cache
+from collections import defaultdict
 from typing import Any, Final
 
 import numpy as np
@@ -30,8 +30,7 @@ from gateway.recordings.columns import (
     FloatArray,
 )
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.stream_clock import STREAMS, times_on_clock
-from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
+from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, layout_of
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
 from gateway.records import (
     NAN,
@@ -49,20 +48,6 @@ from gateway.wire.mavlink_splitter import START_V2
 HEAD_V1: Final = 6
 HEAD_V2: Final = 10
 LENGTH_AT: Final = 1
-
-
-@cache
-def layout_of(kind: Any) -> np.dtype[np.void]:
-    """Return a message's fields as they lie in its payload."""
-    fields = []
-    for name, code, length in zip(
-        kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
-    ):
-        if chr(code) == "c":
-            fields.append((name, f"S{max(1, length)}"))
-        else:
-            fields.append((name, f"({length},)<{chr(code)}" if length else f"<{chr(code)}"))
-    return np.dtype(fields)
 
 
 def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
@@ -240,8 +225,8 @@ IMU_RANK: Final = {
 _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
 _PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
 
-_STREAMS: Final = {FIX: 1, PRESSURE: 2, ATTITUDE: 3}
-"""Streams with a clock of their own, in addition to the IMU, which is 0."""
+_OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
+"""Kinds of messages that may have another clock than the IMU's."""
 
 _BARO, _GPS, _IMU = 1, 2, 3
 """The order of a row: a record that is not behind its predecessor in it begins a row."""
@@ -256,11 +241,11 @@ class AutopilotReader:
         self.unix_us_at_zero: int | None = None
         """Civil time of the rows' time zero, by the times of the recording."""
         self._rank = 0
-        self._zero_us = np.zeros(2, np.int64)
-        """The vehicle's own time, and that of the recording, at the rows' zero."""
-        self._newest_us = np.zeros(STREAMS, np.int64)
-        """Of each stream, on the rows' clock."""
-        self._sampled_us = np.zeros(1, np.int64)
+        self._zero_us = 0
+        """The vehicle's own time at the rows' zero."""
+        self._newest_us: defaultdict[int, int] = defaultdict(int)
+        """Of each of `_OWN_CLOCKS`, and of the IMU under `_IMU`, on the rows' clock."""
+        self._sampled_us = 0
         """When the newest IMU sample was recorded, or else the first message."""
         self._places = np.empty(0, _PLACE)
         self._places_us = np.empty(0, np.int64)
@@ -319,19 +304,33 @@ class AutopilotReader:
             else:
                 own = values["time_boot_ms"].astype(np.int64) * 1000
             own_us[message_ids == message_id] = own
-        clocked = message_ids != POSITION
-        if self.unix_us_at_zero is None and clocked.any():
-            first = int(np.argmax(clocked))
-            self.unix_us_at_zero = int(recorded_us[first])
-            self._zero_us[:] = own_us[first] or recorded_us[first], recorded_us[first]
-            self._sampled_us[0] = recorded_us[first]
-        own_us[~clocked] = -1
-        streams = np.zeros(len(message_ids), np.int64)
-        for message_id, stream in _STREAMS.items():
-            streams[message_ids == message_id] = stream
-        return times_on_clock(
-            streams, own_us, recorded_us, self._zero_us, self._newest_us, self._sampled_us
-        )
+        time_us = np.zeros(len(message_ids), np.int64)
+        columns = (message_ids.tolist(), own_us.tolist(), recorded_us.tolist())
+        for k, message in enumerate(zip(*columns, strict=True)):
+            if message[0] != POSITION:
+                time_us[k] = self._time(*message)
+        return time_us
+
+    def _time(self, message_id: int, own_us: int, recorded_us: int) -> int:
+        """Put one message on the rows' clock; it contains no time if `own_us` is 0."""
+        newest_us = self._newest_us
+        if self.unix_us_at_zero is None:
+            self.unix_us_at_zero = self._sampled_us = recorded_us
+            self._zero_us = own_us or recorded_us
+        stream = message_id if message_id in _OWN_CLOCKS else _IMU
+        elapsed_us = (own_us or recorded_us) - self._zero_us
+        if not 0 <= elapsed_us - newest_us[_IMU] <= US_PER_S:
+            # Another clock than the IMU's, or a restart: use the time of recording. The two clocks
+            # drift apart, so only since the newest sample.
+            elapsed_us = (
+                recorded_us - self.unix_us_at_zero
+                if stream == _IMU
+                else newest_us[_IMU] + max(recorded_us - self._sampled_us, 0)
+            )
+        newest_us[stream] = max(newest_us[stream], elapsed_us)
+        if stream == _IMU:
+            self._sampled_us = recorded_us
+        return newest_us[stream]
 
     def _places_at(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
