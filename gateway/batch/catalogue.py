@@ -32,12 +32,12 @@ from gateway.recordings.files import (
     GZIP,
     NO_RECORDING,
     OTHER_FORMATS,
-    FileKind,
+    TABLE,
+    TLOG,
     FlightError,
     first_bytes,
-    kind_of,
+    format_of,
     open_recording,
-    other_format,
     read_batches,
     read_blocks,
 )
@@ -413,7 +413,7 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
         found = replace(found, size=size, modified_ns=modified_ns, digest=digest_of(path))
         if found.digest == known_digest:
             return found
-        found = replace(found, kind=_kind_name(path))
+        found = replace(found, kind=format_of(path))
         flights = tuple(_flights_in(path, options))
     except OSError as error:
         return replace(found, error=error.strerror or as_text(str(error)))
@@ -507,20 +507,15 @@ def _may_be_recording(path: Path) -> bool:
     return any(knows(begin) for knows in OTHER_FORMATS.values())
 
 
-def _kind_name(path: Path) -> str:
-    kind = kind_of(path)
-    return other_format(path) if kind is FileKind.OTHER else kind.value
-
-
 def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
-    kind = kind_of(path)
-    if kind is FileKind.TLOG:
+    kind = format_of(path)
+    if kind == TLOG:
         tlog = TlogTally()
         for batch in read_batches(path):
             tlog.add(batch)
         return tlog.flown()
     tally = TableTally()
-    if kind is FileKind.TABLE:
+    if kind == TABLE:
         reader = TableReader()
         for block in read_blocks(path, reader, None):
             tally.add(block)

@@ -22,7 +22,7 @@ from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import Uplink
 from gateway.recordings.answers import FIRST_GROUND_STATION, is_station
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import FileKind, kind_of, read_chunks
+from gateway.recordings.files import TLOG, format_of, read_chunks
 from gateway.recordings.formats.maps import TrackPoint, VehicleTrack, tracks_of_frames
 from gateway.recordings.index import RecordingError, find_recording, parts_together
 from gateway.recordings.opening import TlogFile
@@ -64,7 +64,7 @@ def look_into(files: Sequence[Path]) -> list[list[RecordedAircraft]]:
     """
     flights = []
     for parts in parts_together(files):
-        if kind_of(parts[0]) is FileKind.TLOG:
+        if format_of(parts[0]) == TLOG:
             flights.append(_of_tlogs(parts))
         else:
             flights.append([_of_tables(parts)])

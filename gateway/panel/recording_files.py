@@ -24,14 +24,14 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
 from gateway.panel.access import RECORDINGS, ROLE, Role
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import FileKind, kind_of
+from gateway.recordings.files import TABLE, TLOG, format_of
 from gateway.recordings.index import RecordingError, check_free, find_recording
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
 
 LOOKED_AT: Final = 1 << 20
 CHUNK: Final = 1 << 18
-KINDS: Final[dict[FileKind | None, str]] = {FileKind.TLOG: "_01.tlog", FileKind.TABLE: "_01_v1.csv"}
+KINDS: Final[dict[str | None, str]] = {TLOG: "_01.tlog", TABLE: "_01_v1.csv"}
 """Kinds that can be uploaded, and the ending of their files."""
 
 
@@ -163,13 +163,13 @@ def _recording_name(name: str, path: Path) -> str:
     return f"{name}{suffix}"
 
 
-def _kind(path: Path) -> FileKind | None:
+def _kind(path: Path) -> str | None:
     """Return the kind of an upload by its first bytes; None if it is no recording."""
-    kind = kind_of(path)
+    kind = format_of(path)
     with path.open("rb") as file:
         head = file.read(LOOKED_AT)
-    if kind is FileKind.TLOG:
+    if kind == TLOG:
         batch = TlogScanner().feed(head, final=True)
         return kind if len(batch) else None
     rows = (event for event in TableReader().feed(head) if isinstance(event, TableRow))
-    return kind if kind is FileKind.TABLE and next(rows, None) is not None else None
+    return kind if kind == TABLE and next(rows, None) is not None else None

@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.files import NO_RECORDING, FileKind, FlightError, kind_of
+from gateway.recordings.files import NO_RECORDING, TLOG, FlightError, format_of
 from gateway.recordings.formats.maps import (
     VehicleTrack,
     to_geojson,
@@ -55,8 +55,8 @@ class FlightToWrite:
     ) -> None:
         self.files, self.options, self.title, self.message = files, options, title, message
         self._limits, self._smooth = limits, smooth
-        kinds = {kind_of(file) for file in files}
-        self.is_mavlink = kinds == {FileKind.TLOG}
+        kinds = {format_of(file) for file in files}
+        self.is_mavlink = kinds == {TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self._sources: list[RecordedFusion | RecordedTable] = []

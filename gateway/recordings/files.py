@@ -18,7 +18,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from enum import IntEnum, StrEnum
+from enum import IntEnum
 from pathlib import Path
 from tempfile import NamedTemporaryFile, gettempdir
 from typing import IO, Any, BinaryIO, Final, Literal, cast
@@ -71,22 +71,14 @@ class FlightError(UserError):
     """A file without the data that a command needs; the text names the data and the file."""
 
 
-class FileKind(StrEnum):
-    """Kind of a file, by its first bytes."""
-
-    TLOG = "tlog"
-    TABLE = "table"
-    CSV = "csv"
-    """Of another program, with columns of its own."""
-    OTHER = "other"
-    """A format in `OTHER_FORMATS`."""
+TLOG, TABLE, CSV, PARQUET = "tlog", "table", "csv", "Parquet"
+"""Formats; a CSV is that of another program, with columns of its own."""
 
 
 def _begins(*heads: bytes) -> Callable[[bytes], bool]:
     return lambda head: head.startswith(heads)
 
 
-PARQUET: Final = "Parquet"
 OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
     "ULog": _begins(b"ULog\x01\x12\x35"),
     "DataFlash": lambda head: head.startswith((b"\xa3\x95", b"FMT,")) or b"\nFMT, 1" in head,
@@ -107,27 +99,19 @@ def encoding_of(head: bytes) -> str:
     return "utf-8-sig"
 
 
-def kind_of(path: Path) -> FileKind:
-    """Recognise a file by its first bytes; raises OSError if it cannot be read."""
+def format_of(path: Path) -> str:
+    """Recognise the format of a file by its first bytes; raises OSError if it cannot be read."""
     head = first_bytes(path)
     if encoding_of(head) != "utf-8-sig":
-        return FileKind.CSV
-    if any(knows(head) for knows in OTHER_FORMATS.values()):
-        return FileKind.OTHER
+        return CSV
+    known = (name for name, knows in OTHER_FORMATS.items() if knows(head))
+    if (name := next(known, None)) is not None:
+        return name
     if head.startswith((b"# mavgate table", b"time_us,")):
-        return FileKind.TABLE
+        return TABLE
     is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
     has_cells = any(delimiter in head for delimiter in (b",", b";", b"\t"))
-    return FileKind.CSV if has_cells and not is_binary else FileKind.TLOG
-
-
-def other_format(path: Path) -> str:
-    """Return which of `OTHER_FORMATS` a file has; raises KeyError if none."""
-    head = first_bytes(path)
-    for name, knows in OTHER_FORMATS.items():
-        if knows(head):
-            return name
-    raise KeyError(path)
+    return CSV if has_cells and not is_binary else TLOG
 
 
 def first_bytes(path: Path) -> bytes:

@@ -14,13 +14,13 @@ from gateway.recordings.answers import FIRST_GROUND_STATION, LogAnswers, is_stat
 from gateway.recordings.files import (
     MAX_UNPACKED,
     NO_RECORDING,
-    FileKind,
+    TLOG,
     FlightError,
     Layout,
     Progress,
     TlogSource,
+    format_of,
     is_packed,
-    kind_of,
     open_descriptor,
     open_tlog,
     temporary_copy,
@@ -218,7 +218,7 @@ def open_flights(
     flights = []
     for parts in parts_together(files):
         flight = OpenFlight()
-        if kind_of(parts[0]) is FileKind.TLOG:
+        if format_of(parts[0]) == TLOG:
             for file in parts:
                 tlog = TlogFile(file, options.progress, flight.answers, options.unpacked_limit)
                 opened.callback(tlog.close)

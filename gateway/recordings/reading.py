@@ -24,18 +24,19 @@ from gateway.estimation.select import migrate_sections
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TIMES, BoolArray, TableRow
 from gateway.recordings.files import (
+    CSV,
     MAX_UNPACKED,
     OTHER_FORMATS,
     PARQUET,
-    FileKind,
+    TABLE,
+    TLOG,
     FlightError,
     Position,
     Progress,
     SettingsChoice,
     encoding_of,
-    kind_of,
+    format_of,
     open_tlog,
-    other_format,
     read_blocks,
     read_chunks,
 )
@@ -112,8 +113,8 @@ class RecordedTable:
 
 Read = Callable[[Path, ReadOptions], RecordedTable]
 
-READERS: Final[dict[str, Read]] = {}
-"""Of the formats in `OTHER_FORMATS`."""
+READERS: dict[str, Read] = {}
+"""By the name of the format."""
 
 
 def add_reader(name: str, knows: Callable[[bytes], bool], read: Read) -> None:
@@ -147,8 +148,7 @@ def _add_packaged(name: str, module: str) -> None:
 
 def is_table(path: Path) -> bool:
     """Return whether a file is a table of mavgate's, with its own settings and states."""
-    kind = kind_of(path)
-    return kind is FileKind.TABLE or (kind is FileKind.OTHER and other_format(path) == PARQUET)
+    return format_of(path) in (TABLE, PARQUET)
 
 
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
@@ -157,15 +157,7 @@ def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     Raises FlightError if it holds no flight that can be read; OSError if it cannot be read at
     all.
     """
-    match kind_of(path):
-        case FileKind.TABLE:
-            return _open_table(path, options)
-        case FileKind.CSV:
-            return _open_csv(path, options)
-        case FileKind.TLOG:
-            return _open_autopilot(path, options)
-        case FileKind.OTHER:
-            return READERS[other_format(path)](path, options)
+    return READERS[format_of(path)](path, options)
 
 
 def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
@@ -359,9 +351,9 @@ def _header_of_today(
     return msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)
 
 
-_add_packaged("ULog", "ulog")
-_add_packaged("DataFlash", "dataflash")
-_add_packaged(PARQUET, "parquet")
+READERS |= {TABLE: _open_table, CSV: _open_csv, TLOG: _open_autopilot}
+for _name, _module in (("ULog", "ulog"), ("DataFlash", "dataflash"), (PARQUET, "parquet")):
+    _add_packaged(_name, _module)
 
 
 Limits = tuple[Moment | None, Moment | None]

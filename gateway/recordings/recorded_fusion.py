@@ -38,10 +38,11 @@ from gateway.recordings.columns import (
     write_lines,
 )
 from gateway.recordings.files import (
-    FileKind,
+    CSV,
+    TABLE,
     FlightError,
     encoding_of,
-    kind_of,
+    format_of,
     read_chunks,
     read_ends,
 )
@@ -226,7 +227,7 @@ def _in_words(latency: FoundLatency) -> str:
 def facts_of(file: Path) -> dict[str, float]:
     """Read `key=value` in the comments of another program's CSV; FlightError if no number."""
     facts: dict[str, float] = {}
-    if kind_of(file) is not FileKind.CSV:
+    if format_of(file) != CSV:
         return facts
     begin = next(read_chunks(file), b"")
     head = begin.decode(encoding_of(begin), errors="replace")
@@ -399,11 +400,11 @@ def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
 
 def end_of(file: Path, options: ReadOptions) -> int | None:
     """Return the civil time of a table's last row without reading all of it; None if unknown."""
-    kind = kind_of(file)
-    if kind is FileKind.OTHER:
+    kind = format_of(file)
+    if kind not in (TABLE, CSV):
         return None
     head, tail = read_ends(file)
-    if kind is FileKind.CSV:
+    if kind == CSV:
         lines = (head + tail).decode(errors="replace").splitlines()
         with suppress(ValueError):
             *_, last = csv_reader(options).blocks(lines)

@@ -30,12 +30,12 @@ from gateway.recordings.columns import (
 )
 from gateway.recordings.files import (
     NO_RECORDING,
-    FileKind,
+    TABLE,
+    TLOG,
     FlightError,
     Progress,
-    kind_of,
+    format_of,
     open_tlog,
-    other_format,
     read_blocks,
 )
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
@@ -375,8 +375,8 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
     `options` is called for other programs' files alone.
     """
-    kind, size = kind_of(file), file.stat().st_size
-    if kind is FileKind.TLOG:
+    kind, size = format_of(file), file.stat().st_size
+    if kind == TLOG:
         tlog, source = TlogSummary(), open_tlog(file)
         for batch in source.batches(progress):
             tlog.add(batch)
@@ -385,7 +385,7 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
         if not found.records:
             raise FlightError(f"{file}: {NO_RECORDING}")
         return found
-    if kind in (FileKind.CSV, FileKind.OTHER):
+    if kind != TABLE:
         return _describe_by_rows(file, kind, options())
     table, reader = TableSummary(), TableReader()
     for block in read_blocks(file, reader, progress):
@@ -393,7 +393,7 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
     return table.result(size)
 
 
-def _describe_by_rows(file: Path, kind: FileKind, options: ReadOptions) -> FileInfo:
+def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
     # They import every stage, which a summary of a recording of our own does not need.
     from gateway.recordings.reading import is_table, open_rows, shifted
 
@@ -404,7 +404,7 @@ def _describe_by_rows(file: Path, kind: FileKind, options: ReadOptions) -> FileI
         table.add(shifted(block, zero_us), recorded.header)
     return replace(
         table.result(file.stat().st_size),
-        kind=other_format(file) if kind is FileKind.OTHER else kind.value,
+        kind=kind,
         header=recorded.header if own else None,
         remarks=tuple(recorded.remarks),
     )

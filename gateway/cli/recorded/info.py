@@ -22,11 +22,12 @@ from gateway.cli.support.recording_options import (
 from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new
 from gateway.recordings.files import (
+    CSV,
     NO_RECORDING,
-    FileKind,
+    TLOG,
     FlightError,
     Progress,
-    kind_of,
+    format_of,
     open_tlog,
     read_blocks,
 )
@@ -95,7 +96,7 @@ def recover(
     console = console_of()
     left_out: list[str] = []
     with progress_of([file]) as advance:
-        is_tlog = kind_of(file) is FileKind.TLOG
+        is_tlog = format_of(file) == TLOG
         kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
         target = out or file.with_name(f"{file.stem}.recovered{kept}")
         if out is not None and out.suffix == other:
@@ -153,7 +154,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
 
 def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
-    kind = "another program's CSV" if found.kind == FileKind.CSV else found.kind
+    kind = "another program's CSV" if found.kind == CSV else found.kind
     console.print(f"{file}: {kind}, {found.size / 1e6:.3f} MB")
     console.print(f"{counted(found.records, 'record')} in {_clock(found.duration_s)}{_when(found)}")
     if found.header is not None:

@@ -19,7 +19,14 @@ from gateway.cli.support.options import (
     read_settings,
 )
 from gateway.cli.support.terminal import console_of, progress_bar
-from gateway.recordings.files import FileKind, FlightError, Position, SettingsChoice, kind_of
+from gateway.recordings.files import (
+    TABLE,
+    TLOG,
+    FlightError,
+    Position,
+    SettingsChoice,
+    format_of,
+)
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
 
@@ -168,11 +175,10 @@ SystemOption = Annotated[
     int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
 ]
 
+OTHER_STORY: Final = "Recorded by another program; its samples count as calibrated."
 STORIES: Final = {
-    FileKind.TABLE: "Recorded by mavgate.",
-    FileKind.CSV: "Recorded by another program; its samples count as calibrated.",
-    FileKind.OTHER: "Recorded by another program; its samples count as calibrated.",
-    FileKind.TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
+    TABLE: "Recorded by mavgate.",
+    TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
 }
 
 
@@ -214,7 +220,7 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
             system_id=loading.system,
             progress=advance,
         )
-        story = STORIES[FileKind.TABLE if is_table(parts[0]) else kind_of(parts[0])]
+        story = STORIES.get(TABLE if is_table(parts[0]) else format_of(parts[0]), OTHER_STORY)
         try:
             flight, table, _ = flight_of_files(
                 parts, options, name=path.name, story=story, checked=True

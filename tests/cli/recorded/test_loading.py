@@ -12,7 +12,7 @@ from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
 from gateway.recordings import recorded_fusion as log_facts
 from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.files import FileKind, FlightError
+from gateway.recordings.files import TABLE, FlightError
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import encode_head
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
@@ -37,7 +37,7 @@ def recording(path: Path, samples: int) -> Path:
 def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
     flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
     assert flight.fusion.estimation == RECORDED.estimation
-    assert flight.story == STORIES[FileKind.TABLE]
+    assert flight.story == STORIES[TABLE]
     today = load_flight(tmp_path / "flight.csv", replace(TODAY, choice="current"))
     assert today.fusion.estimation == TODAY.settings.default_aircraft.estimation
 
