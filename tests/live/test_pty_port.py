@@ -11,7 +11,7 @@ import serial
 
 from gateway.live.pty_port import PtyPort
 from gateway.simulator.timed_frame import TimedFrame
-from gateway.wire.framing import Fault, Frame, FrameDecoder, encode_frame
+from gateway.wire.framing import Fault, FrameDecoder, encode_frame
 
 pytestmark = pytest.mark.io
 
@@ -23,16 +23,16 @@ def frames(count: int, rate_hz: float = 20_000.0) -> Iterator[TimedFrame]:
         yield TimedFrame(k / rate_hz, encode_frame(k.to_bytes(4, "big") * (CONTENT_SIZE // 4)))
 
 
-def numbers(events: list[Frame | Fault]) -> list[int]:
-    assert all(isinstance(event, Frame) for event in events)
-    return [int.from_bytes(e.content[:4], "big") for e in events if isinstance(e, Frame)]
+def numbers(events: list[bytes | Fault]) -> list[int]:
+    assert all(isinstance(event, bytes) for event in events)
+    return [int.from_bytes(event[:4], "big") for event in events if isinstance(event, bytes)]
 
 
 class Reader:
     """Opens a port as the gateway does and collects what it says."""
 
     def __init__(self, path: str) -> None:
-        self.events: list[Frame | Fault] = []
+        self.events: list[bytes | Fault] = []
         self._decoder = FrameDecoder()
         self._port = serial.Serial(path, 500_000, timeout=0, exclusive=True)
         self._waiting: list[tuple[int, asyncio.Future[None]]] = []

@@ -1,0 +1,230 @@
+"""The end of a process, output that is not read, and the keys of a terminal."""
+
+import asyncio
+import io
+import logging
+import os
+import pty
+import select
+import signal
+import subprocess
+import sys
+import termios
+from collections.abc import Iterator
+from typing import TextIO
+
+import pytest
+
+from gateway.live import terminal as terminal_module
+from gateway.live.terminal import (
+    MAX_TEXTS,
+    DetachedStream,
+    Keyboard,
+    detached_output,
+    keys_of,
+    on_end_signals,
+)
+
+pytestmark = pytest.mark.io
+
+
+CHILD = """
+import asyncio
+from gateway.live.terminal import on_parent_gone
+
+async def main():
+    gone = asyncio.Event()
+    on_parent_gone(gone.set)
+    print("ready", flush=True)
+    await gone.wait()
+
+asyncio.run(main())
+"""
+PARENT = """
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", sys.argv[1]], stdin=subprocess.PIPE)
+print(child.pid, flush=True)
+child.wait()
+"""
+
+
+def test_a_parent_that_is_killed_takes_its_child_along() -> None:
+    words = [sys.executable, "-c", PARENT, CHILD]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        first, second = sorted(parent.stdout.readline().strip() for _ in range(2))
+        assert second == "ready"
+        child = os.pidfd_open(int(first))
+        try:
+            assert not select.select([child], [], [], 0)[0]
+            parent.send_signal(signal.SIGKILL)
+            assert select.select([child], [], [], 120)[0]
+        finally:
+            os.close(child)
+
+
+@pytest.mark.parametrize("is_ignored", [False, True])
+async def test_the_end_of_the_terminal_stays_ignored_where_it_is(is_ignored: bool) -> None:
+    """As `nohup` has it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
+    calls: list[bool] = []
+    on_end_signals(lambda: calls.append(True))
+    try:
+        signal.raise_signal(signal.SIGHUP)
+        signal.raise_signal(signal.SIGTERM)
+        while not calls:
+            await asyncio.sleep(0)
+        assert len(calls) == (1 if is_ignored else 2)
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            asyncio.get_running_loop().remove_signal_handler(number)
+        signal.signal(signal.SIGHUP, before)
+
+
+@pytest.fixture
+def pipe() -> Iterator[tuple[TextIO, TextIO]]:
+    reader, writer = os.pipe()
+    with (
+        os.fdopen(reader, encoding="utf-8") as out,
+        os.fdopen(writer, "w", encoding="utf-8") as into,
+    ):
+        yield out, into
+
+
+def test_what_is_written_arrives_in_order(pipe: tuple[TextIO, TextIO]) -> None:
+    out, into = pipe
+    stream = DetachedStream(into)
+    lines = [f"line {number}, 20 °\n" for number in range(MAX_TEXTS)]
+    for line in lines:
+        assert stream.write(line) == len(line)
+    assert [out.readline() for _ in lines] == lines
+    stream.finish()
+    assert not stream._thread.is_alive()
+    assert (stream.fileno(), stream.isatty(), stream.encoding) == (into.fileno(), False, "utf-8")
+
+
+@pytest.mark.parametrize("blocking", [True, False])
+def test_a_pipe_that_nobody_reads_holds_nobody_up(
+    pipe: tuple[TextIO, TextIO], blocking: bool
+) -> None:
+    """Two texts do not fit into the pipe's 64 kB: a plain stream would wait here for ever."""
+    out, into = pipe
+    os.set_blocking(into.fileno(), blocking)
+    stream = DetachedStream(into)
+    texts = [f"{number:06d} {'x' * 50_000}\n" for number in range(2 * MAX_TEXTS)]
+    for text in texts:
+        stream.write(text)
+    # One or two are being written, and MAX_TEXTS wait.
+    heard = [out.readline() for _ in range(MAX_TEXTS)]
+    assert heard == texts[:MAX_TEXTS]
+    # Without a reader the rest is soon gone, and the thread ends before its file is closed.
+    out.close()
+    stream._waiting.put(None)
+    stream._thread.join()
+
+
+def test_a_reader_that_has_gone_is_no_error() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with os.fdopen(writer, "w", encoding="utf-8") as into:
+        stream = DetachedStream(into)
+        stream.write("to nobody\n")
+        stream.finish()
+        assert not stream._thread.is_alive()
+
+
+def test_log_and_prints_are_detached_and_attached_again(
+    pipe: tuple[TextIO, TextIO], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, into = pipe
+    plain = io.StringIO()
+    monkeypatch.setattr("sys.stderr", into)
+    monkeypatch.setattr("sys.stdout", plain)
+    handler = logging.StreamHandler()
+    logging.getLogger().addHandler(handler)
+    try:
+        with detached_output():
+            assert isinstance(sys.stderr, DetachedStream)
+            assert sys.stdout is plain, "it has no file that could block"
+            logging.getLogger("test").warning("heard")
+            sys.stderr.write("too\n")
+        assert sys.stderr is into
+        assert handler.stream is into
+    finally:
+        logging.getLogger().removeHandler(handler)
+    assert [out.readline(), out.readline()] == ["heard\n", "too\n"]
+
+
+LIMIT_S = 60
+LOCAL_FLAGS = 3
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("q+ ", ["q", "+", "space"]),
+        ("\x1b[A\x1b[B\x1b[C\x1b[D", ["up", "down", "right", "left"]),
+        ("\x1bOA\x1b[H\x1b[F", ["up", "home", "end"]),
+        ("\x1b[1;5C\x1b[3~l", ["right", "l"]),
+        ("\x1b\x1bq\r\n\t\x00", ["q"]),
+        ("", []),
+    ],
+)
+def test_keys_have_names(text: str, names: list[str]) -> None:
+    assert list(keys_of(text)) == names
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
+    """Both ends of a terminal, of which this process is taken for the one in front."""
+    ours, theirs = pty.openpty()
+    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp())
+    yield ours, theirs
+    os.close(ours)
+    os.close(theirs)
+
+
+async def until(done: asyncio.Event) -> None:
+    async with asyncio.timeout(LIMIT_S):
+        await done.wait()
+
+
+async def test_keys_come_one_by_one_and_are_not_echoed(terminal: tuple[int, int]) -> None:
+    ours, theirs = terminal
+    before = termios.tcgetattr(theirs)
+    found: list[str] = []
+    done = asyncio.Event()
+
+    def take(key: str) -> None:
+        found.append(key)
+        if key == "q":
+            done.set()
+
+    board = Keyboard(take, theirs)
+    board.start()
+    assert not termios.tcgetattr(theirs)[LOCAL_FLAGS] & termios.ECHO
+    os.write(ours, b" \x1b[Cq")
+    await until(done)
+    assert found == ["space", "right", "q"]
+    board.close()
+    assert termios.tcgetattr(theirs) == before
+    board.close()
+
+
+async def test_what_is_no_terminal_is_left_alone(tmp_path: object) -> None:
+    read, write = os.pipe()
+    board = Keyboard(lambda _: None, read)
+    board.start()
+    board.close()
+    os.close(read)
+    os.close(write)
+
+
+async def test_a_job_in_the_background_leaves_the_terminal_alone(
+    terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    before = termios.tcgetattr(terminal[1])
+    board = Keyboard(lambda _: None, terminal[1])
+    board.start()
+    assert termios.tcgetattr(terminal[1]) == before
