@@ -344,8 +344,6 @@ def _unpacked(places: bytes) -> list[Place]:
 
 ENDINGS: Final = (".tlog", ".csv")
 """Files of other endings are looked at where a format knows their first bytes."""
-CHUNK_FILES: Final = 8
-"""Files that one process reads before it reports."""
 LATEST_NS: Final = 2**63 - 1
 """The greatest number that SQLite keeps; a file's time may lie beyond it."""
 KEEP_S: Final = 1.0
@@ -440,48 +438,33 @@ def _read_all(
     on_progress: Callable[[int, int], None] | None,
     report: IndexReport,
 ) -> IndexReport:
-    pieces = [wanted[k : k + CHUNK_FILES] for k in range(0, len(wanted), CHUNK_FILES)]
     waiting: list[CataloguedFile] = []
-    kept_s, done = time.monotonic(), 0
+    kept_s = time.monotonic()
     try:
-        for number, outcome in executor.run(partial(_read_piece, folder, options), pieces):
-            piece = pieces[number]
-            files = (
-                [_unread(folder, name, outcome.reason) for name, _ in piece]
-                if isinstance(outcome, WorkFailed)
-                else outcome
-            )
-            known = {as_text(name): digest for name, digest in piece}
-            same = [file for file in files if file.digest and file.digest == known[file.path]]
-            for file in same:
+        for number, outcome in executor.run(partial(read_file, folder, options), wanted):
+            name, known_digest = wanted[number]
+            file = _unread(folder, name, outcome) if isinstance(outcome, WorkFailed) else outcome
+            report = replace(report, read=report.read + 1)
+            if file.digest and file.digest == known_digest:
                 catalogue.touch(file.path, file.modified_ns)
-            fresh = [file for file in files if file not in same]
-            waiting += fresh
-            report = replace(
-                report,
-                read=report.read + len(files),
-                broken=report.broken + sum(file.error is not None for file in fresh),
-            )
+            else:
+                waiting.append(file)
+                report = replace(report, broken=report.broken + (file.error is not None))
             if time.monotonic() - kept_s > KEEP_S:
                 catalogue.put(waiting)
                 waiting, kept_s = [], time.monotonic()
-            done += len(piece)
             if on_progress is not None:
-                on_progress(done, len(wanted))
+                on_progress(report.read, len(wanted))
     finally:
         catalogue.put(waiting)
     return report
 
 
-def _read_piece(folder: Path, options: ReadOptions, piece: list[Wanted]) -> list[CataloguedFile]:
-    return [read_file(folder, options, wanted) for wanted in piece]
-
-
-def _unread(folder: Path, name: str, reason: str) -> CataloguedFile:
+def _unread(folder: Path, name: str, failed: WorkFailed) -> CataloguedFile:
     path = folder / name
     size, modified_ns = _stamp_if_there(path) or (0, 0)
     recording = as_text(recording_name(path))
-    return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", reason)
+    return CataloguedFile(as_text(name), recording, None, size, modified_ns, "", failed.reason)
 
 
 def _stamp(path: Path) -> tuple[int, int]:
