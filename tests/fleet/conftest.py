@@ -2,9 +2,11 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -107,17 +109,26 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
     )
 
 
-@pytest.fixture
-async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
-    fleet = FleetServer(settings, HubSettings(endpoints=("udp-listen:127.0.0.1:0",)))
+@asynccontextmanager
+async def opened_world(
+    rig: Rig, settings: FleetSettings, hub: HubSettings | None = None, place: str = ""
+) -> AsyncIterator[World]:
+    """Run a fleet with one ground station; sites reach it at its router, or at another address."""
+    hub = msgspec.structs.replace(hub or HubSettings(), endpoints=("udp-listen:127.0.0.1:0",))
+    fleet = FleetServer(settings, hub)
     await fleet.start()
     station = rig.station(fleet._hub.listening_ports()[0])
-    world = World(rig, fleet, settings.listen, station)
     async with asyncio.timeout(LIMIT_S):
         while not fleet._session.is_open:
             await asyncio.sleep(0.01)
-    yield world
+    yield World(rig, fleet, place or settings.listen, station)
     fleet.close()
     for close in rig.closing:
         close()
     rig.closing.clear()
+
+
+@pytest.fixture
+async def world(rig: Rig, settings: FleetSettings) -> AsyncIterator[World]:
+    async with opened_world(rig, settings) as world:
+        yield world

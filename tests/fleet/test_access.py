@@ -12,9 +12,8 @@ import pytest
 from msgspec.structs import replace
 
 from gateway.config import load
-from gateway.fleet.server import FleetServer
 from gateway.hub.transports.zenoh.session import open_session, session_config
-from tests.fleet.conftest import World
+from tests.fleet.conftest import World, opened_world
 from tests.hub.conftest import LIMIT_S, Rig, rig
 from tests.ports import free_port
 
@@ -79,17 +78,9 @@ async def world(
 ) -> Any:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     settings = load(documented.folder / "fleet.toml")
-
-    fleet_settings = replace(settings.fleet, ids_file=str(tmp_path / "ids.json"))
-    fleet = FleetServer(
-        fleet_settings, replace(settings.hub, endpoints=("udp-listen:127.0.0.1:0",))
-    )
-    await fleet.start()
-    yield World(rig, fleet, documented.locator, rig.station(fleet._hub.listening_ports()[0]))
-    fleet.close()
-    for close in rig.closing:
-        close()
-    rig.closing.clear()
+    fleet = replace(settings.fleet, ids_file=str(tmp_path / "ids.json"))
+    async with opened_world(rig, fleet, settings.hub, documented.locator) as world:
+        yield world
 
 
 async def test_documented_site_is_shown_and_commanded_through_the_documented_fleet(

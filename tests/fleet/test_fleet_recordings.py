@@ -258,62 +258,62 @@ class TestAnswers:
         assert ask(size=1000, digest=True) == whole
 
 
+class Site:
+    """The answers of a site that has one file, without a network."""
+
+    def __init__(self, content: bytes = CONTENT, digest: str = "") -> None:
+        self.content, self.digest = content, digest
+        self.asked: list[tuple[int, int]] = []
+        """Offset and size of each piece."""
+        self.took_s, self.now_s = 0.0, 0.0
+
+    def __call__(self, verb: str, params: dict[str, Any], wait_s: float) -> Any:
+        self.now_s += self.took_s
+        if verb == "fleet.digest":
+            right = hashlib.sha256(self.content[: params["size"]]).hexdigest()
+            return {"sha256": self.digest or right}
+        begin, size = params["offset"], params["size"]
+        self.asked.append((begin, size))
+        return {"data": base64.b64encode(self.content[begin : begin + size]).decode()}
+
+
 class TestFetch:
-    """Without a network: what the other end may do."""
-
-    def fetch(self, folder: Path, content: bytes, digest: str, size: int = 10_000) -> bool:
-        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
-            if verb == "fleet.digest":
-                return {"sha256": digest}
-            begin = params["offset"]
-            return {"data": base64.b64encode(content[begin : begin + params["size"]]).decode()}
-
-        one = RecordingFetch("site", folder, ask, wait=lambda _: None)
+    def fetch(self, folder: Path, site: Callable[..., Any], size: int = 10_000) -> bool:
+        one = RecordingFetch("site", folder, site, wait=lambda _: None)
         return one.fetch(NAME, size, lambda _: None)
 
     def test_file_changed_during_the_fetch_is_discarded(self, tmp_path: Path) -> None:
         with pytest.raises(FetchError, match="changed"):
-            self.fetch(tmp_path, CONTENT, "0" * 64)
+            self.fetch(tmp_path, Site(digest="0" * 64))
         assert not (tmp_path / NAME).exists()
-        good = hashlib.sha256(CONTENT[:10_000]).hexdigest()
-        assert self.fetch(tmp_path, CONTENT, good)
+        assert self.fetch(tmp_path, Site())
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
     def test_grown_recording_is_continued(self, tmp_path: Path) -> None:
-        asked: list[int] = []
-
-        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
-            if verb == "fleet.digest":
-                return {"sha256": hashlib.sha256(CONTENT[: params["size"]]).hexdigest()}
-            asked.append(params["offset"])
-            begin = params["offset"]
-            return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
-
+        site = Site()
         for size in (10_000, 25_000):
-            one = RecordingFetch("site", tmp_path, ask, wait=lambda _: None)
-            assert one.fetch(NAME, size, lambda _: None)
+            assert self.fetch(tmp_path, site, size)
             assert (tmp_path / NAME).read_bytes() == CONTENT[:size]
-        assert asked.count(0) == 1
+        assert [begin for begin, _ in site.asked].count(0) == 1
         (tmp_path / NAME).write_bytes(b"another")
         with pytest.raises(FetchError, match="differs"):
-            RecordingFetch("site", tmp_path, ask).fetch(NAME, 25_000, lambda _: None)
+            self.fetch(tmp_path, site, 25_000)
 
     def test_partial_file_of_other_content_is_replaced(self, tmp_path: Path) -> None:
         (tmp_path / f".{NAME}.part").write_bytes(b"x" * 5000)
-        assert self.fetch(tmp_path, CONTENT, hashlib.sha256(CONTENT[:10_000]).hexdigest())
+        assert self.fetch(tmp_path, Site())
         assert (tmp_path / NAME).read_bytes() == CONTENT[:10_000]
 
     def test_shortened_file_is_an_error(self, tmp_path: Path) -> None:
         with pytest.raises(FetchError, match="shorter"):
-            self.fetch(tmp_path, CONTENT[:100], "", size=10_000)
+            self.fetch(tmp_path, Site(CONTENT[:100]))
 
     def test_site_that_never_answers_is_an_error(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(fleet_command, "PATIENCE_S", -1.0)
-        one = RecordingFetch("site", tmp_path, lambda *_: {"data": None}, wait=lambda _: None)
         with pytest.raises(FetchError, match="continues from here"):
-            one.fetch(NAME, 10, lambda _: None)
+            self.fetch(tmp_path, lambda *_: {"data": None})
 
     @pytest.mark.parametrize("name", ["../flight_01.tlog", "flight.txt", "x/flight_01.tlog"])
     def test_names_that_leave_the_folder(self, tmp_path: Path, name: str) -> None:
@@ -334,23 +334,12 @@ class TestFetch:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, waited_s: float,
         kib: list[int],
     ) -> None:  # fmt: skip
-        now_s = 0.0
-        waits: list[float] = []
-        sizes: list[int] = []
-
-        def ask(verb: str, params: dict[str, Any], wait_s: float) -> Any:
-            nonlocal now_s
-            now_s += took_s
-            if verb == "fleet.digest":
-                return {"sha256": hashlib.sha256(CONTENT[: params["size"]]).hexdigest()}
-            begin = params["offset"]
-            sizes.append(params["size"])
-            return {"data": base64.b64encode(CONTENT[begin : begin + params["size"]]).decode()}
-
-        monkeypatch.setattr(fleet_command.time, "monotonic", lambda: now_s)
-        one = RecordingFetch("site", tmp_path, ask, wait=waits.append)
+        site, waits = Site(), list[float]()
+        site.took_s = took_s
+        monkeypatch.setattr(fleet_command.time, "monotonic", lambda: site.now_s)
+        one = RecordingFetch("site", tmp_path, site, wait=waits.append)
         one.piece_size = kib[0] << 10
         assert one.fetch(NAME, sum(kib) << 10, lambda _: None)
-        assert sizes == [size << 10 for size in kib]
+        assert [size for _, size in site.asked] == [size << 10 for size in kib]
         assert waits == pytest.approx([waited_s] * len(kib))
         assert fleet_command.LARGEST == MAX_PIECE

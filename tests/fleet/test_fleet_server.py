@@ -5,8 +5,6 @@ import errno
 import json
 import os
 import socket
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -25,6 +23,7 @@ from gateway.live.control_socket import ControlError, request
 from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, run
 from tests.hub.conftest import LIMIT_S
+from tests.kit.process import Process, wait_for
 from tests.ports import free_port
 
 pytestmark = pytest.mark.io
@@ -218,47 +217,33 @@ def test_malformed_site_pattern_is_refused(settings: FleetSettings, site: str) -
         FleetServer(FleetSettings(sites=(site,), ids_file=settings.ids_file), HubSettings())
 
 
-class TestTheCommand:
-    def start(self, tmp_path: Path, *words: str) -> "subprocess.Popen[bytes]":
-        patient = tmp_path / "patient.json5"
-        patient.write_text("{transport: {unicast: {open_timeout: 3600000}}}")
-        config = tmp_path / "fleet.toml"
-        config.write_text(
-            f'[fleet]\nids_file = "{tmp_path}/ids.json"\nzenoh_config = "{patient}"\n'
-        )
-        words = (*words, "--config", str(config), "--endpoint", "udp:127.0.0.1:9")
-        return subprocess.Popen(
-            [sys.executable, "-m", "gateway.cli", "fleet", *words], stderr=subprocess.DEVNULL
-        )
+def command(folder: Path, *words: str) -> Process:
+    """Run a fleet that waits for its router for an hour."""
+    patient = folder / "patient.json5"
+    patient.write_text("{transport: {unicast: {open_timeout: 3600000}}}")
+    config = f'[fleet]\nids_file = "{folder}/ids.json"\nzenoh_config = "{patient}"\n'
+    return Process(folder, "fleet", *words, "--endpoint", "udp:127.0.0.1:9", config=config)
 
-    def end(self, process: "subprocess.Popen[bytes]") -> None:
-        try:
-            process.terminate()
-            assert process.wait(LIMIT_S) == 0
-        finally:
-            process.kill()
-            process.wait()
 
-    def test_fleet_ends_on_sigterm(self, tmp_path: Path, settings: FleetSettings) -> None:
-        process = self.start(tmp_path, "--listen", settings.listen)
-        host, port = settings.listen.removeprefix("tcp/").split(":")
-        end_s = time.monotonic() + LIMIT_S
-        while time.monotonic() < end_s:
-            with suppress(ConnectionRefusedError), socket.create_connection((host, int(port))):
-                break
-            time.sleep(0.1)
-        self.end(process)
+def test_fleet_ends_on_sigterm(tmp_path: Path, settings: FleetSettings) -> None:
+    host, port = settings.listen.removeprefix("tcp/").split(":")
 
-    def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(
-        self, tmp_path: Path, settings: FleetSettings
-    ) -> None:
-        """Zenoh waits for a router to say who it is: here for an hour."""
-        with socket.create_server(("127.0.0.1", 0)) as mute:
-            mute.settimeout(LIMIT_S)
-            place = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
-            process = self.start(tmp_path, "--connect", place)
-            with mute.accept()[0]:
-                self.end(process)
+    def answers() -> bool:
+        with suppress(ConnectionRefusedError), socket.create_connection((host, int(port))):
+            return True
+        return False
+
+    with command(tmp_path, "--listen", settings.listen) as fleet:
+        wait_for(answers)
+        assert fleet.end() == 0
+
+
+def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as mute:
+        mute.settimeout(LIMIT_S)
+        place = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with command(tmp_path, "--connect", place) as fleet, mute.accept()[0]:
+            assert fleet.end() == 0
 
 
 def site_of(world: World, name: str) -> dict[str, Any]:
