@@ -13,14 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.aircraft import AircraftSettings
-from gateway.estimation.columns import (
-    NAV_ALT,
-    NAV_FLAGS,
-    NAV_LAT,
-    NAV_LON,
-    NAV_QUAT,
-    NAV_VEL,
-)
+from gateway.estimation.columns import NAV_ALT, NAV_FLAGS, NAV_LAT, NAV_LON, NAV_QUAT, NAV_VEL
 from gateway.estimation.reference import is_usable
 from gateway.estimation.select import make_estimator
 from gateway.geometry.angle import wrap_180
@@ -44,11 +37,7 @@ from gateway.recordings.reading import (
 )
 from gateway.recordings.recorded_fusion import aircraft_for, check_latency
 from gateway.recordings.table import TableBlock
-from gateway.records import (
-    BaroSample,
-    GpsFix,
-    NavFlags,
-)
+from gateway.records import BaroSample, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut
 from gateway.sensing.chain import ImuLog
 from gateway.units import DEG_PER_DEGE7, US_PER_S

@@ -25,11 +25,7 @@ from gateway.recordings.columns import (
     has_position,
 )
 from gateway.recordings.moment import civil_time
-from gateway.recordings.summary import (
-    GLOBAL_POSITION_INT_ID,
-    GroundDistance,
-    TimesSpan,
-)
+from gateway.recordings.summary import GLOBAL_POSITION_INT_ID, GroundDistance, TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader
 from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, payload_of
 from gateway.records import NodeStatus

@@ -5,13 +5,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gateway.batch.statistics import (
-    choose,
-    errors_by_group,
-    folds_of,
-    lead_of,
-    versus,
-)
+from gateway.batch.statistics import choose, errors_by_group, folds_of, lead_of, versus
 from gateway.batch.tasks import FlightResult
 from gateway.config import load
 from tests.kit.cli import invoke

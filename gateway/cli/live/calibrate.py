@@ -26,12 +26,7 @@ from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
-from gateway.live.serial_port import (
-    PortNotFoundError,
-    SerialPort,
-    SerialSettings,
-    find_receiver,
-)
+from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.recordings.reading import open_rows
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import (

@@ -21,23 +21,9 @@ from msgspec.structs import replace
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.cli.live.panel import is_installed, launched_panel
-from gateway.cli.live.run import (
-    EndpointOption,
-    PlainOption,
-    serve,
-    with_endpoints,
-)
-from gateway.cli.support.options import (
-    ConfigOption,
-    folder_of,
-    read_options,
-    read_settings,
-)
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    files_of,
-    progress_of,
-)
+from gateway.cli.live.run import EndpointOption, PlainOption, serve, with_endpoints
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
 from gateway.compiled.entry_point import load_entry_points

@@ -35,11 +35,7 @@ from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoi
 from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part import free_bytes_near
-from gateway.live.serial_port import (
-    PortNotFoundError,
-    fitting_ports,
-    list_serial_ports,
-)
+from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.printable import reason_of
 
 TTY: Final = Path("/sys/class/tty")

@@ -13,13 +13,7 @@ import typer
 from msgspec.structs import replace
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from gateway.cli.live.calibrate import (
-    Step,
-    calibrate_each,
-    capture_from,
-    listen,
-    poses_from,
-)
+from gateway.cli.live.calibrate import Step, calibrate_each, capture_from, listen, poses_from
 from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import unix_time_us

@@ -7,12 +7,7 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from gateway.cli.support.options import (
-    ConfigOption,
-    folder_of,
-    read_options,
-    read_settings,
-)
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 

@@ -13,10 +13,7 @@ import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
-from gateway.cli.support.options import (
-    ConfigOption,
-    read_settings,
-)
+from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
