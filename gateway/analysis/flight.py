@@ -201,7 +201,7 @@ class LocalFrame:
         _, parallel = radii_m(self.lat_deg, self.alt_m)
         return np.asarray(np.radians(wrap_180(lon_deg - self.lon_deg)) * parallel)
 
-    def place(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
+    def local_m(self, lat_deg: FloatArray, lon_deg: FloatArray) -> FloatArray:
         """Convert positions to metres, shape (N, 2): north and east."""
         return np.column_stack([self.north_m(lat_deg), self.east_m(lon_deg)])
 

@@ -98,14 +98,14 @@ def errors_over_time(track: FlightTrack, reference: FlightTrack) -> dict[str, Fl
     """Compute every error at every sample, in the units of their names."""
     turned = rotation_error(track.q_nb, reference.q_nb)
     angles = np.degrees(wrap_pi(euler_rad(track.q_nb) - euler_rad(reference.q_nb)))
-    place = position_error_m(track, reference)
+    error_m = position_error_m(track, reference)
     return {
         "roll_deg": angles[:, 0],
         "pitch_deg": angles[:, 1],
         "yaw_deg": angles[:, 2],
         "tilt_deg": np.degrees(inclination_error_rad(turned)),
         "heading_deg": np.degrees(heading_error_rad(turned)),
-        "horizontal_m": np.hypot(place[:, 0], place[:, 1]),
-        "height_m": place[:, 2],
+        "horizontal_m": np.hypot(error_m[:, 0], error_m[:, 1]),
+        "height_m": error_m[:, 2],
         "speed_mps": np.linalg.norm(track.vel_n_mps - reference.vel_n_mps, axis=1),
     }

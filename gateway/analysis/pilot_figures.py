@@ -59,7 +59,7 @@ class PilotFigures:
 def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> PilotFigures:
     """Summarise one flight."""
     seconds = flight.time_s
-    place = frame.place(track.lat_deg, track.lon_deg)
+    pos_m = frame.local_m(track.lat_deg, track.lon_deg)
     height_m = np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan)
     speed_mps = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
     airborne = _held(seconds, (speed_mps > AIRBORNE_MPS) & (height_m > AIRBORNE_M))
@@ -73,11 +73,11 @@ def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> Pilo
     return PilotFigures(
         began_unix_s=_began_unix_s(flight),
         airborne_s=float(np.diff(seconds)[airborne[1:]].sum()),
-        distance_m=_distance_m(place, airborne),
+        distance_m=_distance_m(pos_m, airborne),
         highest_m=greatest(height_m),
         fastest_mps=greatest(speed_mps),
         climb_mps=greatest(_smoothed(-track.vel_n_mps[:, 2], round(flight.rate_hz))),
-        farthest_m=greatest(np.hypot(place[:, 0], place[:, 1])),
+        farthest_m=greatest(np.hypot(pos_m[:, 0], pos_m[:, 1])),
         gps_outages_s=outages,
         link_losses_s=losses,
         events=tuple(sorted(events, key=lambda event: event.time_s)),
@@ -113,8 +113,8 @@ def _held(seconds: FloatArray, state: np.ndarray) -> np.ndarray:
     return found
 
 
-def _distance_m(place: FloatArray, airborne: np.ndarray) -> float:
-    steps = np.hypot(*np.diff(place, axis=0).T)
+def _distance_m(pos_m: FloatArray, airborne: np.ndarray) -> float:
+    steps = np.hypot(*np.diff(pos_m, axis=0).T)
     flown = airborne[1:] & np.isfinite(steps) & (steps < LONGEST_STEP_M)
     return float(steps[flown].sum()) if flown.any() else 0.0
 

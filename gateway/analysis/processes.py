@@ -80,16 +80,16 @@ def _send(
 ) -> None:
     # So that the pipe reports when no process receives.
     receiver.close()
-    threading.Thread(target=_end_unheard, args=(sender,), daemon=True).start()
+    threading.Thread(target=_end_without_receiver, args=(sender,), daemon=True).start()
     with suppress(BrokenPipeError):
         work(argument, sender)
 
 
-def _end_unheard(sender: Connection) -> None:
+def _end_without_receiver(sender: Connection) -> None:
     """End this process when nobody can receive any more; it may be long before it sends."""
-    heard = select.poll()
-    heard.register(sender, 0)  # no event but that one
-    heard.poll()
+    hang_up = select.poll()
+    hang_up.register(sender, 0)  # no event but that one
+    hang_up.poll()
     os._exit(0)
 
 

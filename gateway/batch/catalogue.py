@@ -20,7 +20,7 @@ from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import (
     FlightFacts,
     Flown,
-    Place,
+    Position,
     TableTally,
     TlogTally,
     feature,
@@ -75,7 +75,7 @@ _SQL: Final = {int | None: "INTEGER", float | None: "REAL", str | None: "TEXT"}
 _FACT_COLUMNS: Final = {name: _SQL[kind] for name, kind in get_type_hints(FlightFacts).items()}
 COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
 """Columns that a query may use."""
-_PLACE: Final = struct.Struct("<iii")
+_POSITION: Final = struct.Struct("<iii")
 """Latitude and longitude in 1e-7 deg, height in cm."""
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
 _DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
@@ -186,7 +186,7 @@ class Catalogue:
                 (*of_file, file.error, *msgspec.structs.astuple(facts)),
             )
             if track:
-                packed = b"".join(_PLACE.pack(*_counts(place)) for place in track)
+                packed = b"".join(_POSITION.pack(*_counts(position)) for position in track)
                 self._db.execute("INSERT INTO tracks VALUES (?, ?)", (cursor.lastrowid, packed))
 
 
@@ -333,13 +333,15 @@ def _with_advice(path: Path) -> Iterator[None]:
         raise CatalogueError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
 
 
-def _counts(place: Place) -> tuple[int, int, int]:
-    lat, lon, alt = place
+def _counts(position: Position) -> tuple[int, int, int]:
+    lat, lon, alt = position
     return round(lat * 1e7), round(lon * 1e7), round(alt * 100.0) if alt == alt else 0
 
 
-def _unpacked(places: bytes) -> list[Place]:
-    return [(lat * 1e-7, lon * 1e-7, alt / 100.0) for lat, lon, alt in _PLACE.iter_unpack(places)]
+def _unpacked(packed: bytes) -> list[Position]:
+    return [
+        (lat * 1e-7, lon * 1e-7, alt / 100.0) for lat, lon, alt in _POSITION.iter_unpack(packed)
+    ]
 
 
 ENDINGS: Final = (".tlog", ".csv")
@@ -393,10 +395,10 @@ def index_folder(
 
 def recordings_below(folder: Path) -> Iterator[Path]:
     """Find all files that may be recordings, by path; hidden ones and folders are passed over."""
-    for place, folders, files in os.walk(folder):
+    for inner, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for name in sorted(files):
-            path = Path(place, name)
+            path = Path(inner, name)
             if not name.startswith(".") and path.is_file() and _may_be_recording(path):
                 yield path
 

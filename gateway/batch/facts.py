@@ -33,27 +33,27 @@ from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 
 TOLERANCE_M: Final = 3.0
 """Less than the error of the GPS."""
-MAX_PLACES: Final = 400
+MAX_POSITIONS: Final = 400
 """Of one track; a day in circles gets coarser instead of larger."""
 
-Place = tuple[float, float, float]
+Position = tuple[float, float, float]
 """Latitude and longitude in deg, height above mean sea level in m."""
 
 
-def simplified(places: Sequence[Place]) -> list[Place]:
-    """Leave out places that the straight lines between the others pass within a few metres."""
-    if len(places) < 3:
-        return list(places)
-    plane, tolerance_m = _in_metres(places), TOLERANCE_M
-    while np.count_nonzero(kept := _kept(plane, tolerance_m)) > MAX_PLACES:
+def simplified(positions: Sequence[Position]) -> list[Position]:
+    """Leave out positions that the straight lines between the others pass within a few metres."""
+    if len(positions) < 3:
+        return list(positions)
+    plane, tolerance_m = _in_metres(positions), TOLERANCE_M
+    while np.count_nonzero(kept := _kept(plane, tolerance_m)) > MAX_POSITIONS:
         tolerance_m *= 2.0
-    return [place for place, keep in zip(places, kept.tolist(), strict=True) if keep]
+    return [position for position, keep in zip(positions, kept.tolist(), strict=True) if keep]
 
 
-def feature(places: Sequence[Place], properties: Mapping[str, Any]) -> dict[str, Any]:
+def feature(positions: Sequence[Position], properties: Mapping[str, Any]) -> dict[str, Any]:
     """Write a track as a GeoJSON feature (RFC 7946); cut in two where it crosses 180 degrees."""
     lines: list[list[list[float]]] = [[]]
-    for lat, lon, alt in places:
+    for lat, lon, alt in positions:
         if lines[-1] and abs(lon - lines[-1][-1][0]) > 180.0:
             lines.append([])
         lines[-1].append([round(lon, 7), round(lat, 7), round(alt, 2)])
@@ -70,8 +70,8 @@ def feature_collection(features: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
     return {"type": "FeatureCollection", "features": list(features)}
 
 
-def _in_metres(places: Sequence[Place]) -> NDArray[np.float64]:
-    lat, lon, alt = np.array(places, np.float64).T
+def _in_metres(positions: Sequence[Position]) -> NDArray[np.float64]:
+    lat, lon, alt = np.array(positions, np.float64).T
     meridian, parallel = radii_m(float(lat[0]), float(alt[0]))
     east_deg = wrap_180(lon - lon[0])
     return np.column_stack([np.radians(lat - lat[0]) * meridian, np.radians(east_deg) * parallel])
@@ -172,23 +172,23 @@ class FlightTally:
     """Collect the facts of one vehicle while its recording is read."""
 
     def __init__(self) -> None:
-        self.way = GroundDistance()
+        self.distance = GroundDistance()
         self.points: list[tuple[int, float, float, float, float]] = []
         self._gps_us: list[int] = []
         self._fixed: list[bool] = []
         self.faults = 0
 
-    def add_position(self, time_us: int, place: Place, speed_mps: float) -> None:
+    def add_position(self, time_us: int, position: Position, speed_mps: float) -> None:
         """Take a position in: latitude and longitude in deg, height in m, ground speed in m/s."""
-        self.way.add(time_us, place[0], place[1])
+        self.distance.add(time_us, position[0], position[1])
         if self.points and 0 <= time_us - self.points[-1][0] < POINT_US:
             return
-        self.points.append((time_us, *place, speed_mps))
+        self.points.append((time_us, *position, speed_mps))
 
     def prefer_positions_of(self, other: "FlightTally") -> None:
         """Use the positions of another tally, if it has any."""
         if other.points:
-            self.points, self.way = other.points, other.way
+            self.points, self.distance = other.points, other.distance
 
     def add_gps(self, time_us: int, *, fixed: bool) -> None:
         """Note that the receiver sent something, and whether it had a fix."""
@@ -209,7 +209,7 @@ class FlightTally:
         takeoff = max(int(flying[0]) - 1, 0) if len(flying) else None
         return msgspec.structs.replace(
             known,
-            distance=self.way.distance_m,
+            distance=self.distance.distance_m,
             highest=_greatest(height),
             fastest=_greatest(speed),
             lat_min=float(lat.min()),
@@ -220,8 +220,8 @@ class FlightTally:
             takeoff_lon=None if takeoff is None else float(lon[takeoff]),
         )
 
-    def track(self) -> list[Place]:
-        """Return the way as few places as show it."""
+    def track(self) -> list[Position]:
+        """Return the track in as few positions as show it."""
         return simplified([(lat, lon, alt) for _, lat, lon, alt, _ in self.points])
 
     def _outages(self, end_us: int | None) -> tuple[int | None, float | None]:
@@ -270,7 +270,7 @@ def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
 SYS_STATUS_ID: Final = 1
 GPS_RAW_INT_ID: Final = 24
 STATUSTEXT_ID: Final = 253
-LOOKED_AT: Final = np.array(
+USED_IDS: Final = np.array(
     [
         HEARTBEAT_ID, SYS_STATUS_ID, PARAM_VALUE_ID, GPS_RAW_INT_ID, GLOBAL_POSITION_INT_ID,
         AUTOPILOT_VERSION_ID, STATUSTEXT_ID,
@@ -288,12 +288,12 @@ _FIRMWARE: Final = struct.Struct("<16xI")
 _PARAMETER: Final = struct.Struct("<4s4x16s")
 CHECKSUM_DIGITS: Final = 12
 
-_PLACE_AND_SPEED: Final = [
+_POSITION_AND_SPEED: Final = [
     *(COLUMNS.index(name) for name in ("time_us", "nav_lat_deg", "nav_lon_deg", "nav_alt_amsl_m")),
     *(COLUMNS.index(name) for name in ("nav_vel_north_mps", "nav_vel_east_mps")),
 ]
 
-Flown = tuple[FlightFacts, list[Place]]
+Flown = tuple[FlightFacts, list[Position]]
 """The facts of a flight, and its track."""
 
 
@@ -326,12 +326,12 @@ class TableTally:
             fix = GPS_CODEC.read(values)
             self._fixes.add_gps(fix.time_us, fixed=fix.fix_ok)
             if fix.fix_ok:
-                place = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
+                position = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
                 speed_mps = math.hypot(*fix.vel_n_mps[:2])
-                self._fixes.add_position(fix.time_us, (*place, fix.alt_amsl_m), speed_mps)
+                self._fixes.add_position(fix.time_us, (*position, fix.alt_amsl_m), speed_mps)
         placed = cells[has_position(cells)]
-        for time_us, *place, north, east in placed[:, _PLACE_AND_SPEED].tolist():
-            self._states.add_position(int(time_us), tuple(place), math.hypot(north, east))
+        for time_us, *position, north, east in placed[:, _POSITION_AND_SPEED].tolist():
+            self._states.add_position(int(time_us), tuple(position), math.hypot(north, east))
 
     def _add_status(self, status: NodeStatus) -> None:
         """Count the failures of a node since its last report."""
@@ -375,14 +375,13 @@ class TlogTally:
         self._index.add(batch)
         if len(batch):
             self._span.add_all(batch.time_us)
-        for i in np.flatnonzero(np.isin(batch.message_ids, LOOKED_AT)).tolist():
+        for i in np.flatnonzero(np.isin(batch.message_ids, USED_IDS)).tolist():
             origin = int(batch.origins[i])
             if is_station(origin, self._index.stations):
                 continue
             sent = self._vehicles.setdefault(origin >> 8, _Sent())
             time_us = int(batch.time_us[i])
-            sent.see(time_us)
-            sent.take(int(batch.message_ids[i]), time_us, batch.frame(i))
+            sent.update(int(batch.message_ids[i]), time_us, batch.frame(i))
 
     def flown(self) -> list[Flown]:
         """Return a flight for each vehicle; one without a vehicle where there is none."""
@@ -413,16 +412,14 @@ class _Sent:
         self._firmware: str | None = None
         self._parameters: dict[bytes, bytes] = {}
 
-    def see(self, time_us: int) -> None:
+    def update(self, message_id: int, time_us: int, frame: bytes) -> None:
         self._span.add(time_us)
         self._last_us = max(time_us, self._last_us)
-
-    def take(self, message_id: int, time_us: int, frame: bytes) -> None:
         if message_id == GLOBAL_POSITION_INT_ID:
             _, lat, lon, alt, _, north, east = _POSITION.unpack(payload_of(frame, _POSITION.size))
             if lat or lon:
-                place = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
-                self._tally.add_position(time_us, place, float(np.hypot(north, east)) / 100.0)
+                position = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
+                self._tally.add_position(time_us, position, float(np.hypot(north, east)) / 100.0)
         elif message_id == GPS_RAW_INT_ID:
             (fix_type,) = _FIX_TYPE.unpack(payload_of(frame, _FIX_TYPE.size))
             self._tally.add_gps(time_us, fixed=fix_type >= FIX_2D)

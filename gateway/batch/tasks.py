@@ -212,9 +212,7 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
 def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[FlightResult, Files]:
     """Do a task on one recording; the `error` of the result is the reason of a failure."""
     item, stamp, key, name = known
-    result = FlightResult(
-        place=as_text(item.place), digest=stamp, key=key, task=task.name, version=__version__
-    )
+    result = _blank(task, item, stamp, key)
     with local_files(item) as files:
         if item.is_fetched:
             result = msgspec.structs.replace(result, digest=digest_of_files(files))
@@ -438,14 +436,12 @@ def _key(task: FlightTask, stamp: str) -> str:
     return sha256(values + b"\n" + task.fingerprint).hexdigest()[:32]
 
 
+def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightResult:
+    place = as_text(item.place)
+    return FlightResult(place=place, digest=stamp, key=key, task=task.name, version=__version__)
+
+
 def _failed(
     task: FlightTask, item: BatchItem, stamp: str, key: str, failure: WorkFailed
 ) -> FlightResult:
-    return FlightResult(
-        place=as_text(item.place),
-        digest=stamp,
-        key=key,
-        task=task.name,
-        version=__version__,
-        error=failure.reason,
-    )
+    return msgspec.structs.replace(_blank(task, item, stamp, key), error=failure.reason)

@@ -80,9 +80,9 @@ def test_the_start_up_does_not_count() -> None:
 
 def test_the_local_frame_measures_metres() -> None:
     frame = LocalFrame(-7.0, 179.9999, 100.0)
-    place = frame.place(np.array([-6.999]), np.array([-179.9999]))
+    pos_m = frame.local_m(np.array([-6.999]), np.array([-179.9999]))
     expected = displacement_m(-7.0, 179.9999, -6.999, -179.9999, 100.0)
-    assert place[0] == pytest.approx(expected)
+    assert pos_m[0] == pytest.approx(expected)
 
 
 def test_a_flight_without_fixes_has_no_frame() -> None:

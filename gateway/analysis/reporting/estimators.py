@@ -235,9 +235,9 @@ def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
     frame = a.frame
     for case, name, colour, width in zip((a, b), NAMES, AB_COLOURS, (2.6, 1.0), strict=True):
         if frame is not None:
-            place = frame.place(case.track.lat_deg, case.track.lon_deg)
-            step = max(1, len(place) // 4000)
-            axes.plot(place[::step, 1], place[::step, 0], color=colour, lw=width, label=name)
+            pos_m = frame.local_m(case.track.lat_deg, case.track.lon_deg)
+            step = max(1, len(pos_m) // 4000)
+            axes.plot(pos_m[::step, 1], pos_m[::step, 0], color=colour, lw=width, label=name)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="east of A's first fix (m)", ylabel="north of A's first fix (m)")
     style.legend_above(axes)

@@ -254,8 +254,8 @@ def _path(
     axes: Axes, frame: LocalFrame, track: FlightTrack, colour: str, label: str, **style_of: float
 ) -> None:
     step = max(1, len(track.lat_deg) // 4000)
-    place = frame.place(track.lat_deg[::step], track.lon_deg[::step])
-    axes.plot(place[:, 1], place[:, 0], color=colour, label=label, **style_of)
+    pos_m = frame.local_m(track.lat_deg[::step], track.lon_deg[::step])
+    axes.plot(pos_m[:, 1], pos_m[:, 0], color=colour, label=label, **style_of)
 
 
 def _graticule(axes: Axes, frame: LocalFrame) -> None:
@@ -326,13 +326,13 @@ def _draw_interpolation(case: Case, width_in: float) -> Figure:
     fixes = case.fixes
     begin, end = _excerpt(case)
     figure, axes = style.panels(width_in, 1, 3.4, columns=2, share_x=False)
-    place = frame.place(fixes.lat_deg[begin:end], fixes.lon_deg[begin:end])
+    pos_m = frame.local_m(fixes.lat_deg[begin:end], fixes.lon_deg[begin:end])
     for panel in axes:
-        panel.plot(place[:, 1], place[:, 0], "o", color=style.ORANGE, ms=3.6, label="GPS fixes")
+        panel.plot(pos_m[:, 1], pos_m[:, 0], "o", color=style.ORANGE, ms=3.6, label="GPS fixes")
         panel.set(xlabel="east (m)")
-        style.fit_square(panel, place[:, 1], place[:, 0])
+        style.fit_square(panel, pos_m[:, 1], pos_m[:, 0])
     axes[0].set_ylabel("north (m)")
-    axes[1].plot(place[:, 1], place[:, 0], color=style.BLUE, label="interpolated")
+    axes[1].plot(pos_m[:, 1], pos_m[:, 0], color=style.BLUE, label="interpolated")
     axes[0].set_title("before")
     axes[1].set_title("after")
     axes[1].legend(loc="best")
@@ -366,10 +366,10 @@ def _draw_residuals(case: Case, width_in: float) -> Figure:
     assert frame is not None
     fixes = case.fixes
     straight = interpolate(fixes, flight.time_us)
-    base = frame.place(straight.lat_deg, straight.lon_deg)
+    base = frame.local_m(straight.lat_deg, straight.lon_deg)
     newest = np.searchsorted(fixes.arrival_us, flight.time_us, side="right") - 1
-    held = frame.place(fixes.lat_deg[newest], fixes.lon_deg[newest]) - base
-    fused = frame.place(case.track.lat_deg, case.track.lon_deg) - base
+    held = frame.local_m(fixes.lat_deg[newest], fixes.lon_deg[newest]) - base
+    fused = frame.local_m(case.track.lat_deg, case.track.lon_deg) - base
     held[~flight.scored], fused[~flight.scored] = np.nan, np.nan
     figure, axes = style.over_time(width_in, 1.6, ["north (m)", "east (m)"])
     for axis, panel in enumerate(axes):

@@ -112,14 +112,14 @@ def _draw_map(case: Case, width_in: float) -> Figure:
     frame, track = case.frame, case.track
     assert frame is not None
     step = max(1, len(track.lat_deg) // LINE_POINTS)
-    place = frame.place(track.lat_deg[::step], track.lon_deg[::step])
+    pos_m = frame.local_m(track.lat_deg[::step], track.lon_deg[::step])
     height = track.alt_amsl_m[::step] - frame.alt_m
-    known = np.isfinite(place).all(axis=1) & np.isfinite(height)
-    place, height = place[known], height[known]
+    known = np.isfinite(pos_m).all(axis=1) & np.isfinite(height)
+    pos_m, height = pos_m[known], height[known]
     figure = Figure(figsize=(width_in, width_in * 0.66 if width_in >= style.WIDE_IN else 4.0))
     axes = figure.subplots()
-    if len(place) > 1:
-        points = place[:, ::-1].reshape(-1, 1, 2)
+    if len(pos_m) > 1:
+        points = pos_m[:, ::-1].reshape(-1, 1, 2)
         segments = np.concatenate([points[:-1], points[1:]], axis=1)
         line = LineCollection(list(segments), cmap=mpl.colormaps[COLOUR_MAP], lw=2.0)
         line.set_array(height[1:])
@@ -128,8 +128,8 @@ def _draw_map(case: Case, width_in: float) -> Figure:
         bar = figure.colorbar(line, ax=axes, fraction=0.04, pad=0.02)
         bar.set_label("height above the first fix (m)")
         bar.outline.set_visible(False)
-        axes.plot(place[0, 1], place[0, 0], "^", color=style.GREEN, ms=8, label="start")
-        axes.plot(place[-1, 1], place[-1, 0], "s", color=style.RED, ms=7, mfc="none", label="end")
+        axes.plot(pos_m[0, 1], pos_m[0, 0], "^", color=style.GREEN, ms=8, label="start")
+        axes.plot(pos_m[-1, 1], pos_m[-1, 0], "s", color=style.RED, ms=7, mfc="none", label="end")
         _mark_events(axes, case)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="east of the first fix (m)", ylabel="north of the first fix (m)")
@@ -144,10 +144,10 @@ def _mark_events(axes: Axes, case: Case) -> None:
     for kind, colour in EVENT_COLOURS.items():
         times = np.array([event.time_s for event in figures.events if event.kind == kind])
         index = np.minimum(np.searchsorted(case.flight.time_s, times), len(track.lat_deg) - 1)
-        place = frame.place(track.lat_deg[index], track.lon_deg[index])
-        if len(place):
+        pos_m = frame.local_m(track.lat_deg[index], track.lon_deg[index])
+        if len(pos_m):
             axes.plot(
-                place[:, 1], place[:, 0], "o", color=colour, ms=8, mfc="none", mew=1.4,
+                pos_m[:, 1], pos_m[:, 0], "o", color=colour, ms=8, mfc="none", mew=1.4,
                 label=EVENT_NAMES[kind],
             )  # fmt: skip
 
