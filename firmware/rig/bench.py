@@ -5,61 +5,18 @@ A board's action may then schedule an event behind that moment only: the radio's
 order to send to the first bit is the look-ahead that makes its timing exact.
 """
 
+import ctypes
 import heapq
 import itertools
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final
+
+from firmware.rig.mcu import Mcu, library
 
 PS_PER_S: Final = 1_000_000_000_000
 PS_PER_US: Final = 1_000_000
 STEP_PS: Final = 100 * PS_PER_US
-_FS_PER_S: Final = 1_000_000_000_000_000
-
-
-class RunsOnCycles(Protocol):
-    """What the bench needs of a chip."""
-
-    frequency_hz: int
-
-    def run(self, cycle: int) -> None:
-        """Run to at least this cycle."""
-
-    @property
-    def cycle(self) -> int:
-        """Cycles run so far."""
-
-
-class Timer:
-    """A chip's cycles on the bench's time line.
-
-    Parameters
-    ----------
-    chip : RunsOnCycles
-    clock_ppm : float
-        How much faster than its nominal frequency the chip's crystal runs.
-    """
-
-    def __init__(self, chip: RunsOnCycles, clock_ppm: float = 0.0) -> None:
-        self.chip = chip
-        self._period_fs = round(_FS_PER_S / (chip.frequency_hz * (1 + clock_ppm * 1e-6)))
-        self._halted_ps = 0
-
-    def time_of(self, cycle: int) -> int:
-        """Return when a cycle begins, in ps."""
-        return self._halted_ps + cycle * self._period_fs // 1000
-
-    @property
-    def now_ps(self) -> int:
-        """The chip's present."""
-        return self.time_of(self.chip.cycle)
-
-    def run(self, until_ps: int) -> None:
-        """Run to at least this time."""
-        self.chip.run(-((self._halted_ps - until_ps) * 1000 // self._period_fs))
-
-    def halt(self, until_ps: int) -> None:
-        """Let time pass until then without a cycle."""
-        self._halted_ps += max(0, until_ps - self.now_ps)
+_NEVER_PS: Final = 2**63 - 1
 
 
 class Bench:
@@ -67,25 +24,32 @@ class Bench:
 
     def __init__(self) -> None:
         self.now_ps = 0
-        self.timers: list[Timer] = []
+        self.chips: list[Mcu] = []
         self.after_step: list[Callable[[], None]] = []
-        """Called whenever all boards have reached the same moment."""
+        """Called after events, and after a step in which a board's serial line has changed."""
         self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._order = itertools.count()
+        self._next_ps = ctypes.c_int64(_NEVER_PS)
+        """Time of the first event, which the shim reads before every step."""
 
     def at(self, time_ps: int, action: Callable[[], None]) -> None:
         """Have `action` called at a time; if that is past, at once."""
         heapq.heappush(self._events, (time_ps, next(self._order), action))
+        self._next_ps.value = self._events[0][0]
 
     def run_until(self, time_ps: int) -> None:
         """Run boards and models to this time."""
+        run, next_event, events = library().boards_run, ctypes.byref(self._next_ps), self._events
+        boards = (ctypes.c_void_p * len(self.chips))(*(chip.board for chip in self.chips))
         while self.now_ps < time_ps:
-            next_ps = self._events[0][0] if self._events else time_ps
-            self.now_ps = max(self.now_ps, min(next_ps, self.now_ps + STEP_PS, time_ps))
-            for timer in self.timers:
-                timer.run(self.now_ps)
-            while self._events and self._events[0][0] <= self.now_ps:
-                heapq.heappop(self._events)[2]()
+            now_ps = run(boards, len(boards), self.now_ps, time_ps, STEP_PS, next_event)
+            self.now_ps = now_ps
+            for chip in self.chips:
+                chip.check()
+            while events and events[0][0] <= now_ps:
+                action = heapq.heappop(events)[2]
+                self._next_ps.value = events[0][0] if events else _NEVER_PS
+                action()
             for action in self.after_step:
                 action()
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware.rig.air import Air
 from firmware.rig.barometer import make_barometer
-from firmware.rig.bench import Bench, Timer
+from firmware.rig.bench import Bench
 from firmware.rig.compass import make_compass
 from firmware.rig.gps import COMPUTING_S, GPS_MODULES, Gps
 from firmware.rig.i2c import I2cBus
@@ -83,18 +83,17 @@ class Board:
 
     def __init__(self, setup: Setup, program: str, clock_ppm: float = 0.0) -> None:
         self.setup = setup
-        self.mcu = Mcu(setup.build / f"{program}.hex", setup.frequency_hz)
-        self.timer = Timer(self.mcu, clock_ppm)
-        setup.bench.timers.append(self.timer)
+        self.mcu = Mcu(setup.build / f"{program}.hex", setup.frequency_hz, clock_ppm)
+        setup.bench.chips.append(self.mcu)
         self._radio_line = True
         self.radio = Nrf24(
             setup.bench,
             setup.air,
-            lambda: self.timer.now_ps,
+            lambda: self.mcu.now_ps,
             self._drive_radio_line,
             RADIO_CHIPS[setup.parts.radio if program == "receiver" else setup.parts.node_radio],
         )
-        self.mcu.on_spi = self.radio.exchange
+        self.mcu.on_spi = self.radio.begin
         self.mcu.on_port_b = self._port_b
         Board._restore_lines(self)
         self.mcu.on_reset = self._restore_lines
@@ -109,7 +108,8 @@ class Board:
 
     def _port_b(self, value: int) -> None:
         self.radio.enable(bool(value & _CE))
-        self.radio.select(not value & _CSN)
+        if value & _CSN:
+            self.radio.deselect(self.mcu.spi_data())
 
     def _drive_radio_line(self, high: bool) -> None:
         self._radio_line = high
@@ -128,17 +128,17 @@ class ImuNode(Board):
         super().__init__(setup, program, clock_ppm)
         bench, world = setup.bench, setup.world
         chip = IMU_CHIPS[setup.parts.imu]
-        self.imu = Imu(bench, world, setup.rng(), self._drive_imu_line, chip, noise)
+        self.imu = Imu(bench, world, setup.rng(), self._pulse_imu_line, chip, noise)
         parts, clock = setup.parts, self._clock
         self.compass = make_compass(parts.compass, world, clock, self.imu)
         self.barometer = make_barometer(parts.barometer, world, clock)
         self.bus = I2cBus(self.mcu, [self.imu, self.compass, self.barometer])
 
     def _clock(self) -> int:
-        return self.timer.now_ps
+        return self.mcu.now_ps
 
-    def _drive_imu_line(self, high: bool) -> None:
-        self.mcu.set_pin("D", _IMU_LINE, high)
+    def _pulse_imu_line(self, duration_us: int) -> None:
+        self.mcu.pulse(_IMU_LINE, duration_us)
 
     def _restore_lines(self) -> None:
         super()._restore_lines()
@@ -162,11 +162,13 @@ class GpsNode(Board):
             module,
             setup.gps_computing_s,
         )
+        self.mcu.watch_line()
         setup.bench.after_step.append(self._pass_bytes)
 
     def _pass_bytes(self) -> None:
-        for cycle, byte in self.mcu.uart_take():
-            self.gps.hear(self.timer.time_of(cycle), byte)
+        for end_ps, byte in self.mcu.uart_take():
+            self.gps.hear(end_ps, byte)
+        self.gps.sample()
 
 
 class Receiver(Board):
@@ -183,5 +185,4 @@ class Receiver(Board):
         return sent
 
     def _take(self) -> None:
-        time_of = self.timer.time_of
-        self._sent += [(time_of(cycle), byte) for cycle, byte in self.mcu.uart_take()]
+        self._sent += self.mcu.uart_take()

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware.rig.bench import PS_PER_S, Bench
+from firmware.rig.bench import PS_PER_S, STEP_PS, Bench
 from firmware.rig.serial_line import LineSampler
 from firmware.rig.world import Solution, World
 
@@ -231,8 +231,7 @@ class Gps:
         self._to_board = LineSampler(feed)
         self._to_module = LineSampler(self._take)
         self._frame_errors: deque[int] = deque(maxlen=_FRAME_ERRORS_MAX + 1)
-        self._deaf_until_ps = 0
-        bench.after_step.append(self._sample)
+        self._deaf_until_ps = self._next_look_ps = 0
         self.reset(module.baud)
 
     def reset(self, baud: int) -> None:
@@ -278,10 +277,14 @@ class Gps:
             self._board_free_ps = start_ps + byte_ps
             self._to_module.send(start_ps, byte, baud)
 
-    def _sample(self) -> None:
+    def sample(self) -> None:
+        """Sample what has passed on both lines by now."""
         now_ps = self._bench.now_ps
         self._to_board.receive(now_ps, self._board_baud())
         self._to_module.receive(now_ps, self.baud)
+        if now_ps >= self._next_look_ps and (self._to_board.busy or self._to_module.busy):
+            self._next_look_ps = now_ps + STEP_PS
+            self._bench.at(self._next_look_ps, lambda: None)  # a step ends there
 
     def _pass_byte(self, byte: int, speed: int) -> None:
         board_baud = self._board_baud()

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from firmware.rig.mcu import BUS_ADDRESS, BUS_READ, BUS_START, BUS_WRITE, Mcu
+from firmware.rig.mcu import BUS_ADDRESS, BUS_READ, BUS_WRITE, Mcu
 
 _SCL: Final = 1 << 5
 
@@ -26,6 +26,10 @@ class RegisterDevice:
     def read_register(self, register: int) -> int:
         """Return what a register holds."""
         raise NotImplementedError
+
+    def burst(self) -> bytes:
+        """Return bytes from the pointer on that may be read at once: none, or those of one sample."""
+        return b""
 
     def write_register(self, register: int, value: int) -> None:
         """Set a register."""
@@ -65,7 +69,7 @@ class I2cBus:
         if event == BUS_ADDRESS:
             return self._address(byte)
         device = self._device
-        if device is None or event == BUS_START:
+        if device is None:
             return 0xFF if event == BUS_READ else 0
         if event == BUS_READ:
             value = device.read_register(device.pointer)
@@ -73,6 +77,7 @@ class I2cBus:
             return value
         if event == BUS_WRITE:
             return self._write(device, byte)
+        device.pointer = (device.pointer - byte) & 0xFF  # bytes of a burst that were not read
         self._device = None
         return 0
 
@@ -81,7 +86,12 @@ class I2cBus:
             (d for d in self.devices if d.address == byte >> 1 and d.reachable()), None
         )
         self._pointer_next = True
-        return int(self._device is not None)
+        if self._device is None:
+            return 0
+        if byte & 1 and (data := self._device.burst()):
+            self._mcu.twi_answer(data)
+            self._device.pointer = (self._device.pointer + len(data)) & 0xFF
+        return 1
 
     def _write(self, device: RegisterDevice, byte: int) -> int:
         if device.refuse_bytes:

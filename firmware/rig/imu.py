@@ -3,6 +3,7 @@
 Register maps RM-MPU-6000A revision 4.2, RM-MPU-6500A revision 2.1, DS-000143 (ICM-20689).
 """
 
+import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from firmware.rig.bench import PS_PER_S, PS_PER_US, Bench
+from firmware.rig.bench import PS_PER_S, Bench
 from firmware.rig.i2c import RegisterDevice, big_endian, hold
 from firmware.rig.world import World
 
@@ -23,7 +24,8 @@ _RESET: Final = 0x80
 _GRAVITY_MPS2: Final = 9.80665
 _PER_DPS: Final = (131.0, 65.5, 32.8, 16.4)
 _DLPF_HZ: Final = (260, 184, 94, 44, 21, 10, 5)
-_INT_PULSE_PS: Final = 50 * PS_PER_US
+_INT_PULSE_US: Final = 50
+_SAMPLE_SIZE: Final = 14
 _NOISE_COUNTS: Final = 1.5
 _TRIM_CODES: Final = (14, 17, 20)
 """Factory codes of all six axes of the MPU6050, taken in turn."""
@@ -87,6 +89,12 @@ IMU_CHIPS: Final = {
 """By the names that the node report is shown with."""
 
 
+@functools.cache
+def _first_order_gain(code: int, period_ps: int) -> float:
+    """Return the gain of a sample for a code of the DLPF's cut-off frequency."""
+    return 1 - math.exp(-2 * math.pi * _DLPF_HZ[min(code, 6)] * period_ps / PS_PER_S)
+
+
 class Imu(RegisterDevice):
     """The chip; it samples the world by its own clock and pulses its interrupt line."""
 
@@ -97,12 +105,12 @@ class Imu(RegisterDevice):
         bench: Bench,
         world: World,
         rng: np.random.Generator,
-        set_irq: Callable[[bool], None],
+        pulse_irq: Callable[[int], None],
         chip: ImuChip,
         noise: bool = True,
     ) -> None:
         super().__init__()
-        self._bench, self._world, self._rng, self._set_irq = bench, world, rng, set_irq
+        self._bench, self._world, self._rng, self._pulse_irq = bench, world, rng, pulse_irq
         self._chip = chip
         self._noise = _NOISE_COUNTS if noise else 0.0
         self.self_test_works = True
@@ -139,6 +147,12 @@ class Imu(RegisterDevice):
     def read_register(self, register: int) -> int:
         """Return what a register holds."""
         return self._registers.get(register, 0)
+
+    def burst(self) -> bytes:
+        """Return a whole sample: acceleration, temperature, rates."""
+        if self.pointer != DATA:
+            return b""
+        return bytes(self._registers.get(DATA + i, 0) for i in range(_SAMPLE_SIZE))
 
     def write_register(self, register: int, value: int) -> None:
         """Set a register; rate and sleep restart the sampling."""
@@ -178,42 +192,35 @@ class Imu(RegisterDevice):
         self._store(values, moment.temperature_degc)
         if self._registers.get(INT_ENABLE, 0) & 1:
             self.sampled_ps.append(now_ps)
-            self._set_irq(True)
-            self._bench.at(now_ps + _INT_PULSE_PS, lambda: self._set_irq(False))
+            self._pulse_irq(_INT_PULSE_US)
 
     def _low_pass(self, values: list[float]) -> list[float]:
         """Filter as the chip's DLPF would, to first order."""
-        gains = [self._filter_gain(_ACCEL_CONFIG_2 if self._chip.later else CONFIG)] * 3
-        gains += [self._filter_gain(CONFIG)] * 3
+        accel = self._filter_gain(_ACCEL_CONFIG_2 if self._chip.later else CONFIG)
+        gyro = self._filter_gain(CONFIG)
         before = values if self._filtered is None else self._filtered
+        gains = (accel, accel, accel, gyro, gyro, gyro)
         self._filtered = [
             b + gain * (v - b) for b, v, gain in zip(before, values, gains, strict=True)
         ]
         return self._filtered
 
     def _filter_gain(self, register: int) -> float:
-        cutoff_hz = _DLPF_HZ[min(self._registers.get(register, 0) & 7, 6)]
-        return 1 - math.exp(-2 * math.pi * cutoff_hz * self._period_ps / PS_PER_S)
+        return _first_order_gain(self._registers.get(register, 0) & 7, self._period_ps)
 
     def _store(self, values: list[float], temperature_degc: float) -> None:
         accel_config = self._registers.get(ACCEL_CONFIG, 0)
         gyro_config = self._registers.get(GYRO_CONFIG, 0)
         per_g = 16384 >> (accel_config >> 3 & 3)
         per_dps = _PER_DPS[gyro_config >> 3 & 3]
-        noise = self._rng.normal(0.0, self._noise, 6) if self._noise else np.zeros(6)
-        words = []
-        for axis in range(3):
-            g = values[axis] / _GRAVITY_MPS2
-            if accel_config & 0x80 >> axis and self.self_test_works:
-                g += self._trims[0][axis]
-            words.append(hold(g * per_g + noise[axis]))
-        words.append(
-            hold((temperature_degc - self._chip.degc_at_zero) * self._chip.counts_per_degc)
-        )
-        for axis in range(3):
-            dps = math.degrees(values[3 + axis])
-            if gyro_config & 0x80 >> axis and self.self_test_works:
-                dps += self._trims[1][axis]
-            words.append(hold(dps * per_dps + noise[3 + axis]))
+        noise = self._rng.normal(0.0, self._noise, 6).tolist() if self._noise else [0.0] * 6
+        scales = [per_g / _GRAVITY_MPS2] * 3 + [math.degrees(per_dps)] * 3
+        counts = [v * scale + n for v, scale, n in zip(values, scales, noise, strict=True)]
+        if self.self_test_works:
+            for axis in range(3):
+                counts[axis] += per_g * self._trims[0][axis] * bool(accel_config & 0x80 >> axis)
+                counts[3 + axis] += per_dps * self._trims[1][axis] * bool(gyro_config & 0x80 >> axis)
+        temperature = (temperature_degc - self._chip.degc_at_zero) * self._chip.counts_per_degc
+        words = [hold(value) for value in (*counts[:3], temperature, *counts[3:])]
         for i, word in enumerate(words):
             self._registers[DATA + 2 * i], self._registers[DATA + 2 * i + 1] = big_endian(word)

@@ -17,11 +17,12 @@ BROWN_OUT: Final = 1 << 2
 WATCHDOG: Final = 1 << 3
 """Bits of MCUSR."""
 
-BUS_START, BUS_ADDRESS, BUS_WRITE, BUS_READ, BUS_STOP = range(5)
+BUS_ADDRESS, BUS_WRITE, BUS_READ, BUS_STOP = range(4)
 
-_RUNNING: Final = (2, 3)
 _UART_OUT: Final = 4096
+_SPI_DATA: Final = 32
 _SRAM_OFFSET: Final = 0x800000
+_FS_PER_S: Final = 1_000_000_000_000_000
 _R2: Final = 2
 _RJMP_TO_ITSELF: Final = 0xCFFF
 
@@ -44,17 +45,22 @@ def library() -> ctypes.CDLL:
         If it is not built, or libsimavr is not installed.
     """
     lib = ctypes.CDLL(str(LIBRARY))
-    pointer, u8, u16, u32, u64 = (
+    pointer, u8, u16, u32, u64, i64 = (
         ctypes.c_void_p, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_uint32, ctypes.c_uint64,
+        ctypes.c_int64,
     )  # fmt: skip
     signatures: dict[str, tuple[type | None, tuple[type, ...]]] = {
-        "board_new": (pointer, (u32,)),
+        "board_new": (pointer, (u32, i64)),
         "board_free": (None, (pointer,)),
-        "board_connect": (None, (pointer, _SPI, _TWI, _PIN)),
+        "board_connect": (None, (pointer, _SPI, _TWI, _PIN, ctypes.c_char_p, ctypes.c_char_p)),
         "board_load": (None, (pointer, ctypes.c_char_p, u32)),
         "board_start_at": (None, (pointer, u32)),
         "board_reset": (None, (pointer, u8)),
-        "board_run": (ctypes.c_int, (pointer, u64)),
+        "boards_run": (i64, (ctypes.POINTER(pointer), ctypes.c_int, i64, i64, i64, pointer)),
+        "board_now_ps": (i64, (pointer,)),
+        "board_halt": (None, (pointer, i64)),
+        "board_fail": (None, (pointer,)),
+        "board_sound": (ctypes.c_int, (pointer,)),
         "board_cycle": (u64, (pointer,)),
         "board_slept": (u64, (pointer,)),
         "board_resets": (u32, (pointer,)),
@@ -63,10 +69,14 @@ def library() -> ctypes.CDLL:
         "board_flash_word": (u16, (pointer, u32)),
         "board_patch_flash": (None, (pointer, u32, u16)),
         "board_set_pin": (None, (pointer, ctypes.c_char, u8, u8)),
+        "board_pulse": (None, (pointer, u8, u32)),
+        "board_twi_answer": (None, (pointer, ctypes.c_char_p, u8)),
+        "board_spi_count": (u8, (pointer,)),
+        "board_watch_line": (None, (pointer,)),
         "board_hold_sda": (None, (pointer, u8)),
         "board_uart_feed": (None, (pointer, u8, u8)),
         "board_uart_cycles_per_byte": (u32, (pointer,)),
-        "board_uart_take": (u32, (pointer, ctypes.c_char_p, ctypes.POINTER(u64))),
+        "board_uart_take": (u32, (pointer, ctypes.c_char_p, ctypes.POINTER(i64))),
     }
     for name, (result, arguments) in signatures.items():
         function = getattr(lib, name)
@@ -108,98 +118,120 @@ class Mcu:
         The `.hex` file, of a program or a bootloader; the `.elf` of the same name has the symbols.
     frequency_hz : int
         What the program was built for.
+    clock_ppm : float
+        How much faster than that the crystal runs.
     """
 
-    def __init__(self, program: Path, frequency_hz: int) -> None:
+    def __init__(self, program: Path, frequency_hz: int, clock_ppm: float = 0.0) -> None:
         self.program = program
         self.frequency_hz = frequency_hz
-        self.on_spi: Callable[[int], int] = lambda _byte: 0xFF
+        self.on_spi: Callable[[int], tuple[int, bytes]] = lambda _command: (0xFF, b"")
+        """Takes a command; returns the answers to it and to the bytes behind it."""
         self.on_twi: Callable[[int, int], int] = lambda _event, _byte: 0
         self.on_port_b: Callable[[int], None] = lambda _value: None
         self.on_turn_c: Callable[[int], None] = lambda _value: None
         self.on_reset: Callable[[], None] = lambda: None
         self.failure: BaseException | None = None
         self._lib = library()
-        self._board = self._lib.board_new(frequency_hz)
+        period_fs = round(_FS_PER_S / (frequency_hz * (1 + clock_ppm * 1e-6)))
+        self.board = self._lib.board_new(frequency_hz, period_fs)
         # ctypes keeps no reference to a callback: these must live as long as the board.
         self._callbacks = (_SPI(self._spi), _TWI(self._twi), _PIN(self._pin))
         code, start = read_hex(program)
-        self._lib.board_load(self._board, code, len(code))
+        self._lib.board_load(self.board, code, len(code))
         # A program that begins elsewhere is a bootloader, where the chip's fuses let it start.
-        self._lib.board_start_at(self._board, start)
-        self._lib.board_connect(self._board, *self._callbacks)
+        self._lib.board_start_at(self.board, start)
+        self._spi_in, self._spi_out = (ctypes.create_string_buffer(_SPI_DATA) for _ in range(2))
+        self._lib.board_connect(self.board, *self._callbacks, self._spi_in, self._spi_out)
         self._bytes = ctypes.create_string_buffer(_UART_OUT)
-        self._cycles = (ctypes.c_uint64 * _UART_OUT)()
+        self._ends_ps = (ctypes.c_int64 * _UART_OUT)()
 
     def close(self) -> None:
         """Free the chip."""
-        if self._board:
-            self._lib.board_free(self._board)
-            self._board = None
+        if self.board:
+            self._lib.board_free(self.board)
+            self.board = None
 
     def reset(self, cause: int = POWER_ON, through_bootloader: bool = False) -> None:
         """Restart the program; `cause` is what it finds in MCUSR, behind optiboot in r2."""
-        self._lib.board_reset(self._board, 0 if through_bootloader else cause)
+        self._lib.board_reset(self.board, 0 if through_bootloader else cause)
         if through_bootloader:
-            self._lib.board_poke(self._board, _R2, cause)
+            self._lib.board_poke(self.board, _R2, cause)
 
-    def run(self, cycle: int) -> None:
-        """Run to at least this cycle.
-
-        Raises
-        ------
-        CrashedError
-            If the program crashed; any exception of a model that its callbacks met.
-        """
-        state = self._lib.board_run(self._board, cycle)
+    def check(self) -> None:
+        """Raise the exception that a model's callback met, or CrashedError if the program ended."""
+        if self._lib.board_sound(self.board):
+            return
         if self.failure is not None:
             failure, self.failure = self.failure, None
             raise failure
-        if state not in _RUNNING:
-            raise CrashedError(
-                f"{self.program.stem} stopped at {self._lib.board_pc(self._board):#x}"
-            )
+        raise CrashedError(f"{self.program.stem} stopped at {self._lib.board_pc(self.board):#x}")
+
+    @property
+    def now_ps(self) -> int:
+        """The chip's present on the bench's time line: within a step it is ahead of the bench's."""
+        return int(self._lib.board_now_ps(self.board))
+
+    def halt(self, until_ps: int) -> None:
+        """Let time pass until then without a cycle."""
+        self._lib.board_halt(self.board, until_ps)
 
     @property
     def cycle(self) -> int:
         """Cycles since the chip was made; goes on over resets."""
-        return int(self._lib.board_cycle(self._board))
+        return int(self._lib.board_cycle(self.board))
 
     @property
     def slept(self) -> int:
         """Cycles spent asleep."""
-        return int(self._lib.board_slept(self._board))
+        return int(self._lib.board_slept(self.board))
 
     @property
     def resets(self) -> int:
         """How often it was reset, from outside or by its watchdog."""
-        return int(self._lib.board_resets(self._board))
+        return int(self._lib.board_resets(self.board))
 
     def set_pin(self, port: str, bit: int, level: bool) -> None:
         """Drive an input pin."""
-        self._lib.board_set_pin(self._board, port.encode(), bit, level)
+        self._lib.board_set_pin(self.board, port.encode(), bit, level)
+
+    def pulse(self, bit: int, duration_us: int) -> None:
+        """Drive an input pin of port D high for some time."""
+        self._lib.board_pulse(self.board, bit, duration_us)
+
+    def spi_data(self) -> bytes:
+        """Return the bytes that followed the command since the radio was selected."""
+        return self._spi_in[: max(self._lib.board_spi_count(self.board) - 1, 0)]
+
+    def twi_answer(self, data: bytes) -> None:
+        """Let the slave that was just addressed send these bytes first."""
+        self._lib.board_twi_answer(self.board, data, len(data))
+
+    def watch_line(self) -> None:
+        """Have the bench end a step whenever this board's serial line changes."""
+        self._lib.board_watch_line(self.board)
 
     def hold_sda(self, held: bool) -> None:
         """Let somebody hold the I2C data line low, or let it go."""
-        self._lib.board_hold_sda(self._board, held)
+        self._lib.board_hold_sda(self.board, held)
         self.set_pin("C", 4, not held)
 
     def uart_feed(self, byte: int, framing_error: bool = False) -> None:
         """Start one byte on the receive line; the program has it a byte's time later."""
-        self._lib.board_uart_feed(self._board, byte, framing_error)
+        self._lib.board_uart_feed(self.board, byte, framing_error)
 
     @property
     def uart_baud(self) -> float:
         """The speed that the program has set."""
-        cycles: int = self._lib.board_uart_cycles_per_byte(self._board)
+        cycles: int = self._lib.board_uart_cycles_per_byte(self.board)
         return 10 * self.frequency_hz / cycles if cycles else 0.0
 
     def uart_take(self) -> list[tuple[int, int]]:
-        """Return what was sent since the last call: the cycle of each stop bit's end, the byte."""
-        count = self._lib.board_uart_take(self._board, self._bytes, self._cycles)
+        """Return what was sent since the last call: the end of each stop bit in ps, the byte."""
+        count = self._lib.board_uart_take(self.board, self._bytes, self._ends_ps)
         if not count:
             return []
-        return list(zip(self._cycles[:count], ctypes.string_at(self._bytes, count), strict=True))
+        return list(zip(self._ends_ps[:count], ctypes.string_at(self._bytes, count), strict=True))
 
     @functools.cached_property
     def symbols(self) -> dict[str, int]:
@@ -210,27 +242,29 @@ class Mcu:
         """Set a variable of the program."""
         start = self.symbols[name] - _SRAM_OFFSET
         for i, byte in enumerate(value.to_bytes(size, "little")):
-            self._lib.board_poke(self._board, start + i, byte)
+            self._lib.board_poke(self.board, start + i, byte)
 
     def hang(self, function: str) -> Callable[[], None]:
         """Patch an endless loop into the start of a function; returns the way to take it out."""
         address = self.symbols[function]
-        before = self._lib.board_flash_word(self._board, address)
-        self._lib.board_patch_flash(self._board, address, _RJMP_TO_ITSELF)
-        return lambda: self._lib.board_patch_flash(self._board, address, before)
+        before = self._lib.board_flash_word(self.board, address)
+        self._lib.board_patch_flash(self.board, address, _RJMP_TO_ITSELF)
+        return lambda: self._lib.board_patch_flash(self.board, address, before)
 
     def _spi(self, byte: int) -> int:
         try:
-            return self.on_spi(byte)
+            answer, data = self.on_spi(byte)
+            self._spi_out[:] = data.ljust(_SPI_DATA, b"\0")
+            return answer
         except BaseException as error:  # noqa: BLE001 - ctypes would swallow it: raised by run()
-            self.failure = self.failure or error
+            self._fail(error)
             return 0xFF
 
     def _twi(self, event: int, byte: int) -> int:
         try:
             return self.on_twi(event, byte)
         except BaseException as error:  # noqa: BLE001 - as above
-            self.failure = self.failure or error
+            self._fail(error)
             return 0
 
     def _pin(self, port: int, value: int) -> None:
@@ -242,4 +276,8 @@ class Mcu:
             else:
                 self.on_reset()
         except BaseException as error:  # noqa: BLE001 - as above
-            self.failure = self.failure or error
+            self._fail(error)
+
+    def _fail(self, error: BaseException) -> None:
+        self.failure = self.failure or error
+        self._lib.board_fail(self.board)

@@ -91,10 +91,8 @@ class Nrf24:
         self._rx: deque[tuple[int, bytes]] = deque()
         self._identity = 0
         self._heard: dict[int, tuple[int, bytes]] = {}
-        self._ce = self._selected = False
+        self._ce = False
         self._command: int | None = None
-        self._data: list[int] = []
-        self._out: list[int] = []
         self._listening_ps: int | None = None
         self._attempt = 0
         self._job = 0
@@ -103,15 +101,11 @@ class Nrf24:
 
     # --- The pins -----------------------------------------------------------------------------
 
-    def select(self, selected: bool) -> None:
-        """Move CSN; True is low."""
-        if selected == self._selected or self.absent:
-            return
-        self._selected = selected
-        if selected:
-            self._command, self._data, self._out = None, [], []
-        elif self._command is not None:
-            self._finish(self._command, bytes(self._data))
+    def deselect(self, data: bytes) -> None:
+        """Raise CSN behind a command and its data."""
+        if self._command is not None:
+            command, self._command = self._command, None
+            self._finish(command, data)
 
     def enable(self, ce: bool) -> None:
         """Move CE."""
@@ -126,30 +120,24 @@ class Nrf24:
         if ce and self._tx and not self._receiving_mode() and not self._causes & MAX_RT:
             self._begin_job()
 
-    def exchange(self, byte: int) -> int:
-        """Exchange one SPI byte."""
-        if not self._selected or self.absent:
-            return 0xFF
-        if self._command is None:
-            self._command = byte
-            self._out = self._answer(byte)
-            return self._status()
-        self._data.append(byte)
-        at = len(self._data) - 1
-        return self._out[at] if at < len(self._out) else 0
+    def begin(self, command: int) -> tuple[int, bytes]:
+        """Take a command; return what is sent with it and with the bytes behind it."""
+        if self.absent:
+            return 0xFF, b"\xff" * 32
+        self._command = command
+        answer = self._answer(command)
+        return self._status(), answer
 
     # --- Commands: table 20 -------------------------------------------------------------------
 
-    def _answer(self, command: int) -> list[int]:
+    def _answer(self, command: int) -> bytes:
         if command < 0x20:
-            if command in self.addresses:
-                return list(self.addresses[command])
-            return [self._read_register(command)]
+            return self.addresses.get(command) or bytes([self._read_register(command)])
         if command == 0x60:
-            return [len(self._rx[0][1]) if self._rx else 0]
+            return bytes([len(self._rx[0][1]) if self._rx else 0])
         if command == 0x61 and self._rx:
-            return list(self._rx.popleft()[1])
-        return []
+            return self._rx.popleft()[1]
+        return b""
 
     def _finish(self, command: int, data: bytes) -> None:
         if 0x20 <= command < 0x40 and data:

@@ -27,6 +27,11 @@ class LineSampler:
         self._ready_ps = 0
         self._baud = 0.0
 
+    @property
+    def busy(self) -> bool:
+        """Whether bits are still to be sampled."""
+        return bool(self._lows)
+
     def send(self, start_ps: int, byte: int, baud: float) -> None:
         """Put one byte on the line."""
         bit_ps = PS_PER_S / baud

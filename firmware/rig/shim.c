@@ -24,12 +24,13 @@
 #include <simavr/sim_time.h>
 
 enum { SUPPLY_MV = 3300, MCUSR = 0x54, UART_OUT_SIZE = 4096 };
+enum { RADIO_SELECT = 1 << 2, SPI_SIZE = 33, TWI_SIZE = 32 }; /* CSN on PB2; a command and 32 bytes */
 enum { TWCR_TWIE = 0, TWCR_TWEN = 2, TWCR_TWSTO = 4, TWCR_TWSTA = 5, TWCR_TWEA = 6, TWCR_TWINT = 7 };
 
 /* A message of the bus to the model, which answers with an acknowledgement or a byte. */
-enum { BUS_START = 0, BUS_ADDRESS = 1, BUS_WRITE = 2, BUS_READ = 3, BUS_STOP = 4 };
+enum { BUS_ADDRESS = 0, BUS_WRITE = 1, BUS_READ = 2, BUS_STOP = 3 };
 
-typedef uint8_t (*spi_callback)(uint8_t byte);
+typedef uint8_t (*spi_callback)(uint8_t command);
 typedef uint8_t (*twi_callback)(uint8_t event, uint8_t byte);
 typedef void (*pin_callback)(uint8_t port, uint8_t value);
 
@@ -44,10 +45,22 @@ typedef struct {
     twi_callback on_twi;
     pin_callback on_pin;
     uint8_t spi_answer;
+    uint8_t spi_count; /* bytes since the radio was selected */
+    uint8_t *spi_in;   /* those behind the command, and what the radio sends meanwhile */
+    const uint8_t *spi_out;
+    uint8_t port_b;
     uint8_t twi_status;    /* what the running bus action ends with */
     uint8_t twi_busy;      /* between start and stop */
     uint8_t twi_addressed; /* 0, or the read-write bit + 1 */
     uint8_t twi_stuck;     /* somebody holds SDA low */
+    uint8_t twi_answer[TWI_SIZE]; /* bytes that a slave sends in one go, those left at the end */
+    uint8_t twi_left;
+    int64_t period_fs; /* of the crystal, with its error */
+    int64_t halted_ps; /* time that passed without a cycle */
+    uint8_t failed;    /* a callback met an exception */
+    uint8_t line_watched; /* somebody listens: */
+    uint8_t line_changed; /* bytes were sent, or the speed was set */
+    uint8_t pulse_bit;    /* of port D */
     uint64_t slept;
     uint32_t resets;
     uint32_t uart_count;
@@ -101,6 +114,20 @@ static avr_cycle_count_t spi_done(avr_t *avr, avr_cycle_count_t when, void *para
     return 0;
 }
 
+/* The command goes to the model, which then has its answer ready; the bytes behind it are kept. */
+static uint8_t spi_exchange(board_t *board, uint8_t byte)
+{
+    uint8_t answer = 0;
+    if (board->spi_count == 0)
+        answer = board->on_spi ? board->on_spi(byte) : 0xFF;
+    else if (board->spi_count < SPI_SIZE) {
+        board->spi_in[board->spi_count - 1] = byte;
+        answer = board->spi_out[board->spi_count - 1];
+    }
+    board->spi_count += board->spi_count < SPI_SIZE;
+    return answer;
+}
+
 static void spi_write(avr_t *avr, avr_io_addr_t address, uint8_t value, void *param)
 {
     static const uint8_t cycles_a_bit[8] = {4, 16, 64, 128, 2, 8, 32, 64};
@@ -110,7 +137,7 @@ static void spi_write(avr_t *avr, avr_io_addr_t address, uint8_t value, void *pa
         return;
     avr_clear_interrupt(avr, &board->spi->spi);
     uint8_t divider = (avr->data[board->spi->r_spcr] & 3) | (avr->data[board->spi->r_spsr] & 1) << 2;
-    board->spi_answer = board->on_spi ? board->on_spi(value) : 0xFF;
+    board->spi_answer = spi_exchange(board, value);
     avr_cycle_timer_register(avr, 8 * cycles_a_bit[divider], spi_done, board);
 }
 
@@ -143,7 +170,6 @@ static uint8_t twi_tell(board_t *board, uint8_t event, uint8_t byte)
 static void twi_start(board_t *board)
 {
     twi_end_after(board, 2, board->twi_busy ? 0x10 : 0x08);
-    twi_tell(board, BUS_START, 0);
     board->twi_busy = 1;
     board->twi_addressed = 0;
 }
@@ -153,7 +179,8 @@ static void twi_stop(board_t *board)
     avr_t *avr = board->avr;
     avr->data[board->twi->r_twcr] &= ~(1 << TWCR_TWSTO);
     if (board->twi_busy)
-        twi_tell(board, BUS_STOP, 0);
+        twi_tell(board, BUS_STOP, board->twi_left);
+    board->twi_left = 0;
     board->twi_busy = board->twi_addressed = 0;
 }
 
@@ -162,13 +189,16 @@ static void twi_byte(board_t *board, int acknowledge)
     avr_t *avr = board->avr;
     uint8_t byte = avr->data[board->twi->r_twdr];
     if (!board->twi_addressed) {
+        board->twi_left = 0;
         uint8_t ack = twi_tell(board, BUS_ADDRESS, byte);
         board->twi_addressed = 1 + (byte & 1);
         twi_end_after(board, 9, byte & 1 ? (ack ? 0x40 : 0x48) : (ack ? 0x18 : 0x20));
     } else if (board->twi_addressed == 1) {
         twi_end_after(board, 9, twi_tell(board, BUS_WRITE, byte) ? 0x28 : 0x30);
     } else {
-        avr->data[board->twi->r_twdr] = twi_tell(board, BUS_READ, acknowledge);
+        avr->data[board->twi->r_twdr] = board->twi_left
+                                            ? board->twi_answer[TWI_SIZE - board->twi_left--]
+                                            : twi_tell(board, BUS_READ, acknowledge);
         twi_end_after(board, 9, acknowledge ? 0x50 : 0x58);
     }
 }
@@ -208,6 +238,7 @@ static void uart_baud_write(avr_t *avr, avr_io_addr_t address, uint8_t value, vo
     board->uart_baud_write(avr, address, value, uart);
     uint32_t divisor = avr_regbit_get(avr, uart->ubrrl) | avr_regbit_get(avr, uart->ubrrh) << 8;
     uart->cycles_per_byte = (divisor + 1) * 8 * (avr_regbit_get(avr, uart->u2x) ? 1 : 2) * 10;
+    board->line_changed = board->line_watched;
 }
 
 static void uart_output(struct avr_irq_t *irq, uint32_t value, void *param)
@@ -218,6 +249,7 @@ static void uart_output(struct avr_irq_t *irq, uint32_t value, void *param)
         board->uart_bytes[board->uart_count] = (uint8_t)value;
         board->uart_cycles[board->uart_count] = board->avr->cycle + board->uart->cycles_per_byte;
         board->uart_count++;
+        board->line_changed = board->line_watched | (board->uart_count > UART_OUT_SIZE / 2);
     }
 }
 
@@ -226,9 +258,15 @@ static void uart_output(struct avr_irq_t *irq, uint32_t value, void *param)
 static void port_b_changed(struct avr_irq_t *irq, uint32_t value, void *param)
 {
     board_t *board = param;
+    uint8_t changed = board->port_b ^ value;
     (void)irq;
+    board->port_b = (uint8_t)value;
+    if (changed == RADIO_SELECT && !(value & RADIO_SELECT))
+        return; /* selected: the command comes next */
     if (board->on_pin)
         board->on_pin('B', (uint8_t)value);
+    if (value & RADIO_SELECT)
+        board->spi_count = 0;
 }
 
 static void port_c_turned(struct avr_irq_t *irq, uint32_t value, void *param)
@@ -276,7 +314,7 @@ static void hook(board_t *board)
                             port_c_turned, board);
 }
 
-board_t *board_new(uint32_t frequency_hz)
+board_t *board_new(uint32_t frequency_hz, int64_t period_fs)
 {
     int slot = 0;
     while (slot < MAX_BOARDS && boards[slot])
@@ -289,6 +327,7 @@ board_t *board_new(uint32_t frequency_hz)
     avr_init(board->avr);
     boards[slot] = board;
     board->avr->frequency = frequency_hz;
+    board->period_fs = period_fs;
     board->avr->vcc = board->avr->avcc = SUPPLY_MV;
     board->avr->sleep = note_sleep;
     board->core_reset = board->avr->reset;
@@ -307,8 +346,11 @@ void board_free(board_t *board)
     free(board);
 }
 
-void board_connect(board_t *board, spi_callback on_spi, twi_callback on_twi, pin_callback on_pin)
+void board_connect(board_t *board, spi_callback on_spi, twi_callback on_twi, pin_callback on_pin,
+                   uint8_t *spi_in, const uint8_t *spi_out)
 {
+    board->spi_in = spi_in;
+    board->spi_out = spi_out;
     board->on_spi = on_spi;
     board->on_twi = on_twi;
     board->on_pin = on_pin;
@@ -341,18 +383,70 @@ static avr_cycle_count_t stop_here(avr_t *avr, avr_cycle_count_t when, void *par
     return 0;
 }
 
-/* Runs to at least the given cycle; returns simavr's state. */
-int board_run(board_t *board, uint64_t cycle)
+/* --- Time: a board's cycles on the time line of the bench, in ps ------------------------------ */
+
+static int64_t time_of(const board_t *board, uint64_t cycle)
+{
+    return board->halted_ps + (int64_t)((unsigned __int128)cycle * board->period_fs / 1000);
+}
+
+int64_t board_now_ps(const board_t *board) { return time_of(board, board->avr->cycle); }
+
+/* Lets time pass until then without a cycle. */
+void board_halt(board_t *board, int64_t until_ps)
+{
+    int64_t late_ps = until_ps - board_now_ps(board);
+    board->halted_ps += late_ps > 0 ? late_ps : 0;
+}
+
+void board_fail(board_t *board) { board->failed = 1; }
+
+/* Whether the program runs, and no callback met an exception since the last call. */
+int board_sound(board_t *board)
+{
+    int failed = board->failed, state = board->avr->state;
+    board->failed = 0;
+    return !failed && (state == cpu_Running || state == cpu_Sleeping);
+}
+
+static void run_to(board_t *board, int64_t until_ps)
 {
     avr_t *avr = board->avr;
+    int64_t left_ps = until_ps - board->halted_ps;
+    if (left_ps <= 0)
+        return;
+    uint64_t cycle = ((unsigned __int128)left_ps * 1000 + board->period_fs - 1) / board->period_fs;
     if (avr->cycle >= cycle)
-        return avr->state;
+        return;
     /* A timer at the end, or a sleeping core would jump past it. */
     avr_cycle_timer_register(avr, cycle - avr->cycle, stop_here, board);
     while (avr->cycle < cycle && avr->state != cpu_Done && avr->state != cpu_Crashed)
         avr_run(avr);
     avr_cycle_timer_cancel(avr, stop_here, board);
-    return avr->state;
+}
+
+/* Runs all boards in steps until a model's event is due, a serial line changes or a program ends:
+ * these are for the caller. Callbacks may bring the next event forward. Returns the time reached. */
+int64_t boards_run(board_t **bench, int count, int64_t now_ps, int64_t until_ps, int64_t step_ps,
+                   const volatile int64_t *next_event_ps)
+{
+    int stop = 0;
+    for (int i = 0; i < count; i++)
+        bench[i]->line_changed = 0;
+    while (now_ps < until_ps && !stop) {
+        int64_t next_ps = now_ps + step_ps < until_ps ? now_ps + step_ps : until_ps;
+        if (*next_event_ps < next_ps)
+            next_ps = *next_event_ps;
+        now_ps = next_ps > now_ps ? next_ps : now_ps;
+        for (int i = 0; i < count; i++) {
+            run_to(bench[i], now_ps);
+            avr_t *avr = bench[i]->avr;
+            stop |= bench[i]->line_changed | bench[i]->failed | (avr->state == cpu_Done) |
+                    (avr->state == cpu_Crashed);
+        }
+        stop |= *next_event_ps <= now_ps;
+    }
+    return now_ps;
 }
 
 uint64_t board_cycle(const board_t *board) { return board->avr->cycle; }
@@ -380,6 +474,31 @@ void board_set_pin(board_t *board, char port, uint8_t bit, uint8_t level)
     avr_raise_irq(irq, level);
 }
 
+static avr_cycle_count_t end_pulse(avr_t *avr, avr_cycle_count_t when, void *param)
+{
+    board_t *board = param;
+    (void)avr, (void)when;
+    board_set_pin(board, 'D', board->pulse_bit, 0);
+    return 0;
+}
+
+/* Drives a pin of port D high for some time. */
+void board_pulse(board_t *board, uint8_t bit, uint32_t duration_us)
+{
+    board->pulse_bit = bit;
+    board_set_pin(board, 'D', bit, 1);
+    avr_cycle_timer_register_usec(board->avr, duration_us, end_pulse, board);
+}
+
+/* Bytes that the slave sends next, without being asked for each. */
+void board_twi_answer(board_t *board, const uint8_t *bytes, uint8_t size)
+{
+    memcpy(board->twi_answer + TWI_SIZE - size, bytes, size);
+    board->twi_left = size;
+}
+
+uint8_t board_spi_count(const board_t *board) { return board->spi_count; }
+
 void board_hold_sda(board_t *board, uint8_t stuck) { board->twi_stuck = stuck; }
 
 void board_uart_feed(board_t *board, uint8_t byte, uint8_t framing_error)
@@ -388,17 +507,21 @@ void board_uart_feed(board_t *board, uint8_t byte, uint8_t framing_error)
     avr_raise_irq(irq, byte | (framing_error ? UART_INPUT_FE : 0));
 }
 
+/* Ends a step of `boards_run` whenever this line changes. */
+void board_watch_line(board_t *board) { board->line_watched = 1; }
+
 uint32_t board_uart_cycles_per_byte(const board_t *board)
 {
     return (uint32_t)board->uart->cycles_per_byte;
 }
 
-/* Moves what was sent, and the cycle at which each byte's stop bit ended, to the caller. */
-uint32_t board_uart_take(board_t *board, uint8_t *bytes, uint64_t *cycles)
+/* Moves what was sent, and the time at which each byte's stop bit ended, to the caller. */
+uint32_t board_uart_take(board_t *board, uint8_t *bytes, int64_t *ends_ps)
 {
     uint32_t count = board->uart_count;
     memcpy(bytes, board->uart_bytes, count);
-    memcpy(cycles, board->uart_cycles, count * sizeof *cycles);
+    for (uint32_t i = 0; i < count; i++)
+        ends_ps[i] = time_of(board, board->uart_cycles[i]);
     board->uart_count = 0;
     return count;
 }

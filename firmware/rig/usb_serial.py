@@ -85,7 +85,7 @@ class UsbSerial:
         # The bench may have run alone meanwhile.
         self._ahead_of_s = time.monotonic() - self._bench.now_ps / PS_PER_S
         end_ps = self._bench.now_ps + round(limit_s * PS_PER_S)
-        timers, self._bench.timers = self._bench.timers, [self._board.timer]
+        chips, self._bench.chips = self._bench.chips, [self._board.mcu]
         try:
             while process.poll() is None:
                 if self._bench.now_ps > end_ps:
@@ -93,9 +93,9 @@ class UsbSerial:
                     raise TimeoutError(f"{process.args} runs for more than {limit_s} s")
                 self.run(PIECE_S)
         finally:
-            self._bench.timers = timers
-            for timer in timers:
-                timer.halt(self._bench.now_ps)
+            self._bench.chips = chips
+            for chip in chips:
+                chip.halt(self._bench.now_ps)
         return process.returncode
 
     def run(self, seconds: float) -> None:

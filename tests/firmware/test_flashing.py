@@ -161,7 +161,7 @@ def led_of(node: Board) -> list[float]:
 
     def look(value: int) -> None:
         if value & SPI_CLOCK and not level[0]:
-            flashes.append(node.timer.now_ps)
+            flashes.append(node.mcu.now_ps)
         level[0] = value & SPI_CLOCK
         before(value)
 

@@ -215,19 +215,19 @@ def test_imu_without_its_interrupt_is_polled_and_reported(bench: MakeBench) -> N
     chip = rig.imu_node().imu
     rig.run(0.8)
     woken = 0
-    write, irq = chip.write_register, chip._set_irq
+    write, irq = chip.write_register, chip._pulse_irq
 
     def count(register: int, value: int) -> None:
         nonlocal woken
         woken += register == PWR_MGMT_1
         write(register, value)
 
-    chip.write_register, chip._set_irq = count, lambda high: None
+    chip.write_register, chip._pulse_irq = count, lambda duration_us: None
     rig.run(1.4)
     assert 3 <= woken <= 8
     assert rig.last(NodeStatusPayload).sensors_failed == IMU
     assert len(rig.payloads(BaroPayload, since_s=1.2)) == pytest.approx(25, abs=2)
-    chip._set_irq = irq
+    chip._pulse_irq = irq
     rig.run(1.2)
     assert rig.last(NodeStatusPayload).sensors_failed == 0
 
@@ -296,7 +296,7 @@ def test_other_calibration_words_give_the_same_pressure(
     node = rig.imu_node()
     node.barometer.__init__(  # type: ignore[misc]
         rig.setup.world,
-        lambda: node.timer.now_ps,
+        lambda: node.mcu.now_ps,
         Words(7911, -1022, -14429, 33996, 25204, 16739, 5498, 57, -32768, -11786, 2723),
     )
     rig.run(START_S + 0.15)
