@@ -28,7 +28,7 @@ class RegisterDevice:
         raise NotImplementedError
 
     def burst(self) -> bytes:
-        """Return bytes from the pointer on that may be read at once: none, or those of one sample."""
+        """Return the bytes from the pointer on that belong to one sample, if any."""
         return b""
 
     def write_register(self, register: int, value: int) -> None:

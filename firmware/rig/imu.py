@@ -219,7 +219,9 @@ class Imu(RegisterDevice):
         if self.self_test_works:
             for axis in range(3):
                 counts[axis] += per_g * self._trims[0][axis] * bool(accel_config & 0x80 >> axis)
-                counts[3 + axis] += per_dps * self._trims[1][axis] * bool(gyro_config & 0x80 >> axis)
+                counts[3 + axis] += (
+                    per_dps * self._trims[1][axis] * bool(gyro_config & 0x80 >> axis)
+                )
         temperature = (temperature_degc - self._chip.degc_at_zero) * self._chip.counts_per_degc
         words = [hold(value) for value in (*counts[:3], temperature, *counts[3:])]
         for i, word in enumerate(words):

@@ -255,10 +255,10 @@ class Mcu:
         try:
             answer, data = self.on_spi(byte)
             self._spi_out[:] = data.ljust(_SPI_DATA, b"\0")
-            return answer
         except BaseException as error:  # noqa: BLE001 - ctypes would swallow it: raised by run()
             self._fail(error)
             return 0xFF
+        return answer
 
     def _twi(self, event: int, byte: int) -> int:
         try:
