@@ -5,6 +5,7 @@ import contextlib
 import logging
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -137,7 +138,6 @@ class Hub:
         self.deliver = self._router.deliver
         self._ping_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
-        self._published = self._shed = 0
         self._gathering: dict[float, list[Callable[[], None]]] = {}
         """Callbacks to flush, by their wait."""
         self._numbering = Numbering()
@@ -201,7 +201,7 @@ class Hub:
         try:
             while telemetry and telemetry[0][3] < now_us - SHED_AFTER_US:
                 telemetry.popleft()
-                self._shed += 1
+                self._router.counters.shed += 1
             while (answers or telemetry) and (
                 room > 0 or len(answers) + len(telemetry) > MAX_WAITING
             ):
@@ -214,12 +214,12 @@ class Hub:
 
     def _send(self, queued: _Queued, now_us: int) -> None:
         frame, step, client_id, _ = queued
-        self._published += 1
+        self._router.counters.published += 1
         sequence = frame.sequence if step is None else self._numbering.leave(frame, step)
         if self._vehicles.has_waiting:
             self._greet(frame, sequence, now_us)
         if client_id is not None:
-            self._fanout.answer(frame, sequence, self._router.group(client_id), now_us)
+            self._fanout.answer(frame, sequence, self._router.links.group(client_id), now_us)
             return
         if self._vehicles.register(frame, now_us):
             self._fanout.clear()
@@ -227,7 +227,7 @@ class Hub:
 
     def set_interval(self, request: ClientInterval) -> None:
         """Send a client one message of one system at the interval that it requested."""
-        for client_id in self._router.group(request.client_id):
+        for client_id in self._router.links.group(request.client_id):
             self._fanout.set_interval(msgspec.structs.replace(request, client_id=client_id))
 
     def add(self, url: str) -> None:
@@ -272,7 +272,7 @@ class Hub:
         before = {parse_endpoint(url).location for url in self.settings.endpoints}
         after = {parse_endpoint(url).location: url for url in settings.endpoints}
         self.settings = settings
-        self._router.apply(settings)
+        self._router.settings = settings
         for location in before - after.keys():
             if location in self._endpoints:
                 self.remove(location)
@@ -301,17 +301,9 @@ class Hub:
 
     def counters(self) -> HubCounters:
         """Return the totals since the start."""
-        router = self._router
-        return HubCounters(
-            published=self._published,
-            forwarded=router.forwarded,
-            duplicates=router.duplicates,
-            late=router.late,
-            shed=self._shed,
-            looped=router.looped,
-            unroutable=router.unroutable,
-            unserved=router.unserved,
-        )
+        self._fanout.settle()
+        counters = self._router.counters
+        return replace(counters, forwarded=counters.forwarded + self._fanout.forwarded)
 
     def listening_ports(self) -> tuple[int, ...]:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
@@ -401,7 +393,8 @@ class Hub:
                 self._tick_one(endpoint, now_us)
         for client in list(self._clients.values()):
             self._tick_one(client, now_us)
-        self._router.tick(now_us)
+        self._router.links.expire(now_us)
+        self._fanout.thin(now_us)
         interval_us = round(self.settings.ping_interval_s * US_PER_S)
         # One at a tick: either takes as long as several frames.
         if now_us - self._alerts_us >= US_PER_S:

@@ -37,13 +37,7 @@ def is_of_gateway(frame: MavFrame) -> bool:
 
 
 class RoundTrip:
-    """Send round-trip requests and read the answers.
-
-    Parameters
-    ----------
-    signer : FrameSigner
-        Signs the requests of systems that have a key.
-    """
+    """Build round-trip requests and read the answers."""
 
     def __init__(self, signer: FrameSigner) -> None:
         self._signer = signer

@@ -26,6 +26,7 @@ from gateway.hub.routing_table import (
     SystemPath,
 )
 from gateway.hub.settings import HubSettings
+from gateway.hub.stats import HubCounters
 from gateway.hub.transports.base import Client
 from gateway.records import Incoming
 from gateway.units import US_PER_S
@@ -34,33 +35,15 @@ from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 UNADDRESSED_REQUESTS: Final = frozenset({HEARTBEAT_ID, dialect.MAVLINK_MSG_ID_TIMESYNC})
 """Messages without a target that our vehicles handle, whoever sends them."""
-MAX_CLAIMS: Final = 8
+MAX_UNTRUSTED_SYSTEMS: Final = 8
 """Systems that are shown for an untrusted client."""
 
 
 class Router:
-    """Route each received frame.
+    """Route each received frame that has no cached route.
 
-    Parameters
-    ----------
-    settings : HubSettings
-        Limits.
-    clients : mapping of int to Client
-        All clients by id, as they are at any time.
-    fanout : Fanout
-        Sends frames to them.
-    vehicles : OwnVehicles
-        Ours.
-    round_trip : RoundTrip
-        Reads answers to our round-trip requests.
-    on_frame : callable
-        Handles requests to our vehicles.
-    on_foreign : callable, optional
-        Called with each frame that is forwarded.
-    rejects : callable, optional
-        Called with each received frame and the time; True drops it.
-    now_us : callable
-        The gateway clock.
+    `on_frame` handles requests to our vehicles, `on_foreign` is called with each frame that is
+    forwarded, and `rejects` with each received one: if it returns True the frame is dropped.
     """
 
     def __init__(
@@ -75,8 +58,9 @@ class Router:
         rejects: Callable[[bytes, int], bool] | None,
         now_us: Callable[[], int],
     ) -> None:
-        self.duplicates = self.late = self.looped = self.unroutable = self.unserved = 0
-        self._forwarded = 0
+        self.settings = settings
+        self.counters = HubCounters()
+        self.links = RedundantLinks()
         self._clients = clients
         self._fanout = fanout
         self._vehicles = vehicles
@@ -86,32 +70,16 @@ class Router:
         self._rejects = rejects
         self._now_us = now_us
         self._table = RoutingTable(fanout.clear)
-        self._claims = RoutingTable(max_origins=MAX_CLAIMS)
+        self._untrusted = RoutingTable(max_origins=MAX_UNTRUSTED_SYSTEMS)
         self._duplicates = DuplicateFilter()
-        self._links = RedundantLinks()
         self._requests = RequestQueue()
         self._serving: int | None = None
         self._turn: asyncio.Handle | None = None
         self._pause: asyncio.TimerHandle | None = None
-        self.apply(settings)
-
-    def apply(self, settings: HubSettings) -> None:
-        """Apply changed settings."""
-        self._late_us = round(settings.late_after_s * US_PER_S)
-
-    @property
-    def forwarded(self) -> int:
-        """Frames of other systems that were forwarded."""
-        self._fanout.settle()
-        return self._forwarded + self._fanout.forwarded
 
     def origins(self, client_id: int) -> tuple[Origin, ...]:
         """Return the systems and components received from a client."""
-        return self._table.origins(client_id) or self._claims.origins(client_id)
-
-    def group(self, client_id: int) -> tuple[int, ...]:
-        """Return all links to a client's peer."""
-        return self._links.group(client_id)
+        return self._table.origins(client_id) or self._untrusted.origins(client_id)
 
     def charge(self, client_id: int | None, size: int) -> None:
         """Charge a client for a frame to it, or for one to all that it has just requested."""
@@ -120,25 +88,18 @@ class Router:
             copies = len(self._clients) if client_id is None else 1
             self._requests.charge(payer, size * copies)
 
-    def tick(self, now_us: int) -> None:
-        """Separate links without copies, and thin the frames to narrow links."""
-        self._links.expire(now_us)
-        self._fanout.thin(now_us)
-
     def reconfigure(self, client: Client) -> None:
         """Apply a client's changed options; one no longer trusted leaves the routing table."""
         if client.trusted:
-            self._claims.remove(client.client_id)
+            self._untrusted.remove(client.client_id)
         else:
             self._table.remove(client.client_id)
-            self._links.remove(client.client_id)
+            self.links.remove(client.client_id)
 
     def remove(self, client_id: int) -> None:
         """Remove all state of a client that has gone."""
-        self._table.remove(client_id)
-        self._claims.remove(client_id)
-        self._links.remove(client_id)
-        self._requests.remove(client_id)
+        for part in (self._table, self._untrusted, self.links, self._requests):
+            part.remove(client_id)
 
     def close(self) -> None:
         """Stop answering."""
@@ -154,10 +115,10 @@ class Router:
         if self._rejects is not None and self._rejects(frame.data, now_us):
             return
         if self._vehicles.is_own(origin, now_us) or origin == self._round_trip.origin:
-            self.looped += 1
+            self.counters.looped += 1
             return
-        table = self._table if client.trusted else self._claims
-        path = table.hear(client.client_id, origin, now_us)
+        table = self._table if client.trusted else self._untrusted
+        path = table.register(client.client_id, origin, now_us)
         if path is not None and frame.message_id == HEARTBEAT_ID:
             path.is_station = frame.is_station_heartbeat
         round_trip_us = self._round_trip.read(frame, now_us)
@@ -183,13 +144,14 @@ class Router:
         if not self._table.is_shared(frame.origin, now_us):
             path.stream.accept(frame.sequence, client_id, now_us)
             return False
-        first = self._duplicates.check(frame, client_id, path, now_us, self._late_us)
+        late_us = round(self.settings.late_after_s * US_PER_S)
+        first = self._duplicates.check(frame, client_id, path, now_us, late_us)
         if first == NEW:
             return False
         if first == LATE:
-            self.late += 1
+            self.counters.late += 1
             return True
-        self.duplicates += 1
+        self.counters.duplicates += 1
         if first != client_id:
             self._register_link(first, client, frame, now_us)
         return True
@@ -199,8 +161,8 @@ class Router:
         for_us = frame.target[0] in self._vehicles.systems(now_us)
         if not (for_us or is_of_gateway(frame)):
             return
-        if self._links.register(first, client.client_id, now_us):
-            self._fanout.align(self._links.group(client.client_id))
+        if self.links.register(first, client.client_id, now_us):
+            self._fanout.align(self.links.group(client.client_id))
             if for_us:
                 # The first request has been answered on one link only.
                 self._ask(client, frame, forwarded=False)
@@ -215,7 +177,7 @@ class Router:
         if clients:
             self._count(frame)
         elif not ours:
-            self.unroutable += 1
+            self.counters.unroutable += 1
         if client.trusted or ours:
             self._fanout.deliver(frame, clients, client.client_id)
 
@@ -252,7 +214,7 @@ class Router:
         route.forward(frame, now_us, is_checked=True)
 
     def _count(self, frame: MavFrame) -> None:
-        self._forwarded += 1
+        self.counters.forwarded += 1
         if self._on_foreign is not None:
             self._on_foreign(frame.data)
 
@@ -260,7 +222,7 @@ class Router:
         """Queue a request to our vehicles."""
         incoming = Incoming(client.client_id, frame.data, client.trusted, forwarded)
         if not self._requests.offer(incoming, self._now_us()):
-            self.unserved += 1
+            self.counters.unserved += 1
         elif self._turn is None:
             self._serve()
 

@@ -118,12 +118,8 @@ class SystemPath:
 class RoutingTable:
     """Which client has brought frames of which system.
 
-    Parameters
-    ----------
-    changed : callable, optional
-        Called when cached routes may be wrong: a system has one path more, or fewer.
-    max_origins : int, optional
-        Remembered per client; a new one replaces the one that has been silent longest.
+    `changed` is called when cached routes may be wrong: a system has one path more, or fewer. Of
+    more than `max_origins` systems of a client, the one received longest ago is replaced.
     """
 
     def __init__(
@@ -138,7 +134,7 @@ class RoutingTable:
         """By system."""
         self._streams: dict[Origin, FrameStream] = {}
 
-    def hear(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
+    def register(self, client_id: int, origin: Origin, now_us: int) -> SystemPath | None:
         """Register a client's frame of a system; return the path, or None without room for it."""
         paths = self._to.get(origin)
         path = paths.get(client_id) if paths else None
@@ -228,15 +224,7 @@ class RoutingTable:
 
 
 class FrameMemory(Generic[Note]):
-    """Notes on recent frames, kept for one to two spans, bounded.
-
-    Parameters
-    ----------
-    span_us : int
-        Length of a generation.
-    most : int
-        Frames of a generation; there are two.
-    """
+    """Notes on recent frames in two generations, each of at most a time and a number of frames."""
 
     def __init__(self, span_us: int, most: int) -> None:
         self._span_us = span_us

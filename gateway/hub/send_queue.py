@@ -79,13 +79,7 @@ Key = bytes
 
 
 class Bandwidth:
-    """Message intervals on one link of a known bandwidth.
-
-    Parameters
-    ----------
-    bytes_per_s : int
-        Of everything sent.
-    """
+    """Message intervals on one link of a known bandwidth."""
 
     def __init__(self, bytes_per_s: int) -> None:
         self.share = 1.0
@@ -197,12 +191,8 @@ class Numbering:
 
     Each frame keeps its step from the frame before it in our own order; when frames leave, their
     steps add up. So without drops every frame leaves with its own number, gaps of a recording
-    included, and with drops the numbers continue without a gap.
-
-    Parameters
-    ----------
-    is_own : callable, optional
-        Whether an origin is one of our vehicles; frames of others are never changed.
+    included, and with drops the numbers continue without a gap. Frames of others, for whose origin
+    `is_own` returns False, are never changed.
     """
 
     def __init__(self, is_own: Callable[[Origin], bool] | None = None) -> None:
@@ -233,13 +223,7 @@ class Numbering:
 class LinkEncoder:
     """Number and sign our own frames on one link, in the order in which they leave.
 
-    Parameters
-    ----------
-    is_own : callable
-        Whether an origin is one of our vehicles.
-    signer : FrameSigner
-        Signs frames of systems that have a key; a frame that was overtaken is signed again, since
-        its timestamp is too early.
+    A frame that was overtaken is signed again, since its timestamp is too early.
     """
 
     def __init__(self, is_own: Callable[[Origin], bool], signer: FrameSigner) -> None:
@@ -256,12 +240,9 @@ class LinkEncoder:
 
 
 class SendQueue:
-    """A bounded queue in front of one slow link.
+    """A queue in front of one slow link: at most `max_bytes` wait, in addition to bulk.
 
-    Parameters
-    ----------
-    max_bytes : int
-        Most waiting bytes in addition to bulk; the newest frame is always accepted.
+    The newest frame is always accepted.
     """
 
     def __init__(self, max_bytes: int) -> None:
@@ -390,14 +371,7 @@ class Pacer:
     """Keep the driver's buffer of a serial line short, so that urgent frames need not wait for it.
 
     A driver accepts kilobytes at once, which at 57600 Bd is most of a second. The pacer computes
-    when the line will have sent them and allows the next frame just before.
-
-    Parameters
-    ----------
-    baud : int
-        Line rate.
-    ahead_us : int
-        Time on the line that may be in the driver's buffer.
+    when the line of `baud` will have sent them, and allows the next frame `ahead_us` before.
     """
 
     def __init__(self, baud: int, ahead_us: int) -> None:

@@ -75,7 +75,7 @@ class ListenerStats:
     """New clients refused because the port was full."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class HubCounters:
     """Totals of the hub since it started."""
 
@@ -101,15 +101,7 @@ WINDOW_US: Final = 60 * US_PER_S
 
 
 class LogRateLimiter:
-    """Lines of one kind: a few of each minute in full, the others as their number.
-
-    Parameters
-    ----------
-    in_full : int
-        Most lines passed in full in one minute.
-    rest : str
-        Text that follows the number of the others.
-    """
+    """Lines of one kind: `in_full` of each minute as they are, the number of others with `rest`."""
 
     def __init__(self, in_full: int, rest: str) -> None:
         self._in_full = in_full

@@ -28,9 +28,9 @@ LIMIT_US = US_PER_S
 @pytest.fixture
 def table() -> RoutingTable:
     table = RoutingTable()
-    table.hear(1, (10, 1), 0)
-    table.hear(2, (10, 100), 0)
-    table.hear(3, (20, 1), 0)
+    table.register(1, (10, 1), 0)
+    table.register(2, (10, 100), 0)
+    table.register(3, (20, 1), 0)
     return table
 
 
@@ -53,15 +53,15 @@ def test_clients_to_a_target(
 
 
 def test_a_fresh_path_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
-    table.hear(4, (20, 1), ROUTE_FRESH_US + 1)
+    table.register(4, (20, 1), ROUTE_FRESH_US + 1)
     assert table.clients_to((20, 1), 9, ROUTE_FRESH_US + 1) == [4]
     assert table.clients_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]
 
 
 def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None:
-    table.hear(4, (20, 1), 0)
+    table.register(4, (20, 1), 0)
     assert table.is_shared((20, 1), ROUTE_FRESH_US)
-    table.hear(4, (20, 1), ROUTE_FRESH_US + 1)
+    table.register(4, (20, 1), ROUTE_FRESH_US + 1)
     assert not table.is_shared((20, 1), ROUTE_FRESH_US + 1)
     assert not table.is_shared((10, 1), 0)
 
@@ -74,8 +74,8 @@ def test_a_removed_client_has_no_paths(table: RoutingTable) -> None:
 
 
 def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
-    table.hear(4, (255, 190), 0)
-    path = table.hear(4, (255, 190), 0)
+    table.register(4, (255, 190), 0)
+    path = table.register(4, (255, 190), 0)
     path.is_station = True
     assert table.is_station((255, 190))
     assert table.clients_with_vehicles(1) == [2, 3]
@@ -85,23 +85,23 @@ def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
 
 def test_a_path_begins_again_after_a_timeout(table: RoutingTable) -> None:
     later_us = ROUTE_FRESH_US
-    table.hear(8, (10, 1), 0)
-    assert table.hear(1, (10, 1), later_us).since_us == 0
-    assert table.hear(1, (10, 1), 2 * later_us + 1).since_us == 2 * later_us + 1
+    table.register(8, (10, 1), 0)
+    assert table.register(1, (10, 1), later_us).since_us == 0
+    assert table.register(1, (10, 1), 2 * later_us + 1).since_us == 2 * later_us + 1
 
 
 class TestBounds:
     def test_all_255_systems_behind_one_client_are_reached(self) -> None:
         table = RoutingTable()
         for system in range(1, 256):
-            assert table.hear(1, (system, 1), system)
+            assert table.register(1, (system, 1), system)
         assert all(table.clients_to((system, 1), 9, 255) == [1] for system in range(1, 256))
 
     def test_the_stalest_origin_is_replaced(self) -> None:
         table = RoutingTable(max_origins=3)
         for system, us in ((1, 5), (2, 0), (3, 9)):
-            table.hear(1, (system, 1), us)
-        assert table.hear(1, (4, 1), ROUTE_FRESH_US + 1)
+            table.register(1, (system, 1), us)
+        assert table.register(1, (4, 1), ROUTE_FRESH_US + 1)
         assert table.origins(1) == ((1, 1), (3, 1), (4, 1))
         assert table.clients_to((2, 1), 9, 0) == []
 
@@ -109,11 +109,11 @@ class TestBounds:
         changes: list[int] = []
         table = RoutingTable(lambda: changes.append(1), max_origins=3)
         for system in range(1, 4):
-            table.hear(1, (system, 1), 0)
-            table.hear(2, (system, 1), 0)
+            table.register(1, (system, 1), 0)
+            table.register(2, (system, 1), 0)
         changes.clear()
         for system in range(4, 250):
-            assert not table.hear(1, (system, 1), 1)
+            assert not table.register(1, (system, 1), 1)
         assert table.origins(1) == ((1, 1), (2, 1), (3, 1))
         assert changes == []
 
@@ -121,7 +121,7 @@ class TestBounds:
         changes: list[int] = []
         table = RoutingTable(lambda: changes.append(1))
         for client_id, system, expected in ((1, 10, 0), (2, 10, 1), (2, 10, 1), (2, 11, 1)):
-            table.hear(client_id, (system, 1), 0)
+            table.register(client_id, (system, 1), 0)
             assert len(changes) == expected
         table.remove(2)
         assert len(changes) == 2
@@ -129,7 +129,7 @@ class TestBounds:
     def test_removed_clients_leave_no_entries(self) -> None:
         table = RoutingTable()
         for client in range(400):
-            table.hear(client, (client % 255, 190), 0)
+            table.register(client, (client % 255, 190), 0)
             table.remove(client)
         assert (table._to, table._of_client, table._components) == ({}, {}, {})
 

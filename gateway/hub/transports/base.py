@@ -3,7 +3,8 @@
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
@@ -47,6 +48,18 @@ Write = Callable[[bytes], object]
 def not_open(data: bytes) -> int:
     """Write function of a client without an open socket; raises OSError."""
     raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
+
+
+@contextmanager
+def new_socket(family: int, kind: int) -> Iterator[socket.socket]:
+    """Give a socket that does not block; it is closed if the block of `with` raises."""
+    sock = socket.socket(family, kind)
+    try:
+        sock.setblocking(False)
+        yield sock
+    except BaseException:
+        sock.close()
+        raise
 
 
 class HubContext(Protocol):
@@ -229,6 +242,7 @@ class Client:
     """When it began to send MAVLink 1."""
     _sends_version2: bool = False
     _only_version1: bool = False
+    _retry_us: int = 0
 
     def __post_init__(self) -> None:
         """Fill in the remaining fields."""
@@ -280,6 +294,13 @@ class Client:
 
     def tick(self, now_us: int) -> None:
         """Reconnect and expire; called a few times a second."""
+
+    def _is_retry_due(self, now_us: int) -> bool:
+        """Return whether the last True is `RETRY_US` ago."""
+        if now_us < self._retry_us:
+            return False
+        self._retry_us = now_us + RETRY_US
+        return True
 
     @property
     def host(self) -> str:

@@ -12,7 +12,7 @@ from gateway.hub.endpoint import Endpoint
 from gateway.hub.limits import SILENT_AFTER_US
 from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import RETRY_US, Client, Write, not_open
+from gateway.hub.transports.base import RETRY_US, Client, Write, new_socket, not_open
 from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram
 
 NOBODY_LISTENS: Final = "nobody listens there"
@@ -95,14 +95,14 @@ class DatagramClient(Client):
         """Use an open socket from now on."""
         self._socket = sock
         self.write = self._direct = write
-        self.revive()
+        self._revive()
         self._read = self._reader(sock)
         self.loop.add_reader(sock, self._read)
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process one datagram of this peer."""
         if self.state != "open":
-            self.revive()
+            self._revive()
         frame = read_datagram(data)
         if frame is None:
             self.receive(split_datagram(data), len(data), now_us)
@@ -110,7 +110,7 @@ class DatagramClient(Client):
         self.counters.bytes_received += len(data)
         self.receive_frame(frame, now_us)
 
-    def revive(self) -> None:
+    def _revive(self) -> None:
         """Note that the peer is reachable after all."""
         self.become("open")
         self.refused_us = None
@@ -243,10 +243,10 @@ class DatagramPeer(DatagramClient):
     address: Address
     """Host and port of the peer."""
 
-    def revive(self) -> None:
+    def _revive(self) -> None:
         """Note that the client is reachable after all."""
         self._end_hold()
-        super().revive()
+        super()._revive()
 
     def tick(self, now_us: int) -> None:
         """Clear a problem that was not repeated; retry a client that refused."""
@@ -281,18 +281,13 @@ class DatagramPeer(DatagramClient):
 def bound_socket(address: tuple[str, int], *, shared: bool) -> socket.socket:
     """Open a datagram socket on an address; `shared` if one is bound there already."""
     family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_DGRAM)
-    try:
-        sock.setblocking(False)
+    with new_socket(family, socket.SOCK_DGRAM) as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         if shared:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
         sock.bind(address)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
-    except OSError:
-        sock.close()
-        raise
-    return sock
+        return sock
 
 
 def local_host_of(ancillary: list[tuple[int, int, bytes]]) -> str:

@@ -14,7 +14,6 @@ import serial
 
 from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.send_queue import RADIO_STATUS, Pacer
-from gateway.hub.transports.base import RETRY_US
 from gateway.hub.transports.stream import QueuedClient
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
@@ -33,7 +32,6 @@ class SerialClient(QueuedClient):
     """A peer on a serial port that may come and go."""
 
     _port: serial.Serial | None = None
-    _retry_us = 0
     _timer: asyncio.TimerHandle | None = None
 
     def __post_init__(self) -> None:
@@ -59,9 +57,8 @@ class SerialClient(QueuedClient):
 
     def tick(self, now_us: int) -> None:
         """Open the port again if it is gone."""
-        if self._port is not None or now_us < self._retry_us:
+        if self._port is not None or not self._is_retry_due(now_us):
             return
-        self._retry_us = now_us + RETRY_US
         try:
             port = serial.Serial(
                 self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True

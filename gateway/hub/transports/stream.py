@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port
 from gateway.hub.send_queue import LinkEncoder, SendQueue
-from gateway.hub.transports.base import Client, Listener, Peer
+from gateway.hub.transports.base import Client, Listener, Peer, new_socket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
 
@@ -146,7 +146,7 @@ class StreamClient(QueuedClient):
             self._push(frame, step)
         else:
             data = self._encoder.encode(frame, step, self.context.now_us())
-            self._write(self._socket, self.wrap(data))
+            self._write(self._socket, self._wrap(data))
 
     def adopt(self, sock: socket.socket) -> None:
         """Use a connected socket from now on."""
@@ -161,9 +161,9 @@ class StreamClient(QueuedClient):
         self._splitter.reset()
         self._read = partial(self._on_readable, sock)
         self.loop.add_reader(sock, self._read)
-        self.begin()
+        self._begin()
 
-    def begin(self) -> None:
+    def _begin(self) -> None:
         """Start the protocol on a new connection."""
         self.become("open")
         self.context.greet(self)
@@ -178,11 +178,11 @@ class StreamClient(QueuedClient):
         self._sending_us = None
         self._drop_all()
 
-    def broke(self) -> None:
+    def _broke(self) -> None:
         """Handle the end of the connection."""
         raise NotImplementedError
 
-    def wrap(self, frames: bytes) -> bytes:
+    def _wrap(self, frames: bytes) -> bytes:
         """Return the bytes that carry some frames on this connection."""
         return frames
 
@@ -201,7 +201,7 @@ class StreamClient(QueuedClient):
         except BlockingIOError:
             taken = 0
         except OSError:
-            self.broke()
+            self._broke()
             return False
         self.counters.bytes_sent += taken
         self._partial = data[taken:]
@@ -233,12 +233,12 @@ class StreamClient(QueuedClient):
         while size < self._chunk_bytes and (waiting := self._queue.pop()) is not None:
             frame = self._encoder.encode(*waiting, now_us)
             if frames and len(frames) + len(frame) > self.endpoint.pack_bytes:
-                messages.append(self.wrap(frames))
+                messages.append(self._wrap(frames))
                 frames = b""
             frames += frame
             size += len(frame)
         if frames:
-            messages.append(self.wrap(frames))
+            messages.append(self._wrap(frames))
         return b"".join(messages)
 
     def _on_readable(self, sock: socket.socket) -> None:
@@ -249,7 +249,7 @@ class StreamClient(QueuedClient):
         except OSError:
             data = b""
         if not data:
-            self.broke()
+            self._broke()
             return
         self.accept(data, self.context.now_us())
         if self._socket is sock:
@@ -261,16 +261,12 @@ class StreamListener(Listener[Peer]):
 
     def _bind(self) -> socket.socket:
         host, port = self.endpoint.host, self.endpoint.port
-        sock = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
-        try:
-            sock.setblocking(False)
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with new_socket(family, socket.SOCK_STREAM) as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             sock.bind((host, port))
             sock.listen(ACCEPT_BACKLOG)
-        except OSError:
-            sock.close()
-            raise
-        return sock
+            return sock
 
     def _watch(self, sock: socket.socket) -> None:
         accept_each(sock, self._on_connection, self._report)

@@ -5,20 +5,18 @@ import socket
 from typing import Any
 
 from gateway.hub.endpoint import host_and_port
-from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.base import new_socket
 from gateway.hub.transports.stream import StreamClient, StreamListener
 
 
 class TcpClient(StreamClient):
     """A connection that the gateway makes, and remakes when it breaks."""
 
-    _retry_us = 0
     _task: asyncio.Task[None] | None = None
 
     def tick(self, now_us: int) -> None:
         """Connect if there is no connection and the last attempt is long enough ago."""
-        if self._socket is None and self._task is None and now_us >= self._retry_us:
-            self._retry_us = now_us + RETRY_US
+        if self._socket is None and self._task is None and self._is_retry_due(now_us):
             self._task = self.loop.create_task(self._connect())
 
     def close(self) -> None:
@@ -27,8 +25,7 @@ class TcpClient(StreamClient):
             self._task.cancel()
         super().close()
 
-    def broke(self) -> None:
-        """Let the next tick connect again."""
+    def _broke(self) -> None:
         super().close()
         self.become("connecting")
 
@@ -46,23 +43,20 @@ class TcpClient(StreamClient):
             self._task = None
 
     async def _connect_to(self, family: int, address: tuple[Any, ...]) -> bool:
-        sock = socket.socket(family, socket.SOCK_STREAM)
         try:
-            sock.setblocking(False)
-            await self.loop.sock_connect(sock, address)
-            if sock.getsockname() == sock.getpeername():
-                # A closed local port may be chosen as our own and so connect to itself.
-                raise ConnectionRefusedError
-        except OSError as error:
-            sock.close()
-            if isinstance(error, ConnectionRefusedError):
-                self.become("refused")
-            else:
-                self.become("unreachable", error)
+            with new_socket(family, socket.SOCK_STREAM) as sock:
+                await self.loop.sock_connect(sock, address)
+        except ConnectionRefusedError:
+            self.become("refused")
             return False
-        except asyncio.CancelledError:
+        except OSError as error:
+            self.become("unreachable", error)
+            return False
+        if sock.getsockname() == sock.getpeername():
+            # A closed local port may be chosen as our own and so connect to itself.
             sock.close()
-            raise
+            self.become("refused")
+            return False
         self.remote = host_and_port(*address[:2])
         self.adopt(sock)
         return True
@@ -71,8 +65,7 @@ class TcpClient(StreamClient):
 class TcpPeer(StreamClient):
     """A connection that a client made."""
 
-    def broke(self) -> None:
-        """Remove the client; it may connect again."""
+    def _broke(self) -> None:
         assert self.leave is not None
         self.leave(self)
 

@@ -10,7 +10,7 @@ import socket
 from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port, is_numeric
-from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.base import RETRY_US, new_socket
 from gateway.hub.transports.datagram import RECEIVE_BUFFER_BYTES, DatagramClient
 from gateway.units import US_PER_S
 
@@ -27,7 +27,6 @@ class UdpClient(DatagramClient):
     """
 
     _port = 0
-    _retry_us = 0
     _resolve_us = 0
     _task: asyncio.Task[None] | None = None
 
@@ -39,9 +38,8 @@ class UdpClient(DatagramClient):
 
     def tick(self, now_us: int) -> None:
         """Open the socket or look the name up again; clear a refusal that was not repeated."""
-        if now_us < self._retry_us:
+        if not self._is_retry_due(now_us):
             return
-        self._retry_us = now_us + RETRY_US
         if self.state == "unreachable":
             super().close()
         if self.refused_us is not None:
@@ -49,7 +47,7 @@ class UdpClient(DatagramClient):
                 self._addresses.append(self._addresses.pop(0))
                 self._connect()
             elif now_us - self.refused_us >= RETRY_US:
-                self.revive()
+                self._revive()
         if self._task is None and (self._socket is None or self._wants_look_up(now_us)):
             self._resolve_us = now_us + RESOLVE_AGAIN_US
             self._task = self.loop.create_task(self._open())
@@ -95,15 +93,10 @@ class UdpClient(DatagramClient):
 
     def _connected(self, family: int, address: tuple[Any, ...]) -> socket.socket:
         """Open a socket that keeps the port it had, so that the peer sees the same client."""
-        sock = socket.socket(family, socket.SOCK_DGRAM)
-        try:
-            sock.setblocking(False)
+        port, self._port = self._port, 0
+        with new_socket(family, socket.SOCK_DGRAM) as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-            sock.bind(("", self._port))
+            sock.bind(("", port))
             sock.connect(address)
-        except OSError:
-            sock.close()
-            self._port = 0
-            raise
-        self._port = sock.getsockname()[1]
-        return sock
+            self._port = sock.getsockname()[1]
+            return sock

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import EndpointKind
-from gateway.hub.transports.base import RETRY_US
+from gateway.hub.transports.base import new_socket
 from gateway.hub.transports.datagram import MAX_DATAGRAM, READS, DatagramClient
 
 MULTICAST_HOPS: Final = 1
@@ -23,13 +23,11 @@ class GroupClient(DatagramClient):
 
     _listening: socket.socket | None = None
     _own_address = ("", 0)
-    _retry_us = 0
 
     def tick(self, now_us: int) -> None:
         """Open the sockets again if they failed."""
-        if now_us < self._retry_us:
+        if not self._is_retry_due(now_us):
             return
-        self._retry_us = now_us + RETRY_US
         if self.state == "unreachable":
             self.close()
         if self._socket is None:
@@ -46,31 +44,25 @@ class GroupClient(DatagramClient):
     def _open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
         multicast = self.endpoint.kind is EndpointKind.UDP_MULTICAST
-        sock: socket.socket | None = None
         try:
-            found = socket.getaddrinfo(
-                host, port, type=socket.SOCK_DGRAM, flags=socket.AI_NUMERICHOST
-            )
+            flags = socket.AI_NUMERICHOST
+            found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM, flags=flags)
             family, _, _, _, address = found[0]
-            sock = socket.socket(family, socket.SOCK_DGRAM)
-            sock.setblocking(False)
-            if multicast:
-                self._listening = _listening_socket(family, address)
-                self.loop.add_reader(self._listening, self._on_group, self._listening)
-                _prepare_sender(sock, address)
-            else:
-                sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            host, _, *scope = _route_source(family, address)
-            sock.bind((host, 0, *scope))
+            with new_socket(family, socket.SOCK_DGRAM) as sock:
+                if multicast:
+                    self._listening = _listening_socket(family, address)
+                    self.loop.add_reader(self._listening, self._on_group, self._listening)
+                    _prepare_sender(sock, address)
+                else:
+                    sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+                host, _, *scope = _route_source(family, address)
+                sock.bind((host, 0, *scope))
         except OSError as error:
-            if sock is not None:
-                sock.close()
             self.close()
             self.become("unreachable", error)
             return
         self._own_address = sock.getsockname()[:2]
-        opened = sock
-        self.adopt(opened, lambda data: opened.sendto(data, address))
+        self.adopt(sock, lambda data: sock.sendto(data, address))
 
     def _on_group(self, sock: socket.socket) -> None:
         size, most = 0, self.context.read_bytes
@@ -105,9 +97,7 @@ def _prepare_sender(sock: socket.socket, address: tuple[object, ...]) -> None:
 
 def _listening_socket(family: int, address: tuple[object, ...]) -> socket.socket:
     """Open a socket that has joined the group."""
-    sock = socket.socket(family, socket.SOCK_DGRAM)
-    try:
-        sock.setblocking(False)
+    with new_socket(family, socket.SOCK_DGRAM) as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(address)
         group = socket.inet_pton(family, str(address[0]).partition("%")[0])
@@ -117,7 +107,4 @@ def _listening_socket(family: int, address: tuple[object, ...]) -> socket.socket
         else:
             source = socket.inet_aton(_route_source(family, address)[0])
             sock.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, group + source)
-    except OSError:
-        sock.close()
-        raise
-    return sock
+        return sock

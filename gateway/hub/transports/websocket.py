@@ -42,32 +42,30 @@ class WebStream(StreamClient):
     _connected_us = _received_us = _pinged_us = 0
     _answers = False
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether there is a connection, before or after the handshake."""
-        return self._socket is not None
-
-    def begin(self) -> None:
+    def _begin(self) -> None:
         """Start the handshake."""
+        assert self._socket is not None
         self._connected_us = self._received_us = self.context.now_us()
         self._answers = False
         self.become("connecting")
         try:
-            self._tls = self.secure() if self.endpoint.kind in TLS_KINDS else None
+            self._tls = self._secure() if self.endpoint.kind in TLS_KINDS else None
         except OSError as error:
             self.give_up(reason_of(error))
             return
-        self._web = self.protocol()
+        self._web = self._protocol()
+        if hello := self._web.hello if self._tls is None else self._tls.feed(b"")[1]:
+            self._write(self._socket, hello)
 
-    def protocol(self) -> WsProtocol:
+    def _protocol(self) -> WsProtocol:
         """Create the protocol of a new connection."""
         raise NotImplementedError
 
-    def secure(self) -> TlsLayer:
+    def _secure(self) -> TlsLayer:
         """Create the TLS layer, or raise OSError."""
         raise NotImplementedError
 
-    def opened(self) -> None:
+    def _opened(self) -> None:
         """Add the client: the handshake is done."""
         self.become("open")
         self.context.greet(self)
@@ -76,8 +74,7 @@ class WebStream(StreamClient):
         """Close the connection and record the reason."""
         raise NotImplementedError
 
-    def wrap(self, frames: bytes) -> bytes:
-        """Return the bytes that carry some frames on this connection."""
+    def _wrap(self, frames: bytes) -> bytes:
         return self._encrypt(self._web.wrap(frames))
 
     def transmit(self, frame: MavFrame) -> None:
@@ -100,19 +97,19 @@ class WebStream(StreamClient):
         """Process received bytes."""
         self._received_us = now_us
         plain = self._decrypt(data) if self._tls is not None else data
-        if not plain or not self.is_connected:
+        if not plain or self._socket is None:
             return
         found = self._web.feed(plain)
         self._answers |= found.ponged
-        if found.reply and not self.send_control(found.reply):
+        if found.reply and not self._send_control(found.reply):
             return
         if found.opened:
-            self.opened()
+            self._opened()
         self._receive_payload(found, now_us)
         if found.ended:
             self.give_up(found.ended)
 
-    def send_control(self, data: bytes) -> bool:
+    def _send_control(self, data: bytes) -> bool:
         """Send a protocol message before the queue; return whether the peer is still connected."""
         assert self._socket is not None
         data = self._encrypt(data)
@@ -122,7 +119,7 @@ class WebStream(StreamClient):
             self._partial += data
         else:
             self.give_up("sends requests and does not read")
-        return self.is_connected
+        return self._socket is not None
 
     def tick(self, now_us: int) -> None:
         """Ping a silent peer, and drop one that does not answer."""
@@ -139,7 +136,7 @@ class WebStream(StreamClient):
             self.give_up("no answer to pings")
         elif min(silent_us, now_us - self._pinged_us) >= idle_us // PINGS:
             self._pinged_us = now_us
-            self.send_control(self._web.ping())
+            self._send_control(self._web.ping())
 
     def close(self) -> None:
         """Send a close message if there is room, and close; waiting frames are lost."""
@@ -165,14 +162,11 @@ class WebStream(StreamClient):
             return b""
         if reply:
             self._write(self._socket, reply)
-        if self._tls.is_open and not was_open and self.is_connected:
-            self.secured()
-        if self._tls.is_ended and not plain and self.is_connected:
-            self.broke()
+        if self._tls.is_open and not was_open and self._web.hello and self._socket is not None:
+            self._send_control(self._web.hello)
+        if self._tls.is_ended and not plain and self._socket is not None:
+            self._broke()
         return plain
-
-    def secured(self) -> None:
-        """Continue after the TLS handshake."""
 
     def _encrypt(self, data: bytes) -> bytes:
         return data if self._tls is None else self._tls.wrap(data)
@@ -196,35 +190,16 @@ class WebStream(StreamClient):
 class WsClient(WebStream, TcpClient):
     """A connection that the gateway makes, and remakes when it breaks."""
 
-    _caller: WsCaller
+    def _protocol(self) -> WsProtocol:
+        return WsCaller(self.endpoint.address, self.endpoint.path)
 
-    def begin(self) -> None:
-        """Start the handshake."""
-        super().begin()
-        if self._socket is None:
-            return
-        if self._tls is None:
-            self._write(self._socket, self._caller.hello)
-        else:
-            self._write(self._socket, self._tls.feed(b"")[1])
-
-    def protocol(self) -> WsProtocol:
-        """Create the protocol of a new connection."""
-        self._caller = WsCaller(self.endpoint.address, self.endpoint.path)
-        return self._caller
-
-    def secure(self) -> TlsLayer:
-        """Create the TLS layer, or raise OSError."""
+    def _secure(self) -> TlsLayer:
         return TlsLayer(caller_context(self.context.settings), self.endpoint.host)
-
-    def secured(self) -> None:
-        """Send the upgrade request."""
-        self.send_control(self._caller.hello)
 
     def give_up(self, reason: str) -> None:
         """Close the connection, and keep the reason until another is made."""
         was_open = self.state == "open"
-        self.broke()
+        self._broke()
         if not was_open:
             self.state = "refused"
         self.reason = reason

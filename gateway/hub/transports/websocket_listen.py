@@ -29,27 +29,23 @@ class WsPeer(WebStream):
     refuse: Callable[[str], None] = field(kw_only=True)
     """Called with the reason when a connection is refused."""
 
-    def protocol(self) -> WsProtocol:
-        """Create the protocol of a new connection."""
+    def _protocol(self) -> WsProtocol:
         return WsServer(lambda origin: admits_page(origin, self.local_host, self.endpoint.origins))
 
-    def secure(self) -> TlsLayer:
-        """Create the TLS layer, or raise OSError."""
+    def _secure(self) -> TlsLayer:
         return TlsLayer(server_context(self.context.settings))
 
-    def opened(self) -> None:
-        """Add the client: the handshake is done."""
+    def _opened(self) -> None:
         self.welcome(self)
-        super().opened()
+        super()._opened()
 
     def give_up(self, reason: str) -> None:
         """Close the connection for good."""
         if self.state != "open":
             self.refuse(f"{self.remote}: {reason}")
-        self.broke()
+        self._broke()
 
-    def broke(self) -> None:
-        """Remove the client; it may connect again."""
+    def _broke(self) -> None:
         assert self.leave is not None
         self.leave(self)
 

@@ -59,15 +59,7 @@ READ_BYTES: Final = 16_384
 
 
 class TlsLayer:
-    """One end of one connection.
-
-    Parameters
-    ----------
-    context : ssl.SSLContext
-        Certificates and accepted authorities.
-    server_name : str, optional
-        Name of the server; None if we are the server.
-    """
+    """One end of one connection; without the name of a server, we are the server."""
 
     def __init__(self, context: ssl.SSLContext, server_name: str | None = None) -> None:
         self._inward = ssl.MemoryBIO()
@@ -144,18 +136,9 @@ def caller_context(settings: HubSettings) -> ssl.SSLContext:
 def valid_until_s(certificate: Path, key: Path) -> float:
     """Return when a certificate ends, in s since 1970.
 
-    It is shown to a client that trusts it, whoever signed it: Python reads no other.
-
-    Parameters
-    ----------
-    certificate, key : Path
-        PEM files; both may be the same.
-
-    Raises
-    ------
-    OSError
-        If the files cannot be read or are invalid; ssl.SSLCertVerificationError if the certificate
-        is not valid now.
+    It is shown to a client that trusts it, whoever signed it: Python reads no other. Raises OSError
+    if the PEM files, which may be the same, cannot be read or are invalid;
+    ssl.SSLCertVerificationError if the certificate is not valid now.
     """
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trusting.check_hostname = False
@@ -219,6 +202,8 @@ class WsProtocol:
 
     def __init__(self, role: ConnectionType) -> None:
         self._wire = WSConnection(role)
+        self.hello = b""
+        """The first bytes that we send."""
         self._message_size = 0
         self._ended = False
 
@@ -300,13 +285,7 @@ class WsProtocol:
 
 
 class WsServer(WsProtocol):
-    """Our end of a connection that a page or a program has made.
-
-    Parameters
-    ----------
-    admits : callable
-        Whether a page of this origin may connect.
-    """
+    """Our end of a connection by a page or a program; `admits` decides on a page's origin."""
 
     def __init__(self, admits: Callable[[str], bool]) -> None:
         super().__init__(ConnectionType.SERVER)
@@ -343,20 +322,11 @@ class WsServer(WsProtocol):
 
 
 class WsCaller(WsProtocol):
-    """Our end of a connection that we make.
-
-    Parameters
-    ----------
-    address : str
-        Host and port of the server.
-    path : str
-        Path of the request.
-    """
+    """Our end of a connection that we make."""
 
     def __init__(self, address: str, path: str) -> None:
         super().__init__(ConnectionType.CLIENT)
         self.hello = self._wire.send(Request(host=address, target=path))
-        """The upgrade request."""
 
     def wrap(self, payload: bytes) -> bytes:
         """Build a binary message, masked as required of clients."""

@@ -288,7 +288,7 @@ class TestCalling:
     async def test_a_server_that_never_answers_is_given_up(self, rig: Rig) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             hub = rig.hub(f"ws:127.0.0.1:{server.getsockname()[1]}")
-            await rig.until(lambda: bool(hub._clients[1].is_connected))
+            await rig.until(lambda: hub._clients[1]._socket is not None)
             rig.clock.us += 5_000_000
             rig.tick(hub)
             assert hub.clients()[0].state == "refused"

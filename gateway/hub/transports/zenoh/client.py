@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
 from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import READ_BYTES, RETRY_US, Client
+from gateway.hub.transports.base import READ_BYTES, Client
 from gateway.hub.transports.zenoh.session import (
     ALL_SYSTEMS,
     JSON_IN,
@@ -67,7 +67,6 @@ class ZenohClient(Client):
     _session: "zenoh.Session | None" = None
     _task: asyncio.Task[None] | None = None
     _publishers: Publishers | None = None
-    _retry_us = 0
 
     def __post_init__(self) -> None:
         """Begin without a session; the first tick opens it."""
@@ -106,8 +105,7 @@ class ZenohClient(Client):
     def tick(self, now_us: int) -> None:
         """Open the session, and check whether it has a router."""
         if self._session is None:
-            if self._task is None and now_us >= self._retry_us:
-                self._retry_us = now_us + RETRY_US
+            if self._task is None and self._is_retry_due(now_us):
                 self._task = self.loop.create_task(self._open())
             return
         is_linked = bool(self._session.info.routers_zid())

@@ -144,28 +144,11 @@ def end_calls() -> bool:
 
 
 def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Config":
-    """Return the configuration of a session.
+    """Return the configuration of a session: a `client`, or a `router` that others connect to.
 
-    Parameters
-    ----------
-    locator : str
-        Where to connect, or where a router listens: `tcp/127.0.0.1:7447`.
-    file : str
-        Zenoh's own configuration file, for everything but mode, locator and scouting; empty for
-        none.
-    mode : str
-        `client`, or `router` for a session that others connect to.
-
-    Returns
-    -------
-    zenoh.Config
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If Zenoh is not installed.
-    ValueError
-        If the file or the locator is malformed.
+    Zenoh's own configuration file, if any, is used for everything but mode, locator and scouting.
+    Raises ModuleNotFoundError if Zenoh is not installed, ValueError if the file or the locator,
+    such as `tcp/127.0.0.1:7447`, is malformed.
     """
     import zenoh
 
@@ -191,10 +174,7 @@ def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Conf
 def open_session(config: "zenoh.Config") -> "zenoh.Session":
     """Open a session; waits, so it is called off the loop.
 
-    Raises
-    ------
-    OSError
-        If nobody answers at the locator, or a certificate or key cannot be read.
+    Raises OSError if nobody answers at the locator, or a certificate or key cannot be read.
     """
     import zenoh
 
@@ -260,14 +240,8 @@ def handle_turn(
 class LoopQueue(Generic[Item]):
     """Pass items from a thread to the loop, in order; when too many wait the oldest are dropped.
 
-    Parameters
-    ----------
-    handle : callable
-        Called on the loop with each item.
-    cost : callable, optional
-        Returns the part of a turn that an item takes.
-    pause_s : callable, optional
-        Returns for how many seconds nothing may be handled; 0 for no pause.
+    `handle` is called with each item on the loop. `cost` returns the part of a turn that an item
+    takes, and `pause_s` for how many seconds nothing may be handled.
     """
 
     def __init__(
@@ -323,15 +297,6 @@ class Subscription:
     Python's lock: at thousands of messages a second that costs more than handling them. Here a
     thread waits for the first message, wakes the loop, and sleeps until the loop has handled all
     messages that arrived meanwhile.
-
-    Parameters
-    ----------
-    session : zenoh.Session
-        An open session.
-    key : str
-        Key expression.
-    handle : callable
-        Called on the loop with each message.
     """
 
     def __init__(
@@ -400,13 +365,7 @@ def _cost_of(sample: "zenoh.Sample") -> float:
 
 
 class Publishers:
-    """Publish under many keys, each declared at its first use.
-
-    Parameters
-    ----------
-    session : zenoh.Session
-        An open session.
-    """
+    """Publish under many keys, each declared at its first use."""
 
     def __init__(self, session: "zenoh.Session") -> None:
         import zenoh

@@ -71,16 +71,9 @@ class RemoteRecording(msgspec.Struct, frozen=True):
 
 
 class QueryAnswers:
-    """Answer the queries of one key, one after another.
+    """Answer the queries of one key, one after another, on a thread.
 
-    Parameters
-    ----------
-    session : zenoh.Session
-        An open session.
-    key : str
-        Key that is queried.
-    answer : callable
-        Turns a query's payload into the answer's; raises RefusedQueryError. Called on the thread.
+    `answer` turns a query's payload into the answer's, or raises RefusedQueryError.
     """
 
     def __init__(
@@ -127,13 +120,7 @@ class QueryAnswers:
 
 
 class RecordingAnswers:
-    """Answer queries for the recordings in a folder; every call waits for the disk.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the recordings.
-    """
+    """Answer queries for the recordings in a folder; every call waits for the disk."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
