@@ -29,6 +29,14 @@ LIMIT_S = 60.0
 
 
 @pytest.fixture
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folders of a user and of the system service, which is returned."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
+    return tmp_path / "service"
+
+
+@pytest.fixture
 async def server(tmp_path: Path) -> AsyncIterator[ControlServer]:
     async def seek(offset_s: float) -> dict[str, float]:
         return {"position_s": offset_s}
@@ -225,23 +233,17 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
     assert not path.exists()
 
 
-def test_nobody_there_is_said_plainly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
+def test_nobody_there_is_said_plainly(folders: Path) -> None:
     with pytest.raises(ControlError, match="nobody listens at the socket"):
-        request(tmp_path / "run.sock", "status")
+        request(folders / "run.sock", "status")
     with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):
         find_socket("run")
     with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate play` first"):
         find_socket("play")
 
 
-async def test_a_command_finds_the_gateway_that_is_meant(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
-    service = ControlServer(tmp_path / "service" / "run.sock")
+async def test_a_command_finds_the_gateway_that_is_meant(folders: Path) -> None:
+    service = ControlServer(folders / "run.sock")
     await service.start()
     assert find_socket("run") == service.path, "the service's, where the user has none"
     first, second = ControlServer(socket_path("run")), ControlServer(socket_path("run"))
@@ -257,12 +259,10 @@ async def test_a_command_finds_the_gateway_that_is_meant(
 
 
 async def test_error_without_access_to_a_service_names_its_group(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.setattr(control_socket, "SERVICE_FOLDER", tmp_path / "service")
     monkeypatch.setattr(control_socket.os, "access", lambda *_: False)
-    service = ControlServer(tmp_path / "service" / "run.sock")
+    service = ControlServer(folders / "run.sock")
     await service.start()
     with pytest.raises(ControlError, match="usermod -aG mavgate"):
         find_socket("run")

@@ -55,6 +55,10 @@ class Bench:
             self.clock.advance(0.001)
             self.recorder.frame(frame)
 
+    async def record(self, frames: list[bytes], seconds: float = 0.5) -> None:
+        self.send(frames)
+        await self.turn(seconds)
+
     @property
     def troubles(self) -> list[str]:
         return [text for is_trouble, text in self.announced if is_trouble]
@@ -80,8 +84,7 @@ def frames_of(folder: Path) -> list[bytes]:
 async def test_every_frame_is_in_the_tlog_at_its_time(bench: Bench) -> None:
     await bench.turn()
     begin_us = bench.clock()
-    bench.send(FRAMES)
-    await bench.turn()
+    await bench.record(FRAMES)
     records = read_tlog(bench.recorder.folder / f"{NAME}_01.tlog")
     assert [record.frame for record in records] == FRAMES
     for i, record in enumerate(records):
@@ -178,8 +181,7 @@ async def test_rotation_loses_nothing(tmp_path: Path, clock: ManualClock) -> Non
     bench = Bench(tmp_path, clock, rotate_min=1)
     await bench.turn()
     for frame in FRAMES:
-        bench.send([frame])
-        await bench.turn(10)
+        await bench.record([frame], 10)
     bench.recorder.close()
     assert len(list(tmp_path.glob(f"{NAME}_*.tlog"))) > 3
     assert frames_of(tmp_path) == FRAMES
@@ -193,8 +195,7 @@ async def test_stop_and_start_make_two_recordings(bench: Bench) -> None:
     bench.send(FRAMES[5:10])
     bench.recorder.record()
     await bench.turn()
-    bench.send(FRAMES[10:])
-    await bench.turn()
+    await bench.record(FRAMES[10:])
     assert len(list_recordings(bench.recorder.folder)) == 2
     assert sorted(frames_of(bench.recorder.folder)) == sorted(FRAMES[:5] + FRAMES[10:])
 
@@ -206,37 +207,30 @@ async def test_a_failing_disk_stops_recording_until_it_recovers(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
 ) -> None:
     await bench.turn()
-    bench.send(FRAMES[:5])
-    await bench.turn()
+    await bench.record(FRAMES[:5])
 
     def refuse(*args: object) -> int:
         raise OSError(number, os.strerror(number))
 
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", refuse)
-        bench.send(FRAMES[5:6])
-        await bench.turn()
+        await bench.record(FRAMES[5:6])
         assert bench.troubles == [f"Recording stopped: {text}"]
-        bench.send(FRAMES[6:7])
-        await bench.turn()
+        await bench.record(FRAMES[6:7])
     await bench.turn(RETRY_US / 1e6)
-    bench.send(FRAMES[7:])
-    await bench.turn()
+    await bench.record(FRAMES[7:])
     assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[7:]
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
 async def test_folder_that_vanishes_is_made_again(bench: Bench) -> None:
     await bench.turn()
-    bench.send(FRAMES[:5])
-    await bench.turn()
+    await bench.record(FRAMES[:5])
     shutil.rmtree(bench.recorder.folder)
-    bench.send(FRAMES[5:6])
-    await bench.turn()
+    await bench.record(FRAMES[5:6])
     assert bench.troubles == ["Recording stopped: folder has vanished"]
     await bench.turn(RETRY_US / 1e6)
-    bench.send(FRAMES[6:])
-    await bench.turn()
+    await bench.record(FRAMES[6:])
     assert frames_of(bench.recorder.folder) == FRAMES[6:]
 
 
@@ -258,8 +252,7 @@ async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     bench = Bench(tmp_path / "recordings", clock, rotate_min=1)
     bench.unix_at_zero_us = 1_000_000
     await bench.turn()
-    bench.send(FRAMES[:3])
-    await bench.turn(100)
+    await bench.record(FRAMES[:3], 100)
     bench.send(FRAMES[3:5])
     bench.recorder.flight(make_fused(rng, 1000))
     await bench.turn()
@@ -302,13 +295,10 @@ async def test_two_aircraft_whose_times_differ_split_no_session_for_ever(
 async def test_save_renames_while_it_runs(tmp_path: Path, clock: ManualClock) -> None:
     bench = Bench(tmp_path, clock, rotate_min=1)
     await bench.turn()
-    bench.send(FRAMES[:5])
-    await bench.turn()
+    await bench.record(FRAMES[:5])
     await bench.recorder.save("first flight")
-    bench.send(FRAMES[5:9])
-    await bench.turn(100)
-    bench.send(FRAMES[9:])
-    await bench.turn()
+    await bench.record(FRAMES[5:9], 100)
+    await bench.record(FRAMES[9:])
     assert bench.recorder.status().name == "first flight"
     bench.recorder.close()
     (recording,) = list_recordings(tmp_path)
@@ -323,8 +313,7 @@ async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
     with pytest.raises(RecordingError, match="nothing was recorded"):
         await bench.recorder.save("x")
     await bench.turn()
-    bench.send(FRAMES)
-    await bench.turn()
+    await bench.record(FRAMES)
     with pytest.raises(RecordingError, match="no name"):
         await bench.recorder.save("../x")
 
@@ -423,12 +412,10 @@ async def test_it_records_only_once_the_disk_has_taken_something(
         patch.setattr(PartFiles, "_open", refuse)
         await bench.turn()
         assert outcome() == (False, "")
-        bench.send(FRAMES[:5])
-        await bench.turn()
+        await bench.record(FRAMES[:5])
         assert outcome() == (False, "disk is read-only")
     bench.recorder.record()
     await bench.turn()
     assert outcome() == (False, "")
-    bench.send(FRAMES[5:])
-    await bench.turn()
+    await bench.record(FRAMES[5:])
     assert outcome() == (True, "")

@@ -40,8 +40,7 @@ def disk(tmp_path: Path) -> Iterator[Path]:
 async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[Bench]:
     made = Bench(disk / "recordings", clock)
     await made.turn()
-    made.send(FRAMES[:5])
-    await made.turn()
+    await made.record(FRAMES[:5])
     assert made.troubles == []
     yield made
     made.recorder.close()
@@ -52,17 +51,14 @@ async def test_a_full_disk(bench: Bench, disk: Path) -> None:
     with pytest.raises(OSError, match="No space left"):
         ballast.write_bytes(bytes(2 * SIZE))
     # The page that the file has begun has room for some of these, which are taken back.
-    bench.send(FRAMES[5:] * 20)
-    await bench.turn()
+    await bench.record(FRAMES[5:] * 20)
     assert bench.troubles == ["Recording stopped: disk is full"]
     assert bench.recorder.status().reason == "disk is full"
-    bench.send(FRAMES[5:8])
-    await bench.turn(RETRY_S)
+    await bench.record(FRAMES[5:8], RETRY_S)
     assert not bench.recorder.recording
     ballast.unlink()
     await bench.turn(RETRY_S)
-    bench.send(FRAMES[8:])
-    await bench.turn()
+    await bench.record(FRAMES[8:])
     assert bench.recorder.recording
     assert frames_of(bench.recorder.folder) == FRAMES[:5] + FRAMES[8:]
     assert bench.announced[-1] == (False, f"Recording {NAME}")
@@ -76,15 +72,13 @@ async def test_a_disk_that_turns_read_only(bench: Bench, disk: Path) -> None:
     mount("-o", "remount,ro", str(disk))
     bench.recorder.record()
     await bench.turn()
-    bench.send(FRAMES[5:8])
-    await bench.turn()
+    await bench.record(FRAMES[5:8])
     assert bench.troubles == ["Recording stopped: disk is read-only"]
     await bench.turn(RETRY_S)
     assert len(bench.troubles) == 1
     mount("-o", "remount,rw", str(disk))
     await bench.turn(RETRY_S)
-    bench.send(FRAMES[8:])
-    await bench.turn()
+    await bench.record(FRAMES[8:])
     assert bench.recorder.recording
     assert [len(r.files) for r in list_recordings(bench.recorder.folder)] == [1, 1]
     assert frames_of(bench.recorder.folder)[5:] == FRAMES[8:]

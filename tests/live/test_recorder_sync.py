@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from gateway.live.part import PartFiles
-from gateway.live.session import RETRY_US, ClosePart, CorrectTimes, OpenPart
+from gateway.live.session import RETRY_US, ClosePart, CorrectTimes, OpenPart, SessionAction
 from tests.conftest import ManualClock
 from tests.live.test_recorder import FRAMES, NAME, Bench, frames_of
 
@@ -57,8 +57,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Iterator[SlowDisk]:
 async def bench(tmp_path: Path, clock: ManualClock, disk: SlowDisk) -> AsyncIterator[Bench]:
     made = Bench(tmp_path / "recordings", clock)
     await made.turn()
-    made.send(FRAMES[:5])
-    await made.turn()
+    await made.record(FRAMES[:5])
     await disk.await_sync()
     yield made
     disk.may_end.set()
@@ -71,12 +70,16 @@ async def await_closing(bench: Bench) -> None:
             await asyncio.sleep(0)
 
 
+async def record_each(bench: Bench, frames: list[bytes]) -> None:
+    """Record the last frames one by one, while a sync may run."""
+    for frame in frames:
+        await asyncio.wait_for(bench.record([frame]), FAR_S)
+    assert frames_of(bench.recorder.folder) == FRAMES
+
+
 async def test_writes_do_not_wait_for_a_sync(bench: Bench, disk: SlowDisk) -> None:
     syncing = bench.recorder._syncing
-    for frame in FRAMES[5:]:
-        bench.send([frame])
-        await asyncio.wait_for(bench.turn(), FAR_S)
-    assert frames_of(bench.recorder.folder) == FRAMES
+    await record_each(bench, FRAMES[5:])
     assert bench.troubles == []
     assert bench.recorder._syncing is syncing
 
@@ -100,13 +103,11 @@ async def test_a_sync_that_fails_stops_recording_until_the_disk_recovers(
     disk.may_end.set()
     assert bench.recorder._syncing is not None
     await asyncio.wait([asyncio.wrap_future(bench.recorder._syncing)])
-    bench.send(FRAMES[5:6])
-    await bench.turn()
+    await bench.record(FRAMES[5:6])
     assert bench.troubles == ["Recording stopped: disk fails"]
     disk.fails = False
     await bench.turn(RETRY_US / 1e6)
-    bench.send(FRAMES[6:])
-    await bench.turn()
+    await bench.record(FRAMES[6:])
     # What could be written before is kept.
     assert frames_of(bench.recorder.folder) == FRAMES
     assert bench.announced[-1] == (False, f"Recording {NAME}")
@@ -169,37 +170,17 @@ async def test_a_recorder_that_ends_while_a_part_is_closed_closes_it(
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
+@pytest.mark.parametrize("between", [[], [CorrectTimes()]])
 async def test_the_next_part_waits_for_no_sync_of_the_one_before(
-    bench: Bench, disk: SlowDisk
+    bench: Bench, disk: SlowDisk, between: list[SessionAction]
 ) -> None:
+    """Also where the recording gets its true time."""
     part = bench.recorder._part
     assert part is not None
     bench.send(FRAMES[5:7])
-    await asyncio.wait_for(
-        bench.recorder._perform([ClosePart(), OpenPart(part.session, part.number + 1)]), FAR_S
-    )
-    for frame in FRAMES[7:]:
-        bench.send([frame])
-        await asyncio.wait_for(bench.turn(), FAR_S)
-    assert frames_of(bench.recorder.folder) == FRAMES
-    assert len(list(bench.recorder.folder.glob("*.tlog"))) == 2
-    disk.may_end.set()
-    bench.recorder.close()
-    assert disk.most == 1
-
-
-async def test_a_recording_that_gets_its_true_time_waits_for_no_sync(
-    bench: Bench, disk: SlowDisk
-) -> None:
-    part = bench.recorder._part
-    assert part is not None
-    bench.send(FRAMES[5:7])
-    actions = [ClosePart(), CorrectTimes(), OpenPart(part.session, part.number + 1)]
+    actions = [ClosePart(), *between, OpenPart(part.session, part.number + 1)]
     await asyncio.wait_for(bench.recorder._perform(actions), FAR_S / 2)
-    for frame in FRAMES[7:]:
-        bench.send([frame])
-        await asyncio.wait_for(bench.turn(), FAR_S)
-    assert frames_of(bench.recorder.folder) == FRAMES
+    await record_each(bench, FRAMES[7:])
     names = sorted(path.name for path in bench.recorder.folder.glob("*.tlog"))
     assert names == [f"{part.session}_0{number}.tlog" for number in (1, 2)]
     disk.may_end.set()
@@ -211,10 +192,7 @@ async def test_a_recording_is_saved_under_a_name_while_it_is_written(
     bench: Bench, disk: SlowDisk
 ) -> None:
     saving = asyncio.create_task(bench.recorder.save("first flight"))
-    for frame in FRAMES[5:]:
-        bench.send([frame])
-        await asyncio.wait_for(bench.turn(), FAR_S)
-    assert frames_of(bench.recorder.folder) == FRAMES
+    await record_each(bench, FRAMES[5:])
     assert {path.name for path in bench.recorder.folder.glob("*.tlog")} == {"first flight_01.tlog"}
     assert not saving.done()
     disk.may_end.set()

@@ -21,6 +21,8 @@ UNIX_US = 1_781_187_930_000_000
 NAME = "20260611-142530"
 MUCH = 10**12
 ALWAYS = RecordingSettings(mode="always")
+STARTED = Announce(is_trouble=False, text=f"Recording {NAME}")
+ENDED = Announce(is_trouble=False, text=f"Recording {NAME} ended")
 
 
 def poll(
@@ -33,7 +35,7 @@ def recording(settings: RecordingSettings = ALWAYS) -> Session:
     session = Session(settings)
     session.start()
     assert poll(session) == [OpenPart(NAME, 1)]
-    assert session.opened(0) == [Announce(is_trouble=False, text=f"Recording {NAME}")]
+    assert session.opened(0) == [STARTED]
     return session
 
 
@@ -85,7 +87,7 @@ def test_stop_closes() -> None:
     session.stop()
     assert poll(session) == [
         ClosePart(),
-        Announce(is_trouble=False, text=f"Recording {NAME} ended"),
+        ENDED,
     ]
     assert session.state is SessionState.IDLE
     assert poll(session) == []
@@ -101,9 +103,7 @@ def test_large_or_old_parts_are_followed_by_the_next(now_us: int, size: int) -> 
 
 def test_wrong_clock_corrects_the_times_and_keeps_the_announced_name() -> None:
     session = recording()
-    actions = session.poll(
-        60_000_000, UNIX_US + 86_460_000_000, part_bytes=0, free_bytes=MUCH, jumped=True
-    )
+    actions = session.poll(60_000_000, UNIX_US + 86_460_000_000, 0, MUCH, jumped=True)
     assert actions == [ClosePart(), CorrectTimes(), OpenPart(NAME, 2)]
 
 
@@ -117,7 +117,7 @@ def test_a_full_disk_blocks_until_there_is_room_again() -> None:
     assert poll(session, RETRY_US - 1) == []
     assert poll(session, RETRY_US, free=110_000_000) == []
     assert poll(session, RETRY_US, free=130_000_000) == [OpenPart(NAME, 2)]
-    assert session.opened(RETRY_US) == [Announce(is_trouble=False, text=f"Recording {NAME}")]
+    assert session.opened(RETRY_US) == [STARTED]
 
 
 def test_the_same_trouble_is_announced_once_and_wastes_no_part_number() -> None:
@@ -140,7 +140,7 @@ def test_stop_while_blocked_gives_up() -> None:
     session = recording()
     session.failed("disk full", 0)
     session.stop()
-    assert poll(session) == [Announce(is_trouble=False, text=f"Recording {NAME} ended")]
+    assert poll(session) == [ENDED]
     assert session.state is SessionState.IDLE
     assert poll(session, 10 * RETRY_US) == []
 
