@@ -24,7 +24,7 @@ def test_good_fix_and_unknown_accuracy_are_usable() -> None:
     ],
     ids=str,
 )
-def test_what_makes_a_fix_unusable(change: dict[str, object]) -> None:
+def test_invalid_fix_is_unusable(change: dict[str, object]) -> None:
     assert not is_usable(replace(fix(0), **change), ReferenceSettings())
 
 

@@ -69,7 +69,7 @@ async def test_a_request_is_answered(server: ControlServer) -> None:
         ("seek", {"offset_s": 1, "far": 2}, "unknown field `far`"),
     ],
 )
-async def test_what_cannot_be_granted_is_refused_with_a_reason(
+async def test_refused_requests_get_a_reason(
     server: ControlServer, verb: str, params: dict[str, Any], text: str
 ) -> None:
     with pytest.raises(ControlError, match=text):
@@ -84,7 +84,9 @@ async def test_what_cannot_be_granted_is_refused_with_a_reason(
     ],
     ids=range(7),
 )
-async def test_nonsense_is_answered_too(server: ControlServer, line: bytes) -> None:
+async def test_invalid_requests_are_answered_with_an_error(
+    server: ControlServer, line: bytes
+) -> None:
     answer = msgspec.json.decode(await server.answer(line))
     assert answer["ok"] is False
     assert answer["error"]
@@ -233,7 +235,7 @@ async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> Non
     assert not path.exists()
 
 
-def test_nobody_there_is_said_plainly(folders: Path) -> None:
+def test_missing_gateway_is_reported(folders: Path) -> None:
     with pytest.raises(ControlError, match="nobody listens at the socket"):
         request(folders / "run.sock", "status")
     with pytest.raises(ControlError, match=r"nothing runs.*: start `mavgate run` or"):

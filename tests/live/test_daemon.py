@@ -77,7 +77,7 @@ def frame(message: mavlink.MAVLink_message, sequence: int = 0) -> bytes:
     return packed(message, 255, 190, sequence=sequence)
 
 
-def test_of_an_untrusted_client_only_requests_with_an_effect_are_recorded(
+def test_untrusted_requests_are_recorded_only_with_an_effect(
     daemon: Daemon, recorded: list[bytes]
 ) -> None:
     daemon._on_frame(Incoming(5, frame(HEARTBEAT), False))
@@ -125,7 +125,7 @@ async def test_due_time_is_polled_neither_without_pause_nor_too_late(
     daemon._timer.cancel()
 
 
-async def test_it_is_ready_once_orders_can_be_taken(
+async def test_ready_is_notified_once_the_control_socket_listens(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ready: list[bool] = []
@@ -159,7 +159,7 @@ async def test_reload_reports_settings_that_need_a_restart(
 
 
 @pytest.mark.parametrize("is_full", [False, True])
-async def test_settings_are_said_to_be_stored_when_the_file_is_whole(
+async def test_settings_are_reported_as_stored_once_the_file_is_whole(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, is_full: bool
 ) -> None:
     file, seen = tmp_path / "1.toml", []

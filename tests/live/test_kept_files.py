@@ -41,7 +41,7 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     made.files.close()
 
 
-async def test_what_is_saved_is_loaded(bench: Bench) -> None:
+async def test_saved_places_are_loaded(bench: Bench) -> None:
     assert bench.files.load() == {}
     await bench.save(1, FIRST)
     await bench.save(31, SECOND)
@@ -63,7 +63,7 @@ async def test_only_the_newest_of_many_is_written(
     assert len(written) <= 2
 
 
-async def test_an_end_loses_nothing(bench: Bench) -> None:
+async def test_closing_writes_pending_places(bench: Bench) -> None:
     bench.files.save(1, FIRST)
     bench.files.save(2, SECOND)
     bench.files.close()
@@ -89,7 +89,7 @@ async def test_a_disk_that_refuses_is_counted_and_reported(
     assert bench.reports[1:] == [(1, None)]
 
 
-async def test_what_could_not_be_written_is_tried_again_and_reported_once(
+async def test_failed_write_is_retried_and_reported_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     attempts = []
@@ -114,7 +114,7 @@ async def test_what_could_not_be_written_is_tried_again_and_reported_once(
     assert bench.files._retry is None
 
 
-async def test_one_that_cannot_be_written_holds_up_no_other(
+async def test_unwritable_file_does_not_delay_others(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await bench.save(2, FIRST)
@@ -147,7 +147,7 @@ async def test_a_broken_file_is_reported_and_left_alone(
     assert bench.read() == {1: FIRST, 2: SECOND}
 
 
-async def test_strange_names_are_none_of_ours(bench: Bench) -> None:
+async def test_files_with_other_names_are_ignored(bench: Bench) -> None:
     await bench.save(1, FIRST)
     for name in ("x.places.json", "1.places.json.bak", "12345.places.json", "1.places.new"):
         (bench.folder / name).write_text("nonsense")

@@ -129,7 +129,7 @@ def test_rates_are_those_since_the_previous_view() -> None:
     assert "1.0" in text
 
 
-def test_what_stands_in_the_way_is_reported() -> None:
+def test_reasons_of_closed_ports_and_clients_are_shown() -> None:
     closed = ListenerStats("udp-listen:[::]:5760", "", "closed", "Address already in use", 0, 0, 0)
     radio = replace(CLIENT, name="radio", state="unreachable", reason="Permission denied")
     text = text_of(replace(SNAPSHOT, listeners=(closed,), clients=(CLIENT, radio)))
@@ -227,7 +227,7 @@ def test_a_fix_that_is_none_is_red() -> None:
     assert "\x1b[31m3D" not in text_of(WELL_KNOWN, coloured=True)
 
 
-def test_what_is_not_known_is_no_figure() -> None:
+def test_unknown_values_are_dashes() -> None:
     unknown = AircraftStatus(1, None, None, Way(1.0, 2.0, 3.0, None, None), ())
     lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
     for head in ("supply", "fix", "home m", "mark m", "mark at°"):

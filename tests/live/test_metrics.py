@@ -81,14 +81,14 @@ def test_every_family_is_declared_once_before_its_samples() -> None:
     assert len(declared) == len(set(declared))
 
 
-def test_what_is_not_known_is_left_out() -> None:
+def test_unknown_values_have_no_sample() -> None:
     text = "".join(prometheus_text(dataclasses.replace(SNAPSHOT, states=((1, live.LOST),))))
     assert "NaN" not in text
     assert "mavgate_vehicle_latitude_degrees{" not in text
     assert 'mavgate_vehicle_valid{quantity="heading",vehicle="1"} 0.0' in text
 
 
-def test_another_program_reads_it() -> None:
+def test_text_is_read_by_the_parser_of_prometheus() -> None:
     """Every family of the text, as Prometheus' own reader understands it."""
     read = list(text_string_to_metric_families(TEXT))
     assert {family.type for family in read} == {"counter", "gauge"}
@@ -140,7 +140,7 @@ class TestServer:
             ),
         ],
     )
-    async def test_a_page_that_is_rebound_to_loopback_gets_nothing(
+    async def test_request_for_another_host_is_refused(
         self, server: MetricsServer, host: str, status: bytes
     ) -> None:
         for name in ("Host", "hOST"):

@@ -109,7 +109,7 @@ def test_table_contains_its_corrected_time(tmp_path: Path) -> None:
     assert reader.header == moved
 
 
-def test_what_was_deleted_meanwhile_does_not_come_back(tlog: Path) -> None:
+def test_deleted_file_is_not_restored(tlog: Path) -> None:
     restamper = Restamper(0)
     restamper.add(tlog, SHIFT_US)
     restamper.step()

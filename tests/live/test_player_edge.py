@@ -60,7 +60,7 @@ async def test_it_plays_to_the_end_by_itself(tlog: Path) -> None:
     played.close()
 
 
-async def test_orders(tlog: Path, clock: ManualClock) -> None:
+async def test_player_follows_each_command(tlog: Path, clock: ManualClock) -> None:
     played = Played(tlog, clock)
     played.edge.start()
     assert played.frames == FRAMES[:1]

@@ -102,7 +102,7 @@ async def test_frames_keep_their_times(play: Callable[..., PtyPort]) -> None:
     reader.close()
 
 
-async def test_nobody_reads(play: Callable[..., PtyPort]) -> None:
+async def test_frames_without_a_reader_are_dropped(play: Callable[..., PtyPort]) -> None:
     port = play(frames(3000))
     port.start()
     await asyncio.wait_for(port.ended.wait(), 60.0)

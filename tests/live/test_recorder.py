@@ -150,7 +150,7 @@ async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.
     assert not reader.header.cold_start
 
 
-async def test_a_part_begins_with_what_the_fusion_remembers(
+async def test_part_begins_with_the_state_of_the_fusion(
     tmp_path: Path, clock: ManualClock, rng: np.random.Generator
 ) -> None:
     bench = Bench(tmp_path, clock, rotate_min=1)
@@ -318,7 +318,7 @@ async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
         await bench.recorder.save("../x")
 
 
-async def test_what_is_wanted_from_the_start_misses_nothing(bench: Bench) -> None:
+async def test_recording_wanted_at_start_misses_no_frame(bench: Bench) -> None:
     bench.recorder.start()
     assert bench.recorder.status().state == "recording"
     bench.send(FRAMES)

@@ -54,7 +54,7 @@ def test_find_port(wanted: str, ports: list[Port], device: str) -> None:
         ("usb:dead:beef", [CH340], "no port fits 'usb:dead:beef'"),
     ],
 )
-def test_find_port_says_what_there_is(wanted: str, ports: list[Port], message: str) -> None:
+def test_error_of_find_port_lists_the_ports(wanted: str, ports: list[Port], message: str) -> None:
     with pytest.raises(PortNotFoundError, match=message):
         find_port(wanted, ports)
 
@@ -78,7 +78,7 @@ def test_reason_of_a_failed_opening(device: str, ports: list[Port], reason: str)
     assert why_not_open(raised.value, ports) == reason
 
 
-def test_a_port_that_another_program_holds_is_said_to_be_so() -> None:
+def test_port_in_use_by_another_program_is_reported() -> None:
     master, slave = os.openpty()
     try:
         with serial.Serial(os.ttyname(slave), timeout=0, exclusive=True) as held:

@@ -65,14 +65,14 @@ def test_names_that_would_harm(name: str) -> None:
         ("always", False, True),
     ],
 )
-def test_the_mode_decides_without_an_order(mode: str, in_flight: bool, expected: bool) -> None:
+def test_mode_decides_without_a_command(mode: str, in_flight: bool, expected: bool) -> None:
     session = Session(RecordingSettings(mode=mode))  # type: ignore[arg-type]
     session.set_in_flight(in_flight)
     assert session.wanted is expected
     assert bool(poll(session)) is expected
 
 
-def test_orders_outweigh_the_mode_until_the_next_flight() -> None:
+def test_commands_override_the_mode_until_the_next_flight() -> None:
     session = Session(RecordingSettings(mode="in_flight"))
     session.set_in_flight(True)
     session.stop()
@@ -160,7 +160,7 @@ def test_a_full_disk_needs_some_room_even_without_a_floor() -> None:
     assert poll(session, RETRY_US, free=1_100_000) == [OpenPart(NAME, 2)]
 
 
-def test_an_order_tries_at_once_what_was_blocked() -> None:
+def test_command_retries_a_blocked_recording_at_once() -> None:
     session = Session(ALWAYS)
     poll(session)
     session.failed("read-only disk", 0)

@@ -91,7 +91,7 @@ def pipe() -> Iterator[tuple[TextIO, TextIO]]:
         yield out, into
 
 
-def test_what_is_written_arrives_in_order(pipe: tuple[TextIO, TextIO]) -> None:
+def test_written_texts_arrive_in_order(pipe: tuple[TextIO, TextIO]) -> None:
     out, into = pipe
     stream = DetachedStream(into)
     lines = [f"line {number}, 20 °\n" for number in range(MAX_TEXTS)]
@@ -104,9 +104,7 @@ def test_what_is_written_arrives_in_order(pipe: tuple[TextIO, TextIO]) -> None:
 
 
 @pytest.mark.parametrize("blocking", [True, False])
-def test_a_pipe_that_nobody_reads_holds_nobody_up(
-    pipe: tuple[TextIO, TextIO], blocking: bool
-) -> None:
+def test_unread_pipe_does_not_block_the_writer(pipe: tuple[TextIO, TextIO], blocking: bool) -> None:
     """Two texts do not fit into the pipe's 64 kB: a plain stream would wait here for ever."""
     out, into = pipe
     os.set_blocking(into.fileno(), blocking)
@@ -211,7 +209,7 @@ async def test_keys_come_one_by_one_and_are_not_echoed(terminal: tuple[int, int]
     board.close()
 
 
-async def test_what_is_no_terminal_is_left_alone(tmp_path: object) -> None:
+async def test_keyboard_leaves_a_pipe_unchanged(tmp_path: object) -> None:
     read, write = os.pipe()
     board = Keyboard(lambda _: None, read)
     board.start()
