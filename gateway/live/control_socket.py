@@ -92,7 +92,6 @@ class ControlServer:
         self._for_group = "RUNTIME_DIRECTORY" in os.environ
         self._socket: socket.socket | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self._is_closed = False
         self._writers: set[asyncio.StreamWriter] = set()
         self._verbs = {
             verb: (_parameters_of(handler), handler)
@@ -125,7 +124,7 @@ class ControlServer:
 
         asyncio.get_running_loop().remove_reader(self._socket)
         self._socket.close()
-        self._socket, self._is_closed = None, True
+        self._socket = None
         for writer in self._writers:
             writer.close()
         self.path.unlink(missing_ok=True)
@@ -184,7 +183,7 @@ class ControlServer:
 
         reader, writer = await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)
         # One that was accepted just before the end is served only after it.
-        is_refused = self._is_closed or len(self._writers) >= MAX_CONNECTIONS
+        is_refused = self._socket is None or len(self._writers) >= MAX_CONNECTIONS
         if is_refused or not self._is_allowed(writer):
             writer.close()
             return

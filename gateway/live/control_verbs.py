@@ -134,12 +134,12 @@ class SerialVerbs:
             raise ControlError(
                 f"{port!r} is no serial port of this machine; there are {', '.join(sorted(known))}"
             )
-        self._port.connect(port)
+        await self._port.connect(port)
         return self._port.status(ports)
 
     async def _disconnect(self) -> SerialStatus:
         self._check_changeable()
-        self._port.disconnect()
+        await self._port.disconnect()
         return await self._status()
 
     def _check_changeable(self) -> None:

@@ -182,74 +182,56 @@ def open_port(device: str, baud: int, ports: list[Port]) -> serial.Serial:
         raise PortNotFoundError(f"receiver {device}: {why_not_open(error, ports)}") from error
 
 
-class ReceiverSearch:
-    """Open several ports and find the one that sends the receiver's frames.
+async def search_receiver(devices: list[str], baud: int) -> tuple[serial.Serial, bytes]:
+    """Open several ports; return the one that sends the receiver's frames, and the bytes read last.
 
-    `on_end` is called once with the open port and the bytes that were read last, or, if no port
-    sends a frame within `ASK_S`, with None, no bytes, and a text that describes each.
+    Raises PortNotFoundError if none sends a frame within `ASK_S`; its text describes each.
     """
+    loop = asyncio.get_running_loop()
+    found: asyncio.Future[tuple[str, bytes]] = loop.create_future()
+    asked, answers = _open_each(devices, baud)
+    decoders = {device: FrameDecoder() for device in asked}
 
-    def __init__(
-        self,
-        devices: list[str],
-        baud: int,
-        on_end: Callable[[serial.Serial | None, bytes, str], None],
-    ) -> None:
-        self._devices = devices
-        self._baud = baud
-        self._on_end = on_end
-        self._asked: dict[str, tuple[serial.Serial, FrameDecoder]] = {}
-        self._answers: dict[str, str] = {}
-        self._timer: asyncio.TimerHandle | None = None
-
-    def start(self) -> None:
-        """Open the ports. Needs a running event loop."""
-        loop, ports = asyncio.get_running_loop(), list_serial_ports()
-        self._timer = loop.call_later(ASK_S, self._give_up)
-        for device in self._devices:
-            try:
-                port = open_port(device, self._baud, ports)
-            except PortNotFoundError as error:
-                self._answers[device] = str(error).removeprefix("receiver ")
-                continue
-            self._answers[device] = f"{device}: silent"
-            self._asked[device] = (port, FrameDecoder())
-            loop.add_reader(port.fileno(), self._read, device)
-
-    def close(self) -> None:
-        """Close all ports."""
-        if self._timer is not None:
-            self._timer.cancel()
-        for device in [*self._asked]:
-            self._release(device).close()
-
-    def _read(self, device: str) -> None:
-        port, decoder = self._asked[device]
+    def read(device: str) -> None:
+        if found.done():
+            return
         try:
-            data = os.read(port.fileno(), READ_ASKED)
-        except BlockingIOError:
-            return
+            data = asked[device].read(READ_ASKED)
         except OSError:
-            data = b""
-        if not data:
-            self._answers[device] = f"{device}: gone"
-            self._release(device).close()
+            answers[device] = f"{device}: gone"
+            loop.remove_reader(asked[device].fileno())
             return
-        self._answers[device] = f"{device}: sends no frames at {self._baud} baud"
-        if not all(isinstance(event, Fault) for event in decoder.feed(data)):
-            found = self._release(device)
-            self.close()
-            self._on_end(found, data, "")
+        answers[device] = f"{device}: sends no frames at {baud} baud"
+        if not all(isinstance(event, Fault) for event in decoders[device].feed(data)):
+            found.set_result((device, data))
 
-    def _give_up(self) -> None:
-        self.close()
-        answers = "; ".join(self._answers.values())
-        self._on_end(None, b"", f"several USB adapters fit, and none is the receiver: {answers}")
+    for device, port in asked.items():
+        loop.add_reader(port.fileno(), read, device)
+    receiver = ""
+    try:
+        async with asyncio.timeout(ASK_S):
+            receiver, data = await found
+    except TimeoutError:
+        text = f"several USB adapters fit, and none is the receiver: {'; '.join(answers.values())}"
+        raise PortNotFoundError(text) from None
+    finally:
+        for device, port in asked.items():
+            loop.remove_reader(port.fileno())
+            if device != receiver:
+                port.close()
+    return asked[receiver], data
 
-    def _release(self, device: str) -> serial.Serial:
-        port, _ = self._asked.pop(device)
-        asyncio.get_running_loop().remove_reader(port.fileno())
-        return port
+
+def _open_each(devices: list[str], baud: int) -> tuple[dict[str, serial.Serial], dict[str, str]]:
+    """Open the ports that can be opened, and describe each so far."""
+    opened, answers, ports = {}, {}, list_serial_ports()
+    for device in devices:
+        answers[device] = f"{device}: silent"
+        try:
+            opened[device] = open_port(device, baud, ports)
+        except PortNotFoundError as error:
+            answers[device] = str(error).removeprefix("receiver ")
+    return opened, answers
 
 
 async def find_receiver(settings: SerialSettings) -> str:
@@ -260,23 +242,11 @@ async def find_receiver(settings: SerialSettings) -> str:
     ports = list_serial_ports()
     fitting = fitting_ports(settings.port, ports)
     if len(fitting) == 1:
-        open_port(fitting[0], settings.baud, ports).close()
-        return fitting[0]
-    result = asyncio.get_running_loop().create_future()
-
-    def on_end(port: serial.Serial | None, _: bytes, text: str) -> None:
-        if port is None:
-            result.set_exception(PortNotFoundError(text))
-        else:
-            port.close()
-            result.set_result(str(port.port))
-
-    search = ReceiverSearch(fitting, settings.baud, on_end)
-    search.start()
-    try:
-        return str(await result)
-    finally:
-        search.close()
+        port = open_port(fitting[0], settings.baud, ports)
+    else:
+        port, _ = await search_receiver(fitting, settings.baud)
+    port.close()
+    return str(port.port)
 
 
 class SerialPort:
@@ -303,7 +273,7 @@ class SerialPort:
         self._retry: asyncio.TimerHandle | None = None
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
-        self._search: ReceiverSearch | None = None
+        self._search: asyncio.Task[None] | None = None
         self._silent: set[str] = set()
         """Ports that were asked and are not the receiver."""
         self._asked_s = 0.0
@@ -325,13 +295,13 @@ class SerialPort:
             self._retry.cancel()
             self._retry = None
         if self._search is not None:
-            self._search.close()
+            self._search.cancel()
             self._search = None
         self._release()
 
-    def connect(self, wanted: str) -> None:
+    async def connect(self, wanted: str) -> None:
         """Close the port, and open the one that a setting `port` names, now or once it exists."""
-        self.disconnect()
+        await self.disconnect()
         self._settings = replace(self._settings, port=wanted)
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
@@ -339,10 +309,13 @@ class SerialPort:
         self._on_lost(wanted)
         self._open()
 
-    def disconnect(self) -> None:
+    async def disconnect(self) -> None:
         """Close the port until `connect` is called."""
         device = None if self._port is None else str(self._port.port)
+        search = self._search
         self.close()
+        if search is not None:
+            await asyncio.wait([search])
         if device is not None:
             self._on_lost(device)
 
@@ -364,7 +337,8 @@ class SerialPort:
         try:
             fitting = self._candidates(ports)
             if len(fitting) > 1:
-                self._ask(fitting)
+                log.info("several USB adapters fit, asking each: %s", ", ".join(fitting))
+                self._search = asyncio.get_running_loop().create_task(self._ask(fitting))
                 return
             port = open_port(fitting[0], self._settings.baud, ports)
         except PortNotFoundError as error:
@@ -386,22 +360,19 @@ class SerialPort:
             f"{ASK_AGAIN_S:.0f} s; plug it in, or name its port in [serial] port or with --port"
         )
 
-    def _ask(self, devices: list[str]) -> None:
-        def on_end(port: serial.Serial | None, data: bytes, text: str) -> None:
-            self._search = None
-            self._asked_s = asyncio.get_running_loop().time()
-            found = None if port is None else port.port
-            self._silent = {device for device in devices if device != found}
-            if port is None:
-                self._complain(text)
-                self._try_later()
-                return
+    async def _ask(self, devices: list[str]) -> None:
+        try:
+            port, data = await search_receiver(devices, self._settings.baud)
+        except PortNotFoundError as error:
+            self._silent = {*devices}
+            self._complain(str(error))
+            self._try_later()
+        else:
+            self._silent = {*devices} - {port.port}
             self._use(port)
             self._on_bytes(data, self._now_us())
-
-        log.info("several USB adapters fit, asking each: %s", ", ".join(devices))
-        self._search = ReceiverSearch(devices, self._settings.baud, on_end)
-        self._search.start()
+        self._search = None
+        self._asked_s = asyncio.get_running_loop().time()
 
     def _use(self, port: serial.Serial) -> None:
         self._port, device = port, str(port.port)
