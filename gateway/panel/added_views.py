@@ -24,7 +24,7 @@ class View:
     title: str
     icon: str
     """Name of a Material icon, which NiceGUI includes."""
-    build: Callable[[ViewContext], None]
+    build: Callable[[ViewContext], object]
 
 
 ADDED_VIEWS: Final[dict[str, View]] = {}

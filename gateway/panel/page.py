@@ -13,15 +13,13 @@ from gateway.panel.access import Role
 from gateway.panel.added_views import ADDED_VIEWS, View
 from gateway.panel.playback import Playback
 from gateway.panel.view_context import LIVE, WEB, PanelParts, ViewContext
-from gateway.panel.views import (
-    calibration_view,
-    events_view,
-    flight_view,
-    link_view,
-    plots_view,
-    recordings_view,
-    tuning_view,
-)
+from gateway.panel.views.calibration_view import CalibrationView
+from gateway.panel.views.events_view import EventsView, build_banner
+from gateway.panel.views.flight_view import build_flight, build_map
+from gateway.panel.views.link_view import LinkView
+from gateway.panel.views.plots_view import PlotsView
+from gateway.panel.views.recordings_view import RecordingsView
+from gateway.panel.views.tuning_view import TuningView
 from gateway.panel.widgets import notify_failure
 from gateway.printable import printable
 
@@ -31,14 +29,14 @@ THEMES: Final = {None: "brightness_auto", False: "light_mode", True: "dark_mode"
 
 
 VIEWS: Final = (
-    View("flight", "Flight", "flight", flight_view.build),
-    View("map", "Map", "map", flight_view.build_map),
-    View("link", "Link", "cell_tower", link_view.build),
-    View("recordings", "Recordings", "video_library", recordings_view.build),
-    View("calibration", "Calibration", "tune", calibration_view.build),
-    View("tuning", "Tuning", "settings", tuning_view.build),
-    View("plots", "Plots", "show_chart", plots_view.build),
-    View("events", "Events", "notifications", events_view.build),
+    View("flight", "Flight", "flight", build_flight),
+    View("map", "Map", "map", build_map),
+    View("link", "Link", "cell_tower", LinkView),
+    View("recordings", "Recordings", "video_library", RecordingsView),
+    View("calibration", "Calibration", "tune", CalibrationView),
+    View("tuning", "Tuning", "settings", TuningView),
+    View("plots", "Plots", "show_chart", PlotsView),
+    View("events", "Events", "notifications", EventsView),
 )
 """In the order of the rail, and of the keys 1 to 9, which added views follow."""
 
@@ -48,7 +46,7 @@ def build_page(parts: PanelParts, role: Role) -> None:
     page = ui.context.client
     playback = Playback(parts.uplink, parts.fleet, page.id)
     page.on_delete(playback.close)
-    _Page(ViewContext(parts, role, parts.settings.units, playback, page.id)).build()
+    _Page(ViewContext(parts, role, parts.settings.units, playback, page.id))
 
 
 class PageRail(Element, component=WEB / "page_rail.js"):
@@ -59,7 +57,7 @@ class PageRail(Element, component=WEB / "page_rail.js"):
 
 
 class _Page:
-    """The elements of one browser's page."""
+    """The elements of one browser's page; a view is built when it is first shown."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
@@ -69,14 +67,11 @@ class _Page:
         self._dark = ui.dark_mode(None)
         self._names: dict[int, str] = {}
         self._chips: list[tuple[str, str]] = []
-
-    def build(self) -> None:
-        """Build everything; a view is built when it is first shown."""
         with ui.element("div").classes("shell") as self._shell:
             self._build_head()
             with ui.element("div").classes("banners"):
                 self._build_recording_bar()
-                events_view.build_banner(self._context)
+                build_banner(self._context)
             self._build_rail()
             with ui.element("div").classes("stage"):
                 for view in self._views.values():

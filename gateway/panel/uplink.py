@@ -21,6 +21,7 @@ from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError
 from gateway.panel.gateway_client import ControlClient
 from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.vehicle import Spot
 from gateway.records import Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
@@ -127,9 +128,7 @@ class Uplink:
         )
         await self._until_acknowledged(system_id, number, message)
 
-    async def command_at(
-        self, system_id: int, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
-    ) -> None:
+    async def command_at(self, system_id: int, number: int, spot: Spot) -> None:
         """Send a command with a position; raises as `command`."""
         message = mavlink.MAVLink_command_int_message(
             system_id,
@@ -137,9 +136,9 @@ class Uplink:
             mavlink.MAV_FRAME_GLOBAL,
             number,
             *(0, 0, 0.0, 0.0, 0.0, 0.0),
-            round(lat_deg * 1e7),
-            round(lon_deg * 1e7),
-            alt_amsl_m,
+            round(spot.lat_deg * 1e7),
+            round(spot.lon_deg * 1e7),
+            spot.alt_amsl_m,
         )
         await self._until_acknowledged(system_id, number, message)
 

@@ -1,8 +1,8 @@
 """The context of every view: the aircraft, requests to the gateway, units, the role.
 
-A view is a file in `gateway/panel/views/` with a function `build(context: ViewContext) -> None`
-that creates its NiceGUI elements, inside the tab's panel; `page.py` lists them. One `ViewContext`
-belongs to one open page (browser tab).
+A view is a file in `gateway/panel/views/` with a class or function that is called with a
+`ViewContext` and creates its NiceGUI elements, inside the tab's panel; `page.py` lists them. One
+`ViewContext` belongs to one open page (browser tab).
 
 There are two ways from the aircraft to the screen:
 
@@ -44,7 +44,7 @@ from gateway.panel.playback import Playback
 from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
-from gateway.panel.state.vehicle import VehicleState
+from gateway.panel.state.vehicle import Spot, VehicleState
 from gateway.panel.uplink import Uplink
 
 WEB: Final = Path(__file__).parent / "web"
@@ -149,13 +149,10 @@ class ViewContext:
         self.check_may_change()
         await self.parts.uplink.command(self.system_id or 0, number, *params)
 
-    async def command_at(
-        self, number: int, lat_deg: float, lon_deg: float, alt_amsl_m: float
-    ) -> None:
+    async def command_at(self, number: int, spot: Spot) -> None:
         """Send a MAV_CMD with a position to the selected aircraft; raises as `command`."""
         self.check_may_change()
-        uplink = self.parts.uplink
-        await uplink.command_at(self.system_id or 0, number, lat_deg, lon_deg, alt_amsl_m)
+        await self.parts.uplink.command_at(self.system_id or 0, number, spot)
 
     async def ask(self, verb: str, **params: Any) -> Any:
         """Send a request to the gateway's control socket; see docs/control.md.

@@ -63,11 +63,28 @@ def notify_failure(context: ViewContext) -> Iterator[None]:
             ui.notify(f"only a gateway on this machine can: {text}", type="negative")
 
 
-def named_dialog(name: str) -> ui.dialog:
-    """Create a dialog that a screen reader announces by its name."""
+@contextmanager
+def asking(title: str, look: str = "") -> Iterator[ui.dialog]:
+    """Open a dialog of a title, the elements built in the block, and a button that cancels."""
     dialog = ui.dialog()
-    dialog.props["aria-label"] = name
-    return dialog
+    # A screen reader announces it by its name.
+    dialog.props["aria-label"] = title
+    with dialog, ui.card().classes("asks"):
+        ui.label(printable(title)).classes("title").classes(look)
+        yield dialog
+        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
+    dialog.on("hide", dialog.delete)
+    dialog.open()
+
+
+@contextmanager
+def ongoing(text: str) -> Iterator[None]:
+    """Show on the page that something takes its time."""
+    note = ui.notification(printable(text), spinner=True, timeout=None, type="ongoing")
+    try:
+        yield
+    finally:
+        note.dismiss()
 
 
 def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
@@ -87,18 +104,14 @@ def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[]
 
 def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
     """Ask for confirmation, and act on a yes."""
-    with named_dialog(question) as dialog, ui.card().classes("asks"):
-        ui.label(printable(question)).classes("title")
+    with asking(question) as dialog:
         ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
-        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
 
 
-Cells = Sequence[tuple[str, ...]]
-"""Text, style class, icon and track of each cell; the class is `""`, `good`, `warn`, `bad`,
-`info` or `soft`; the icon, a name of a Material icon, and the track, corners of a line in a box of
-46 by 24, may be left out."""
+Cells = Sequence[str | tuple[str, ...]]
+"""Each cell's text alone, or its text, style class, icon and track; the class is `""`, `good`,
+`warn`, `bad`, `info` or `soft`; the icon is a name of a Material icon; the track, corners of a line
+in a box of 46 by 24, may be left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +143,11 @@ class DataTable(Element, component=WEB / "data_table.js"):
 
     def show(self, rows: Mapping[str, Cells]) -> None:
         """Show these rows, in this order."""
-        shown = [
-            {"key": key, "cells": [[printable(cell[0]), *cell[1:]] for cell in cells]}
-            for key, cells in rows.items()
-        ]
+        shown = []
+        for key, row in rows.items():
+            cells = [(cell, "") if isinstance(cell, str) else cell for cell in row]
+            printed = [[printable(text), *rest] for text, *rest in cells]
+            shown.append({"key": key, "cells": printed})
         if shown != self._rows:
             self._rows = shown
             self.props["rows"] = shown
@@ -179,44 +193,33 @@ class RecorderControls:
         self._detail.set_text(printable(_detail_of(recorder)))
 
     def _build_buttons(self) -> None:
-        for text, icon, look, act in (
-            ("Start", "fiber_manual_record", "no-caps dense color=negative", self._order("start")),
-            ("Stop", "stop", "no-caps dense outline", self._order("stop")),
-            ("Save …", "save", "no-caps dense flat", self._ask_save),
-            ("Delete …", "delete", "no-caps dense flat", self._ask_delete),
+        for text, icon, look, value, act in (
+            ("Start", "fiber_manual_record", "color", "negative", partial(self._ask, "start")),
+            ("Stop", "stop", "outline", True, partial(self._ask, "stop")),
+            ("Save …", "save", "flat", True, self._ask_save),
+            ("Delete …", "delete", "flat", True, self._ask_delete),
         ):
-            button = ui.button(text, icon=icon, on_click=act)
+            button = ui.button(text, icon=icon, on_click=act).props("no-caps dense")
             button.props["aria-label"] = f"{text.removesuffix(' …')} recording"
-            _apply(button, look)
+            button.props[look] = value
 
-    def _order(self, verb: str) -> Any:
-        async def order() -> None:
-            with notify_failure(self._context):
-                await self._context.ask(f"record.{verb}")
-                await self._refresh_status()
-
-        return order
-
-    async def _refresh_status(self) -> None:
-        await self._context.parts.watch.refresh()
-        self.refresh()
+    async def _ask(self, verb: str, done: str = "", **params: Any) -> None:
+        with notify_failure(self._context):
+            await self._context.ask(f"record.{verb}", **params)
+            if done:
+                ui.notify(printable(done), type="positive")
+            await self._context.parts.watch.refresh()
+            self.refresh()
 
     def _ask_save(self) -> None:
-        with named_dialog("Save the recording") as dialog, ui.card().classes("asks"):
-            ui.label("Name for this recording, or the last one").classes("title")
+        with asking("Name for this recording, or the last one") as dialog:
             name = ui.input().props('dense outlined autofocus aria-label="Name of the recording"')
-            save = closing(dialog, lambda: self._save(name.value))
+            save = closing(dialog, lambda: self._save(name.value.strip()))
             name.on("keydown.enter", save)
             ui.button("Save", on_click=save).props("no-caps")
-            ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
-        dialog.on("hide", dialog.delete)
-        dialog.open()
 
     async def _save(self, name: str) -> None:
-        with notify_failure(self._context):
-            await self._context.ask("record.save", name=name.strip())
-            ui.notify(f"Saved as {printable(name.strip())}", type="positive")
-            await self._refresh_status()
+        await self._ask("save", f"Saved as {name}", name=name)
 
     async def _ask_delete(self) -> None:
         with notify_failure(self._context):
@@ -225,21 +228,8 @@ class RecorderControls:
                 ui.notify("Nothing was recorded yet.", type="warning")
                 return
             name = recordings[-1]["name"]
-            question = f"Delete the last recording, {name}, permanently?"
-            confirm(question, "Delete", partial(self._delete, name))
-
-    async def _delete(self, name: str) -> None:
-        with notify_failure(self._context):
-            await self._context.ask("record.delete", name=name)
-            ui.notify(f"{printable(name)} is deleted", type="positive")
-            await self._refresh_status()
-
-
-def _apply(button: ui.button, look: str) -> None:
-    """Set properties of a constant of this file: words, or `name=value`."""
-    for part in look.split():
-        name, _, value = part.partition("=")
-        button.props[name] = value or True
+            delete = partial(self._ask, "delete", f"{name} is deleted", name=name)
+            confirm(f"Delete the last recording, {name}, permanently?", "Delete", delete)
 
 
 def _detail_of(recorder: dict[str, Any]) -> str:

@@ -85,12 +85,7 @@ class FieldSphere(Element, component=WEB / "field_sphere.js"):
         self.run_method("show", rounded, seen)
 
 
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    _CalibrationView(context).build()
-
-
-class _CalibrationView:
+class CalibrationView:
     """The steps on the left, the guide to one of them on the right."""
 
     def __init__(self, context: ViewContext) -> None:
@@ -101,8 +96,6 @@ class _CalibrationView:
         self._mounted = ""
         self._choice: ui.select
         self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
-
-    def build(self) -> None:
         with ui.element("div").classes("calibration"):
             self._steps = ui.element("div").classes("steps")
             self._guide = ui.element("div").classes("card guide")
@@ -322,9 +315,7 @@ class _CalibrationView:
             words = f"{meta.short} ({unit_text(meta.unit)}), {name}" if meta else name
             found.append((words, old, new))
         table = DataTable(("", "before", "after")).classes("residuals")
-        table.show(
-            {name: ((name, ""), (_figure(old), ""), (_figure(new), "")) for name, old, new in found}
-        )
+        table.show({name: (name, _figure(old), _figure(new)) for name, old, new in found})
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         """Return the parameters that the calibration changed."""

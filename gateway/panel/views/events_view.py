@@ -23,11 +23,6 @@ ICONS: Final = {"bad": "error", "warn": "warning", "info": "info", "soft": "bug_
 """Each kind has its own icon, because colour alone is not accessible to everybody."""
 
 
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    _EventsView(context).build()
-
-
 def build_banner(context: ViewContext) -> None:
     """Build the banners of alerts; shown above every view."""
     shown: list[Alert] = []
@@ -61,14 +56,12 @@ def _build_alert(alert: Alert) -> None:
         ui.label(printable(alert.detail))
 
 
-class _EventsView:
+class EventsView:
     """The log of one page."""
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
         self._drawn: object = None
-
-    def build(self) -> None:
         with ui.element("div").classes("tools"):
             self._least = ui.select(SHOWN, value=7, on_change=self._refresh)
             self._least.props('dense outlined options-dense aria-label="Severity"')

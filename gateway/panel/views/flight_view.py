@@ -13,13 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.panel.access import MAPS
 from gateway.panel.state.vehicle import Spot
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import (
-    RecorderControls,
-    UploadButton,
-    closing,
-    named_dialog,
-    notify_failure,
-)
+from gateway.panel.widgets import RecorderControls, UploadButton, asking, closing, notify_failure
 
 STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
@@ -65,8 +59,7 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
     """Ask what to do at the clicked position."""
     spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
     name = f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}"
-    with named_dialog(name) as dialog, ui.card().classes("asks"):
-        ui.label(name).classes("figure title")
+    with asking(name, "figure") as dialog:
         ui.label(f"aircraft {context.system_id}").classes("soft")
 
         def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
@@ -83,9 +76,6 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
         if context.vehicle is not None and context.vehicle.instant(context.now_us).mark:
             clear = ui.button("Clear the mark", on_click=then(partial(_clear, context)))
             clear.props("no-caps outline")
-        ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
-    dialog.on("hide", dialog.delete)
-    dialog.open()
 
 
 def _ground_m(context: ViewContext) -> float:
@@ -98,18 +88,14 @@ def _ground_m(context: ViewContext) -> float:
 
 
 async def _mark(context: ViewContext, spot: Spot) -> None:
-    await context.command_at(
-        mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
-    )
+    await context.command_at(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot)
     if context.vehicle is not None:
         context.vehicle.exact_mark = spot
     ui.notify("Marked", type="positive")
 
 
 async def _set_home(context: ViewContext, spot: Spot) -> None:
-    await context.command_at(
-        mavlink.MAV_CMD_DO_SET_HOME, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m
-    )
+    await context.command_at(mavlink.MAV_CMD_DO_SET_HOME, spot)
     ui.notify("Home set", type="positive")
 
 
@@ -145,7 +131,7 @@ class FlightTimeline(Element, component=WEB / "flight_timeline.js"):
     """The current flight over time, in which the page can go back."""
 
 
-def build(context: ViewContext) -> None:
+def build_flight(context: ViewContext) -> None:
     """Build the view."""
     with ui.element("div").classes("flight"):
         with ui.element("div").classes("flight-numbers card"):

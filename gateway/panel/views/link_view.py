@@ -1,6 +1,7 @@
 """View 3: the receiver, its nodes, and the gateway's clients."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final
 
 from nicegui import ui
@@ -21,6 +22,10 @@ LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
 """Percent of payloads: above it the estimators mostly extrapolate."""
 
+NODE_COLUMNS: Final = (
+    "Node", "Rate", "Received", "Lost", "Loss", "Restarts", "Clock", "Age", "Chips"
+)  # fmt: skip
+
 Record = Mapping[str, Any]
 
 
@@ -37,17 +42,7 @@ class LinkView:
                 if context.may_change:
                     self._build_serial()
                 self._nodes = DataTable(
-                    (
-                        "Node",
-                        "Rate",
-                        "Received",
-                        "Lost",
-                        "Loss",
-                        "Restarts",
-                        "Clock",
-                        "Age",
-                        "Chips",
-                    ),
+                    NODE_COLUMNS,
                     "No node was heard.",
                 )
             with ui.element("div").classes("card padded wide"):
@@ -85,7 +80,7 @@ class LinkView:
             self._port = ui.select({"auto": AUTO}, value="auto").classes("spring")
             self._port.props('dense outlined options-dense aria-label="Serial port"')
             ui.button("Connect", on_click=self._connect).props("no-caps")
-            self._leave = ui.button("Disconnect", on_click=self._disconnect)
+            self._leave = ui.button("Disconnect", on_click=partial(self._ask, "serial.disconnect"))
             self._leave.props("no-caps outline")
         self._serial_reason = ui.label().classes("soft").props("data-role=serial")
         self._serial.set_visibility(False)
@@ -117,34 +112,28 @@ class LinkView:
         self._leave.set_enabled(status["state"] != "closed")
         self._serial_reason.set_text(printable(_serial_line(status)))
 
-    async def _connect(self) -> None:
+    async def _ask(self, verb: str, **params: Any) -> bool:
+        """Request a change and show its result; return whether it was carried out."""
+        done = False
         with notify_failure(self._context):
-            self._show_serial(await self._context.ask("serial.connect", port=self._port.value))
+            answer = await self._context.ask(verb, **params)
+            done = True
+            if verb.startswith("serial."):
+                self._show_serial(answer)
             await self._context.parts.watch.refresh()
             self.refresh()
+        return done
 
-    async def _disconnect(self) -> None:
-        with notify_failure(self._context):
-            self._show_serial(await self._context.ask("serial.disconnect"))
-            await self._context.parts.watch.refresh()
-            self.refresh()
+    async def _connect(self) -> None:
+        await self._ask("serial.connect", port=self._port.value)
 
     async def _add(self) -> None:
-        with notify_failure(self._context):
-            url = self._url.value
-            await self._context.ask("clients.add", url=url.strip())
-            if self._url.value == url:
-                self._url.value = ""
-            await self._context.parts.watch.refresh()
-            self.refresh()
+        url = self._url.value
+        if await self._ask("clients.add", url=url.strip()) and self._url.value == url:
+            self._url.value = ""
 
     def _ask_remove(self, name: str) -> None:
-        async def remove() -> None:
-            with notify_failure(self._context):
-                await self._context.ask("clients.remove", name=name)
-                await self._context.parts.watch.refresh()
-                self.refresh()
-
+        remove = partial(self._ask, "clients.remove", name=name)
         confirm(f"Remove the client {name}? It gets nothing more.", "Remove", remove)
 
     def refresh(self) -> None:
@@ -177,9 +166,9 @@ class LinkView:
         self._ports.show(
             {
                 port["name"]: (
-                    (port["name"], ""),
+                    port["name"],
                     (port["reason"] or port["state"], "bad" if port["reason"] else "good"),
-                    (str(port["clients"]), ""),
+                    str(port["clients"]),
                     (str(port["turned_away"]), "warn" if port["turned_away"] else ""),
                 )
                 for port in status["listeners"]
@@ -190,26 +179,18 @@ class LinkView:
         rows: dict[str, Cells] = {}
         for system_id, vehicle in sorted(self._context.vehicles.items()):
             ages = [self._age(vehicle.heard_us.get(name)) for name in _SHOWN]
-            rows[str(system_id)] = (
-                (f"{vehicle.model} {system_id}", ""),
-                *ages,
-                (str(len(vehicle.newest)), ""),
-            )
+            name, kinds = f"{vehicle.model} {system_id}", str(len(vehicle.newest))
+            rows[str(system_id)] = (name, *ages, kinds)
         return rows
 
-    def _age(self, heard_us: int | None) -> tuple[str, str]:
+    def _age(self, heard_us: int | None) -> str | tuple[str, str]:
         if heard_us is None:
-            return (UNKNOWN, "")
+            return UNKNOWN
         age_us = self._context.now_us - heard_us
         return (f"{age_us / US_PER_S:.1f} s ago", "bad" if age_us > SILENT_US else "")
 
 
 _SHOWN: Final = ("HEARTBEAT", "ATTITUDE", "GLOBAL_POSITION_INT")
-
-
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    LinkView(context)
 
 
 def _serial_line(status: Record) -> str:
@@ -245,15 +226,15 @@ def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
     age_us = max(0, now_us - node["last_time_us"])
     kind = "bad" if loss > LOSS_BAD else "warn" if loss > LOSS_WARN else ""
     return (
-        (_name_of(node), ""),
-        (f"{node['rate_hz']:.0f} Hz", ""),
-        (str(node["received"]), ""),
-        (str(node["lost"]), ""),
+        _name_of(node),
+        f"{node['rate_hz']:.0f} Hz",
+        str(node["received"]),
+        str(node["lost"]),
         (f"{loss:.2f} %", kind),
         (str(node["restarts"]), "warn" if node["restarts"] else ""),
-        (f"{node['clock_skew_ppm']:+.0f} ppm", ""),
+        f"{node['clock_skew_ppm']:+.0f} ppm",
         (f"{age_us / US_PER_S:.1f} s", "bad" if age_us > SILENT_US else "good"),
-        (", ".join(board["chips"]) if board is not None else UNKNOWN, ""),
+        ", ".join(board["chips"]) if board is not None else UNKNOWN,
     )
 
 
@@ -269,13 +250,13 @@ def _client_row(client: Record, now_us: int, before: dict[int, int], span_s: flo
     heard_us, trip_us = client["heard_us"], client["round_trip_us"]
     is_open = client["state"] == "open"
     return (
-        (client["name"], ""),
+        client["name"],
         (client["reason"] or client["state"], "good" if is_open else "bad"),
-        (str(client["sent"]), ""),
-        (rate, ""),
+        str(client["sent"]),
+        rate,
         (str(client["dropped"]), "warn" if client["dropped"] else ""),
-        (str(client["received"]), ""),
-        (UNKNOWN if trip_us is None else f"{trip_us / 1000:.1f} ms", ""),
-        ("never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago", ""),
-        ("may change" if client["trusted"] else "may look", ""),
+        str(client["received"]),
+        UNKNOWN if trip_us is None else f"{trip_us / 1000:.1f} ms",
+        "never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago",
+        "may change" if client["trusted"] else "may look",
     )

@@ -20,12 +20,7 @@ FIRST: Final = (
 """Default fields, which every vehicle sends."""
 
 
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    _PlotsView(context).build()
-
-
-class _PlotsView:
+class PlotsView:
     """The strips and their common controls."""
 
     def __init__(self, context: ViewContext) -> None:
@@ -34,8 +29,6 @@ class _PlotsView:
         self._names: list[str] = []
         self._paused = False
         self._window_s = 60
-
-    def build(self) -> None:
         with ui.element("div").classes("tools"):
             self._pause = ui.button("Pause", icon="pause", on_click=self._toggle).props("no-caps")
             self._pause.props("unelevated dense").mark("plots-pause")
@@ -52,6 +45,7 @@ class _PlotsView:
         self._context.every(CHOICES_S, self._offer)
 
     def remove(self, strip: "_Strip") -> None:
+        """Remove a chart."""
         self._strips.remove(strip)
         strip.card.delete()
 
@@ -106,7 +100,7 @@ class _PlotsView:
 class _Strip:
     """One chart with the choice of its fields."""
 
-    def __init__(self, view: _PlotsView, context: ViewContext, fields: tuple[str, ...]) -> None:
+    def __init__(self, view: PlotsView, context: ViewContext, fields: tuple[str, ...]) -> None:
         self._fields = list(fields)
         with ui.element("div").classes("card strip-card") as self.card:
             with ui.element("div").classes("strip-head"):

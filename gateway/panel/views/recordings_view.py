@@ -1,6 +1,7 @@
 """View 4: recordings, and a flight that is played again."""
 
 import asyncio
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -22,11 +23,12 @@ from gateway.panel.widgets import (
     RecorderControls,
     RowButton,
     UploadButton,
+    asking,
     closing,
     confirm,
     heading,
-    named_dialog,
     notify_failure,
+    ongoing,
 )
 from gateway.printable import printable
 from gateway.recordings.index import delete_recording, list_recordings
@@ -48,6 +50,7 @@ class RecordingsView:
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
+        self._playback = context.playback
         self._facts = RecordingFacts()
         with ui.element("div").classes("cards one"):
             self._player = ui.element("div").classes("card padded").props("data-role=player")
@@ -87,16 +90,17 @@ class RecordingsView:
         with ui.element("div").classes("line"):
             self._title = ui.label().classes("title spring")
             self._fused_again = ui.switch("fused again next to it", on_change=self._on_fused_again)
-            ui.button(icon="close", on_click=self._close).props(
-                'flat round dense aria-label="Close the recording"'
-            )
+            close = ui.button(icon="close", on_click=partial(self._play, self._playback.close))
+            close.props('flat round dense aria-label="Close the recording"')
         self._slider = TimeSlider()
         self._slider.on("seek", self._on_seek)
         with ui.element("div").classes("line"):
-            self._toggle = ui.button(icon="pause", on_click=self._on_toggle)
+            toggle = partial(self._play, self._playback.toggle)
+            self._toggle = ui.button(icon="pause", on_click=toggle)
             self._toggle.props('round dense aria-label="Play or pause"')
             for icon, to, title in (("replay_10", "-10", "Back"), ("forward_10", "+10", "Ahead")):
-                button = ui.button(icon=icon, on_click=partial(self._play, "seek", to=to))
+                seek = partial(self._play, self._playback.order, "seek", to=to)
+                button = ui.button(icon=icon, on_click=seek)
                 button.props("flat round dense").props["aria-label"] = f"{title} ten seconds"
             self._speed = ui.select(
                 {speed: f"{speed:g}×" for speed in SPEEDS}, value=1, on_change=self._on_speed
@@ -131,8 +135,7 @@ class RecordingsView:
         )
 
     def _show_place(self) -> None:
-        playback = self._context.playback
-        status = playback.status
+        playback, status = self._playback, self._playback.status
         self._player.set_visibility(status is not None)
         if status is None:
             return
@@ -169,76 +172,40 @@ class RecordingsView:
         ui.download.from_url(f"/recordings/{quote(name)}")
 
     def _ask_export(self, name: str) -> None:
-        title = f"Export {name}"
-        with named_dialog(title) as dialog, ui.card().classes("asks"):
-            ui.label(printable(title)).classes("title")
+        with asking(f"Export {name}") as dialog:
             for kind, (label, _, _) in FORMATS.items():
                 export = closing(dialog, partial(self._export, name, kind))
                 ui.button(label, on_click=export).props("no-caps outline")
-            ui.button("Cancel", on_click=dialog.close).props("no-caps flat")
-        dialog.on("hide", dialog.delete)
-        dialog.open()
 
     async def _export(self, name: str, kind: str) -> None:
-        context, (label, _, _) = self._context, FORMATS[kind]
-        note = ui.notification(
-            f"{printable(name)}: making {label} …", spinner=True, timeout=None, type="ongoing"
-        )
-        with notify_failure(context):
-            try:
-                url = await context.parts.jobs.export(context.parts.recordings_folder, name, kind)
-                ui.download.from_url(url)
-            finally:
-                note.dismiss()
+        parts = self._context.parts
+        text = f"{name}: making {FORMATS[kind][0]} …"
+        with notify_failure(self._context), ongoing(text):
+            url = await parts.jobs.export(parts.recordings_folder, name, kind)
+            ui.download.from_url(url)
 
     async def _open(self, name: str, *, fused_again: bool = False) -> None:
-        context = self._context
-        with notify_failure(context):
-            context.check_may_change()
-            note = ui.notification(
-                f"Opening {printable(name)} …", spinner=True, timeout=None, type="ongoing"
-            )
-            try:
-                await context.playback.open(
-                    context.parts.recordings_folder, name, fused_again=fused_again
-                )
-            finally:
-                note.dismiss()
-            self._show_place()
+        folder = self._context.parts.recordings_folder
+        with ongoing(f"Opening {name} …"):
+            await self._play(self._playback.open, folder, name, fused_again=fused_again)
 
     async def _on_fused_again(self, event: Any) -> None:
-        playback = self._context.playback
-        if playback.name and event.value != playback.has_fused_again:
-            await self._open(playback.name, fused_again=event.value)
+        if self._playback.name and event.value != self._playback.has_fused_again:
+            await self._open(self._playback.name, fused_again=event.value)
 
-    def _close(self) -> None:
+    async def _play(self, act: Callable[..., Any], *args: Any, **params: Any) -> None:
+        """Change the playback, and show its state."""
         with notify_failure(self._context):
             self._context.check_may_change()
-            self._context.playback.close()
-            self._show_place()
-
-    async def _play(self, verb: str, **params: Any) -> None:
-        with notify_failure(self._context):
-            self._context.check_may_change()
-            await self._context.playback.order(verb, **params)
+            if (answer := act(*args, **params)) is not None:
+                await answer
             self._show_place()
 
     async def _on_seek(self, event: GenericEventArguments) -> None:
-        await self._play("seek", to=f"{float(event.args):.2f}")
-
-    async def _on_toggle(self) -> None:
-        with notify_failure(self._context):
-            self._context.check_may_change()
-            await self._context.playback.toggle()
-            self._show_place()
+        await self._play(self._playback.order, "seek", to=f"{float(event.args):.2f}")
 
     async def _on_speed(self, event: Any) -> None:
-        await self._play("play.speed", speed=float(event.value))
-
-
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    RecordingsView(context)
+        await self._play(self._playback.order, "play.speed", speed=float(event.value))
 
 
 def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
@@ -252,9 +219,9 @@ def _row(recording: Any, facts: Row | None, track: str) -> Cells:
     kinds = sorted({Path(file).suffix.lstrip(".") for file in recording.files})
     return (
         (recording.name, "", "", track),
-        (f"{when:%Y-%m-%d %H:%M:%S}", ""),
-        (f"{recording.size / 1e6:.2f} MB", ""),
-        (f"{len(recording.files)} {'+'.join(kinds)}", ""),
+        f"{when:%Y-%m-%d %H:%M:%S}",
+        f"{recording.size / 1e6:.2f} MB",
+        f"{len(recording.files)} {'+'.join(kinds)}",
         *_facts_cells(facts),
     )
 
@@ -262,15 +229,15 @@ def _row(recording: Any, facts: Row | None, track: str) -> Cells:
 def _facts_cells(facts: Row | None) -> Cells:
     """Return the catalogue's cells; blank where unknown."""
     if facts is None:
-        return (("", ""),) * len(FACTS)
+        return ("",) * len(FACTS)
     if facts["error"] is not None:
-        return (("broken", "bad"), ("", ""), ("", ""), ("", ""))
+        return (("broken", "bad"), "", "", "")
     duration, distance, highest, loss = (
         facts[key] for key in ("duration", "distance", "highest", "loss")
     )
     return (
-        ("" if duration is None else str(timedelta(seconds=round(duration))), ""),
-        ("" if distance is None else f"{distance / 1000.0:.2f} km", ""),
-        ("" if highest is None else f"{highest:.0f} m", ""),
+        "" if duration is None else str(timedelta(seconds=round(duration))),
+        "" if distance is None else f"{distance / 1000.0:.2f} km",
+        "" if highest is None else f"{highest:.0f} m",
         ("" if loss is None else f"{loss:.1%}", "warn" if (loss or 0.0) > MUCH_LOST else ""),
     )

@@ -200,9 +200,9 @@ class ComparisonCard:
         self._table.show(
             {
                 e.name: (
-                    (e.name, ""),
-                    (f"{_rms_text(e, key, curves[-1])} {unit}", ""),
-                    (f"{_figure(e.to_fixes_m)} m", ""),
+                    e.name,
+                    f"{_rms_text(e, key, curves[-1])} {unit}",
+                    f"{_figure(e.to_fixes_m)} m",
                 )
                 for e in self._estimates
             }
@@ -245,12 +245,7 @@ EFFECTS: Final = {
 """Plots in which a change may show, by the label of the choice."""
 
 
-def build(context: ViewContext) -> None:
-    """Build the view."""
-    _TuningView(context).build()
-
-
-class _TuningView:
+class TuningView:
     """The parameters on the left, their effect on the right."""
 
     def __init__(self, context: ViewContext) -> None:
@@ -259,8 +254,6 @@ class _TuningView:
         self._grouped: object = None
         self._drawn: object = None
         self._asked: int | None = None
-
-    def build(self) -> None:
         with ui.element("div").classes("tools"):
             self._search = ui.input(placeholder="Search: gps, cutoff, heading …")
             self._search.props('dense outlined clearable debounce=200 aria-label="Search"')
