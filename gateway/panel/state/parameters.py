@@ -10,6 +10,7 @@ import lzma
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Final
@@ -147,8 +148,21 @@ MAX_PLAIN: Final = 16_000_000
 """Limit of an unpacked metadata file, against decompression bombs."""
 
 
-class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
-    """Metadata of one parameter."""
+class Choice(msgspec.Struct, frozen=True):
+    """One value of a parameter, and what it means."""
+
+    value: float
+    description: str = ""
+
+
+RENAMED: Final = {
+    "short": "shortDesc", "long": "longDesc", "unit": "units", "low": "min", "high": "max",
+    "choices": "values",
+}  # fmt: skip
+
+
+class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True, rename=RENAMED):
+    """Metadata of one parameter, under the names of MAVLink's parameter metadata."""
 
     name: str
     group: str = ""
@@ -159,8 +173,8 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True):
     default: float = NAN
     low: float = NAN
     high: float = NAN
-    choices: tuple[tuple[float, str], ...] = ()
-    """The only values, and what they mean."""
+    choices: tuple[Choice, ...] = ()
+    """The only values; any number if there are none."""
 
 
 def parameter_path(general: bytes) -> str | None:
@@ -174,8 +188,12 @@ def parameter_path(general: bytes) -> str | None:
 
 def parse_parameters(content: bytes) -> dict[str, ParameterMeta]:
     """Read a parameters' file; unreadable entries are left out."""
-    found = (_meta_of(item) for item in _items(_parsed(content), "parameters"))
-    return {meta.name: meta for meta in found if meta is not None}
+    found: dict[str, ParameterMeta] = {}
+    for item in _items(_parsed(content), "parameters"):
+        with suppress(msgspec.ValidationError):
+            meta = msgspec.convert(item, ParameterMeta)
+            found[meta.name] = meta
+    return found
 
 
 def _parsed(content: bytes) -> Any:
@@ -190,36 +208,6 @@ def _parsed(content: bytes) -> Any:
 def _items(tree: Any, key: str) -> list[Mapping[str, Any]]:
     items = tree.get(key, []) if isinstance(tree, dict) else []
     return [item for item in items if isinstance(item, dict)] if isinstance(items, list) else []
-
-
-def _meta_of(item: Mapping[str, Any]) -> ParameterMeta | None:
-    name = item.get("name")
-    if not isinstance(name, str):
-        return None
-    return ParameterMeta(
-        name=name,
-        group=_text(item, "group"),
-        category=_text(item, "category"),
-        short=_text(item, "shortDesc"),
-        long=_text(item, "longDesc"),
-        unit=_text(item, "units"),
-        default=_number(item.get("default")),
-        low=_number(item.get("min")),
-        high=_number(item.get("max")),
-        choices=tuple(
-            (_number(value.get("value")), _text(value, "description"))
-            for value in _items(item, "values")
-        ),
-    )
-
-
-def _text(item: Mapping[str, Any], key: str) -> str:
-    value = item.get(key)
-    return value if isinstance(value, str) else ""
-
-
-def _number(value: Any) -> float:
-    return float(value) + 0.0 if isinstance(value, int | float) else NAN
 
 
 QUIET_US: Final = US_PER_S

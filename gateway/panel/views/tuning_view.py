@@ -70,7 +70,7 @@ class ParameterRow:
         field: Any
         meta, may = self._meta, self._context.may_change
         if meta.choices:
-            options = {number: printable(text) for number, text in meta.choices}
+            options = {each.value: printable(each.description) for each in meta.choices}
             options.setdefault(value, f"{value:g}")
             field = ui.select(options, value=value, on_change=lambda e: self._set(e.value))
             field.props("dense outlined options-dense")
@@ -111,7 +111,8 @@ def _range_of(meta: ParameterMeta) -> str:
     elif meta.unit:
         parts.append(unit_text(meta.unit))
     if math.isfinite(meta.default):
-        word = next((text for number, text in meta.choices if number == meta.default), None)
+        words = (each.description for each in meta.choices if each.value == meta.default)
+        word = next(words, "")
         parts.append(f"default {word or f'{meta.default:g}'}")
     return " · ".join(parts)
 
