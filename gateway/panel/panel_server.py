@@ -27,17 +27,15 @@ from gateway.live.terminal import on_end_signals, on_parent_gone
 from gateway.panel.access import ROLE, AccessControl, Logins, ScriptNonces
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
 from gateway.panel.dialogues import Dialogues
-from gateway.panel.gateway_client import ControlClient, GatewayWatch
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.recording_files import add_recording_files
-from gateway.panel.recording_jobs import RecordingJobs
+from gateway.panel.recording_files import RecordingJobs, add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.telemetry_feed import PATH, TelemetryFeed, add_tracks
-from gateway.panel.uplink import Uplink
+from gateway.panel.uplink import ControlClient, GatewayWatch, Uplink
 from gateway.panel.view_context import WEB, PanelParts
 
 log = logging.getLogger(__name__)

@@ -17,9 +17,8 @@ from typing import Any, Final
 
 from gateway.live.control_socket import ControlError
 from gateway.live.terminal import own_command
-from gateway.panel.gateway_client import ControlClient
 from gateway.panel.state.fleet import FleetState, Origin
-from gateway.panel.uplink import Uplink
+from gateway.panel.uplink import ControlClient, Uplink
 from gateway.recordings.answers import FIRST_GROUND_STATION, is_station
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TLOG, format_of, read_chunks

@@ -37,15 +37,14 @@ from nicegui import ui
 from gateway.clock import GatewayClock
 from gateway.panel.access import Role
 from gateway.panel.dialogues import Dialogues
-from gateway.panel.gateway_client import READING, ControlClient, GatewayWatch
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
-from gateway.panel.recording_jobs import RecordingJobs
+from gateway.panel.recording_files import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory
 from gateway.panel.state.vehicle import Spot, VehicleState
-from gateway.panel.uplink import Uplink
+from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink
 
 WEB: Final = Path(__file__).parent / "web"
 """The components' JavaScript and the style sheet."""

@@ -3,9 +3,7 @@
 import base64
 import gzip
 import json
-import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,43 +18,13 @@ from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
 from tests.kit.cli import invoke
 from tests.panel.browsing import FEW_FRAMES, needs_chromium
-
-BEGIN_US = 1_750_000_000_000_000
-HOSTILE = "</script><script>window.ran = 1</script><img src=x onerror=window.ran=1>"
-
-
-def frames(seconds: int, hz: int = 10) -> Iterator[tuple[int, bytes]]:
-    """Make the messages of a flight in circles, with a little noise."""
-    sender = mavlink.MAVLink(None, 3, 1)
-    for step in range(seconds * hz):
-        time_us, turn = BEGIN_US + step * 1_000_000 // hz, step / hz / 20
-        wobble = math.sin(step * 12.9898) * 0.03
-        north, east = round(20_000 * math.sin(turn)), round(20_000 * math.cos(turn))
-        height = 400 + 80 * math.sin(turn / 7)
-        messages: list[Any] = [
-            mavlink.MAVLink_attitude_message(0, 0.4 + wobble, wobble, turn % 6 - 3, 0, 0, 0),
-            mavlink.MAVLink_global_position_int_message(
-                0, 470_000_000 + north, 80_000_000 + east, round(height * 1e3),
-                round((height - 320) * 1e3), 0, 0, 0, round(turn * 5729) % 36000,
-            ),
-            mavlink.MAVLink_vfr_hud_message(18 + wobble, 17 + wobble, 10, 50, height, wobble),
-        ]  # fmt: skip
-        if step % hz == 0:
-            messages += [
-                mavlink.MAVLink_heartbeat_message(1, 0, 128, 0, 4, 3),
-                mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 11800, -1, 63, 0, 0, 0, 0, 0, 0),
-            ]
-        if step == 5 * hz:
-            text = HOSTILE.encode()[:50]
-            messages.append(mavlink.MAVLink_statustext_message(2, text))
-        for message in messages:
-            yield time_us, bytes(message.pack(sender))
+from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_frames
 
 
 def flight_of(folder: Path, seconds: int) -> PageFlight:
     path = folder / "day_01.tlog"
-    path.write_bytes(b"".join(encode_record(*record) for record in frames(seconds)))
-    return read_flight([path], read_options(GatewaySettings()), HOSTILE)
+    path.write_bytes(b"".join(encode_record(*record) for record in flight_frames(seconds)))
+    return read_flight([path], read_options(GatewaySettings()), HOSTILE_TEXT)
 
 
 def unpacked(page: str, name: str) -> Any:
@@ -68,7 +36,7 @@ def unpacked(page: str, name: str) -> Any:
 @pytest.mark.io
 def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
     page = render_page(flight_of(tmp_path, 60))
-    assert HOSTILE not in page
+    assert HOSTILE_TEXT not in page
     data = unpacked(page, "data")
     (aircraft,) = data["aircraft"]
     assert (aircraft["system_id"], aircraft["model"]) == (3, "plane")
@@ -76,7 +44,7 @@ def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
     heights = [column["r"] * sum(column["d"][: n + 1]) for n in range(len(column["d"]))]
     assert heights[0] == pytest.approx(400.0)
     assert len(heights) == pytest.approx(60 * 10 / 3, abs=2)
-    assert data["texts"] == [[5.0, 3, 2, HOSTILE[:50]]]
+    assert data["texts"] == [[5.0, 3, 2, HOSTILE_TEXT[:50]]]
     assert set(unpacked(page, "modules")) >= {"vue", "./flight_page.js"}
 
 

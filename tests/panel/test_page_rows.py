@@ -15,7 +15,7 @@ from gateway.live.control_socket import request
 from gateway.recordings.tlog import encode_record
 from tests.kit.process import wait_for
 from tests.panel.browsing import START_LIMIT_MS, WAIT_MS, Process, needs_chromium, open_page, show
-from tests.panel.test_flight_page import frames
+from tests.panel.messages import flight_frames
 from tests.panel.test_map_tiles import write_pmtiles
 
 pytestmark = [
@@ -319,7 +319,7 @@ def test_another_page_does_not_show_the_recording_of_this_one(
 ) -> None:
     (demo.log.parent / "recordings").mkdir(exist_ok=True)
     folder = demo.log.parent / "recordings"
-    (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in frames(60)))
+    (folder / "mine_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(60)))
     show(page, "recordings")
     view = page.locator("section[data-view='recordings']")
     view.locator("tr[data-key='mine']").get_by_label("Open").click()

@@ -1,5 +1,6 @@
-"""Recordings to the browser and from it, whatever is asked for or sent."""
+"""Recordings to the browser and from it, exports by other commands, and the catalogue."""
 
+import asyncio
 import os
 import tempfile
 from collections.abc import AsyncIterator
@@ -14,11 +15,27 @@ from fastapi import FastAPI
 from pymavlink.dialects.v20 import common as mavlink
 from starlette.types import Receive, Scope, Send
 
-from gateway.panel.access import ROLE
-from gateway.panel.recording_files import CHUNK, add_recording_files, zip_stream
-from gateway.panel.view_context import Role
+from gateway.batch.catalogue import Catalogue, CataloguedFile
+from gateway.batch.facts import FlightFacts
+from gateway.panel import recording_files
+from gateway.panel.access import ROLE, Role
+from gateway.panel.recording_files import (
+    CHUNK,
+    FORMATS,
+    MAX_WAITING,
+    ExportError,
+    RecordingFacts,
+    RecordingJobs,
+    add_recording_files,
+    zip_stream,
+)
+from gateway.recordings.index import RecordingError, list_recordings
+from gateway.recordings.tlog import encode_record
+from tests.panel.messages import flight_frames
 
 pytestmark = pytest.mark.io
+
+NAME = "a day's --flight"
 
 
 def flight() -> bytes:
@@ -142,3 +159,133 @@ def test_archive_is_packed_piece_by_piece_without_a_file_or_an_open_descriptor(
     assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == before
     with ZipFile(BytesIO(b"".join(zip_stream([large])))) as packed:
         assert packed.read("large_01.tlog") == large.read_bytes()
+
+
+def catalogue(folder: Path, **seconds: float) -> None:
+    catalogue = Catalogue(folder)
+    for name, duration in seconds.items():
+        for kind in ("tlog", "table"):
+            facts = FlightFacts(duration=duration, loss=0.1 if kind == "table" else None)
+            path = f"{name}.{kind}"
+            catalogue.put([CataloguedFile(path, name, kind, 1, 1, path, flights=((facts, []),))])
+    catalogue.close()
+
+
+def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> None:
+    catalogue(tmp_path, Morning=400.0, evening=100.0)
+    facts = RecordingFacts()
+    facts.look(tmp_path, "morn")
+    assert [facts.shows(name, "morn") for name in ("Morning", "evening")] == [True, False]
+    row = facts.of("Morning")
+    assert row is not None
+    # The table contains more facts than the tlog next to it.
+    assert (row["kind"], row["duration"], row["loss"]) == ("table", 400.0, 0.1)
+    facts.look(tmp_path, "duration < 300")
+    assert [facts.shows(name, "duration < 300") for name in ("Morning", "evening")] == [False, True]
+
+
+def test_a_wrong_condition_is_reported_and_shows_nothing(tmp_path: Path) -> None:
+    catalogue(tmp_path, a=1.0)
+    facts = RecordingFacts()
+    facts.look(tmp_path, "height > 3")
+    assert "no such column: height" in facts.trouble
+    assert not facts.shows("a", "height > 3")
+    facts.look(tmp_path, "")
+    assert (facts.trouble, facts.shows("a", "")) == ("", True)
+
+
+def test_without_a_catalogue_names_are_searched_all_the_same(tmp_path: Path) -> None:
+    facts = RecordingFacts()
+    facts.look(tmp_path, "x")
+    assert facts.of("x1") is None
+    assert facts.shows("x1", "x")
+    assert "once the recordings are indexed" in facts.trouble
+    catalogue(tmp_path, x1=5.0)
+    facts.look(tmp_path, "x")
+    assert facts.trouble == ""
+    assert facts.of("x1") is not None
+
+
+@pytest.fixture
+def exported(tmp_path: Path) -> Path:
+    path = tmp_path / 'with "quotes"'
+    path.mkdir()
+    (path / f"{NAME}_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(40)))
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
+async def test_export_is_made_and_fetched_under_an_address_of_its_own(
+    exported: Path, kind: str, begin: bytes
+) -> None:
+    jobs, app = RecordingJobs(), FastAPI()
+    jobs.serve(app)
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+        url = await jobs.export(exported, NAME, kind)
+        answer = await client.get(url)
+        assert answer.content.startswith(begin)
+        assert FORMATS[kind][2] in answer.headers["content-disposition"]
+        assert (await client.get("/exports/guessed")).status_code == 404
+        jobs.close()
+        assert (await client.get(url)).status_code == 404
+
+
+@pytest.mark.slow
+async def test_failed_export_says_why_and_leaves_no_file(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (exported / "broken_01.tlog").write_bytes(b"no recording at all\n" * 10)
+    jobs = RecordingJobs()
+    with pytest.raises(ExportError, match="broken_01"):
+        await jobs.export(exported, "broken", "kml")
+    with pytest.raises(RecordingError):
+        await jobs.export(exported, "../../etc/passwd", "kml")
+    monkeypatch.setattr(recording_files, "EXPORT_S", 0.05)
+    with pytest.raises(ExportError, match=r"not finished after .* another format"):
+        await jobs.export(exported, NAME, "report")
+    cancelled = asyncio.create_task(jobs.export(exported, NAME, "page"))
+    # Its command runs as soon as its folder holds the settings.
+    async with asyncio.timeout(60.0):
+        while not list(tmp_path.glob("mavgate-export-*/*/settings.toml")):
+            await asyncio.sleep(0)
+    cancelled.cancel()
+    await asyncio.wait([cancelled])
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    jobs.close()
+    assert list(tmp_path.glob("mavgate-export-*")) == []
+
+
+async def test_number_of_waiting_exports_is_limited(exported: Path) -> None:
+    jobs = RecordingJobs()
+    async with asyncio.timeout(60.0), jobs._exporting:
+        waiting = [
+            asyncio.create_task(jobs.export(exported, NAME, "kml")) for _ in range(MAX_WAITING)
+        ]
+        await asyncio.sleep(0)
+        with pytest.raises(ExportError, match="other exports"):
+            await jobs.export(exported, NAME, "kml")
+        for task in waiting:
+            task.cancel()
+        await asyncio.wait(waiting)
+    jobs.close()
+
+
+@pytest.mark.slow
+async def test_catalogue_and_tracks_fill_themselves(exported: Path) -> None:
+    jobs, facts = RecordingJobs(), RecordingFacts()
+    jobs.index(exported, list_recordings(exported))
+    assert jobs._indexing is not None
+    await jobs._indexing
+    facts.look(exported)
+    row = facts.of(NAME)
+    assert row is not None
+    assert row["duration"] == pytest.approx(39.9, abs=0.5)
+    corners = [tuple(map(float, corner.split(","))) for corner in facts.track(NAME).split()]
+    assert len(corners) > 5
+    assert all(0 <= x <= 46 and 0 <= y <= 24 for x, y in corners)
+    jobs.index(exported, list_recordings(exported))
+    assert not jobs.is_indexing
+    jobs.close()

@@ -22,7 +22,6 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.panel.access import COOKIE, AccessControl, Logins, hash_password
-from gateway.panel.gateway_client import ControlClient
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.rest_api import (
     MAX_WAITING_BYTES,
@@ -32,7 +31,7 @@ from gateway.panel.rest_api import (
     names_matching,
 )
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.uplink import Uplink
+from gateway.panel.uplink import ControlClient, Uplink
 from gateway.records import Incoming, Outgoing
 from gateway.wire.mavlink_json import template
 

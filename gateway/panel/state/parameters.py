@@ -148,7 +148,7 @@ MAX_PLAIN: Final = 16_000_000
 """Limit of an unpacked metadata file, against decompression bombs."""
 
 
-class Choice(msgspec.Struct, frozen=True):
+class ParameterChoice(msgspec.Struct, frozen=True):
     """One value of a parameter, and what it means."""
 
     value: float
@@ -173,7 +173,7 @@ class ParameterMeta(msgspec.Struct, frozen=True, kw_only=True, rename=RENAMED):
     default: float = NAN
     low: float = NAN
     high: float = NAN
-    choices: tuple[Choice, ...] = ()
+    choices: tuple[ParameterChoice, ...] = ()
     """The only values; any number if there are none."""
 
 

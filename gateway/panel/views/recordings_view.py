@@ -15,7 +15,7 @@ from nicegui.events import GenericEventArguments
 from gateway.batch.catalogue import Row
 from gateway.panel.access import RECORDINGS
 from gateway.panel.playback import SPEEDS, Playback, Profile
-from gateway.panel.recording_jobs import FORMATS, RecordingFacts
+from gateway.panel.recording_files import FORMATS, RecordingFacts
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import (
     Cells,
