@@ -16,7 +16,6 @@ from gateway.cli.support.options import (
     read_options,
     read_settings,
 )
-from gateway.cli.support.recording_options import recordings_folder
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,
@@ -131,7 +130,8 @@ def delete(
 @group.command("list")
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
-    folder = recordings_folder(config)
+    is_asked = config is None and is_running()
+    folder = Path(ask("record.status")["folder"]) if is_asked else _folder(config)
     found = list_recordings(folder)
     if json:
         figures = _figures(found) if found else {}
