@@ -26,7 +26,7 @@ from gateway.records import (
 from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.requests import CalibrationKind, CalibrationMeasured, SettingsChange
+from gateway.vehicle.requests import CalibrationMeasured, SettingsChange
 
 ESTIMATORS = ("paper", "eskf")
 IMU, GPS = NodeId(1, 0), NodeId(1, 1)
@@ -188,7 +188,7 @@ def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> No
         for n, value in enumerate(ends(field), 1):
             section = path.partition(".")[0]
             wanted = getattr(with_value(plain, path, field, value), section)
-            aircraft.perform([SettingsChange(1, section, wanted, path)], 0)
+            aircraft.perform([SettingsChange(section, wanted)], 0)
             assert all_known(fly(aircraft, 1_000_000 + 5_000_000 * n, 14)), (path, value)
 
 
@@ -209,7 +209,7 @@ def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after:
     aircraft = Aircraft(1, with_estimator(before))
     fly(aircraft)
     wanted = with_estimator(after).estimation
-    aircraft.perform([SettingsChange(1, "estimation", wanted, "estimator")], 0)
+    aircraft.perform([SettingsChange("estimation", wanted)], 0)
     assert aircraft.settings.estimation == wanted
     assert all_known(fly(aircraft, 6_000_000)[5:])
 
@@ -219,7 +219,7 @@ def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
     aircraft = Aircraft(1, with_estimator(name))
     before = fly(aircraft)[-1]
     wanted = replaced(with_estimator(name), "estimation.reference.gps_latency_s", 0.3).estimation
-    aircraft.perform([SettingsChange(1, "estimation", wanted, "")], 0)
+    aircraft.perform([SettingsChange("estimation", wanted)], 0)
     after = fly(aircraft, 3_700_000, 2)[0]
     assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
 
@@ -235,9 +235,7 @@ def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
     monkeypatch.setattr("gateway.aircraft.make_estimator", fail)
     before = aircraft.settings
     with pytest.raises(ArithmeticError):
-        aircraft.perform(
-            [SettingsChange(1, "estimation", with_estimator("paper").estimation, "")], 0
-        )
+        aircraft.perform([SettingsChange("estimation", with_estimator("paper").estimation)], 0)
     assert aircraft.settings == before
 
 
@@ -260,12 +258,8 @@ def test_a_calibration_that_cannot_be_is_refused(key: str, value: Any, words: st
 def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
     aircraft = Aircraft(1, AircraftSettings())
     fly(aircraft)
-    measured = CalibrationMeasured(
-        1,
-        CalibrationKind.MAG,
-        msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0)),
-    )
-    actions = aircraft.perform([measured], 0)
+    correction = msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0))
+    actions = aircraft.perform([CalibrationMeasured(correction)], 0)
     assert b"Calibration refused" in actions[0].frame
     assert all(isinstance(action, Outgoing) for action in actions)
     assert aircraft.settings.calibration == NodeCalibration()

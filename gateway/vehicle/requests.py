@@ -24,7 +24,6 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, ClassVar, Final
 
 import msgspec
@@ -78,13 +77,9 @@ class StatusText:
 class SettingsChange:
     """A section of this vehicle's settings has a new, already checked value: apply it live."""
 
-    vehicle_id: int
     section: str
     """Key of the section, as it was given to the vehicle."""
     settings: Settings
-    """The whole section with the change in it."""
-    path: str
-    """What changed, as dotted keys below the section; empty if all of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,21 +106,10 @@ class RecordingRequest:
     start: bool
 
 
-class CalibrationKind(StrEnum):
-    """The sensor error that was measured."""
-
-    GYRO = "gyro"
-    ACCEL = "accel"
-    LEVEL = "level"
-    MAG = "mag"
-
-
 @dataclass(frozen=True, slots=True)
 class CalibrationMeasured:
     """A calibration of the calibrated samples, which the aircraft's own is then joined with."""
 
-    vehicle_id: int
-    kind: CalibrationKind
     correction: NodeCalibration
     """In body axes; see `gateway.sensing.calibrating.corrected_by`."""
 

@@ -138,9 +138,7 @@ class Vehicle:
         )
         self._metadata = Metadata(self._parameters.table)
         self._ftp = FtpService({**self._metadata.files, PACKED_PATH: self._parameters.packed})
-        self._calibrator = Calibrator(
-            self.system_id, lambda: self.in_flight, lambda: self.telemetry.state
-        )
+        self._calibrator = Calibrator(lambda: self.in_flight, lambda: self.telemetry.state)
         self._recording = RecordingService(self._explain)
         self._control = OperatorControl(
             self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"

@@ -150,9 +150,9 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
     pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
     text, states = encode_head(header_for(settings, 1)), []
     changes = {
-        400: SettingsChange(1, "estimation", make_settings("eskf").estimation, ""),
-        800: SettingsChange(1, "calibration", NodeCalibration(), ""),
-        1200: SettingsChange(1, "vehicle", VehicleSettings(), ""),
+        400: SettingsChange("estimation", make_settings("eskf").estimation),
+        800: SettingsChange("calibration", NodeCalibration()),
+        1200: SettingsChange("vehicle", VehicleSettings()),
     }
     records = make_flight(rng, 30)
     for number, record in enumerate(records):

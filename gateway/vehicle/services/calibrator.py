@@ -44,7 +44,6 @@ from gateway.units import US_PER_S
 from gateway.vehicle.requests import (
     INFO,
     Answer,
-    CalibrationKind,
     CalibrationMeasured,
     Reply,
     Service,
@@ -80,19 +79,19 @@ SIDES: Final = ("back", "front", "left", "right", "up", "down")
 
 Method = Callable[[NodeSamples, NodeCalibration], NodeCalibration]
 
-METHODS: Final[dict[tuple[int, int, int], tuple[CalibrationKind, Method | None]]] = {
-    (1, 0, 0): (CalibrationKind.GYRO, calibrate_gyro),
-    (0, 0, 2): (CalibrationKind.LEVEL, calibrate_level),
-    (0, 0, 4): (CalibrationKind.ACCEL, calibrate_accelerometer_level),
-    (0, 0, 1): (CalibrationKind.ACCEL, None),
-    (0, 1, 0): (CalibrationKind.MAG, None),
+METHODS: Final[dict[tuple[int, int, int], tuple[str, Method | None]]] = {
+    (1, 0, 0): ("gyro", calibrate_gyro),
+    (0, 0, 2): ("level", calibrate_level),
+    (0, 0, 4): ("accel", calibrate_accelerometer_level),
+    (0, 0, 1): ("accel", None),
+    (0, 1, 0): ("mag", None),
 }
 """By the parameters 1, 2 and 5 of PREFLIGHT_CALIBRATION; with its solver if one rest suffices."""
 
 
 @dataclass(slots=True)
 class _Run:
-    kind: CalibrationKind
+    kind: str
     at_rest: Method | None
     asked: tuple[float, ...]
     """The parameters that request it."""
@@ -108,12 +107,12 @@ class _Run:
     @property
     def is_turned(self) -> bool:
         """Whether the operator turns it about all axes."""
-        return self.kind is CalibrationKind.MAG and self.at_rest is None
+        return self.kind == "mag" and self.at_rest is None
 
     @property
     def has_sides(self) -> bool:
         """Whether the operator rests it on six sides."""
-        return self.kind is CalibrationKind.ACCEL and self.at_rest is None
+        return self.kind == "accel" and self.at_rest is None
 
     @property
     def deadline_us(self) -> int:
@@ -149,11 +148,9 @@ class Calibrator(Service):
 
     def __init__(
         self,
-        vehicle_id: int,
         in_flight: Callable[[], bool],
         state: Callable[[], NavState | None] = lambda: None,
     ) -> None:
-        self._vehicle_id = vehicle_id
         self._in_flight = in_flight
         self._state = state
         self._run: _Run | None = None
@@ -183,7 +180,7 @@ class Calibrator(Service):
             there, yaw_rad = self._field_at(command), math.radians(yaw_deg)
             return calibrate_magnetometer_by_yaw(samples, calibration, yaw_rad, there)
 
-        return self._begin(_Run(CalibrationKind.MAG, solve, (yaw_deg,), command, now_us))
+        return self._begin(_Run("mag", solve, (yaw_deg,), command, now_us))
 
     def _begin(self, run: _Run) -> Outcome:
         if self._in_flight():
@@ -269,7 +266,7 @@ class Calibrator(Service):
 
     def _done(self, run: _Run, correction: NodeCalibration) -> list[Answer]:
         self._run = None
-        measured = CalibrationMeasured(self._vehicle_id, run.kind, correction)
+        measured = CalibrationMeasured(correction)
         return [measured, run.command.ack(ACCEPTED), *_text(f"calibration done: {run.kind}")]
 
     def _fail(self, why: str) -> list[Answer]:

@@ -194,7 +194,7 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         for key in [key for key in self.table.sections if key not in self._own]:
             if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
                 fresh = self.table.reset(key)
-                answers.append(SettingsChange(self._vehicle_id, key, fresh, ""))
+                answers.append(SettingsChange(key, fresh))
         return ACCEPTED, answers + self._changed_since(before)
 
     def values(self) -> list[Any]:
@@ -233,15 +233,14 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         parameter = self.table.parameters.get(message.param_id)
         if parameter is None:
             return [_error(request, UNKNOWN)]
-        section, path = parameter.section, ".".join(parameter.path)
+        section = parameter.section
         number = decode_value(message.param_value, message.param_type)
         before = self.table.sections[section]
         try:
             settings = self.table.change(parameter, number)
-            own = self._own.get(section)
-            answers: list[Answer] = [SettingsChange(self._vehicle_id, section, settings, path)]
-            if own is not None:
-                answers = own.change(settings, path, now_us)
+            answers: list[Answer] = [SettingsChange(section, settings)]
+            if (own := self._own.get(section)) is not None:
+                answers = own.change(settings, parameter.path[0], now_us)
         except ValueError:
             self.table.sections[section] = before
             return self._reject(request, BAD_VALUE)

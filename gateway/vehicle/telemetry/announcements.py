@@ -148,12 +148,12 @@ RESTART_REPORTS: Final = 10
 MANY_RESTARTS: Final = 3
 
 
-class Announcements:
+class Announcements(Announcer):
     """The announcements of one aircraft."""
 
     def __init__(self, health: Health) -> None:
+        super().__init__()
         self._health = health
-        self._announcer = Announcer()
         self._flags = NavFlags(0)
         self._uncalibrated = 0
         self._restarts: dict[int, deque[int]] = {}
@@ -198,7 +198,7 @@ class Announcements:
     def on_fix(self, now_us: int) -> list[Any]:
         """Announce whether GPS fixes arrive."""
         finding = GPS_FIX if self._health.has_fix(now_us) else GPS_LOST
-        return self._announcer.track(finding, now_us)
+        return self.track(finding, now_us)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
         """Announce once that the estimated latency of fixes differs from the setting.
@@ -211,11 +211,11 @@ class Announcements:
             return []
         text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
         finding = Finding("latency", f"{set_s} s is wrong", StatusText(NOTICE, text))
-        return self._announcer.track(finding, now_us)
+        return self.track(finding, now_us)
 
     def on_findings(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
         """Announce changes of state."""
-        return [m for finding in findings for m in self._announcer.track(finding, now_us)]
+        return [m for finding in findings for m in self.track(finding, now_us)]
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
         """Announce that the receiver or a node was lost or is back."""
@@ -232,17 +232,9 @@ class Announcements:
             findings.append(Finding(f"node {node}", is_silent, text))
         return self.on_findings(findings, now_us) + self._on_restarts(now_us)
 
-    def say(self, text: StatusText, now_us: int) -> list[Any]:
-        """Announce a single event."""
-        return self._announcer.say(text, now_us)
-
     def poll(self, now_us: int) -> list[Any]:
         """Announce what changed while its topic was held."""
-        return self.on_fix(now_us) + self._announcer.poll(now_us)
-
-    def next_due_us(self) -> int | None:
-        """Return when `poll` has something to send."""
-        return self._announcer.next_due_us()
+        return self.on_fix(now_us) + super().poll(now_us)
 
     def _on_restarts(self, now_us: int) -> list[Any]:
         """Announce restarts one by one; many at once only as a state: no board starts so fast."""
@@ -254,7 +246,7 @@ class Announcements:
             name = self._health.node_name(node)
             often = f"{name} keeps restarting, or two nodes share id {node}"
             text = status_text(is_often, often, f"{name} no longer restarts", CRITICAL)
-            found += self._announcer.track(Finding(f"restarts {node}", is_often, text), now_us)
+            found += self.track(Finding(f"restarts {node}", is_often, text), now_us)
             if is_new and not is_often:
                 found += self.say(StatusText(WARNING, f"{name} restarted"), now_us)
         return found
