@@ -276,10 +276,9 @@ def decode_plan(text: str) -> StoredPlan:
     """
     try:
         plan = msgspec.convert(json.loads(text), StoredPlan)
-    except (msgspec.ValidationError, RecursionError) as error:
+    except RecursionError as error:
         raise ValueError(str(error)) from error
-    fault = next(_faults(plan), None)
-    if fault is not None:
+    for fault in _faults(plan):
         raise ValueError(fault)
     return plan
 

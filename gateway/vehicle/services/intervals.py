@@ -30,7 +30,7 @@ NONE: Final = -1
 
 HEARTBEAT: Final = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 
-DATA_STREAMS: Final[dict[int, tuple[int, ...]]] = {
+_GROUPS: Final[dict[int, tuple[int, ...]]] = {
     mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
         mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
         mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
@@ -47,9 +47,8 @@ DATA_STREAMS: Final[dict[int, tuple[int, ...]]] = {
     ),
     mavlink.MAV_DATA_STREAM_EXTRA2: (mavlink.MAVLINK_MSG_ID_VFR_HUD,),
 }
+DATA_STREAMS: Final = _GROUPS | {mavlink.MAV_DATA_STREAM_ALL: tuple(sum(_GROUPS.values(), ()))}
 """REQUEST_DATA_STREAM's groups, as autopilots fill them."""
-
-ALL_GROUPS: Final = tuple(message for group in DATA_STREAMS.values() for message in group)
 
 
 class IntervalService(Service):
@@ -70,8 +69,7 @@ class IntervalService(Service):
         flood the client.
         """
         message = request.message
-        group = ALL_GROUPS if message.req_stream_id == 0 else ()
-        ids = DATA_STREAMS.get(message.req_stream_id, group)
+        ids = DATA_STREAMS.get(message.req_stream_id, ())
         wanted_us = NONE
         if message.start_stop and message.req_message_rate:
             wanted_us = 1_000_000 // message.req_message_rate
