@@ -10,6 +10,8 @@ import typer
 from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
 from gateway.cli.app import RECORDINGS
 from gateway.cli.support.batch_work import (
+    HoldOutOption,
+    IntervalOption,
     JobsOption,
     SchedulerOption,
     SeasonFiles,
@@ -134,12 +136,8 @@ def sweep(
     ],
     output: OutputOption,
     metric: Annotated[Metric, typer.Option(help="What judges, as for `mavgate sweep`.")] = "held",
-    hold_out: Annotated[
-        int, typer.Option(help="Withhold every so many-th fix; 0 for none.", min=0)
-    ] = 5,
-    gps_interval: Annotated[
-        float, typer.Option(help="Fuse one fix in so many seconds; 0 for all.", min=0.0)
-    ] = 0.0,
+    hold_out: HoldOutOption = 5,
+    gps_interval: IntervalOption = 0.0,
     columns: ColumnsOption = None,
     settings: SettingsOption = "recorded",
     jobs: JobsOption = None,

@@ -11,6 +11,7 @@ from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
 from gateway.cli.app import RECORDINGS
+from gateway.cli.support.batch_work import JobsOption
 from gateway.cli.support.options import (
     ConfigOption,
     folder_of,
@@ -79,7 +80,7 @@ def index(
     ] = None,
     *,
     columns: ColumnsOption = None,
-    jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
+    jobs: JobsOption = None,
     config: ConfigOption = None,
 ) -> None:
     """Bring the catalogue of a folder up to date; the word `index` may be left out."""

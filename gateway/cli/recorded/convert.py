@@ -21,6 +21,7 @@ from gateway.cli.support.recording_options import (
     SensorOption,
     SettingsOption,
     SmoothOption,
+    SystemOption,
     ToOption,
     files_of,
     print_remarks,
@@ -34,7 +35,6 @@ from gateway.estimation.record import IntArray
 from gateway.estimation.select import DEPRECATED, ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
-from gateway.recordings.files import SettingsChoice
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
 from gateway.units import US_PER_S, counted
 
@@ -66,9 +66,7 @@ def convert(
     smooth: SmoothOption = False,
     settings: SettingsOption = "recorded",
     position: PositionOption = "causal",
-    system: Annotated[
-        int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
-    ] = None,
+    system: SystemOption = None,
     message: Annotated[
         str | None,
         typer.Option("--message", help="For Parquet: this MAVLink message instead of the table."),
@@ -145,10 +143,7 @@ def fuse_log(
         float | None,
         typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
     ] = None,
-    settings: Annotated[
-        SettingsChoice,
-        typer.Option("--settings", help="For recordings: the recorded or the current settings."),
-    ] = "recorded",
+    settings: SettingsOption = "recorded",
     smooth: SmoothOption = False,
     config: ConfigOption = None,
     force: ForceOption = False,

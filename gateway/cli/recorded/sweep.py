@@ -9,8 +9,6 @@ import msgspec
 import numpy as np
 import pandas as pd
 import typer
-from rich import box
-from rich.table import Table
 
 from gateway.analysis import sweep as sweeping
 from gateway.analysis.sweep import (
@@ -32,11 +30,14 @@ from gateway.analysis.sweep import (
 from gateway.batch.statistics import Choice, FloatArray, choose, group_of
 from gateway.batch.storage import is_url
 from gateway.batch.tasks import FlightResult, SweepTask
-from gateway.cli.support.batch_work import SeasonWork, season_options
-from gateway.cli.support.options import (
-    ConfigOption,
-    read_settings,
+from gateway.cli.support.batch_work import (
+    HoldOutOption,
+    IntervalOption,
+    JobsOption,
+    SeasonWork,
+    season_options,
 )
+from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -88,14 +89,9 @@ def sweep(
             "or against the reference's position or attitude."
         ),
     ] = "held",
-    hold_out: Annotated[int, typer.Option(help="Withhold every n-th fix; 0 for none.", min=0)] = 5,
-    gps_interval: Annotated[
-        float,
-        typer.Option(
-            help="Fuse one fix in this many seconds, and withhold all others; 0 for all.", min=0.0
-        ),
-    ] = 0.0,
-    jobs: Annotated[int | None, typer.Option(help="Processes.", min=1)] = None,
+    hold_out: HoldOutOption = 5,
+    gps_interval: IntervalOption = 0.0,
+    jobs: JobsOption = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", help="Settings file for the best.")
     ] = Path("best.toml"),
@@ -183,8 +179,8 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
             trials = _try_all(grid(axes), run)
     results = sweeping.tabulate(contest.keys, trials, options.metric)
     _show(results, contest, options.metric)
-    best = sweeping.best_of(trials, options.metric)
-    _write(options, _merged(loading.settings, contest, best), results, path)
+    best = with_values(contest.fusion, contest.keys, sweeping.best_of(trials, options.metric))
+    _write(options, loading.settings, best, results, path)
 
 
 def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
@@ -195,10 +191,15 @@ def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
 
 
 def _write(
-    options: SweepOptions, best: GatewaySettings, table: pd.DataFrame, path: Path | None = None
+    options: SweepOptions,
+    settings: GatewaySettings,
+    best: FusionSettings,
+    table: pd.DataFrame,
+    path: Path | None = None,
 ) -> None:
-    """Write the best settings, and the table if it is wanted."""
-    write_new(options.output, [render(best).encode()], overwrite=options.overwrite, inputs=[path])
+    """Write the settings with the best values, and the table if it is wanted."""
+    merged = render(msgspec.structs.replace(settings, estimation=best.estimation))
+    write_new(options.output, [merged.encode()], overwrite=options.overwrite, inputs=[path])
     print(options.output)
     if options.table is not None:
         rows = table.to_csv(index=False).encode()
@@ -271,18 +272,10 @@ def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
     title = (
         f"Best of {counted(len(results), 'trial')}, by the {HEADINGS[judged].rpartition(',')[0]}"
     )
-    shown = Table(box=box.SIMPLE_HEAD, title=title)
-    for name in names:
-        shown.add_column(HEADINGS.get(name, name.rsplit(".", 1)[-1]), justify="right")
+    shown = table_of(*(HEADINGS.get(name, name.rsplit(".", 1)[-1]) for name in names), left=0)
     for row in results[names].head(SHOWN).itertuples(index=False):
         shown.add_row(*map(_cell, row))
-    console_of().print(shown)
-
-
-def _merged(settings: GatewaySettings, contest: Contest, best: Values) -> GatewaySettings:
-    """Put the best values into the whole settings."""
-    fusion: FusionSettings = with_values(contest.fusion, contest.keys, best)
-    return msgspec.structs.replace(settings, estimation=fusion.estimation)
+    console_of().print(title, shown, sep="\n")
 
 
 def run_season_sweep(
@@ -311,25 +304,29 @@ def run_season_sweep(
     base, choice = _chosen(swept)
     _show_choice(axes, points, choice, column, len(swept))
     best = with_values(fusion, keys, points[choice.winner])
-    merged = msgspec.structs.replace(settings, estimation=best.estimation)
-    _write(options, merged, _table_of(swept, base, choice))
+    table = pd.DataFrame(
+        {
+            "recording": [result.place for result in swept],
+            "aircraft": [result.vehicle for result in swept],
+            "began": [result.began for result in swept],
+            "as it came": base,
+            "as others chose": choice.judged,
+        }
+    )
+    _write(options, settings, best, table)
     return results
 
 
 def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
     """Return the errors with the settings that the flights came with, and what is best."""
-    errors = np.array([_numbers(result.figures["scores"]) for result in swept])
-    base = np.array(_numbers([result.figures["base"] for result in swept]))
+    # An unknown score is null in JSON.
+    errors = np.array([result.figures["scores"] for result in swept], float)
+    base = np.array([result.figures["base"] for result in swept], float)
     groups = [group_of(result) for result in swept]
     try:
         return base, choose(errors, base, groups)
     except ValueError as error:
         refuse(f"{error}; choose another --metric")
-
-
-def _numbers(values: Sequence[float | None]) -> list[float]:
-    """Read scores back: what is not known is null in JSON."""
-    return [float("nan") if value is None else value for value in values]
 
 
 def _show_choice(
@@ -357,15 +354,3 @@ def _show_choice(
             f"the winner against the second, on the flights that chose both: "
             f"{choice.over_second.text}",
         )
-
-
-def _table_of(swept: Sequence[FlightResult], base: FloatArray, choice: Choice) -> pd.DataFrame:
-    return pd.DataFrame(
-        {
-            "recording": [result.place for result in swept],
-            "aircraft": [result.vehicle for result in swept],
-            "began": [result.began for result in swept],
-            "as it came": base,
-            "as others chose": choice.judged,
-        }
-    )

@@ -46,6 +46,18 @@ SeasonFiles = Annotated[
     ),
 ]
 
+HoldOutOption = Annotated[
+    int, typer.Option("--hold-out", help="Withhold every n-th fix; 0 for none.", min=0)
+]
+IntervalOption = Annotated[
+    float,
+    typer.Option(
+        "--gps-interval",
+        help="Fuse one fix in this many seconds, and withhold all others; 0 for all.",
+        min=0.0,
+    ),
+]
+
 SHOWN_FAILURES: Final = 12
 """Failures that are listed one by one."""
 
