@@ -38,7 +38,7 @@ from gateway.recordings.files import (
     first_bytes,
     format_of,
     open_recording,
-    read_batches,
+    open_tlog,
     read_blocks,
 )
 from gateway.recordings.index import as_text, recording_name
@@ -496,7 +496,7 @@ def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
     kind = format_of(path)
     if kind == TLOG:
         tlog = TlogTally()
-        for batch in read_batches(path):
+        for batch in open_tlog(path).batches():
             tlog.add(batch)
         return tlog.flown()
     tally = TableTally()

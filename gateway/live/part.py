@@ -31,10 +31,7 @@ from gateway.recordings.table import (
     TableHeader,
     TableMark,
     encode_head,
-    encode_header,
-    encode_mark,
-    encode_node,
-    encode_state,
+    encode_line,
 )
 from gateway.recordings.tlog import Stamper, TlogScanner, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
@@ -104,7 +101,7 @@ class Part:
         if isinstance(record, NodeStatus):
             # It begins no table: the first row must come first.
             if self._tables[vehicle_id].begun:
-                self.add(table_ending(vehicle_id), encode_node(record).encode())
+                self.add(table_ending(vehicle_id), encode_line(record).encode())
             return
         self._write(self._tables[vehicle_id], self._tables[vehicle_id].rows.add(record))
 
@@ -113,13 +110,13 @@ class Part:
         table = self._tables[header.vehicle_id]
         self._begin(table)
         self._write(table, table.rows.flush())
-        self.add(table_ending(header.vehicle_id), encode_header(header).encode())
+        self.add(table_ending(header.vehicle_id), encode_line(header).encode())
 
     def add_mark(self, mark: TableMark) -> None:
         """Add a remark to every table that has begun."""
         for vehicle_id, table in self._tables.items():
             if table.begun:
-                self.add(table_ending(vehicle_id), encode_mark(mark).encode())
+                self.add(table_ending(vehicle_id), encode_line(mark).encode())
 
     def flush_rows(self) -> None:
         """Buffer also the records that still wait for an IMU sample to share its row."""
@@ -131,7 +128,7 @@ class Part:
             table.begun = True
             # The name may have changed since the table was prepared.
             header = msgspec.structs.replace(table.header, session=self.session)
-            begun = "" if table.state is None else encode_state(table.state)
+            begun = "" if table.state is None else encode_line(table.state)
             self.add(table_ending(header.vehicle_id), (encode_head(header) + begun).encode())
 
     def _write(self, table: _Table, rows: list[TableRow]) -> None:
@@ -417,4 +414,4 @@ def _shifted_line(line: bytes, shift_us: int) -> bytes:
     except msgspec.DecodeError:
         return line
     zero_us = (header.unix_us_at_zero or 0) + shift_us
-    return encode_header(msgspec.structs.replace(header, unix_us_at_zero=zero_us)).encode()
+    return encode_line(msgspec.structs.replace(header, unix_us_at_zero=zero_us)).encode()

@@ -340,19 +340,23 @@ BoolArray = NDArray[np.bool_]
 IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in COLUMNS])
 _WHOLE: Final = np.flatnonzero(IS_WHOLE)
 _AT: Final = {name: place for place, name in enumerate(COLUMNS)}
-_NEEDED: Final = {
-    span_of(*group.columns).start: [COLUMNS.index(name) for name in group.needed]
-    for group in (RAW_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
-}
-"""By a group's first column, without which it is not there."""
+_NEEDED: Final = [
+    (0, [0]),
+    (RAW.start, [_AT["node_id"], _AT["node_time_us"]]),
+    *(
+        (_AT[group.columns[0]], [_AT[name] for name in group.needed])
+        for group in (RAW_CODEC, BARO_CODEC, GPS_CODEC, NAV_CODEC)
+    ),
+]
+"""A group's first column, and those without which it is invalid; each row needs its time."""
 TIMES: Final = [
     k for k, name in enumerate(COLUMNS) if name.endswith("time_us") and "node" not in name
 ]
 """Times on the gateway's clock."""
 _HEAD: Final = slice(1, len(HEAD_COLUMNS))
 NODE_ID, NODE_TIME, FLAGS = (_AT[n] for n in ("node_id", "node_time_us", "imu_flags"))
-_FIX_TYPE, FIX_OK = _AT["gps_fix_type"], _AT["gps_fix_ok"]
-FIX_LAT, FIX_LON = _AT["gps_lat_dege7"], _AT["gps_lon_dege7"]
+FIX_TYPE, FIX_OK = _AT["gps_fix_type"], _AT["gps_fix_ok"]
+FIX_LAT, FIX_LON, FIX_ALT = (_AT[f"gps_{n}"] for n in ("lat_dege7", "lon_dege7", "alt_amsl_m"))
 NAV_LAT, NAV_LON, NAV_FLAGS = _AT["nav_lat_deg"], _AT["nav_lon_deg"], _AT["nav_flags"]
 
 _OF_NUMBERS: Final = b"0123456789.,-+eE\n"
@@ -420,32 +424,25 @@ def settle(cells: FloatArray) -> dict[int, str]:
         cells[rows & np.isnan(cells[:, column]), column] = 0.0
     has_gps = has_group(cells, GPS)
     cells[has_gps, FIX_OK] = cells[has_gps, FIX_OK] == 1.0
-    return {row: _fault(cells[row]) for row in np.flatnonzero(_is_bad(cells)).tolist()}
+    return _faults(cells)
 
 
-def _is_bad(cells: FloatArray) -> BoolArray:
-    whole = cells[:, _WHOLE]
-    empty = np.isnan(whole)
-    exact = (np.abs(whole) <= LARGEST_WHOLE) & (whole == np.trunc(whole))
-    bad = ~(empty | exact).all(axis=1) | np.isnan(cells[:, 0])
-    for first, needed in _NEEDED.items():
-        there = np.flatnonzero(~np.isnan(cells[:, first]))
-        bad[there] |= np.isnan(cells[there][:, needed]).any(axis=1)
-    bad |= has_group(cells, RAW) & np.isnan(cells[:, [NODE_ID, NODE_TIME]]).any(axis=1)
-    fix_types = cells[:, _FIX_TYPE]
-    return np.asarray(bad | (fix_types < 0) | (fix_types > max(GpsFixType)))
-
-
-def _fault(row: FloatArray) -> str:
-    """Return why a row is invalid."""
-    for k in _WHOLE.tolist():
-        if not np.isnan(row[k]) and not (abs(row[k]) <= LARGEST_WHOLE and row[k] == int(row[k])):
-            return f"{COLUMNS[k]}: {row[k]:.17g} is no whole number that can be"
-    for first, needed in [(0, [0]), (RAW.start, [NODE_ID, NODE_TIME]), *_NEEDED.items()]:
-        for k in needed:
-            if np.isnan(row[k]) and (first == 0 or not np.isnan(row[first])):
-                return f"{COLUMNS[k]} is empty"
-    return f"{COLUMNS[_FIX_TYPE]}: {row[_FIX_TYPE]:.0f} is no type of a fix"
+def _faults(cells: FloatArray) -> dict[int, str]:
+    """Return why rows are invalid, by their numbers."""
+    found: dict[int, str] = {}
+    whole, is_empty = cells[:, _WHOLE], np.isnan(cells)
+    is_sound = is_empty[:, _WHOLE] | ((np.abs(whole) <= LARGEST_WHOLE) & (whole == np.trunc(whole)))
+    for row, k in np.argwhere(~is_sound).tolist():
+        text = f"{COLUMNS[_WHOLE[k]]}: {whole[row, k]:.17g} is no whole number that can be"
+        found.setdefault(row, text)
+    for first, needed in _NEEDED:
+        is_there = ~is_empty[:, [first]] if first else True
+        for row, k in np.argwhere(is_empty[:, needed] & is_there).tolist():
+            found.setdefault(row, f"{COLUMNS[needed[k]]} is empty")
+    fix_types = cells[:, FIX_TYPE]
+    for row in np.flatnonzero((fix_types < 0) | (fix_types > max(GpsFixType))).tolist():
+        found.setdefault(row, f"{COLUMNS[FIX_TYPE]}: {fix_types[row]:.0f} is no type of a fix")
+    return found
 
 
 def write_lines(cells: FloatArray, is_whole: BoolArray = IS_WHOLE) -> bytes:

@@ -144,26 +144,15 @@ def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
     WRITERS[ending], LACKS[ending] = write, lacks
 
 
-def _write_tlog(flight: FlightToWrite) -> Iterator[bytes]:
-    return (encode_record(record.time_us, record.frame) for record in flight.frames())
-
-
 def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
     table = flight.table()
     yield encode_head(table.header).encode()
     yield from map(encode_block, table.blocks)
 
 
-def _write_kml(flight: FlightToWrite) -> Iterator[bytes]:
-    return (piece.encode() for piece in to_kml(flight.title, _vehicles(flight)))
-
-
-def _write_gpx(flight: FlightToWrite) -> Iterator[bytes]:
-    return (piece.encode() for piece in to_gpx(flight.title, _vehicles(flight)))
-
-
-def _write_geojson(flight: FlightToWrite) -> Iterator[bytes]:
-    return (piece.encode() for piece in to_geojson(flight.title, _vehicles(flight)))
+def _drawn(draw: Callable[[str, list[VehicleTrack]], Iterator[str]]) -> Write:
+    """Return a writer of tracks for a map."""
+    return lambda flight: (piece.encode() for piece in draw(flight.title, _vehicles(flight)))
 
 
 def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
@@ -199,11 +188,15 @@ NOT_DRAWN: Final = (
     "MAVLink messages, only positions, attitude and texts",
 )
 
-add_writer(".tlog", _write_tlog, Lacks(of_tables=NOT_FUSED))
+add_writer(
+    ".tlog",
+    lambda flight: (encode_record(record.time_us, record.frame) for record in flight.frames()),
+    Lacks(of_tables=NOT_FUSED),
+)
 add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))
-add_writer(".kml", _write_kml, Lacks(*NOT_DRAWN))
-add_writer(".gpx", _write_gpx, Lacks(*NOT_DRAWN))
-add_writer(".geojson", _write_geojson, Lacks(*NOT_DRAWN))
+add_writer(".kml", _drawn(to_kml), Lacks(*NOT_DRAWN))
+add_writer(".gpx", _drawn(to_gpx), Lacks(*NOT_DRAWN))
+add_writer(".geojson", _drawn(to_geojson), Lacks(*NOT_DRAWN))
 add_writer(".mcap", _packaged("mcap", "MCAP"), Lacks(of_tables=NOT_FUSED))
 add_writer(".parquet", _packaged("parquet", "Parquet"), Lacks(of_tlogs=NOT_IN_TABLE))
 

@@ -384,13 +384,6 @@ def file_layout(head: bytes) -> Layout:
     return max((Layout.TLOG, Layout.PADDED, Layout.BARE), key=lambda layout: gaps[int(layout)])
 
 
-def read_batches(
-    path: Path, progress: Progress | None = None, *, strict: bool = False
-) -> Iterator[Batch]:
-    """Read any recorded MAVLink batch by batch; see `TlogSource`."""
-    yield from open_tlog(path).batches(progress, strict=strict)
-
-
 def _open_bare(path: Path) -> TlogSource:
     clock, left_out = FrameClock(), 0
     for pieces in _frames(read_chunks(path)):

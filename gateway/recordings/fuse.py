@@ -32,6 +32,11 @@ from gateway.geometry.angle import wrap_180
 from gateway.recordings.columns import (
     BARO,
     BARO_CODEC,
+    FIX_ALT,
+    FIX_LAT,
+    FIX_LON,
+    FIX_OK,
+    FIX_TYPE,
     FLAGS,
     GPS,
     GPS_CODEC,
@@ -341,36 +346,32 @@ class Fusion:
         return found
 
 
-class InterpolatedPosition:
-    """The paper's playback: straight lines between fixes instead of the fused position."""
+def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
+    """Put straight lines between fixes in place of the fused position, as the paper's playback.
 
-    def __init__(self, fixes: Iterable[GpsFix], latency_s: float) -> None:
-        self._latency_us = round(latency_s * US_PER_S)
-        self._fixes = (
-            fix
-            for fix in fixes
-            if fix.fix_ok and fix.fix_type in (GpsFixType.FIX_3D, GpsFixType.FIX_2D)
-        )
-        self._before: GpsFix | None = None
-        self._after = next(self._fixes, None)
+    `fixes` are cells of `GPS`. States before the first fix and behind the last keep theirs.
+    """
+    types = fixes[:, FIX_TYPE - GPS.start]
+    is_2d_or_3d = (types == GpsFixType.FIX_2D) | (types == GpsFixType.FIX_3D)
+    fixes = fixes[is_2d_or_3d & (fixes[:, FIX_OK - GPS.start] == 1.0)]
+    fix_us = np.maximum.accumulate(fixes[:, 0])
+    lat, lon, alt = fixes[:, [FIX_LAT - GPS.start, FIX_LON - GPS.start, FIX_ALT - GPS.start]].T
 
-    def __call__(self, time_us: IntArray, states: FloatArray) -> FloatArray:
-        """Replace the positions by interpolated ones, except before and after the fixes."""
-        states = states.copy()
-        for state, at_us in zip(states, time_us.tolist(), strict=True):
-            arrival_us = at_us + self._latency_us
-            while self._after is not None and self._after.time_us < arrival_us:
-                self._before, self._after = self._after, next(self._fixes, None)
-            a, b = self._before or self._after, self._after
-            if a is None or b is None or arrival_us < a.time_us:
-                continue
-            way = (arrival_us - a.time_us) / max(b.time_us - a.time_us, 1)
-            # The shorter way, so that a flight over the date line does not go around the earth.
-            east_deg = wrap_180((b.lon_dege7 - a.lon_dege7) * DEG_PER_DEGE7)
-            state[NAV_LAT] = (a.lat_dege7 + way * (b.lat_dege7 - a.lat_dege7)) * DEG_PER_DEGE7
-            state[NAV_LON] = wrap_180(a.lon_dege7 * DEG_PER_DEGE7 + way * east_deg)
-            state[NAV_ALT] = a.alt_amsl_m + way * (b.alt_amsl_m - a.alt_amsl_m)
-        return states
+    def correct(time_us: IntArray, states: FloatArray) -> FloatArray:
+        arrival_us = time_us + round(latency_s * US_PER_S)
+        after = np.searchsorted(fix_us, arrival_us)
+        row = np.flatnonzero((after < len(fix_us)) & (arrival_us >= fix_us.min(initial=np.inf)))
+        b, a = after[row], np.maximum(after[row] - 1, 0)
+        share = (arrival_us[row] - fix_us[a]) / np.maximum(fix_us[b] - fix_us[a], 1)
+        # The shorter way, so that a flight over the date line does not go around the earth.
+        east_deg = wrap_180((lon[b] - lon[a]) * DEG_PER_DEGE7)
+        found = states.copy()
+        found[row, NAV_LAT] = (lat[a] + share * (lat[b] - lat[a])) * DEG_PER_DEGE7
+        found[row, NAV_LON] = wrap_180(lon[a] * DEG_PER_DEGE7 + share * east_deg)
+        found[row, NAV_ALT] = alt[a] + share * (alt[b] - alt[a])
+        return found
+
+    return correct
 
 
 def smoothed_states(smooth_us: IntArray, smoothed: FloatArray) -> Correct:

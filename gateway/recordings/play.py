@@ -232,9 +232,11 @@ class Player:
         self.state = PlayState.PLAYING
         self.sent = 0
         """Frames so far."""
-        self._speed = check_speed(speed)
+        self.speed = check_speed(speed)
+        """Factor to recorded time."""
         self._anchor = (now_us, self.begin_us)
-        self._last_us = self.begin_us
+        self.position_us = self.begin_us
+        """Recorded time of the newest frame that was played."""
         self._context = self._seek_tracks(self.begin_us)
 
     @property
@@ -243,20 +245,10 @@ class Player:
         last_us = max(t.last_us for t in self._tracks)
         return last_us if self._end_us is None else min(self._end_us, last_us)
 
-    @property
-    def speed(self) -> float:
-        """Factor to recorded time."""
-        return self._speed
-
-    @property
-    def position_us(self) -> int:
-        """Recorded time of the newest frame that was played."""
-        return self._last_us
-
     def set_speed(self, speed: float, now_us: int) -> None:
         """Change the speed from here on; raises ValueError like `check_speed`."""
         here_us = self._time_at(now_us)
-        self._speed = check_speed(speed)
+        self.speed = check_speed(speed)
         self._anchor = (now_us, here_us)
 
     def pause(self, now_us: int) -> None:
@@ -282,7 +274,7 @@ class Player:
             if track is None:
                 break
             frames.append(self._take(track))
-        self._anchor = (now_us, self._last_us)
+        self._anchor = (now_us, self.position_us)
         return frames
 
     def prepare(self, time_us: int) -> bool:
@@ -294,7 +286,7 @@ class Player:
         time_us = min(max(time_us, self.begin_us), self.end_us)
         self._context = self._seek_tracks(time_us)
         self._anchor = (now_us, time_us)
-        self._last_us = time_us
+        self.position_us = time_us
         if self.state is PlayState.ENDED:
             self.state = PlayState.PLAYING
 
@@ -339,7 +331,7 @@ class Player:
         return found
 
     def _take(self, track: Track) -> bytes:
-        self._last_us = track.peek_us() or self._last_us
+        self.position_us = track.peek_us() or self.position_us
         self.sent += 1
         return track.take()
 
@@ -354,27 +346,27 @@ class Player:
         anchor_now_us, anchor_time_us = self._anchor
         if self.state is not PlayState.PLAYING:
             return anchor_time_us
-        if self._speed == AS_FAST_AS_POSSIBLE:
-            return self._last_us
-        return anchor_time_us + round((now_us - anchor_now_us) * self._speed)
+        if self.speed == AS_FAST_AS_POSSIBLE:
+            return self.position_us
+        return anchor_time_us + round((now_us - anchor_now_us) * self.speed)
 
     def _due_us(self, track: Track) -> int:
         anchor_now_us, anchor_time_us = self._anchor
         time_us = track.peek_us()
-        if time_us is None or self._speed == AS_FAST_AS_POSSIBLE:
+        if time_us is None or self.speed == AS_FAST_AS_POSSIBLE:
             return anchor_now_us
         # Rounded up: a frame must not be due before its time.
-        return anchor_now_us + math.ceil((time_us - anchor_time_us) / self._speed)
+        return anchor_now_us + math.ceil((time_us - anchor_time_us) / self.speed)
 
     def _skip_gap(self, track: Track, now_us: int) -> None:
         """Set a new anchor if the next frame is too far away, or the recorded clock went back."""
         time_us = track.peek_us() or 0
-        gap_us = time_us - self._last_us
+        gap_us = time_us - self.position_us
         longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
         fell = gap_us < -US_PER_S
         if gap_us <= longest_us and not fell:
             return
         kept_us = 0 if fell or self.max_gap_us is None else self.max_gap_us
-        due_last_us = self._anchor[0] + math.ceil((self._last_us - self._anchor[1]) / self._speed)
+        due_last_us = self._anchor[0] + math.ceil((self.position_us - self._anchor[1]) / self.speed)
         self._anchor = (max(due_last_us, now_us) if fell else due_last_us, time_us - kept_us)
-        self._last_us = time_us - kept_us
+        self.position_us = time_us - kept_us

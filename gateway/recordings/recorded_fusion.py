@@ -29,7 +29,6 @@ from gateway.estimation.select import make_estimator
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import (
     GPS,
-    GPS_CODEC,
     NAV,
     NAV_COLUMNS,
     WHOLE_COLUMNS,
@@ -50,8 +49,8 @@ from gateway.recordings.fuse import (
     SMOOTHED_ESTIMATOR,
     Correct,
     Fusion,
-    InterpolatedPosition,
     fuse,
+    interpolated_positions,
     sample_log,
     samples_of,
     smoothed_states,
@@ -77,13 +76,12 @@ from gateway.recordings.table import (
     TableHeader,
     TableMark,
     TableReader,
-    encode_header,
+    encode_line,
 )
 from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
 from gateway.records import (
     RECORDED_ONLY,
     FusionState,
-    GpsFix,
     NodeStatus,
     Outgoing,
 )
@@ -263,7 +261,7 @@ IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in WRITTEN])
 
 def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> Iterator[bytes]:
     """Write a table of states only; unknown values are left blank."""
-    yield f"{FORMAT_LINE}\n{encode_header(header)}{','.join(WRITTEN)}\n".encode()
+    yield f"{FORMAT_LINE}\n{encode_line(header)}{','.join(WRITTEN)}\n".encode()
     table = np.column_stack([time_us, time_us, states])
     for begin in range(0, len(table), LINES):
         yield write_lines(table[begin : begin + LINES], IS_WHOLE)
@@ -300,7 +298,9 @@ class RecordedFusion:
             self._correct = smoothed_states(*self._smoothed)
         elif options.position == "interpolated":
             latency_s = self.aircraft.estimation.reference.gps_latency_s
-            self._correct = InterpolatedPosition(_fixes_of(files, options), latency_s)
+            cells = [block.cells for block in _blocks_of(files, options)]
+            fixes = np.concatenate([each[has_group(each, GPS), GPS] for each in cells])
+            self._correct = interpolated_positions(fixes, latency_s)
         self._refused: list[str] = []
 
     def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
@@ -420,8 +420,3 @@ def _blocks_of(files: Iterable[Path], options: ReadOptions) -> Iterator[TableBlo
     """Read all once more, before the rows or along with them."""
     quiet = replace(options, progress=None)
     return joined_tables([open_rows(file, quiet) for file in files]).blocks
-
-
-def _fixes_of(files: Iterable[Path], options: ReadOptions) -> Iterator[GpsFix]:
-    for block in _blocks_of(files, options):
-        yield from map(GPS_CODEC.read, block.cells[has_group(block.cells, GPS), GPS].tolist())

@@ -97,9 +97,10 @@ class TableFault:
 
 
 _COMMENTS: Final[dict[str, Any]] = {
+    HEADER_PREFIX: TableHeader,
+    STATE_PREFIX: FusionState,
     MARK_PREFIX: TableMark,
     NODE_PREFIX: NodeStatus,
-    STATE_PREFIX: FusionState,
 }
 
 TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | NodeStatus
@@ -108,42 +109,15 @@ TableEvent = TableRow | TableMark | TableFault | TableHeader | FusionState | Nod
 
 def encode_head(header: TableHeader) -> str:
     """Write everything before the first row."""
-    return f"{FORMAT_LINE}\n{encode_header(header)}{','.join(COLUMNS)}\n"
-
-
-def encode_header(header: TableHeader) -> str:
-    """Write a header as a comment line."""
-    return f"{HEADER_PREFIX}{msgspec.json.encode(header).decode()}\n"
-
-
-def encode_state(state: FusionState) -> str:
-    """Write a state as a comment line."""
-    return f"{STATE_PREFIX}{msgspec.json.encode(state).decode()}\n"
-
-
-def encode_mark(mark: TableMark) -> str:
-    """Write a mark as a comment line."""
-    return f"{MARK_PREFIX}{msgspec.json.encode(mark).decode()}\n"
-
-
-def encode_node(status: NodeStatus) -> str:
-    """Write a node's report as a comment line."""
-    return f"{NODE_PREFIX}{msgspec.json.encode(status).decode()}\n"
+    return f"{FORMAT_LINE}\n{encode_line(header)}{','.join(COLUMNS)}\n"
 
 
 def encode_line(event: TableRow | TableHeader | FusionState | TableMark | NodeStatus) -> str:
-    """Write any line that may follow the head."""
-    match event:
-        case TableRow():
-            return row_to_line(event)
-        case TableHeader():
-            return encode_header(event)
-        case FusionState():
-            return encode_state(event)
-        case TableMark():
-            return encode_mark(event)
-        case NodeStatus():
-            return encode_node(event)
+    """Write any line of a table: a row, or a comment line."""
+    if isinstance(event, TableRow):
+        return row_to_line(event)
+    prefix = next(prefix for prefix, kind in _COMMENTS.items() if isinstance(event, kind))
+    return f"{prefix}{msgspec.json.encode(event).decode()}\n"
 
 
 TableComment = TableHeader | TableMark | TableFault | FusionState | NodeStatus
@@ -328,16 +302,13 @@ class TableReader:
         elif text.startswith(FORMAT_PREFIX) and text != FORMAT_LINE:
             version = text.removeprefix(FORMAT_PREFIX)
             raise ValueError(f"table version {version!r}; this mavgate reads 1, a newer one more")
-        elif text.startswith(HEADER_PREFIX):
-            header = msgspec.json.decode(text.removeprefix(HEADER_PREFIX), type=TableHeader)
-            if self.header is not None:
-                return header
-            self.header = header
-        else:
-            for prefix, kind in _COMMENTS.items():
-                if text.startswith(prefix):
-                    found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)
-                    return found
+        for prefix, kind in _COMMENTS.items():
+            if text.startswith(prefix):
+                found: TableComment = msgspec.json.decode(text.removeprefix(prefix), type=kind)
+                if isinstance(found, TableHeader) and self.header is None:
+                    self.header = found
+                    return None
+                return found
         return None
 
     def _take_names(self, names: list[str]) -> None:

@@ -15,7 +15,7 @@ from gateway.live.part import (
     Restamper,
     clear_copies,
 )
-from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_header
+from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
 from tests.recordings.frames import START_US, make_records, make_tlog
 
@@ -95,14 +95,14 @@ def test_a_tlog_of_any_size_is_shifted_in_small_steps(tlog: Path) -> None:
 def test_table_contains_its_corrected_time(tmp_path: Path) -> None:
     path = tmp_path / "a_01_v1.csv"
     header = TableHeader(unix_us_at_zero=7)
-    rest = "1,2\n" * STEP + encode_header(header) + "# header: {\n5"
+    rest = "1,2\n" * STEP + encode_line(header) + "# header: {\n5"
     path.write_text(encode_head(header) + rest)
     restamper = Restamper(0)
     restamper.add(path, SHIFT_US)
     restamper.finish()
     moved = TableHeader(unix_us_at_zero=7 + SHIFT_US)
     assert path.read_text() == encode_head(moved) + rest.replace(
-        encode_header(header), encode_header(moved)
+        encode_line(header), encode_line(moved)
     )
     reader = TableReader()
     reader.feed(path.read_bytes()[:10_000])

@@ -29,7 +29,7 @@ from gateway.recordings.table import (
     block_of,
     encode_block,
     encode_head,
-    encode_mark,
+    encode_line,
 )
 from gateway.records import FusedSample
 from tests.recordings.samples import make_baro, make_fix, make_flight, make_fused
@@ -161,7 +161,7 @@ def test_one_bad_line_changes_no_other() -> None:
     """Then each line is read by itself: the numbers are the same."""
     rows = some_rows(7)
     lines = [row_to_line(row).encode() for row in rows]
-    mark = encode_mark(TableMark(3, "here")).encode()
+    mark = encode_line(TableMark(3, "here")).encode()
     head = encode_head(TableHeader()).encode()
     text = b"".join([head, *lines[:9], b"1,2\n", mark, b"\r\n", *lines[9:]])
     block = TableReader().feed_block(text)

@@ -15,7 +15,7 @@ from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.reading import ReadOptions, header_for
-from gateway.recordings.table import encode_head, encode_header
+from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight, read
@@ -91,7 +91,7 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
     header, rows = read(fly(then, make_flight(rng, 6))[0])
     half = len(rows) // 2
     path = tmp_path / "a_01_v1.csv"
-    lines = [*map(row_to_line, rows[:half]), encode_header(changed), *map(row_to_line, rows[half:])]
+    lines = [*map(row_to_line, rows[:half]), encode_line(changed), *map(row_to_line, rows[half:])]
     path.write_text(encode_head(header) + "".join(lines))
     with ExitStack() as opened:
         (flight,) = lay_out(open_flights([path], OPTIONS, opened), with_commands=False)

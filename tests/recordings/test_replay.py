@@ -13,8 +13,8 @@ from gateway.estimation.columns import NAV_ALT, NAV_LAT, NAV_LON, NAV_QUAT, nav_
 from gateway.estimation.paper.paper import PaperSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.fuse import Fusion, InterpolatedPosition
+from gateway.recordings.columns import GPS_CODEC, RowBuilder, TableRow, row_to_line
+from gateway.recordings.fuse import Fusion, interpolated_positions
 from gateway.recordings.reading import header_for, settings_of
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.table import (
@@ -24,8 +24,7 @@ from gateway.recordings.table import (
     TableReader,
     block_of,
     encode_head,
-    encode_header,
-    encode_state,
+    encode_line,
 )
 from gateway.records import (
     BaroRaw,
@@ -163,7 +162,7 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
         for action in actions:
             if isinstance(action, SettingsChanged):
                 text += "".join(map(row_to_line, rows.flush()))
-                text += encode_header(header_for(pipeline.aircraft[1].settings, 1))
+                text += encode_line(header_for(pipeline.aircraft[1].settings, 1))
             elif isinstance(action, FusedSample | BaroRaw | GpsFix):
                 text += "".join(map(row_to_line, rows.add(action)))
             if isinstance(action, FusedSample):
@@ -193,7 +192,7 @@ def fly_from_the_middle(
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 rows += builder.add(action)
     assert state is not None
-    text = encode_head(header_for(settings, 1)) + encode_state(state)
+    text = encode_head(header_for(settings, 1)) + encode_line(state)
     text += "".join(map(row_to_line, rows))
     found, *again = TableReader().feed(text.encode(), final=True)
     assert isinstance(found, FusionState)
@@ -332,7 +331,9 @@ def test_interpolated_positions_lie_on_the_line_between_the_fixes(
     first, second = make_fix(1_000_000, rng), make_fix(2_000_000, rng)
     first = msgspec.structs.replace(first, lon_dege7=1_799_999_000, alt_amsl_m=10.0)
     second = msgspec.structs.replace(second, lon_dege7=-1_799_999_000, alt_amsl_m=20.0)
-    position = InterpolatedPosition([first, second], 0.25)
+    position = interpolated_positions(
+        np.array([*map(GPS_CODEC.write, (first, second))], float), 0.25
+    )
     _, states = fly(make_settings("paper"), make_flight(rng, 1))
     row = np.array([nav_row(states[0])] * 2)
     middle, outside = position(np.array([1_250_000, 2_000_000]), row)

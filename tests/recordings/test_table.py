@@ -14,7 +14,6 @@ from gateway.recordings.table import (
     block_of,
     encode_head,
     encode_line,
-    encode_mark,
 )
 from gateway.records import NodeId, NodeStatus
 from tests.recordings.samples import make_flight
@@ -57,7 +56,7 @@ def test_written_file_is_read_in_any_chunks(chunk: int | None) -> None:
 def test_marks_stand_between_rows() -> None:
     rows = make_rows(2, 4)
     mark = TableMark(1234, 'over the "gate", # 2')
-    data = make_table(rows[:1]) + encode_mark(mark).encode() + row_to_line(rows[1]).encode()
+    data = make_table(rows[:1]) + encode_line(mark).encode() + row_to_line(rows[1]).encode()
     assert repr(read(data)[1]) == repr([rows[0], mark, rows[1]])
 
 

@@ -23,7 +23,6 @@ from gateway.recordings.table import (
     HEADER_PREFIX,
     TableBlock,
     TableReader,
-    encode_header,
     encode_line,
 )
 from gateway.recordings.tlog import TlogRecord
@@ -123,7 +122,7 @@ def _write_table(table: RecordedTable) -> Iterator[bytes]:
     if zero_us is not None:
         fields = [pa.field(TIME, pa.timestamp("us", "UTC")), *fields]
     fields.append(pa.field(COMMENTS, pa.string()))
-    header = encode_header(table.header).removeprefix(HEADER_PREFIX).strip().encode()
+    header = encode_line(table.header).removeprefix(HEADER_PREFIX).strip().encode()
     schema = pa.schema(fields, metadata={HEADER: header})
     pieces = Pieces()
     with _writer(pieces, schema) as writer:

@@ -11,7 +11,7 @@ import pytest
 
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import header_for
-from gateway.recordings.table import TableReader, encode_head, encode_state
+from gateway.recordings.table import TableReader, encode_head, encode_line
 from tests.estimation.test_golden import GOLDEN
 from tests.kit.cli import invoke
 from tests.recordings.test_replay import fly_from_the_middle
@@ -62,7 +62,7 @@ def test_a_recording_gives_its_own_states_also_from_its_middle(
 ) -> None:
     settings, state, rows = fly_from_the_middle("eskf", rng)
     path = tmp_path / "flight.csv"
-    head = encode_head(header_for(settings, 1)) + encode_state(state)
+    head = encode_head(header_for(settings, 1)) + encode_line(state)
     path.write_text(head + "".join(map(row_to_line, rows)))
     recorded = [row.state for row in rows if row.state]
     again = run(path)

@@ -14,7 +14,7 @@ from gateway.recordings.columns import COLUMNS
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
 from gateway.recordings.reading import ReadOptions, header_for
-from gateway.recordings.table import TableMark, encode_header, encode_mark
+from gateway.recordings.table import TableMark, encode_line
 from tests.kit.cli import run
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 from tests.recordings.test_replay import fly, make_flight
@@ -31,9 +31,9 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     text = fly(settings, make_flight(rng, 12))[0].decode()
     text = text.replace('"unix_us_at_zero":null', f'"unix_us_at_zero":{START_US}')
     lines = text.splitlines(keepends=True)
-    lines.insert(300, encode_header(header_for(settings, 1)))
-    lines.insert(300, encode_mark(TableMark(123, "over the wood")))
-    lines.append(encode_mark(TableMark(456, "landed")))
+    lines.insert(300, encode_line(header_for(settings, 1)))
+    lines.insert(300, encode_line(TableMark(123, "over the wood")))
+    lines.append(encode_line(TableMark(456, "landed")))
     path = tmp_path / "flight.csv"
     path.write_text("".join(lines))
     return path
