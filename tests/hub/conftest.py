@@ -3,8 +3,9 @@
 import asyncio
 import select
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,10 +14,13 @@ from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters
 from gateway.hub.transports.base import Client
-from gateway.records import Incoming, Outgoing
+from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit.mavlink import STATION, Sender, outgoing
+from tests.kit.records import sample_at, state_at
 from tests.ports import free_port
 
 LIMIT_S = 60.0
@@ -92,6 +96,38 @@ class KeepingClient(Client):
         self.sent.append((self.now_us, frame))
 
 
+class FlyingHub:
+    """A hub with a real vehicle; `fly` sends its frames of this moment."""
+
+    def __init__(self, rig: "Rig", system: int, *endpoints: str, **settings: Any) -> None:
+        self.clock = rig.clock
+        self.vehicle = Vehicle(VehicleSettings(), system)
+        self.hub = Hub(
+            HubSettings(endpoints=endpoints, **settings),
+            lambda incoming: self.perform(self.vehicle.handle(incoming, self.clock())),
+            self.clock,
+            lambda _: None,
+            on_gone=self.vehicle.remove_client,
+        )
+        rig.closing.append(self.hub.close)
+        self.hub.start()
+
+    def perform(self, actions: Iterable[Any]) -> None:
+        """Send frames and apply intervals: no client may change anything else."""
+        for action in actions:
+            if isinstance(action, Outgoing):
+                self.hub.send(action)
+            else:
+                assert isinstance(action, ClientInterval)
+                self.hub.set_interval(action)
+
+    def fly(self) -> list[Any]:
+        now_us = self.clock()
+        found = self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us)
+        self.perform([*found, *self.vehicle.poll(now_us)])
+        return found
+
+
 class Rig:
     """A hub, what came in, its vehicle, and the stations; all closed at the end."""
 
@@ -115,6 +151,26 @@ class Rig:
         self.closing.append(hub.close)
         hub.start()
         return hub
+
+    async def open(self, *endpoints: str, **settings: Any) -> Hub:
+        """Return a hub whose clients are all open."""
+        hub = self.hub(*endpoints, **settings)
+        await self.until_open(hub)
+        return hub
+
+    async def call(self, hub: Hub, number: int = 0) -> Station:
+        """Return a station that is served by a listening port, after its first heartbeat."""
+        station, before = self.station(hub.listening_ports()[number]), len(self.incoming)
+        station.say(station.sender.heartbeat())
+        await self.until(lambda: len(self.incoming) > before)
+        return station
+
+    async def check_passes(self, hub: Hub, *stations: Station) -> None:
+        """Send one frame of telemetry, which each of the stations receives next."""
+        frame = self.vehicle.attitude()
+        hub.send(self.out(frame))
+        for station in stations:
+            assert await station.receive() == frame
 
     def station(
         self, target: int | None = None, kind: socket.SocketKind = socket.SOCK_DGRAM

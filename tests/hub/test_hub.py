@@ -181,8 +181,7 @@ async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> Non
 
 async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     trusted = rig.station()
-    hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
-    await rig.until_open(hub)
+    hub = await rig.open("udp-listen:127.0.0.1:0?trusted=no", f"udp:127.0.0.1:{trusted.port}")
     outsider = rig.station(hub.listening_ports()[0])
     outsider.sender = rig.sender(42, 1)
     hub.send(rig.out(rig.vehicle.heartbeat()))
@@ -237,9 +236,7 @@ async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -
     hub = rig.hub("udp-listen:127.0.0.1:0?allow=HEARTBEAT", ping_interval_s=1.0)
     for frame in (rig.vehicle.home(), rig.vehicle.heartbeat()):
         hub.send(rig.out(frame))
-    station = rig.station(hub.listening_ports()[0])
-    station.say(station.sender.heartbeat())
-    await rig.until(lambda: bool(rig.incoming))
+    station = await rig.call(hub)
     for _ in range(8):
         rig.clock.us += 500_000
         hub.send(rig.out(rig.vehicle.heartbeat()))
@@ -284,9 +281,7 @@ async def test_a_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> 
 async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=5.0)
     hub.send(rig.out(rig.vehicle.heartbeat()))
-    station = rig.station(hub.listening_ports()[0])
-    station.say(station.sender.heartbeat())
-    await rig.until(lambda: len(rig.incoming) == 1)
+    station = await rig.call(hub)
     rig.clock.us = 5_000_000
     hub.send(rig.out(rig.vehicle.heartbeat()))
     assert (await station.receive())[7] == 0
@@ -317,9 +312,7 @@ class TestChangesAtRunTime:
         hub, station = rig.hub(), rig.station()
         hub.add(f"udp:127.0.0.1:{station.port}?name=tablet")
         await rig.until_open(hub)
-        frame = rig.vehicle.attitude()
-        hub.send(rig.out(frame))
-        assert await station.receive() == frame
+        await rig.check_passes(hub, station)
         with pytest.raises(ValueError, match="already exists"):
             hub.add(f"udp:127.0.0.1:{station.port}")
         hub.remove("tablet")

@@ -117,8 +117,7 @@ async def test_a_flood_is_forwarded_over_many_turns(
     rig: Any, kind: str, stations: int, most: int
 ) -> None:
     takers = [rig.station() for _ in range(stations)]
-    hub = rig.hub(f"{kind}-listen:127.0.0.1:0", *(f"udp:127.0.0.1:{t.port}" for t in takers))
-    await rig.until_open(hub)
+    hub = await rig.open(f"{kind}-listen:127.0.0.1:0", *(f"udp:127.0.0.1:{t.port}" for t in takers))
     source = socket.socket(type=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
     rig.closing.append(source.close)
     source.connect(("127.0.0.1", hub.listening_ports()[0]))

@@ -125,31 +125,6 @@ async def test_a_client_is_stopped_with_tcp_open_and_goes_on(rig: Any) -> None:
             client.kill()
 
 
-async def test_a_port_is_refused_and_a_name_unknown(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    closed = rig.station()
-    closed.socket.close()
-    flight = Healthy(rig, f"udp:127.0.0.1:{closed.port}", f"tcp:127.0.0.1:{closed.port}")
-    await flight.start()
-    await flight.fly(FRAMES)
-    assert await flight.lost() == 0
-    assert {client.state for client in flight.hub.clients()} == {"open", "refused"}
-
-
-async def test_odd_datagrams_rain(rig: Any) -> None:
-    flight = Healthy(rig)
-    await flight.start()
-    caller, unknown = flight.stations[-1], rig.station(flight.hub.listening_ports()[0])
-    for _ in range(20):
-        for data in (b"", b"\xfe" * 65507, b"\xfd" * 65507, bytes(65507)):
-            caller.say(data)
-            unknown.say(data)
-        await flight.fly(20)
-    assert await flight.lost() == 0
-    assert len(flight.hub.clients()) == 3
-
-
 @pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
 async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
     flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
@@ -176,11 +151,11 @@ async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
 
 
 @pytest.mark.parametrize("room", [16, 100])
-async def test_a_thousand_clients_appear_and_vanish(rig: Any, room: int) -> None:
+async def test_hundreds_of_clients_appear_and_vanish(rig: Any, room: int) -> None:
     flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
     await flight.start()
     target = ("127.0.0.1", flight.hub.listening_ports()[0])
-    for visit in range(1000):
+    for visit in range(400):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as newcomer:
             newcomer.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
         if visit % 10 == 0:

@@ -7,45 +7,13 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.hub import Hub
-from gateway.hub.settings import HubSettings
-from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.vehicle.vehicle import Vehicle
-from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of
-from tests.kit.records import sample_at, state_at
+from tests.hub.conftest import FlyingHub
 from tests.ports import free_ports
 
 pytestmark = pytest.mark.io
 
 STEP_US = 20_000
-
-
-class Gateway:
-    """A hub with a real vehicle."""
-
-    def __init__(self, rig: Any, system: int, *endpoints: str) -> None:
-        self.rig = rig
-        self.vehicle = Vehicle(VehicleSettings(), system)
-        settings = HubSettings(endpoints=endpoints, ping_interval_s=1.0)
-        self.hub = Hub(settings, self.handle, rig.clock, on_gone=self.vehicle.remove_client)
-        rig.closing.append(self.hub.close)
-        self.hub.start()
-
-    def handle(self, incoming: Incoming) -> None:
-        self.perform(self.vehicle.handle(incoming, self.rig.clock()))
-
-    def perform(self, actions: list[Any]) -> None:
-        for action in actions:
-            if isinstance(action, Outgoing):
-                self.hub.send(action)
-            elif isinstance(action, ClientInterval):
-                self.hub.set_interval(action)
-
-    def fly(self) -> None:
-        now_us = self.rig.clock()
-        self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
-        self.perform(self.vehicle.poll(now_us))
 
 
 class Joined:
@@ -55,7 +23,13 @@ class Joined:
         self.rig = rig
         ports = free_ports(2)
         self.first, self.second = (
-            Gateway(rig, system, f"udp-listen:127.0.0.1:{here}", f"udp:127.0.0.1:{there}")
+            FlyingHub(
+                rig,
+                system,
+                f"udp-listen:127.0.0.1:{here}",
+                f"udp:127.0.0.1:{there}",
+                ping_interval_s=1.0,
+            )
             for system, here, there in ((1, *ports), (2, *reversed(ports)))
         )
         self.station = rig.station(ports[1])
@@ -112,7 +86,7 @@ async def test_a_request_over_two_links_is_answered_and_parts_no_numbers(rig: An
 
 
 async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
-    gateway = Gateway(rig, 1, "udp-listen:127.0.0.1:0")
+    gateway = FlyingHub(rig, 1, "udp-listen:127.0.0.1:0")
     twins = [rig.station(gateway.hub.listening_ports()[0]) for _ in range(2)]
     gateway.fly()
     answers = [0, 0]

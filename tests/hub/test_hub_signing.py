@@ -127,9 +127,7 @@ async def test_another_key_applies_from_the_next_frame_on(rig: Any) -> None:
     keys = signer()
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=keys)
     hub.send(rig.out(rig.vehicle.heartbeat()))
-    station = rig.station(hub.listening_ports()[0])
-    station.say(station.sender.heartbeat())
-    await rig.until(lambda: len(hub.clients()) == 1)
+    station = await rig.call(hub)
     for key in (OLD, NEW):
         keys.keys[1] = key
         hub.send(rig.out(rig.vehicle.heartbeat()))

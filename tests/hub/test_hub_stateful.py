@@ -29,14 +29,9 @@ from hypothesis.stateful import (
 )
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.hub import Hub
-from gateway.hub.settings import HubSettings
-from gateway.records import ClientInterval, Incoming, Outgoing
-from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-from tests.hub.conftest import Rig, Station
-from tests.kit.records import sample_at, state_at
+from tests.hub.conftest import FlyingHub, Rig, Station
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -82,7 +77,6 @@ class HubMachine(RuleBasedStateMachine):
         self.errors: list[Any] = []
         self.runner.get_loop().set_exception_handler(lambda _, error: self.errors.append(error))
         self.rig = Rig()
-        self.vehicle = Vehicle(VehicleSettings(), OURS[0])
         self.numbers = bytearray()
         self.telemetry: list[bytes] = []
         """What the autopilot sent and the good client has still to get."""
@@ -109,15 +103,8 @@ class HubMachine(RuleBasedStateMachine):
             f"udp-listen:{UNTRUSTED}:0?trusted=no",
             f"tcp-listen:{TRUSTED}:0",
         )
-        self.hub = Hub(
-            HubSettings(endpoints=endpoints, max_clients=4, idle_timeout_s=5.0),
-            self.handle,
-            self.rig.clock,
-            lambda _: None,
-            on_gone=self.vehicle.remove_client,
-        )
-        self.rig.closing.append(self.hub.close)
-        self.hub.start()
+        self.gateway = FlyingHub(self.rig, OURS[0], *endpoints, max_clients=4, idle_timeout_s=5.0)
+        self.hub, self.vehicle = self.gateway.hub, self.gateway.vehicle
         await self.rig.until_open(self.hub)
         self.trusted, self.untrusted, self.tcp = self.hub.listening_ports()
         self.good.target = ("127.0.0.1", self.hub._clients[1]._port)
@@ -125,23 +112,10 @@ class HubMachine(RuleBasedStateMachine):
         self.autopilot.sender = self.rig.sender(*AUTOPILOT)
         await self._second()
 
-    def handle(self, incoming: Incoming) -> None:
-        self.perform(self.vehicle.handle(incoming, self.rig.clock()))
-
-    def perform(self, actions: list[Any]) -> None:
-        for action in actions:
-            if isinstance(action, Outgoing):
-                self.hub.send(action)
-            else:
-                assert isinstance(action, ClientInterval), "untrusted clients change nothing"
-                self.hub.set_interval(action)
-
     async def _second(self) -> None:
         """Let a second pass in which everybody good is alive."""
         self.rig.clock.us += 1_000_000
-        now_us = self.rig.clock()
-        self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
-        self.perform(self.vehicle.poll(now_us))
+        self.gateway.fly()
         beat = self.autopilot.sender.heartbeat()
         self.telemetry.append(beat)
         self.autopilot.say(beat)
@@ -193,8 +167,7 @@ class HubMachine(RuleBasedStateMachine):
         async def steps() -> None:
             for _ in range(count):
                 self.rig.clock.us += 5_000
-                now_us = self.rig.clock()
-                self.perform(self.vehicle.on_state(state_at(now_us), sample_at(now_us), now_us))
+                self.gateway.fly()
                 self.telemetry.append(self.autopilot.sender.attitude())
                 self.autopilot.say(self.telemetry[-1])
             await self._settle()

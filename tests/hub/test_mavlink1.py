@@ -29,8 +29,7 @@ async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
 
 async def test_endpoint_of_version_1_gets_what_this_version_can_carry(rig: Any) -> None:
     station = rig.station()
-    hub = rig.hub(f"udp:127.0.0.1:{station.port}?mavlink=1")
-    await rig.until_open(hub)
+    hub = await rig.open(f"udp:127.0.0.1:{station.port}?mavlink=1")
     odometry = dialect.MAVLink_odometry_message(
         1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0, [0] * 21, [0] * 21
     )

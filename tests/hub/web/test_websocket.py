@@ -255,8 +255,7 @@ class TestCalling:
     async def test_connects_again_when_the_server_comes_back(self, rig: Rig) -> None:
         server = rig.hub(LISTEN)
         port = server.listening_ports()[0]
-        hub = rig.hub(f"ws:127.0.0.1:{port}?path=/raw")
-        await rig.until_open(hub)
+        hub = await rig.open(f"ws:127.0.0.1:{port}?path=/raw")
         hub.send(rig.out(rig.sender(7).attitude()))
         await rig.until(lambda: bool(server.clients()) and server.clients()[0].received == 1)
         server.send(rig.out(rig.sender(8).attitude()))
@@ -300,8 +299,7 @@ class TestTls:
     async def test_both_ends(self, rig: Rig, visit: Visit, certificate: Path) -> None:
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         port = server.listening_ports()[0]
-        hub = rig.hub(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
-        await rig.until_open(hub)
+        hub = await rig.open(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
         page = await visit(port, tls=ssl.create_default_context(cafile=certificate))
         hub.send(rig.out(rig.sender(7).attitude()))
         (frame,) = await page.frames(1)
