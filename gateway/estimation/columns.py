@@ -13,16 +13,7 @@ import numpy as np
 from gateway.compiled import compiled
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.estimation.reference import EarthField, ReferenceSettings, is_usable
-from gateway.records import (
-    NAN,
-    UNKNOWN_VEC3,
-    GpsFix,
-    ImuFlags,
-    ImuSample,
-    NavFlags,
-    NavState,
-    Vec3,
-)
+from gateway.records import NAN, UNKNOWN_VEC3, GpsFix, ImuFlags, ImuSample, NavFlags, NavState, Vec3
 from gateway.units import DEG_PER_DEGE7
 
 ImuRow = tuple[float, ...]

@@ -14,12 +14,7 @@ from gateway.live.control_socket import ControlError, Verbs
 from gateway.live.recorder import Recorder
 from gateway.live.serial_port import SerialPort, SerialStatus, list_serial_ports
 from gateway.live.session import SessionState
-from gateway.recordings.index import (
-    Recording,
-    delete_recording,
-    find_recording,
-    list_recordings,
-)
+from gateway.recordings.index import Recording, delete_recording, find_recording, list_recordings
 from gateway.records import FusedSample, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.status import RecorderStatus

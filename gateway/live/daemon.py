@@ -22,13 +22,7 @@ from gateway.config import (
 )
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
-from gateway.live.control_verbs import (
-    ImuTap,
-    RecorderVerbs,
-    SerialVerbs,
-    client_verbs,
-    mark_verbs,
-)
+from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, client_verbs, mark_verbs
 from gateway.live.kept_files import PlaceFiles, StampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget

@@ -5,9 +5,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gateway.estimation.columns import (
-    GPS_COLUMNS,
-)
+from gateway.estimation.columns import GPS_COLUMNS
 from gateway.estimation.kernel import SampleLog
 from gateway.records import GpsFix, GpsFixType, ImuFlags, ImuSample, NodeId, Vec3
 

@@ -25,13 +25,7 @@ from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.geometry.geodesy import radii_m
 from tests.estimation.samples import G, log_of
 from tools.flights import Flight
-from tools.score_estimators import (
-    attitude_scores,
-    position_errors_m,
-    rms,
-    run_eskf,
-    share_scores,
-)
+from tools.score_estimators import attitude_scores, position_errors_m, rms, run_eskf, share_scores
 from tools.spoil_flight import RECOVERY_S, SPOILS, Spoilt, gps_jump, wrong_latency
 
 Change = Callable[[Flight], Spoilt]
