@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateway.compiled import address_of, array_at, compiled, compiled_with, entry_point
+from gateway.compiled import address_of, array_at, compiled, entry_point
 from gateway.compiled.entry_point import (
     BUILD_COMMAND,
     ENTRY_POINTS,
@@ -189,9 +189,3 @@ def test_all_entry_points_are_built_of_what_a_wheel_is_built_with() -> None:
     for package in packages - {"gateway", "typing_extensions", "_distutils_hack"}:
         if not package.startswith("__editable__"):
             assert any(one.startswith(package) for one in required), package
-
-
-def test_the_copies_of_a_template_use_their_own_values() -> None:
-    one, two = (compiled_with(scaled, {"FACTOR": f}, f"by_{f}") for f in (1.0, 2.0))
-    assert [one(7.0), two(7.0), scaled(7.0)] == [7.0, 14.0, 21.0]
-    assert {f.__qualname__ for f in (one, two)} == {"scaled_by_1.0", "scaled_by_2.0"}

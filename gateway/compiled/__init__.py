@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from math import prod
 from types import FunctionType
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -24,18 +24,7 @@ _MARKED: set[Callable[..., object]] = set()
 
 
 def compiled(function: Function) -> Function:
-    """Mark a function that compiled code may call.
-
-    Parameters
-    ----------
-    function : callable
-        In numba's nopython subset.
-
-    Returns
-    -------
-    callable
-        The same.
-    """
+    """Mark a function, in numba's nopython subset, that compiled code may call."""
     _MARKED.add(function)
     return function
 
@@ -45,48 +34,13 @@ def is_compiled(function: object) -> bool:
     return isinstance(function, FunctionType) and function in _MARKED
 
 
-def compiled_with(template: Function, names: dict[str, object], mark: str) -> Function:
-    """Copy a function with other values for some of its global names.
-
-    Parameters
-    ----------
-    template : callable
-        In numba's nopython subset.
-    names : dict
-        Their values: constants and compiled functions.
-    mark : str
-        Suffix of the copy's name.
-
-    Returns
-    -------
-    callable
-        As from `compiled`.
-    """
-    source = cast(FunctionType, template)
-    copy = FunctionType(source.__code__, {**source.__globals__, **names}, source.__name__)
-    copy.__qualname__, copy.__doc__ = f"{source.__qualname__}_{mark}", source.__doc__
-    copy.__annotations__ = source.__annotations__
-    return cast(Function, compiled(copy))
-
-
 def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
-    """View the memory at an address as an array, without a copy.
+    """View the memory at an address as a contiguous array, without a copy.
 
-    Parameters
-    ----------
-    address : int
-        From `address_of`; the caller keeps that memory alive.
-    shape : tuple of int
-        Of the array, which is contiguous.
-    kind : numpy.dtype
-        Of its items; in compiled code a constant of its module.
-
-    Returns
-    -------
-    memoryview or ndarray
-        In Python a memoryview if the array has one dimension or two: it gives plain numbers, which
-        Python reckons with five times faster than with numpy's. But it has no row of a matrix, and
-        no way to fill a slice.
+    The caller keeps that memory alive. `kind` is the numpy.dtype of the items, in compiled code a
+    constant of its module. Python gets a memoryview of an array of one dimension or two: it gives
+    plain numbers, with which Python calculates five times faster than with numpy's. But it has no
+    row of a matrix, and no way to fill a slice.
     """
     memory = (ctypes.c_char * (prod(shape) * kind.itemsize)).from_address(address)
     array: Any = np.frombuffer(memory, kind).reshape(shape)
@@ -94,20 +48,10 @@ def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
 
 
 def record_at(address: int, layout: Any) -> Any:
-    """Read the record at an address, without a copy.
+    """View the record at an address, without a copy; its fields are attributes.
 
-    Parameters
-    ----------
-    address : int
-        From `address_of`; the caller keeps that record alive.
-    layout : numpy.dtype
-        Of the record, whose fields are `f8`, `i8` or arrays of `f8`; in compiled code a constant of
-        its module.
-
-    Returns
-    -------
-    object
-        With the fields as attributes: plain numbers and what `array_at` gives.
+    The caller keeps that record alive. The fields of `layout`, a numpy.dtype, are `f8`, `i8` or
+    arrays of `f8`; in compiled code it is a constant of its module.
     """
     return _record_at(address, layout)
 

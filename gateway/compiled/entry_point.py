@@ -72,17 +72,10 @@ class EntryPoint(Generic[Parameters]):
         self._loaded(*args, **kwargs)  # type: ignore[misc]
 
     def load(self, path: Path | None = None) -> None:
-        """Load it before it is called.
+        """Load it before it is called, from another library if a path is given.
 
-        Parameters
-        ----------
-        path : Path, optional
-            A library of other variants of the kernels, whose sources are not compared.
-
-        Raises
-        ------
-        LibraryError
-            If the library is missing, was built from other sources, or lacks this function.
+        Raises LibraryError if the library is missing, lacks this function, or, unless it is another
+        one, was built from other sources.
         """
         library = open_checked_library() if path is None else open_library(path)
         try:
@@ -144,13 +137,7 @@ def stamp_in(library: ctypes.PyDLL) -> str:
 
 
 def changed_source(stamp: str) -> str | None:
-    """Return the first source from which a library would be compiled differently today.
-
-    Parameters
-    ----------
-    stamp : str
-        From `stamp_in`.
-    """
+    """Return the first source that differs from that in the stamp of a library."""
     for line in stamp.splitlines():
         name, content, code = line.split()
         path = ROOT / name
