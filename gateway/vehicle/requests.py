@@ -223,26 +223,25 @@ class SigningTimestamps:
         self.is_due = False
         """Whether `to_keep` has something that must be written."""
 
-    def newest(self, key_id: str, stream: str) -> int | None:
-        """Return the newest timestamp of a stream under a key; None if it is new."""
-        return self._newest.get(key_id, {}).get(stream)
-
-    def has_room(self, key_id: str) -> bool:
-        """Return whether one more stream can be followed under a key."""
-        return len(self._newest.get(key_id, {})) < MAX_STREAMS
-
-    def add(self, key_id: str, stream: str, timestamp: int) -> None:
-        """Add an accepted timestamp."""
-        streams = self._newest.pop(key_id, {})
-        # The key that was used last comes last.
-        self._newest[key_id] = streams
+    def accept(self, key_id: str, stream: str, timestamp: int, oldest: int) -> bool:
+        """Add a timestamp if it grows, or of a new stream if it is not older than `oldest`."""
+        streams = self._newest.get(key_id, {})
+        is_known = stream in streams
+        if timestamp < (streams[stream] + 1 if is_known else oldest):
+            return False
+        if not is_known and len(streams) >= MAX_STREAMS:
+            return False
         streams[stream] = timestamp
+        # The key that was used last comes last.
+        self._newest.pop(key_id, None)
+        self._newest[key_id] = streams
         for removed in list(self._newest)[:-MAX_KEYS]:
             del self._newest[removed]
             self._kept.pop(removed, None)
         if timestamp > self._kept.get(key_id, {}).get(stream, -1):
             self._kept.setdefault(key_id, {})[stream] = timestamp + RESERVE_TICKS
             self.is_due = True
+        return True
 
     def to_keep(self) -> KeptTimestamps:
         """Return what to write now, so that no frame accepted so far is accepted again."""
@@ -311,16 +310,8 @@ class Verifier:
             return False
         stream = f"{frame[-SIGNATURE_BYTES]}.{frame[5]}.{frame[6]}"
         timestamp = int.from_bytes(frame[-12:-6], "little")
-        newest = self._book.newest(self._key_id, stream)
-        if newest is None:
-            if timestamp < self._clock.timestamp(now_us) - NEW_STREAM_TICKS:
-                return False
-            if not self._book.has_room(self._key_id):
-                return False
-        elif timestamp <= newest:
-            return False
-        self._book.add(self._key_id, stream, timestamp)
-        return True
+        oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
+        return self._book.accept(self._key_id, stream, timestamp, oldest)
 
 
 V2_START: Final = 0xFD
@@ -379,10 +370,8 @@ class RequestReader:
     def _is_for_us(self, message: Any) -> bool:
         system = getattr(message, "target_system", BROADCAST)
         component = getattr(message, "target_component", BROADCAST)
-        return system in (BROADCAST, self._system_id) and component in (
-            BROADCAST,
-            AUTOPILOT_COMPONENT,
-        )
+        is_ours = component in (BROADCAST, AUTOPILOT_COMPONENT)
+        return is_ours and system in (BROADCAST, self._system_id)
 
 
 MAX_ENTRIES: Final = 64

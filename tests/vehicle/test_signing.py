@@ -198,8 +198,8 @@ def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
 def test_keys_are_bounded_and_the_oldest_goes() -> None:
     book = SigningTimestamps()
     for n in range(2 * MAX_KEYS):
-        book.add(f"{n}", "0.1.1", n)
+        assert book.accept(f"{n}", "0.1.1", n, oldest=0)
     assert list(book.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
-    assert (
-        SigningTimestamps(book.to_keep()).newest(f"{MAX_KEYS}", "0.1.1") == MAX_KEYS + RESERVE_TICKS
-    )
+    again, newest = SigningTimestamps(book.to_keep()), MAX_KEYS + RESERVE_TICKS
+    assert not again.accept(f"{MAX_KEYS}", "0.1.1", newest, oldest=0)
+    assert again.accept(f"{MAX_KEYS}", "0.1.1", newest + 1, oldest=0)
