@@ -87,7 +87,7 @@ def status_of(aircraft: Aircraft) -> AircraftStatus:
         vehicle.telemetry.fix,
         _way(here, None if home is None else home.location),
         _way(here, vehicle.plan.mark.location),
-        vehicle.health.boards.statuses,
+        vehicle.health.statuses,
     )
 
 

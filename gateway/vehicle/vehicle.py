@@ -145,7 +145,7 @@ class Vehicle:
         )
         self._identity = {
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: encoding.autopilot_version(
-                self.system_id, self.health.boards.firmware, self.telemetry.autopilot
+                self.system_id, self.health.firmware, self.telemetry.autopilot
             ),
             MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: encoding.protocol_version(),
             mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: encoding.available_modes(
@@ -372,7 +372,7 @@ class Vehicle:
 
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
-        self.health.boards.supply_low_v = settings.supply_low_v
+        self.health.supply_low_v = settings.supply_low_v
         self.telemetry.reconfigure(settings)
         self._control.exclusive = settings.operator_control == "exclusive"
         self._sign_by(settings.signing_passphrase)

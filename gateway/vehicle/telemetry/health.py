@@ -32,6 +32,7 @@ from gateway.records import (
     NavState,
     NodeLink,
     NodeStatus,
+    ReceiverStatus,
 )
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
@@ -96,123 +97,13 @@ class _Radio:
 
 
 @dataclass(slots=True)
-class _Node:
+class _Board:
     status: NodeStatus
     low: bool = False
     bus: _Trouble = field(default_factory=_Trouble)
     radio: _Radio = field(default_factory=_Radio)
     pipe: _Trouble = field(default_factory=_Trouble)
     overruns: int | None = None
-
-
-class NodeHealth:
-    """The newest reports of one aircraft's nodes; a supply below `supply_low_v` is announced."""
-
-    def __init__(self, vehicle_id: int, supply_low_v: float) -> None:
-        self.supply_low_v = supply_low_v
-        self._vehicle_id = vehicle_id
-        self._nodes: dict[int, _Node] = {}
-
-    @property
-    def statuses(self) -> tuple[NodeStatus, ...]:
-        """The newest report of each node, in the order of their ids."""
-        return tuple(node.status for _, node in sorted(self._nodes.items()))
-
-    @property
-    def firmware(self) -> int:
-        """Firmware version of the first node as MAVLink packs it; 0 before it has reported."""
-        statuses = self.statuses
-        major, minor = statuses[0].firmware_version if statuses else (0, 0)
-        return major << 24 | minor << 16
-
-    def take(self, status: NodeStatus, name: str) -> list[Finding]:
-        """Note a report."""
-        known = self._nodes.get(status.node.node_id)
-        if known is None:
-            known = self._nodes[status.node.node_id] = _Node(status)
-        before, known.status = known.status, status
-        if status.node_time_us < before.node_time_us:
-            # It has restarted, and so have its counters.
-            before = status
-        errors = status.bus_errors - before.bus_errors & WORD
-        failed = status.radio_failed - before.radio_failed & WORD
-        failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
-        bus_errors = known.bus.note(errors > 0)
-        number, supply_v = status.node.node_id, status.supply_mv / MV
-        known.low = self._is_low(supply_v, was_low=known.low)
-        low, good = f"supply low, {supply_v:.2f} V", f"supply OK again, {supply_v:.2f} V"
-        radio = f"radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s"
-        bus = f"bus errors, {status.bus_errors} so far"
-        chips = StatusText(INFO, f"{name}: {', '.join(status.chips)}")
-        return [
-            Finding(f"chips {number}", status.chips or False, chips),
-            _finding(f"supply {number}", name, known.low, low, good),
-            _finding(f"bus {number}", name, bus_errors, bus, "bus OK again"),
-            _finding(f"radio {number}", name, known.radio.is_bad, radio, "radio OK again"),
-        ]
-
-    def _is_low(self, supply_v: float, *, was_low: bool) -> bool:
-        limit_v = self.supply_low_v + (HYSTERESIS_V if was_low else 0.0)
-        return bool(self.supply_low_v and supply_v) and supply_v < limit_v
-
-    def take_link(self, report: LinkReport, names: dict[int, str]) -> list[Finding]:
-        """Note the receiver's radio module, and the payloads for which it had no room."""
-        if report.receiver is None:
-            return []
-        problem, works = report.receiver.radio.problem, "radio module works again"
-        found = [_finding("receiver radio", "Receiver", bool(problem), problem, works)]
-        for link in report.nodes:
-            number = link.node.node_id
-            node = self._nodes.get(number)
-            if link.node.vehicle_id != self._vehicle_id or node is None:
-                continue
-            overruns = report.receiver.pipes[link.pipe].overruns
-            is_bad = node.pipe.note(node.overruns is not None and overruns > node.overruns)
-            node.overruns = overruns
-            bad, good = f"receiver overrun, {overruns} so far", "receiver keeps up again"
-            found.append(_finding(f"pipe {number}", names.get(number, "Node"), is_bad, bad, good))
-        return found
-
-    def error_counts(self) -> list[int]:
-        """Sum up bus errors, failed sends, repeated sends and overruns, as SYS_STATUS has room."""
-        nodes = self._nodes.values()
-        counts = (
-            sum(node.status.bus_errors for node in nodes),
-            sum(node.status.radio_failed for node in nodes),
-            sum(node.status.radio_retries for node in nodes),
-            sum(node.overruns or 0 for node in nodes),
-        )
-        return [encoding.uint16(count, unknown=0) for count in counts]
-
-    @property
-    def lowest_supply_mv(self) -> int | None:
-        """The lowest supply of the nodes; None if none measures it."""
-        return min((s.supply_mv for s in self.statuses if s.supply_mv), default=None)
-
-    def lowest(self) -> Any:
-        """Encode BATTERY_STATUS of the node with the lowest supply; None if none measures it."""
-        measured = [s for s in self.statuses if s.supply_mv]
-        return self.battery(min(measured, key=lambda s: s.supply_mv)) if measured else None
-
-    def battery(self, status: NodeStatus) -> Any:
-        """Encode a node's supply as BATTERY_STATUS; None if it does not measure it."""
-        if not status.supply_mv:
-            return None
-        low = self._nodes[status.node.node_id].low
-        state = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
-        return mavlink.MAVLink_battery_status_message(
-            id=status.node.node_id,
-            battery_function=mavlink.MAV_BATTERY_FUNCTION_AVIONICS,
-            type=mavlink.MAV_BATTERY_TYPE_UNKNOWN,
-            temperature=encoding.INT16_MAX,
-            voltages=[status.supply_mv] + [encoding.UINT16_MAX] * (CELLS - 1),
-            current_battery=-1,
-            current_consumed=-1,
-            energy_consumed=-1,
-            battery_remaining=-1,
-            time_remaining=0,
-            charge_state=state,
-        )
 
 
 def _finding(topic: str, name: str, is_bad: bool, bad: str, good: str) -> Finding:
@@ -244,26 +135,38 @@ BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 
 
 class Health:
-    """Time of the newest sample of every sensor of one aircraft, and the health of each."""
+    """Newest samples of the sensors and newest reports of the nodes of one aircraft."""
 
     def __init__(self, vehicle_id: int, silent_s: float, supply_low_v: float = 0.0) -> None:
         self.vehicle_id = vehicle_id
-        self.boards = NodeHealth(vehicle_id, supply_low_v)
         self.silent_us = round(silent_s * US_PER_S)
+        self.supply_low_v = supply_low_v
+        """A lower supply is announced; 0 disables this."""
         self.recording = False
         self._seen_us: dict[int, int] = {}
-        self._faulty: dict[int, int] = {}
-        self._roles: dict[int, str] = {}
+        self._boards: dict[int, _Board] = {}
         self._imu_flags = ImuFlags(0)
         self._fix: GpsFix | None = None
         self._nav_flags = NavFlags(0)
         self._load_permille = 0
-        self._nodes: tuple[NodeLink, ...] = ()
+        self._links: tuple[NodeLink, ...] = ()
         self._excused_us: dict[int, int] = {}
         """End of the last stall of the gateway, by node."""
         self._received = 0
         self._lost = 0
         self._drop_rate = 0.0
+
+    @property
+    def statuses(self) -> tuple[NodeStatus, ...]:
+        """The newest report of each node, in the order of their ids."""
+        return tuple(board.status for _, board in sorted(self._boards.items()))
+
+    @property
+    def firmware(self) -> int:
+        """Firmware version of the first node as MAVLink packs it; 0 before it has reported."""
+        statuses = self.statuses
+        major, minor = statuses[0].firmware_version if statuses else (0, 0)
+        return major << 24 | minor << 16
 
     def on_state(self, state: NavState, sample: ImuSample) -> None:
         """Note an IMU sample and what the estimator made of it."""
@@ -290,25 +193,63 @@ class Health:
 
     def on_node_status(self, status: NodeStatus) -> list[Finding]:
         """Note a node's report about itself; return the state of its board."""
-        number, failed = status.node.node_id, status.sensors_failed & status.sensors_present
-        self._faulty[number] = sum(sensors for bit, sensors in NODE_SENSORS if failed & bit)
-        self._roles[number] = node_role(status.sensors_present)
+        number = status.node.node_id
+        known = self._boards.setdefault(number, _Board(status))
+        before, known.status = known.status, status
+        if status.node_time_us < before.node_time_us:
+            # It has restarted, and so have its counters.
+            before = status
+        errors = status.bus_errors - before.bus_errors & WORD
+        failed = status.radio_failed - before.radio_failed & WORD
+        failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
         if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
-        return self.boards.take(status, self.node_name(number))
+        name, bus_errors = self.node_name(number), known.bus.note(errors > 0)
+        supply_v = status.supply_mv / MV
+        known.low = self._is_low(supply_v, was_low=known.low)
+        low, good = f"supply low, {supply_v:.2f} V", f"supply OK again, {supply_v:.2f} V"
+        radio = f"radio sends failed, {failed} in {RADIO_SPAN_US // US_PER_S} s"
+        bus = f"bus errors, {status.bus_errors} so far"
+        chips = StatusText(INFO, f"{name}: {', '.join(status.chips)}")
+        return [
+            Finding(f"chips {number}", status.chips or False, chips),
+            _finding(f"supply {number}", name, known.low, low, good),
+            _finding(f"bus {number}", name, bus_errors, bus, "bus OK again"),
+            _finding(f"radio {number}", name, known.radio.is_bad, radio, "radio OK again"),
+        ]
+
+    def _is_low(self, supply_v: float, *, was_low: bool) -> bool:
+        limit_v = self.supply_low_v + (HYSTERESIS_V if was_low else 0.0)
+        return bool(self.supply_low_v and supply_v) and supply_v < limit_v
 
     def on_link(self, report: LinkReport) -> list[Finding]:
         """Note the state of the radio links to this aircraft's nodes; return its findings."""
-        self._nodes = tuple(
+        self._links = tuple(
             link for link in report.nodes if link.node.vehicle_id == self.vehicle_id
         )
-        received = sum(link.received for link in self._nodes)
-        lost = sum(link.lost for link in self._nodes)
+        received = sum(link.received for link in self._links)
+        lost = sum(link.lost for link in self._links)
         fresh = max(0, received - self._received) + max(0, lost - self._lost)
         self._drop_rate = max(0, lost - self._lost) / fresh if fresh else 0.0
         self._received, self._lost = received, lost
-        return self.boards.take_link(report, {n: self.node_name(n) for n in self.known_nodes()})
+        return self._receiver_findings(report.receiver) if report.receiver else []
+
+    def _receiver_findings(self, receiver: ReceiverStatus) -> list[Finding]:
+        """Check the receiver's radio module, and the payloads for which it had no room."""
+        problem, works = receiver.radio.problem, "radio module works again"
+        found = [_finding("receiver radio", "Receiver", bool(problem), problem, works)]
+        for link in self._links:
+            number = link.node.node_id
+            board = self._boards.get(number)
+            if board is None:
+                continue
+            overruns = receiver.pipes[link.pipe].overruns
+            is_bad = board.pipe.note(board.overruns is not None and overruns > board.overruns)
+            board.overruns = overruns
+            bad, good = f"receiver overrun, {overruns} so far", "receiver keeps up again"
+            found.append(_finding(f"pipe {number}", self.node_name(number), is_bad, bad, good))
+        return found
 
     def on_stall(self, stalled_us: int, now_us: int) -> None:
         """Do not count a time in which the gateway was not running as an outage of a sensor."""
@@ -333,8 +274,9 @@ class Health:
         absent = MAG if self._imu_flags & ImuFlags.MAG_ABSENT else 0
         absent |= PRESSURE if self._imu_flags & ImuFlags.BARO_ABSENT else 0
         faulty = GYRO | ACCEL if self._imu_flags & ImuFlags.SELF_TEST_FAILED else 0
-        for failed in self._faulty.values():
-            faulty |= failed
+        for status in self.statuses:
+            failed = status.sensors_failed & status.sensors_present
+            faulty |= sum(sensors for bit, sensors in NODE_SENSORS if failed & bit)
         for sensor in SENSORS:
             if sensor not in self._seen_us or absent & sensor:
                 continue
@@ -364,11 +306,11 @@ class Health:
         counts are the nodes' bus errors, failed and repeated radio sends, and the receiver's
         overruns.
         """
-        bus, failed, retries, overruns = self.boards.error_counts()
+        bus, failed, retries, overruns = self._error_counts()
         return mavlink.MAVLink_sys_status_message(
             *self.sensors(now_us),
             load=min(1000, self._load_permille),
-            voltage_battery=self.boards.lowest_supply_mv or encoding.UINT16_MAX,
+            voltage_battery=self.lowest_supply_mv or encoding.UINT16_MAX,
             current_battery=-1,
             battery_remaining=-1,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
@@ -379,24 +321,66 @@ class Health:
             errors_count4=overruns,
         )
 
+    def _error_counts(self) -> list[int]:
+        """Sum up bus errors, failed sends, repeated sends and overruns, as SYS_STATUS has room."""
+        boards = self._boards.values()
+        counts = (
+            sum(board.status.bus_errors for board in boards),
+            sum(board.status.radio_failed for board in boards),
+            sum(board.status.radio_retries for board in boards),
+            sum(board.overruns or 0 for board in boards),
+        )
+        return [encoding.uint16(count, unknown=0) for count in counts]
+
+    @property
+    def lowest_supply_mv(self) -> int | None:
+        """The lowest supply of the nodes; None if none measures it."""
+        return min((s.supply_mv for s in self.statuses if s.supply_mv), default=None)
+
+    def lowest(self) -> Any:
+        """Encode BATTERY_STATUS of the node with the lowest supply; None if none measures it."""
+        measured = [s for s in self.statuses if s.supply_mv]
+        return self.battery(min(measured, key=lambda s: s.supply_mv)) if measured else None
+
+    def battery(self, status: NodeStatus) -> Any:
+        """Encode a node's supply as BATTERY_STATUS; None if it does not measure it."""
+        if not status.supply_mv:
+            return None
+        low = self._boards[status.node.node_id].low
+        state = mavlink.MAV_BATTERY_CHARGE_STATE_LOW if low else mavlink.MAV_BATTERY_CHARGE_STATE_OK
+        return mavlink.MAVLink_battery_status_message(
+            id=status.node.node_id,
+            battery_function=mavlink.MAV_BATTERY_FUNCTION_AVIONICS,
+            type=mavlink.MAV_BATTERY_TYPE_UNKNOWN,
+            temperature=encoding.INT16_MAX,
+            voltages=[status.supply_mv] + [encoding.UINT16_MAX] * (CELLS - 1),
+            current_battery=-1,
+            current_consumed=-1,
+            energy_consumed=-1,
+            battery_remaining=-1,
+            time_remaining=0,
+            charge_state=state,
+        )
+
     def silent_nodes(self, now_us: int) -> frozenset[int]:
         """Return the nodes that have sent payloads before and have timed out."""
         limit_us = now_us - self.silent_us
-        late = {link.node.node_id for link in self._nodes if link.last_time_us < limit_us}
+        late = {link.node.node_id for link in self._links if link.last_time_us < limit_us}
         excused = {number for number, us in self._excused_us.items() if us >= limit_us}
         return self.known_nodes() & late - excused
 
     def node_name(self, node_id: int) -> str:
         """Name a node by its sensors, as far as it has reported them."""
-        return f"{self._roles.get(node_id, 'Node')} {node_id}"
+        board = self._boards.get(node_id)
+        return f"{node_role(board.status.sensors_present) if board else 'Node'} {node_id}"
 
     def restarts(self) -> dict[int, int]:
         """Return how often each node has restarted."""
-        return {link.node.node_id: link.restarts for link in self._nodes}
+        return {link.node.node_id: link.restarts for link in self._links}
 
     def known_nodes(self) -> frozenset[int]:
         """Return the nodes that have sent a payload."""
-        return frozenset(link.node.node_id for link in self._nodes if link.received)
+        return frozenset(link.node.node_id for link in self._links if link.received)
 
 
 def node_role(sensors_present: int) -> str:

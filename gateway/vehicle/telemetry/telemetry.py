@@ -199,7 +199,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.boards.lowest(),
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.lowest(),
             mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._of_sample(messages.scaled_imu),
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._of_sample(messages.raw_imu),
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._of_origin(messages.local_position_ned),
@@ -309,7 +309,7 @@ class Telemetry:
         stream = self._batteries.setdefault(status.node.node_id, Stream(common_us))
         if stream.interval_us != common_us:
             stream.change(common_us)
-        message = self.health.boards.battery(status) if stream.offer(status.time_us) else None
+        message = self.health.battery(status) if stream.offer(status.time_us) else None
         return [] if message is None else [message]
 
     def set_home(self, home: Home) -> list[Any]:

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.records import NodeId, PipeCounters, ReceiverStatus
 from gateway.vehicle.requests import INFO, WARNING
 from gateway.vehicle.telemetry.announcements import HOLD_US
-from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, NodeHealth
+from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, Health
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.kit.ground_station import decode, kinds, of_kind, texts
@@ -154,11 +154,11 @@ def test_it_comes_at_its_own_rate(rate_hz: float, count: int) -> None:
 
 
 def test_the_lowest_supply_answers_a_request() -> None:
-    boards = NodeHealth(1, 3.0)
-    assert boards.lowest() is None
-    boards.take(WELL, "IMU node 0")
-    boards.take(replace(WELL, node=NodeId(1, 1), supply_mv=3100), "GPS node 1")
-    assert boards.lowest().id == 1
+    health = Health(1, 2.0)
+    assert health.lowest() is None
+    health.on_node_status(WELL)
+    health.on_node_status(replace(WELL, node=NodeId(1, 1), supply_mv=3100))
+    assert health.lowest().id == 1
 
 
 def test_counters_stand_in_sys_status(flying: Flying) -> None:
