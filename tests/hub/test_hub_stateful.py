@@ -13,6 +13,7 @@ import contextlib
 import itertools
 import os
 import socket
+import struct
 from collections.abc import Coroutine
 from typing import Any
 
@@ -29,9 +30,11 @@ from hypothesis.stateful import (
 )
 from pymavlink.dialects.v20 import common as dialect
 
+from gateway.records import ClientInterval
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
 from tests.hub.conftest import FlyingHub, Rig, Station
+from tests.ports import free_port
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -251,11 +254,39 @@ class HubMachine(RuleBasedStateMachine):
 
         self.run(steps())
 
-    @rule()
-    def a_reader_breaks_off(self) -> None:
+    @rule(is_reset=st.booleans())
+    def a_reader_breaks_off(self, is_reset: bool) -> None:
         if self.readers:
-            self.readers.pop().close()
+            reader = self.readers.pop()
+            if is_reset:
+                reader.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            reader.send(self.rig.sender(7).heartbeat()[:9])
+            reader.close()
             self.run(self._settle())
+
+    @rule(
+        kind=st.sampled_from(["udp", "tcp"]),
+        options=st.sampled_from(["", "?deny=ATTITUDE", "?rate=RAW_IMU:5", "?pack=200"]),
+    )
+    def an_endpoint_without_a_peer_is_added(self, kind: str, options: str) -> None:
+        async def steps() -> None:
+            self.hub.add(f"{kind}:127.0.0.1:{free_port()}{options}")
+            await self._settle()
+
+        self.run(steps())
+
+    @rule()
+    def the_last_added_endpoint_is_removed(self) -> None:
+        async def steps() -> None:
+            for url in self.hub.endpoints()[4:][-1:]:
+                self.hub.remove(url)
+            await self._settle()
+
+        self.run(steps())
+
+    @rule(client_id=st.integers(2, 20), interval_us=st.sampled_from([-1, 0, 100_000]))
+    def another_client_requests_an_interval(self, client_id: int, interval_us: int) -> None:
+        self.hub.set_interval(ClientInterval(client_id, OURS[0], 30, interval_us))
 
     @rule(options=st.sampled_from(["", "&deny=ATTITUDE", "&rate=ATTITUDE:5", "&pack=300"]))
     def settings_are_reloaded(self, options: str) -> None:
@@ -279,8 +310,9 @@ class HubMachine(RuleBasedStateMachine):
         assert self.vehicle.plan.missions.items[0] == ()
 
     @invariant()
-    def untrusted_clients_are_in_no_table(self) -> None:
+    def tables_hold_present_and_trusted_clients_only(self) -> None:
         if hasattr(self, "hub"):
+            assert self.hub._fanout._subscriptions.keys() == self.hub._clients.keys()
             trusted = {client.client_id for client in self.hub.clients() if client.trusted}
             assert set(self.hub._router._table._of_client) <= trusted
 
