@@ -25,7 +25,8 @@ def address() -> Iterator[str]:
 
 
 def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
-    done = invoke("batch", "fuse", season, "-o", out, *more)
+    files = [season / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
+    done = invoke("batch", "fuse", *files, "-o", out, *more)
     return done.exit_code, done.output
 
 
@@ -46,7 +47,7 @@ def test_cluster_gives_the_results_of_this_machine(
     address: str, season: Path, tmp_path: Path
 ) -> None:
     code, text = _run(season, tmp_path / "cluster", "--scheduler", address)
-    assert (code, "1 of 5 recordings failed" in text) == (1, True), text
+    assert (code, "1 of 3 recordings failed" in text) == (1, True), text
     assert _run(season, tmp_path / "here")[0] == 1
     for part in ("results", "fused"):
         here, there = (
@@ -54,7 +55,7 @@ def test_cluster_gives_the_results_of_this_machine(
             for side in ("here", "cluster")
         )
         assert here == there
-        assert len(here) >= 4
+        assert len(here) >= 2
 
 
 def test_a_worker_that_is_killed_is_made_up_for(address: str, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -137,7 +138,7 @@ def test_endless_answers_are_cut_off(monkeypatch: pytest.MonkeyPatch, payload: b
 
 async def test_oversized_messages_are_not_queued() -> None:
     """A queue of messages is bounded in bytes, too."""
-    waiting = [MagicMock(payload=bytes(MAX_MESSAGE + 1)) for _ in range(2 * MAX_WAITING)]
+    waiting = [SimpleNamespace(payload=bytes(MAX_MESSAGE + 1))] * (2 * MAX_WAITING)
     subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
     subscriber.__iter__.return_value = iter(())
     session = MagicMock(declare_subscriber=lambda *_: subscriber)
