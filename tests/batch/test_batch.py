@@ -14,7 +14,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.ground_track import ground_track
-from gateway.batch.executors import LocalProcesses, WorkError, WorkFailed, failure_of
+from gateway.batch.executors import LocalProcesses, ThisProcess, WorkFailed
 from gateway.batch.storage import BatchItem, StorageError, items_of
 from gateway.batch.tasks import (
     RESULTS,
@@ -39,10 +39,6 @@ FLIGHTS = ("alpha_01_v1.csv", "beta_01_v1.csv", "gamma_01_v2.csv", "delta_01_v2.
 def run(*words: object) -> tuple[int, str]:
     done = invoke("batch", *map(str, words))
     return done.exit_code, done.output
-
-
-def silent(what: str, done: int, total: int) -> None:
-    pass
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +97,7 @@ def test_other_settings_are_other_work(season: Path, tmp_path: Path) -> None:
     folder = ResultFolder(tmp_path)
     for choice in ("recorded", "current", "recorded"):
         options = ReadOptions(OPTIONS.current, choice=choice)
-        run_season(FuseTask(options), items, Counted(1), folder, silent)
+        run_season(FuseTask(options), items, Counted(1), folder, lambda *_: None)
     # A digest each time, and two works.
     assert sorted(seen) == ["str", "str", "str", "tuple", "tuple"]
 
@@ -332,15 +328,6 @@ class _Elsewhere(MemoryFileSystem):
         return super()._open(path, mode, **more)
 
 
-class _InThisProcess:
-    def run(self, work, items):
-        for number, item in enumerate(items):
-            try:
-                yield number, work(item)
-            except WorkError as error:
-                yield number, failure_of(error)
-
-
 def test_remote_files_are_fetched_once_unless_changed(season: Path, tmp_path: Path) -> None:
     fsspec.register_implementation("elsewhere", _Elsewhere, clobber=True)
     storage = fsspec.filesystem("elsewhere")
@@ -351,7 +338,7 @@ def test_remote_files_are_fetched_once_unless_changed(season: Path, tmp_path: Pa
     def fetched() -> list[str]:
         items = items_of(["elsewhere://user:secret@host/flights"], each_file=True)
         _Elsewhere.fetched.clear()
-        results = run_season(InfoTask(OPTIONS), items, _InThisProcess(), folder, silent)
+        results = run_season(InfoTask(OPTIONS), items, ThisProcess(), folder, lambda *_: None)
         digests = [sha256(storage.store[f"/flights/{name}"].getvalue()) for name in FLIGHTS[:2]]
         assert [r.digest for r in results[:2]] == [digest.hexdigest() for digest in digests]
         assert [r.place for r in results[:2]] == [

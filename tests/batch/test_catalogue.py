@@ -23,7 +23,7 @@ from gateway.batch.catalogue import (
     read_file,
     recordings_below,
 )
-from gateway.batch.executors import LocalProcesses
+from gateway.batch.executors import LocalProcesses, ThisProcess
 from gateway.batch.facts import FlightFacts, FlightTally, feature, lost_share, simplified
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.reading import ReadOptions
@@ -38,16 +38,15 @@ pytestmark = pytest.mark.io
 OPTIONS = ReadOptions(PipelineSettings(AircraftSettings()))
 
 
-class InThisProcess:
-    """Does the work at once, and remembers on what."""
+class InThisProcess(ThisProcess):
+    """Remembers on what it works."""
 
     def __init__(self) -> None:
         self.seen: list[object] = []
 
     def run(self, work, items):
-        for number, item in enumerate(items):
-            self.seen.append(item)
-            yield number, work(item)
+        self.seen += items
+        yield from super().run(work, items)
 
 
 def write_tlog(path: Path) -> Path:

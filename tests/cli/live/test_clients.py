@@ -4,10 +4,8 @@ import asyncio
 import dataclasses
 import io
 import json
-import threading
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import pytest
@@ -16,7 +14,7 @@ from rich.console import Console
 from gateway.cli.live import clients
 from gateway.config import load
 from gateway.hub.stats import HubCounters, ListenerStats
-from gateway.live.control_socket import ControlError, ControlServer, socket_path
+from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.records import (
     LinkReport,
     LoggedRequest,
@@ -95,62 +93,47 @@ SNAPSHOT = Snapshot(
 )
 
 
-class Gateway:
-    """A control socket in a loop of its own, as the command would meet it."""
+@pytest.fixture
+async def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[list[object]]:
+    """What is asked of a gateway."""
+    asked: list[object] = []
 
-    def __init__(self) -> None:
-        self.asked: list[object] = []
-        self.loop = asyncio.new_event_loop()
-        verbs = {
-            "status": lambda: SNAPSHOT,
-            "clients.list": lambda: SNAPSHOT.clients,
-            "clients.add": self._add,
-            "clients.remove": self._remove,
-            "reload": lambda: "settings of the hub applied",
-            "mark": self._mark,
-        }
-        self.server = ControlServer(socket_path("run"), verbs)
-        self.thread = threading.Thread(target=self.loop.run_forever)
-
-    def _add(self, url: str) -> list[str]:
-        self.asked.append(url)
+    def add(url: str) -> list[str]:
+        asked.append(url)
         return ["udp:127.0.0.1:14550", url]
 
-    def _mark(
-        self,
-        lat_deg: float | None,
-        lon_deg: float | None,
-        alt_amsl_m: float | None,
+    def mark(
+        lat_deg: float | None, lon_deg: float | None, alt_amsl_m: float | None,
         vehicle_id: int | None,
-    ) -> str:
-        self.asked.append((lat_deg, lon_deg, alt_amsl_m, vehicle_id))
+    ) -> str:  # fmt: skip
+        asked.append((lat_deg, lon_deg, alt_amsl_m, vehicle_id))
         return "marked"
 
-    def _remove(self, name: str) -> list[str]:
+    def remove(name: str) -> list[str]:
         raise ControlError(f"no endpoint is called {name!r}")
 
-
-@pytest.fixture
-def gateway(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gateway]:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.setenv("COLUMNS", "140")
-    gateway = Gateway()
-    gateway.loop.run_until_complete(gateway.server.start())
-    gateway.thread.start()
-    yield gateway
-    gateway.loop.call_soon_threadsafe(gateway.server.close)
-    gateway.loop.call_soon_threadsafe(gateway.loop.stop)
-    gateway.thread.join()
-    gateway.loop.run_until_complete(asyncio.sleep(0))
-    gateway.loop.close()
+    verbs: Verbs = {
+        "status": lambda: SNAPSHOT,
+        "clients.list": lambda: SNAPSHOT.clients,
+        "clients.add": add,
+        "clients.remove": remove,
+        "reload": lambda: "settings of the hub applied",
+        "mark": mark,
+    }
+    server = ControlServer(socket_path("run"), verbs)
+    await server.start()
+    yield asked
+    server.close()
 
 
-def run(*words: str) -> Any:
-    return invoke(*words)
+async def run(*words: object, code: int = 0) -> str:
+    return (await asyncio.to_thread(invoke, *words, code=code)).output
 
 
-def test_status_for_people(gateway: Gateway) -> None:
-    text = run("status").output
+async def test_status_for_people(asked: list[object]) -> None:
+    text = await run("status")
     assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in text
     assert "serial: 103 frames, 4 lost; radio: 100 payloads, 7 lost" in text
     assert "aircraft 1: 47.500000 —, — m" in text
@@ -167,30 +150,28 @@ def test_status_for_people(gateway: Gateway) -> None:
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in rows
 
 
-def test_failed_requests_are_listed(gateway: Gateway) -> None:
-    rows = [line.split() for line in run("status", "--requests").output.splitlines()]
+async def test_failed_requests_are_listed(asked: list[object]) -> None:
+    rows = [line.split() for line in (await run("status", "--requests")).splitlines()]
     request = ["COMMAND_LONG", "REQUEST_MESSAGE", "62"]
     assert ["1", "255.190", *request, "UNSUPPORTED", "3", "3.0"] in rows
-    assert json.loads(run("status", "--requests", "--json").output)[0]["count"] == 3
+    assert json.loads(await run("status", "--requests", "--json"))[0]["count"] == 3
 
 
-def test_status_for_programs(gateway: Gateway) -> None:
-    found = json.loads(run("status", "--json").output)
+async def test_status_for_programs(asked: list[object]) -> None:
+    found = json.loads(await run("status", "--json"))
     assert found["clients"][0]["round_trip_us"] == 1500
     assert found["states"][0][1]["lon_deg"] is None
     assert found["hub"]["published"] == 9
 
 
-def test_clients_are_listed_added_and_removed(gateway: Gateway) -> None:
-    assert "3722.0" in run("clients", "list").output
-    assert json.loads(run("clients", "list", "--json").output)[0]["name"] == "tablet"
-    assert "udp:10.0.0.8:14550" in run("clients", "add", "udp:10.0.0.8:14550").output.split()
-    assert gateway.asked == ["udp:10.0.0.8:14550"]
+async def test_clients_are_listed_added_and_removed(asked: list[object]) -> None:
+    assert "3722.0" in (await run("clients", "list"))
+    assert json.loads(await run("clients", "list", "--json"))[0]["name"] == "tablet"
+    assert "udp:10.0.0.8:14550" in (await run("clients", "add", "udp:10.0.0.8:14550")).split()
+    assert asked == ["udp:10.0.0.8:14550"]
     reported = "observers: Address already in use; trying again until it works"
-    assert reported in run("clients", "add", CLOSED.endpoint).output
-    refused = run("clients", "remove", "phone")
-    assert refused.exit_code == 2
-    assert "no endpoint is called 'phone'" in refused.output
+    assert reported in (await run("clients", "add", CLOSED.endpoint))
+    assert "no endpoint is called 'phone'" in await run("clients", "remove", "phone", code=2)
 
 
 def test_client_stands_on_one_line_of_a_narrow_terminal() -> None:
@@ -211,41 +192,36 @@ def test_client_stands_on_one_line_of_a_narrow_terminal() -> None:
     ]
 
 
-def test_piped_tables_and_texts_are_never_wrapped(
-    gateway: Gateway, monkeypatch: pytest.MonkeyPatch
+async def test_piped_tables_and_texts_are_never_wrapped(
+    asked: list[object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "20")
-    lines = run("status").output.splitlines()
+    lines = (await run("status")).splitlines()
     assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in lines
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
 
 
-def test_mark_takes_places_of_the_south_and_west(gateway: Gateway) -> None:
-    assert run("mark", "-7.76", "-110.4", "--alt", "-3").output == "marked\n"
-    assert gateway.asked == [(-7.76, -110.4, -3.0, None)]
-    assert run("mark", "--hight", "3").exit_code == 2
+async def test_mark_takes_places_of_the_south_and_west(asked: list[object]) -> None:
+    assert (await run("mark", "-7.76", "-110.4", "--alt", "-3")) == "marked\n"
+    assert asked == [(-7.76, -110.4, -3.0, None)]
+    await run("mark", "--hight", "3", code=2)
 
 
-def test_reload(gateway: Gateway) -> None:
-    assert "applied" in run("reload").output
+async def test_reload(asked: list[object]) -> None:
+    assert "applied" in await run("reload")
 
 
-def test_an_added_client_is_kept_on_demand(gateway: Gateway, tmp_path: Path) -> None:
+async def test_an_added_client_is_kept_on_demand(asked: list[object], tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
-    answer = run("clients", "add", "udp:127.0.0.1:9", "--save", "--config", str(file))
-    assert answer.exit_code == 0
-    assert f"saved in {file}" in answer.output
+    words = ("clients", "add", "udp:127.0.0.1:9", "--save", "--config", file)
+    assert f"saved in {file}" in await run(*words)
     assert "udp:127.0.0.1:9" in load(file).hub.endpoints
-    again = run("clients", "add", "udp:127.0.0.1:9", "--save", "--config", str(file))
-    assert again.exit_code == 2
-    assert "added, but not saved" in again.output
+    assert "added, but not saved" in await run(*words, code=2)
 
 
 def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    answer = run("status")
-    assert answer.exit_code == 2
-    assert "nothing runs" in answer.output
+    assert "nothing runs" in invoke("status", code=2).output
 
 
 def test_unknown_numbers_are_shown_as_such() -> None:
