@@ -1,8 +1,10 @@
 """One flight fused with every estimator, and its key figures."""
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -139,15 +141,14 @@ def withheld_error_m(case: Case, estimator: str) -> float:
 
 def changed_settings(a: FusionSettings, b: FusionSettings) -> list[tuple[str, object, object]]:
     """List the settings that differ: key, value in `a`, value in `b`."""
-    return _changes(a, b, "")
+    pairs = ((key, attrgetter(key)(a), attrgetter(key)(b)) for key in setting_keys(type(a)))
+    return [(key, of_a, of_b) for key, of_a, of_b in pairs if of_a != of_b]
 
 
-def _changes(a: Settings, b: Settings, prefix: str) -> list[tuple[str, object, object]]:
-    found: list[tuple[str, object, object]] = []
-    for field in fields_of(type(a)):
-        of_a, of_b = getattr(a, field.name), getattr(b, field.name)
+def setting_keys(kind: type[Settings], prefix: str = "") -> Iterator[str]:
+    """List the paths of all settings, such as `estimation.paper.alpha_accel`."""
+    for field in fields_of(kind):
         if field.section:
-            found += _changes(of_a, of_b, f"{prefix}{field.name}.")
-        elif of_a != of_b:
-            found.append((f"{prefix}{field.name}", of_a, of_b))
-    return found
+            yield from setting_keys(field.section, f"{prefix}{field.name}.")
+        else:
+            yield f"{prefix}{field.name}"

@@ -18,12 +18,12 @@ import pandas as pd
 from scipy.optimize import OptimizeResult, differential_evolution
 
 from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, withhold
-from gateway.analysis.case import ESTIMATORS
+from gateway.analysis.case import ESTIMATORS, setting_keys
 from gateway.analysis.flight import Flight, fuse_track
 from gateway.analysis.processes import forked
 from gateway.printable import UserError
 from gateway.recordings.fuse import FusionSettings
-from gateway.settings import Settings, fields_of
+from gateway.settings import fields_of
 
 SHORT: Final = {
     "alpha": "estimation.paper.alpha_accel",
@@ -53,7 +53,7 @@ class Axis:
 def full_key(name: str) -> str:
     """Find a setting by its path, the end of its path, or the paper's name."""
     name = SHORT.get(name, name)
-    found = [key for key in _leaves(FusionSettings, "") if key == name or key.endswith(f".{name}")]
+    found = [key for key in setting_keys(FusionSettings) if key == name or key.endswith(f".{name}")]
     if not found:
         raise SweepError(f"no setting ends in {name!r}")
     if len(found) > 1 and name not in found:
@@ -102,9 +102,8 @@ def with_value(settings: Any, key: str, value: Value) -> Any:
     """Return settings with one value changed."""
     name, _, rest = key.partition(".")
     if rest:
-        return msgspec.structs.replace(
-            settings, **{name: with_value(getattr(settings, name), rest, value)}
-        )
+        section = with_value(getattr(settings, name), rest, value)
+        return msgspec.structs.replace(settings, **{name: section})
     field = next(f for f in fields_of(type(settings)) if f.name == name)
     if isinstance(value, float) and value.is_integer() and isinstance(field.default, int):
         value = int(value)
@@ -130,14 +129,6 @@ def with_estimator_of(fusion: FusionSettings, keys: Sequence[str]) -> FusionSett
     if len(named) > 1:
         raise SweepError(f"one sweep cannot vary several estimators: {', '.join(sorted(named))}")
     return with_value(fusion, ESTIMATOR_KEY, named.pop()) if named else fusion
-
-
-def _leaves(kind: type[Settings], prefix: str) -> Iterator[str]:
-    for field in fields_of(kind):
-        if field.section:
-            yield from _leaves(field.section, f"{prefix}{field.name}.")
-        else:
-            yield f"{prefix}{field.name}"
 
 
 def _value(text: str) -> Value:
@@ -238,19 +229,14 @@ def idle_axes(contest: Contest, axes: Sequence[Axis]) -> list[str]:
     Each is tried at its first, middle and last value, all others at their first, with every
     estimator that is varied.
     """
-    estimators = next((axis.values for axis in axes if axis.key == ESTIMATOR_KEY), (None,))
-    bases = [
-        tuple(name if axis.key == ESTIMATOR_KEY and name else axis.values[0] for axis in axes)
-        for name in estimators
-    ]
+    # Of the estimator all values, of any other setting the first.
+    varied = [axis.values if axis.key == ESTIMATOR_KEY else axis.values[:1] for axis in axes]
+    bases = list(itertools.product(*varied))
     found = []
     for k, axis in enumerate(axes):
         tried = {axis.values[0], axis.values[len(axis.values) // 2], axis.values[-1]}
         runs = [
-            [
-                run_trial(contest, (*base[:k], value, *base[k + 1 :]))
-                for value in sorted(tried, key=str)
-            ]
+            [run_trial(contest, (*base[:k], value, *base[k + 1 :])) for value in tried]
             for base in bases
         ]
         if len(tried) > 1 and all(_is_alike(run[0], other) for run in runs for other in run):
