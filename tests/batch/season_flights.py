@@ -1,6 +1,7 @@
 """Short simulated recordings that differ in aircraft, day and noise, made in no time."""
 
 from functools import cache
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -33,6 +34,11 @@ def _records() -> tuple[ImuRaw | BaroRaw | GpsFix, ...]:
     return tuple(r for r in simulated().records() if isinstance(r, ImuRaw | BaroRaw | GpsFix))
 
 
+def line_of(record: ImuRaw | BaroRaw | GpsFix) -> str:
+    kind = {ImuRaw: "raw", BaroRaw: "baro", GpsFix: "gps"}[type(record)]
+    return row_to_line(TableRow(record.time_us, **{kind: record}))
+
+
 def write_flight(
     path: Path, *, vehicle: int = 1, day: int = 0, noise_m: float = 0.0, lost: int = 0
 ) -> Path:
@@ -45,28 +51,16 @@ def write_flight(
     header = msgspec.structs.replace(
         header_for(aircraft, vehicle), unix_us_at_zero=DAY_0_US + day * DAY_US
     )
-    lines = [encode_head(header)]
-    imu = 0
+    lines, imu = [encode_head(header)], count(1)
     for record in _records():
-        node = NodeId(vehicle, record.node.node_id)
-        match record:
-            case ImuRaw():
-                imu += 1
-                if not lost or imu % lost:
-                    row = TableRow(record.time_us, raw=replace(record, node=node))
-                    lines.append(row_to_line(row))
-            case BaroRaw():
-                row = TableRow(record.time_us, baro=replace(record, node=node))
-                lines.append(row_to_line(row))
-            case GpsFix():
-                north, east = (rng.normal(0.0, noise_m, 2) / 0.0111).astype(int).tolist()
-                fix = replace(
-                    record,
-                    node=node,
-                    lat_dege7=record.lat_dege7 + north,
-                    lon_dege7=record.lon_dege7 + east,
-                )
-                lines.append(row_to_line(TableRow(record.time_us, gps=fix)))
+        record = replace(record, node=NodeId(vehicle, record.node.node_id))
+        if isinstance(record, ImuRaw) and lost and next(imu) % lost == 0:
+            continue
+        if isinstance(record, GpsFix):
+            north, east = (rng.normal(0.0, noise_m, 2) / 0.0111).astype(int).tolist()
+            lat, lon = record.lat_dege7 + north, record.lon_dege7 + east
+            record = replace(record, lat_dege7=lat, lon_dege7=lon)
+        lines.append(line_of(record))
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("".join(lines))
     return path

@@ -1,5 +1,6 @@
 """`mavgate calibrate`: the guidance on a made-up link."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,14 +8,16 @@ import pytest
 
 from gateway.cli.live import calibrate
 from gateway.config import load, load_aircraft
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.table import TableHeader, encode_head
-from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId
+from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId, Vec3
 from gateway.sensing.calibrating import NodeSamples
 from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tests.batch.season_flights import line_of
 from tests.estimation.samples import fix
 from tests.kit.cli import invoke
+
+pytestmark = pytest.mark.io
 
 NODE = NodeId(3, 0)
 G = 9.80665
@@ -67,7 +70,6 @@ def run(config: Path, *arguments: str) -> str:
     return result.output
 
 
-@pytest.mark.io
 def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None:
     output = run(config, "gyro", "accel", "mag")
     assert [f"{step}: done" in output for step in ("gyro", "accel", "mag")] == [True] * 3
@@ -80,7 +82,6 @@ def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None
     assert 0.0 < saved.accel_residual_mps2 < 0.05
 
 
-@pytest.mark.io
 def test_a_port_that_is_not_there_is_said_before_anything_is_asked(tmp_path: Path) -> None:
     command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
     result = invoke(*command, answers="\n")
@@ -89,13 +90,11 @@ def test_a_port_that_is_not_there_is_said_before_anything_is_asked(tmp_path: Pat
     assert "Lay the aircraft down" not in result.output
 
 
-@pytest.mark.io
 def test_dry_run_saves_nothing(config: Path) -> None:
     run(config, "gyro", "--dry-run")
     assert not load_aircraft(load(config))
 
 
-@pytest.mark.io
 def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def moving(seconds: float) -> NodeSamples:
         noise = np.random.default_rng(1).normal(0, 5.0, (300, 3))
@@ -114,7 +113,6 @@ def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch
     assert "nothing changed" in output
 
 
-@pytest.mark.io
 def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
     link.breaks_at = 4
     output = run(config, "gyro", "accel", "mag")
@@ -124,7 +122,6 @@ def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
     assert saved.accel_bias_mps2 == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.io
 def test_leaving_at_a_question_keeps_what_is_done(config: Path) -> None:
     command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
     result = invoke(*command, answers="\n")
@@ -133,42 +130,38 @@ def test_leaving_at_a_question_keeps_what_is_done(config: Path) -> None:
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
 
 
-@pytest.mark.io
-def test_the_gyroscope_from_a_flight(tmp_path: Path, config: Path) -> None:
+def gyro_bias_of(config: Path, records: Sequence[ImuRaw | GpsFix]) -> Vec3:
+    """Calibrate the gyroscope from a recording."""
+    folder = config.parent
+    head = encode_head(TableHeader(vehicle_id=3))
+    (folder / "flight_01_v3.csv").write_text(head + "".join(map(line_of, records)))
+    config.write_text(f'{config.read_text()}[recording]\nfolder = "{folder}"\n')
+    assert "gyro: done" in run(config, "gyro", "--log", "flight")
+    return load_aircraft(load(config))[3].calibration.gyro_bias_radps
+
+
+def test_the_gyroscope_from_a_flight(config: Path) -> None:
     """A flight with a rest before and steady turns: the bias is that of the rest."""
     flight = fly(SimulatorSettings(imu_rate_hz=50))
-    lines = [encode_head(TableHeader(vehicle_id=3))]
-    for record in flight.records():
-        if isinstance(record, ImuRaw | GpsFix):
-            kind = "raw" if isinstance(record, ImuRaw) else "gps"
-            lines.append(row_to_line(TableRow(record.time_us, **{kind: record})))
-    (tmp_path / "flight_01_v3.csv").write_text("".join(lines))
-    config.write_text(f'{config.read_text()}[recording]\nfolder = "{tmp_path}"\n')
-    output = run(config, "gyro", "--log", "flight")
-    saved = load_aircraft(load(config))[3].calibration
-    assert "gyro: done" in output
-    off = np.subtract(saved.gyro_bias_radps, flight.errors.gyro_bias_radps)
+    records = [record for record in flight.records() if isinstance(record, ImuRaw | GpsFix)]
+    bias_radps = gyro_bias_of(config, records)
+    off = np.subtract(bias_radps, flight.errors.gyro_bias_radps)
     assert np.degrees(np.abs(off)).max() < 0.2
 
 
-@pytest.mark.io
-def test_a_steady_turn_counts_as_no_rest(tmp_path: Path, config: Path) -> None:
+def test_a_steady_turn_counts_as_no_rest(config: Path) -> None:
     """In smooth air a long turn is as even as a rest: only the fixes distinguish them."""
     rng = np.random.default_rng(2)
-    lines = [encode_head(TableHeader(vehicle_id=3))]
+    records: list[ImuRaw | GpsFix] = []
     for time_us in range(0, 80_000_000, 20_000):
         turns = time_us >= 20_000_000
         if time_us % 200_000 == 0:
             vel = (15.0 if turns else 0.0, 0.0, 0.0)
-            lines.append(row_to_line(TableRow(time_us, gps=fix(time_us, vel=vel))))
+            records.append(fix(time_us, vel=vel))
         rates = (np.array([5, -8, 330 if turns else 11]) + rng.normal(0, 1, 3)).round()
-        lines.append(row_to_line(TableRow(time_us, raw=make_raw(time_us, rates))))
-    (tmp_path / "flight_01_v3.csv").write_text("".join(lines))
-    config.write_text(f'{config.read_text()}[recording]\nfolder = "{tmp_path}"\n')
-    assert "gyro: done" in run(config, "gyro", "--log", "flight")
-    saved = load_aircraft(load(config))[3].calibration
+        records.append(make_raw(time_us, rates))
     expected = np.radians(np.array([5, -8, 11]) / 32.8)
-    assert saved.gyro_bias_radps == pytest.approx(tuple(expected), abs=1e-4)
+    assert gyro_bias_of(config, records) == pytest.approx(tuple(expected), abs=1e-4)
 
 
 def make_raw(time_us: int, rates: np.ndarray) -> ImuRaw:
