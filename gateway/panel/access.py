@@ -14,7 +14,7 @@ import re
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -49,6 +49,7 @@ CORS_HEADERS: Final = {
     "access-control-allow-private-network": "true",
     "access-control-expose-headers": "x-error-detail",
     "access-control-max-age": "600",
+    "cross-origin-resource-policy": "cross-origin",
     "vary": "Origin",
 }
 """Answer to an allowed page of another origin, its preflight request included."""
@@ -215,7 +216,8 @@ class AccessControl:
             await _refuse(scope, receive, send, HTTPStatus.FORBIDDEN, refusal)
             return
         if is_allowed and scope["type"] == "http":
-            send = _with_cors(send, headers["origin"])
+            allowed = {"access-control-allow-origin": headers["origin"], **CORS_HEADERS}
+            send = _with_headers(send, allowed)
             if scope["method"] == "OPTIONS":
                 await Response(status_code=HTTPStatus.NO_CONTENT)(scope, receive, send)
                 return
@@ -405,30 +407,17 @@ async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
             raise
 
 
-def _with_headers(send: Send) -> Send:
-    """Return a `send` that adds the security headers to a response."""
+def _with_headers(send: Send, added: Mapping[str, str] = HEADERS) -> Send:
+    """Return a `send` that adds headers to a response, by default those for security."""
 
     async def dressed(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
-            headers.update(HEADERS)
+            headers.update(added)
             headers.setdefault("content-security-policy", NO_SCRIPT_POLICY)
         await send(message)
 
     return dressed
-
-
-def _with_cors(send: Send, origin: str) -> Send:
-    """Return a `send` that lets a page of another origin read the response."""
-
-    async def shared(message: Message) -> None:
-        if message["type"] == "http.response.start":
-            headers = MutableHeaders(scope=message)
-            headers.update({"access-control-allow-origin": origin, **CORS_HEADERS})
-            headers["cross-origin-resource-policy"] = "cross-origin"
-        await send(message)
-
-    return shared
 
 
 async def _small_body(receive: Receive) -> bytes:

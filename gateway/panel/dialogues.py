@@ -14,7 +14,6 @@ from gateway.clock import GatewayClock
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.state.parameters import (
-    AUTOPILOT,
     GENERAL_PATHS,
     FileClient,
     ListState,
@@ -23,6 +22,7 @@ from gateway.panel.state.parameters import (
     parameter_path,
     parse_parameters,
 )
+from gateway.panel.state.vehicle import command_long
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000
@@ -62,17 +62,8 @@ class Dialogue:
 
     def ask_for_samples(self) -> list[Any]:
         """Request sensor rates high enough for drawing and fusing; return the messages to send."""
-        return [
-            mavlink.MAVLink_command_long_message(
-                self.parameters.system_id,
-                AUTOPILOT,
-                mavlink.MAV_CMD_SET_MESSAGE_INTERVAL,
-                0,
-                mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-                SAMPLES_US,
-                *(0.0,) * 5,
-            )
-        ]
+        system_id, number = self.parameters.system_id, mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+        return [command_long(system_id, number, mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, SAMPLES_US)]
 
     def take(self, message: Any, now_us: int) -> list[Any]:
         """Process one message of the aircraft; return the messages to send."""

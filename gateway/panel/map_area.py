@@ -17,7 +17,8 @@ from pmtiles.tile import zxy_to_tileid
 from pmtiles.writer import Writer
 
 from gateway import __version__
-from gateway.panel.map_tiles import GetBytes, PmTiles
+from gateway.panel.map_tiles import GetBytes, PmTiles, file_reader
+from gateway.printable import reason_of
 
 EARTH_M: Final = 6_378_137.0
 MAX_TILES: Final = 20_000
@@ -73,7 +74,7 @@ def open_source(source: str, client: httpx.Client | None = None) -> GetBytes:
             "permits extracts"
         )
     if not source.startswith(("http://", "https://")):
-        return _file_reader(Path(source).expanduser())
+        return file_reader(Path(source).expanduser())
     agent = {"user-agent": f"mavgate/{__version__}", "accept-encoding": "identity"}
     client = client or httpx.Client(headers=agent, timeout=TIMEOUT_S, follow_redirects=True)
 
@@ -111,8 +112,8 @@ def extract_area(
     """
     try:
         reader = PmTiles(get_bytes)
-    except ValueError as error:
-        raise MapAreaError(f"the source cannot be used: {error}") from error
+    except (OSError, ValueError) as error:
+        raise MapAreaError(f"the source cannot be used: {reason_of(error)}") from error
     header = reader.header
     zooms = range(header["min_zoom"], min(max_zoom, header["max_zoom"]) + 1)
     wanted = [(z, x, y) for z in zooms for x, y in tiles_in(box, z)]
@@ -160,15 +161,3 @@ def _tile(lat_deg: float, lon_deg: float, zoom: int) -> tuple[int, int]:
     x = (lon_deg + 180.0) / 360.0 * count
     y = (1.0 - math.asinh(math.tan(lat)) / math.pi) / 2.0 * count
     return min(max(int(x), 0), count - 1), min(max(int(y), 0), count - 1)
-
-
-def _file_reader(path: Path) -> GetBytes:
-    def get_bytes(offset: int, length: int) -> bytes:
-        try:
-            with path.open("rb") as file:
-                file.seek(offset)
-                return file.read(length)
-        except OSError as error:
-            raise MapAreaError(f"{path}: {error.strerror}") from error
-
-    return get_bytes

@@ -176,8 +176,8 @@ class PmTiles:
         return data
 
 
-def open_pmtiles(path: Path) -> PmTiles:
-    """Open a PMTiles file on the disk; raises ValueError or OSError if it is none."""
+def file_reader(path: Path) -> GetBytes:
+    """Return what reads ranges of bytes of a file; raises OSError or ValueError at damage."""
 
     def get_bytes(offset: int, length: int) -> bytes:
         # Not mapped into memory: a file that becomes shorter would end the process.
@@ -187,7 +187,7 @@ def open_pmtiles(path: Path) -> PmTiles:
             except OverflowError as error:
                 raise ValueError("a directory of it is damaged") from error
 
-    return PmTiles(get_bytes)
+    return get_bytes
 
 
 def styles_of(settings: PanelSettings) -> list[MapStyle]:
@@ -267,7 +267,7 @@ class MapTiles:
             path = Path(style.url).expanduser()
             try:
                 if path.suffix == ".pmtiles":
-                    map_file = open_pmtiles(path)
+                    map_file = PmTiles(file_reader(path))
                     style = replace(
                         style,
                         max_zoom=min(style.max_zoom, map_file.max_zoom),
@@ -368,7 +368,7 @@ def _open_mbtiles(path: Path) -> Callable[[int, int, int], bytes | None]:
 
 def _map_name(name: str, path: Path) -> str:
     """Return the file name of an uploaded map; raises ValueError if it is none."""
-    data = open_pmtiles(path).first_tile()
+    data = PmTiles(file_reader(path)).first_tile()
     if data is None or kind_of_image(data) is None:
         raise ValueError("it has no PNG, JPEG or WEBP tile")
     return f"{name}.pmtiles"

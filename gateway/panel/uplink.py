@@ -22,7 +22,7 @@ from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
 from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.vehicle import Spot
+from gateway.panel.state.vehicle import Spot, command_long
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
@@ -201,14 +201,7 @@ class Uplink:
 
         Raises CommandFailedError if it is refused or not answered.
         """
-        filled = (*params, *(0.0,) * (7 - len(params)))
-        message = mavlink.MAVLink_command_long_message(
-            system_id,
-            mavlink.MAV_COMP_ID_AUTOPILOT1,
-            number,
-            0,
-            *(float(value) for value in filled),
-        )
+        message = command_long(system_id, number, *params)
         await self._until_acknowledged(system_id, number, message)
 
     async def command_at(self, system_id: int, number: int, spot: Spot) -> None:

@@ -36,7 +36,7 @@ from nicegui import ui
 
 from gateway.clock import GatewayClock
 from gateway.panel.access import Role
-from gateway.panel.dialogues import Dialogues
+from gateway.panel.dialogues import Dialogue, Dialogues
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
@@ -119,6 +119,11 @@ class ViewContext:
     def vehicle(self) -> VehicleState | None:
         """The selected aircraft; None before the first."""
         return None if self.system_id is None else self.fleet.vehicles.get(self.system_id)
+
+    @property
+    def dialogue(self) -> Dialogue | None:
+        """The dialogue with the selected aircraft; None before the first."""
+        return None if self.system_id is None else self.parts.dialogues.of(self.system_id)
 
     @property
     def is_recording(self) -> bool:

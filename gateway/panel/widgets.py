@@ -11,6 +11,7 @@ from nicegui import ui
 from nicegui.element import Element
 from nicegui.elements.mixins.text_element import TextElement
 from nicegui.events import GenericEventArguments
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import unix_time_us
 from gateway.live.control_socket import ControlError
@@ -106,6 +107,21 @@ def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None
     """Ask for confirmation, and act on a yes."""
     with asking(question) as dialog:
         ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
+
+
+WRITE: Final = 1.0
+"""PREFLIGHT_STORAGE_PARAMETER_ACTION."""
+
+
+async def store_parameters(context: ViewContext, done: str) -> bool:
+    """Have the selected aircraft store its parameters; return whether it has."""
+    try:
+        await context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, WRITE)
+    except CommandFailedError as error:
+        ui.notify(f"Not stored: {error}", type="negative")
+        return False
+    ui.notify(done, type="positive")
+    return True
 
 
 Cells = Sequence[str | tuple[str, ...]]
@@ -308,16 +324,14 @@ class LiveChart:
         if not self._is_ready:
             return
         self._sent_us = {}
-        history, system_id = self._context.parts.history, self._context.system_id or 0
-        named = [(name, shown_unit(history.unit(system_id, name))[1]) for name in self.fields]
+        named = [(name, self._unit(name)[1]) for name in self.fields]
         self.element.set_fields(named, self._news(), unix_time_us() / 1000)
 
     def refresh(self) -> None:
         """Send the new data."""
         if not (self._is_ready and self.fields):
             return
-        history, system_id = self._context.parts.history, self._context.system_id or 0
-        if any(name not in self._sent_us and history.unit(system_id, name) for name in self.fields):
+        if any(name not in self._sent_us and self._unit(name)[1] for name in self.fields):
             # The unit is known only since the first message of its kind came.
             self.reload()
             return
@@ -327,15 +341,19 @@ class LiveChart:
         """Return the visible data as CSV."""
         begin_ms, end_ms = await self.element.span_ms()
         zero_us = self._zero_unix_us()
-        history, system_id = self._context.parts.history, self._context.system_id or 0
-        begin_us, end_us = round(begin_ms * 1000) - zero_us, round(end_ms * 1000) - zero_us
-        shown = {name: shown_unit(history.unit(system_id, name)) for name in self.fields}
-        series = {}
-        for name, (factor, _) in shown.items():
-            time_us, values = history.series(system_id, name, begin_us, end_us)
-            series[name] = (time_us, values * factor)
-        units = {name: unit for name, (_, unit) in shown.items()}
-        return fields_csv(series, units, zero_us)
+        span = (round(begin_ms * 1000) - zero_us, round(end_ms * 1000) - zero_us)
+        series = {name: self._series(name, *span) for name in self.fields}
+        return fields_csv(series, {name: self._unit(name)[1] for name in self.fields}, zero_us)
+
+    def _unit(self, name: str) -> tuple[float, str]:
+        """Return the factor and the unit in which a field is shown."""
+        return shown_unit(self._context.parts.history.unit(self._context.system_id or 0, name))
+
+    def _series(self, name: str, after_us: int, until_us: int | None = None) -> Points:
+        system_id = self._context.system_id or 0
+        history = self._context.parts.history
+        time_us, values = history.series(system_id, name, after_us, until_us)
+        return time_us, values * self._unit(name)[0]
 
     def _on_ready(self) -> None:
         self._is_ready = True
@@ -345,14 +363,12 @@ class LiveChart:
         return unix_time_us() - self._context.now_us
 
     def _news(self) -> list[Points]:
-        history, system_id = self._context.parts.history, self._context.system_id or 0
         zero_us, found = self._zero_unix_us(), []
         for name in self.fields:
-            time_us, values = history.series(system_id, name, self._sent_us.get(name, -1))
+            time_us, values = self._series(name, self._sent_us.get(name, -1))
             if len(time_us):
                 self._sent_us[name] = int(time_us[-1])
-            factor, _ = shown_unit(history.unit(system_id, name))
-            found.append(((time_us + zero_us) // 1000, values * factor))
+            found.append(((time_us + zero_us) // 1000, values))
         return found
 
 

@@ -67,7 +67,7 @@ async def locked() -> AsyncIterator[httpx.AsyncClient]:
         yield client
 
 
-async def websocket_answer(guard: AccessControl, path: str = "/telemetry", **headers: str) -> str:
+async def websocket_answer(guard: AccessControl, path: str, **headers: str) -> str:
     """Ask for the telemetry as a page would; what the guard says first."""
     said: list[str] = []
 
@@ -87,12 +87,39 @@ async def websocket_answer(guard: AccessControl, path: str = "/telemetry", **hea
     return said[0]
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:14590", "localhost:14590", "[::1]:14590"])
-async def test_own_names_are_let_in(host: str) -> None:
-    async with client_of(guarded()) as client:
-        answer = await client.get("/", headers={"host": host})
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"host": "127.0.0.1:14590"},
+        {"host": "localhost:14590"},
+        {"host": "[::1]:14590"},
+        {"host": "ground.local:14590"},
+        {"origin": HERE},
+    ],
+)
+async def test_own_names_and_the_own_page_are_let_in(headers: dict[str, str]) -> None:
+    async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
+        answer = await client.post("/", headers=headers)
     assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
     assert answer.headers["x-frame-options"] == "DENY"
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        *({"host": host} for host in ("evil.example", "evil.example:14590", "10.0.0.7:14590", "")),
+        *({"host": host} for host in ("[::1", "[x]")),
+        *({"origin": origin} for origin in ("http://evil.example", "http://127.0.0.1:8080")),
+        *({"origin": origin} for origin in ("null", "http://[::1")),
+    ],
+)
+async def test_foreign_name_that_points_here_and_foreign_page_are_refused(
+    headers: dict[str, str],
+) -> None:
+    async with client_of(guarded()) as client:
+        for method in ("GET", "POST"):
+            answer = await client.request(method, "/", headers=headers)
+            assert answer.status_code == http.HTTPStatus.FORBIDDEN
 
 
 async def test_head_is_answered_as_get_is() -> None:
@@ -108,44 +135,42 @@ async def test_head_is_answered_as_get_is() -> None:
     assert answer.headers["content-length"] == str(len("GET"))
 
 
+async def unanswered(guard: AccessControl, method: str, path: str, received: str) -> None:
+    """Pass a request on that gets a message of its client, and no answer."""
+
+    async def receive() -> Message:
+        return {"type": received}
+
+    async def send(message: Message) -> None:
+        raise AssertionError(message)
+
+    head = [(b"host", b"127.0.0.1:14590")]
+    scope = {"type": "http", "method": method, "path": path, "headers": head}
+    await guard(scope, receive, send)
+
+
 @pytest.mark.parametrize("leaves", [True, False])
 async def test_a_browser_that_leaves_unanswered_is_no_error(leaves: bool) -> None:
     async def says_nothing(scope: Scope, receive: Receive, send: Send) -> None:
         await receive()
-
-    async def receive() -> Message:
-        return {"type": "http.disconnect" if leaves else "http.request"}
-
-    async def send(message: Message) -> None:
-        raise AssertionError(message)
 
     async def pass_on(request: Request, call_next: RequestResponseEndpoint) -> Response:
         return await call_next(request)
 
     guard = guarded()
     guard.app = BaseHTTPMiddleware(says_nothing, pass_on)
-    head = [(b"host", b"127.0.0.1:14590")]
-    scope = {"type": "http", "method": "GET", "path": "/favicon.ico", "headers": head}
     with contextlib.nullcontext() if leaves else pytest.raises(RuntimeError):
-        await guard(scope, receive, send)
+        received = "http.disconnect" if leaves else "http.request"
+        await unanswered(guard, "GET", "/favicon.ico", received)
 
 
-@pytest.mark.parametrize(
-    "host", ["evil.example", "evil.example:14590", "10.0.0.7:14590", "", "[::1", "[x]"]
-)
-async def test_foreign_name_that_points_here_is_refused(host: str) -> None:
-    async with client_of(guarded()) as client:
-        answer = await client.get("/", headers={"host": host})
-    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+async def test_upload_that_is_interrupted_is_no_error() -> None:
+    async def reads_all(scope: Scope, receive: Receive, send: Send) -> None:
+        await Request(scope, receive).body()
 
-
-@pytest.mark.parametrize(
-    "origin", ["http://evil.example", "http://127.0.0.1:8080", "null", "http://[::1"]
-)
-async def test_other_page_of_the_same_browser_cannot_steer(origin: str) -> None:
-    async with client_of(guarded()) as client:
-        answer = await client.post("/", headers={"origin": origin})
-    assert answer.status_code == http.HTTPStatus.FORBIDDEN
+    guard = guarded()
+    guard.app = reads_all
+    await unanswered(guard, "PUT", "/recordings/a", "http.disconnect")
 
 
 FOREIGN = "http://cockpit.example:8080"
@@ -183,13 +208,25 @@ async def test_page_of_a_listed_origin_may_use_the_api_only(
     )
 
 
-async def test_listed_origin_opens_the_websocket_api_but_not_under_a_foreign_host() -> None:
-    host = "127.0.0.1:14590"
-    guard = guarded(ALLOWED)
-    answer = await websocket_answer(guard, "/v1/ws/mavlink", host=host, origin=FOREIGN)
-    assert answer == "websocket.accept"
-    answer = await websocket_answer(guard, "/v1/ws/mavlink", host="evil.example", origin=FOREIGN)
-    assert answer == "websocket.close"
+EVIL = "http://evil.example"
+
+
+@pytest.mark.parametrize(
+    ("settings", "path", "host", "origin", "answer"),
+    [
+        (PanelSettings(), "/telemetry", "127.0.0.1:14590", HERE, "accept"),
+        (PanelSettings(), "/telemetry", "127.0.0.1:14590", EVIL, "close"),
+        (PanelSettings(), "/telemetry", "evil.example", HERE, "close"),
+        (PanelSettings(password=OPERATOR), "/telemetry", "127.0.0.1:14590", HERE, "close"),
+        (ALLOWED, "/v1/ws/mavlink", "127.0.0.1:14590", FOREIGN, "accept"),
+        (ALLOWED, "/v1/ws/mavlink", "evil.example", FOREIGN, "close"),
+    ],
+)
+async def test_websocket_needs_host_origin_and_password(
+    settings: PanelSettings, path: str, host: str, origin: str, answer: str
+) -> None:
+    found = await websocket_answer(guarded(settings), path, host=host, origin=origin)
+    assert found == f"websocket.{answer}"
 
 
 async def test_listed_origin_needs_the_login_too() -> None:
@@ -207,26 +244,6 @@ async def test_listed_origin_needs_the_login_too() -> None:
 def test_origin_that_no_browser_sends_is_refused(origin: str) -> None:
     with pytest.raises(ValueError, match=r"https://example\.org:8080"):
         PanelSettings(origins=(origin,))
-
-
-async def test_own_page_may_post() -> None:
-    async with client_of(guarded()) as client:
-        answer = await client.post("/", headers={"origin": HERE})
-    assert answer.status_code == http.HTTPStatus.OK
-
-
-async def test_websocket_asks_for_the_origin_too() -> None:
-    host = "127.0.0.1:14590"
-    assert await websocket_answer(guarded(), host=host, origin=HERE) == "websocket.accept"
-    evil = await websocket_answer(guarded(), host=host, origin="http://evil.example")
-    assert evil == "websocket.close"
-    assert await websocket_answer(guarded(), host="evil.example", origin=HERE) == "websocket.close"
-
-
-async def test_named_host_is_let_in() -> None:
-    async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
-        answer = await client.get("/", headers={"host": "ground.local:14590"})
-    assert answer.status_code == http.HTTPStatus.OK
 
 
 async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
@@ -259,12 +276,6 @@ async def test_nothing_is_shown_without_the_password(locked: httpx.AsyncClient) 
     assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
     locked.cookies.set(COOKIE, "forged")
     assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
-
-
-async def test_websocket_needs_the_password() -> None:
-    settings = PanelSettings(password=OPERATOR)
-    answer = await websocket_answer(guarded(settings), host="127.0.0.1:14590", origin=HERE)
-    assert answer == "websocket.close"
 
 
 @pytest.mark.parametrize(("password", "role"), [("tower", "operator"), ("guest", "viewer")])
@@ -362,23 +373,6 @@ async def test_inline_scripts_of_a_page_get_the_nonce_of_their_response() -> Non
         assert answer.text.endswith("<scripts>")
         assert "'unsafe-inline'" not in policy.partition("script-src")[2].partition(";")[0]
     assert len(seen) == 2
-
-
-async def test_upload_that_is_interrupted_is_no_error() -> None:
-    async def reads_all(scope: Scope, receive: Receive, send: Send) -> None:
-        await Request(scope, receive).body()
-
-    async def receive() -> Message:
-        return {"type": "http.disconnect"}
-
-    async def send(message: Message) -> None:
-        raise AssertionError(message)
-
-    guard = guarded()
-    guard.app = reads_all
-    head = [(b"host", b"127.0.0.1:14590")]
-    scope = {"type": "http", "method": "PUT", "path": "/recordings/a", "headers": head}
-    await guard(scope, receive, send)
 
 
 def test_hash_matches_its_password_alone() -> None:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.vehicle import TimedText, VehicleState
+from gateway.panel.state.vehicle import VehicleState
 from gateway.units import US_PER_S
 from gateway.vehicle.telemetry.health import node_role
 
@@ -26,12 +26,20 @@ SENSORS: Final = {
     mavlink.MAV_SYS_STATUS_SENSOR_BATTERY: "battery",
 }
 
-_SILENT: Final = re.compile(r"^(?P<what>.+) silent$")
-_BACK: Final = re.compile(r"^(?P<what>.+) is back$")
-_RECEIVER_LOST: Final = re.compile(r"^Receiver lost: (?P<what>.+)$")
-_RECEIVER_BACK: Final = re.compile(r"^Receiver connected\b")
-_RECORDING_FAILED: Final = re.compile(r"^(Recording stopped|Cannot record): (?P<what>.+)$")
-_RECORDING_WELL: Final = re.compile(r"^Recording (?!stopped:).+$")
+_BEGINS: Final = (
+    (re.compile(r"^(.+) silent$"), "node {0}", "{0} silent", "no radio packets"),
+    (re.compile(r"^Receiver lost: (.+)$"), "receiver", "Receiver lost", "{0}"),
+    (re.compile(r"^(?:Recording stopped|Cannot record): (.+)$"), "recording", "Recording failed",
+     "{0}"),
+)  # fmt: skip
+"""Texts of the gateway that begin an alert, and its key, title and detail."""
+_ENDS: Final = (
+    (re.compile(r"^(.+) is back$"), "node {0}"),
+    # Also the text of a restarted gateway, which knows of no silent node.
+    (re.compile(r"^(Receiver connected\b)"), "receiver|node .+"),
+    (re.compile(r"^(Recording (?!stopped:).+)$"), "recording"),
+)
+"""Texts that end alerts, and a regular expression of their keys."""
 
 
 class AlertLevel(IntEnum):
@@ -93,41 +101,22 @@ def _sensors(vehicle: VehicleState) -> list[Alert]:
 def _texts(vehicle: VehicleState, now_us: int) -> list[Alert]:
     standing: dict[str, Alert] = {}
     for text in vehicle.texts.all:
-        _fold(standing, text)
+        is_known = False
+        for pattern, *parts in _BEGINS:
+            if match := pattern.match(text.text):
+                is_known = True
+                key, title, detail = (part.format(match[1]) for part in parts)
+                standing[key] = Alert(key, AlertLevel.CRITICAL, title, detail)
+        for pattern, keys in _ENDS:
+            if match := pattern.match(text.text):
+                is_known = True
+                ended = re.compile(keys.format(re.escape(match[1])))
+                standing = {k: v for k, v in standing.items() if not ended.fullmatch(k)}
         grave = text.severity <= mavlink.MAV_SEVERITY_CRITICAL
-        if grave and now_us - text.time_us < SHOUT_US and not _is_known(text.text):
+        if grave and not is_known and now_us - text.time_us < SHOUT_US:
             key = f"text {text.number}"
             standing[key] = Alert(key, AlertLevel.CRITICAL, text.text)
     return list(standing.values())
-
-
-def _fold(standing: dict[str, Alert], text: TimedText) -> None:
-    """Start or end an alert by one text."""
-    if match := _SILENT.match(text.text):
-        what = match["what"]
-        key = f"node {what}"
-        standing[key] = Alert(key, AlertLevel.CRITICAL, f"{what} silent", "no radio packets")
-    elif match := _BACK.match(text.text):
-        standing.pop(f"node {match['what']}", None)
-    elif match := _RECEIVER_LOST.match(text.text):
-        standing["receiver"] = Alert(
-            "receiver", AlertLevel.CRITICAL, "Receiver lost", match["what"]
-        )
-    elif _RECEIVER_BACK.match(text.text):
-        # Also the text of a restarted gateway, which knows of no silent node.
-        for key in [key for key in standing if key.startswith(("receiver", "node "))]:
-            del standing[key]
-    elif match := _RECORDING_FAILED.match(text.text):
-        standing["recording"] = Alert(
-            "recording", AlertLevel.CRITICAL, "Recording failed", match["what"]
-        )
-    elif _RECORDING_WELL.match(text.text):
-        standing.pop("recording", None)
-
-
-def _is_known(text: str) -> bool:
-    patterns = (_SILENT, _BACK, _RECEIVER_LOST, _RECEIVER_BACK, _RECORDING_FAILED)
-    return any(pattern.match(text) for pattern in patterns)
 
 
 NODE_SILENT_US: Final = 3 * US_PER_S

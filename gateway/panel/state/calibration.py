@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.panel.state.vehicle import command_long
 from gateway.records import NAN
 from gateway.sensing.calibrating import fit_sphere
 from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
@@ -52,17 +53,9 @@ _MIDDLES: Final = np.array([_unit(cell.sum(axis=0)) for cell in CELLS])
 
 
 def seen_cells(vectors: FloatArray) -> list[bool]:
-    """Return which cells the vectors from the origin point into.
+    """Return which of `CELLS` vectors from the origin, shape (n, 3), point into.
 
-    Parameters
-    ----------
-    vectors : ndarray, shape (n, 3)
-        Any length but zero; rows that are not finite are ignored.
-
-    Returns
-    -------
-    list of bool
-        One for each of `CELLS`.
+    They may have any length but zero; rows that are not finite are ignored.
     """
     seen = [False] * len(CELLS)
     finite = vectors[np.isfinite(vectors).all(axis=1)] if len(vectors) else vectors
@@ -132,7 +125,8 @@ PARAMS: Final[dict[CalibrationStep, tuple[float, ...]]] = {
     CalibrationStep.ACCEL: (0.0, 0.0, 0.0, 0.0, 1.0),
     CalibrationStep.LEVEL: (0.0, 0.0, 0.0, 0.0, 2.0),
 }
-"""Of MAV_CMD_PREFLIGHT_CALIBRATION."""
+"""Of the command."""
+CALIBRATE: Final = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
 
 
 class RunState(StrEnum):
@@ -192,16 +186,16 @@ class CalibrationRun:
 
     def start_message(self) -> Any:
         """Return the command that starts it."""
-        return _command(self.system_id, PARAMS[self.step])
+        return command_long(self.system_id, CALIBRATE, *PARAMS[self.step])
 
     def cancel_message(self) -> Any:
         """Return the command that cancels it: all zero."""
-        return _command(self.system_id, ())
+        return command_long(self.system_id, CALIBRATE)
 
     def take(self, message: Any, now_us: int) -> None:
         """Take in one message of the vehicle."""
         match message.get_type():
-            case "COMMAND_ACK" if message.command == mavlink.MAV_CMD_PREFLIGHT_CALIBRATION:
+            case "COMMAND_ACK" if message.command == CALIBRATE:
                 self._take_ack(message, now_us)
             case "STATUSTEXT":
                 self._take_text(message.text, now_us)
@@ -357,13 +351,6 @@ class CalibrationRun:
         left = np.linalg.norm(points - centre, axis=1) - radius
         after = _rms(left) if self.state is RunState.DONE else NAN
         return _rms(strength - strength.mean()), after
-
-
-def _command(system_id: int, params: tuple[float, ...]) -> Any:
-    filled = (*params, *(0.0,) * (7 - len(params)))
-    return mavlink.MAVLink_command_long_message(
-        system_id, 1, mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, 0, *filled
-    )
 
 
 def _highres(message: Any) -> tuple[_Vector, _Vector, _Vector | None]:

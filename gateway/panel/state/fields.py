@@ -95,23 +95,10 @@ class FieldHistory:
     def series(
         self, system_id: int, name: str, after_us: int = -1, until_us: int | None = None
     ) -> tuple[IntArray, FloatArray]:
-        """Read one field.
+        """Return the times, on the panel's clock, and values of a field; empty if it never came.
 
-        Parameters
-        ----------
-        system_id : int
-            Whose.
-        name : str
-            Message and field, such as `ATTITUDE.roll` or `BATTERY_STATUS[0].voltages[1]`.
-        after_us, until_us : int, optional
-            Only values after the one, and not after the other.
-
-        Returns
-        -------
-        time_us : ndarray of int64, shape (N,)
-            On the panel's clock, growing.
-        values : ndarray of float64, shape (N,)
-            As the message has them; both empty for a field that never came.
+        Its name is that of message and field, such as `BATTERY_STATUS[0].voltages[1]`. The values
+        are as the message has them, after the first time and not after the second.
         """
         kind, _, field = name.partition(".")
         columns = self._vehicles.get(system_id, {}).get(kind)

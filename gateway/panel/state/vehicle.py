@@ -18,6 +18,13 @@ from gateway.units import US_PER_S
 from gateway.vehicle.plan import is_on_earth
 
 
+def command_long(system_id: int, number: int, *params: float) -> Any:
+    """Make a COMMAND_LONG for an autopilot; parameters that are not given are zero."""
+    filled = (*map(float, params), *(0.0,) * (7 - len(params)))
+    autopilot = mavlink.MAV_COMP_ID_AUTOPILOT1
+    return mavlink.MAVLink_command_long_message(system_id, autopilot, number, 0, *filled)
+
+
 class Spot(msgspec.Struct, frozen=True):
     """A position; its height is NaN if unknown."""
 

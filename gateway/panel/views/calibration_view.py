@@ -6,9 +6,7 @@ from typing import Any, Final
 
 from nicegui import ui
 from nicegui.element import Element
-from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.dialogues import Dialogue
 from gateway.panel.state.calibration import (
     CELLS,
     ORIENTATIONS,
@@ -20,14 +18,11 @@ from gateway.panel.state.calibration import (
 )
 from gateway.panel.state.fields import FloatArray, unit_text
 from gateway.panel.state.parameters import ListState
-from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import LIVE, WEB, ViewContext
-from gateway.panel.widgets import DataTable, heading
+from gateway.panel.widgets import DataTable, heading, store_parameters
 from gateway.printable import printable
 
 REFRESH_S: Final = 0.2
-STORE: Final = 1.0
-"""PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 MIN_CELLS: Final = 60
 MNT_NAMES: Final = tuple(f"CAL_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
 MAG_MNT_NAMES: Final = tuple(f"CAL_MAG_MNT_{axis}" for axis in ("ROLL", "PIT", "YAW"))
@@ -72,15 +67,7 @@ class FieldSphere(Element, component=WEB / "field_sphere.js"):
         self._props["cells"] = CELLS.round(4).tolist()
 
     def show(self, points: FloatArray, seen: list[bool]) -> None:
-        """Show these samples.
-
-        Parameters
-        ----------
-        points : ndarray, shape (n, 3)
-            In radii of the sphere, from its centre; body FRD.
-        seen : list of bool
-            By cell; see `seen_cells`.
-        """
+        """Show samples in radii from the sphere's centre, shape (n, 3), and the seen cells."""
         rounded: Any = points.round(3).tolist()
         self.run_method("show", rounded, seen)
 
@@ -103,14 +90,9 @@ class CalibrationView:
         self._context.every(REFRESH_S, self._refresh)
         self._refresh()
 
-    @property
-    def _dialogue(self) -> Dialogue | None:
-        system_id = self._context.system_id
-        return None if system_id is None else self._context.parts.dialogues.of(system_id)
-
     def _run(self) -> CalibrationRun | None:
         """Return the newest calibration, if it is of the shown step."""
-        dialogue = self._dialogue
+        dialogue = self._context.dialogue
         run = None if dialogue is None else dialogue.calibration
         return run if run is not None and run.step is self._step else None
 
@@ -123,7 +105,7 @@ class CalibrationView:
         """Rebuild elements whose structure changed; otherwise only update their values."""
         if self._context.system_id is not None:
             self._context.parts.dialogues.load(self._context.system_id)
-        run, dialogue = self._run(), self._dialogue
+        run, dialogue = self._run(), self._context.dialogue
         if run is not None and run.state.is_over:
             done = run.state is RunState.DONE
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
@@ -160,7 +142,7 @@ class CalibrationView:
                     ui.label(short).classes("soft")
 
     def _show(self, step: CalibrationStep) -> None:
-        run = self._dialogue.calibration if self._dialogue else None
+        run = self._context.dialogue.calibration if self._context.dialogue else None
         if run is not None and not run.state.is_over and step is not run.step:
             ui.notify(f"{TITLES[run.step][0]}: cancel it first", type="warning")
             return
@@ -213,7 +195,9 @@ class CalibrationView:
 
     def _orientation(self) -> str:
         """Return which of the orientations the parameters have."""
-        entries = {} if self._dialogue is None else self._dialogue.parameters.entries
+        entries = (
+            {} if self._context.dialogue is None else self._context.dialogue.parameters.entries
+        )
         now = [entries[name].value for name in MNT_NAMES if name in entries]
         near = (
             name
@@ -309,7 +293,7 @@ class CalibrationView:
 
     def _build_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
-        metas = self._dialogue.metas if self._dialogue else {}
+        metas = self._context.dialogue.metas if self._context.dialogue else {}
         for name, (old, new) in self._changes().items():
             meta = metas.get(name)
             words = f"{meta.short} ({unit_text(meta.unit)}), {name}" if meta else name
@@ -319,7 +303,7 @@ class CalibrationView:
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         """Return the parameters that the calibration changed."""
-        dialogue = self._dialogue
+        dialogue = self._context.dialogue
         if dialogue is None:
             return {}
         entries = dialogue.parameters.entries
@@ -373,7 +357,7 @@ class CalibrationView:
 
     def _has_other_unanswered(self) -> bool:
         """Return whether another calibration is neither stored nor undone, and say so."""
-        other = self._dialogue.unanswered if self._dialogue else None
+        other = self._context.dialogue.unanswered if self._context.dialogue else None
         if other is None or other is self._step:
             return False
         # Storing this one would store the other too.
@@ -388,13 +372,8 @@ class CalibrationView:
         """Store it in the vehicle: this button is the confirmation."""
         if self._has_other_unanswered():
             return
-        try:
-            await self._context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE)
-        except CommandFailedError as error:
-            ui.notify(f"Not stored: {error}", type="negative")
-            return
-        ui.notify(f"{TITLES[self._step][0]}: stored", type="positive")
-        self._end()
+        if await store_parameters(self._context, f"{TITLES[self._step][0]}: stored"):
+            self._end()
 
     async def _undo(self) -> None:
         self._context.check_may_change()
@@ -405,8 +384,8 @@ class CalibrationView:
         self._end(stored=False)
 
     def _end(self, *, stored: bool = True) -> None:
-        if self._dialogue is not None:
-            self._dialogue.calibration = None
+        if self._context.dialogue is not None:
+            self._context.dialogue.calibration = None
         if stored:
             self._outcomes[self._step] = ("stored", "good")
         self._refresh()

@@ -8,7 +8,6 @@ from typing import Any, Final
 
 import numpy as np
 from nicegui import ui
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
@@ -16,9 +15,8 @@ from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
 from gateway.panel.state.fields import FloatArray, IntArray, unit_text
 from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_value
-from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import NotAllowedError, ViewContext
-from gateway.panel.widgets import DataTable, LiveChart, StripChart, heading
+from gateway.panel.widgets import DataTable, LiveChart, StripChart, heading, store_parameters
 from gateway.printable import printable, reason_of
 from gateway.units import counted
 
@@ -230,8 +228,6 @@ REFRESH_S: Final = 0.25
 MAX_ROWS: Final = 120
 """More would be confusing; the search finds the others."""
 ALL: Final = "all groups"
-STORE: Final = 1.0
-"""PREFLIGHT_STORAGE_PARAMETER_ACTION: write."""
 
 EFFECTS: Final = {
     "attitude": ("ATTITUDE.roll", "ATTITUDE.pitch"),
@@ -275,11 +271,6 @@ class TuningView:
         self._draw()
         self._refresh()
 
-    @property
-    def _dialogue(self) -> Dialogue | None:
-        system_id = self._context.system_id
-        return None if system_id is None else self._context.parts.dialogues.of(system_id)
-
     def _build_effect(self) -> None:
         with ui.element("div").classes("card"):
             with ui.element("div").classes("tools"):
@@ -299,7 +290,7 @@ class TuningView:
         self._refresh()
 
     def _refresh(self) -> None:
-        dialogue = self._dialogue
+        dialogue = self._context.dialogue
         if dialogue is None:
             self._state.set_text("")
             return
@@ -324,7 +315,7 @@ class TuningView:
 
     def _draw(self, _: Any = None) -> None:
         """Build the visible rows; leave them as they are, with what is typed, if none changes."""
-        dialogue = self._dialogue
+        dialogue = self._context.dialogue
         names = [] if dialogue is None else self._wanted(dialogue)
         metas = {} if dialogue is None else {name: dialogue.metas.get(name) for name in names}
         known = 0 if dialogue is None else len(dialogue.parameters.entries)
@@ -369,12 +360,7 @@ class TuningView:
             self._context.parts.dialogues.load(self._context.system_id, reload=True)
 
     async def _store(self) -> None:
-        try:
-            await self._context.command(mavlink.MAV_CMD_PREFLIGHT_STORAGE, STORE)
-        except CommandFailedError as error:
-            ui.notify(f"Not stored: {error}", type="negative")
-        else:
-            ui.notify("All parameters are stored", type="positive")
+        await store_parameters(self._context, "All parameters are stored")
 
 
 def _group_of(name: str, metas: dict[str, ParameterMeta]) -> str:

@@ -1,12 +1,18 @@
+"""Alerts from an aircraft's messages and from the gateway's status."""
+
 from typing import Any
 
+import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.alerts import AlertLevel, alerts_of
+from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
 from gateway.panel.state.vehicle import VehicleState
 from gateway.units import US_PER_S
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
+MAG, GYRO = 4, 1
+NOW_US = 100 * US_PER_S
+GPS_LOST = Alert("gps", AlertLevel.CRITICAL, "GPS lost")
 
 
 def gps(fix_type: int) -> Any:
@@ -15,102 +21,120 @@ def gps(fix_type: int) -> Any:
     )
 
 
-def say(vehicle: VehicleState, text: str, now_us: int, severity: int = 2) -> None:
-    vehicle.take(mavlink.MAVLink_statustext_message(severity, text.encode()), now_us)
+def text(words: str, severity: int = 2) -> Any:
+    return mavlink.MAVLink_statustext_message(severity, words.encode())
 
 
-def titles(vehicle: VehicleState, now_us: int) -> list[str]:
-    return [alert.title for alert in alerts_of(vehicle, now_us)]
+RECORDING = "Recording 2026-11-22_001122"
+CASES: dict[str, tuple[list[tuple[float, Any]], float, list[tuple[str, str]]]] = {
+    "all is well": ([(0, gps(3))], 1, []),
+    "GPS that was never there": ([(0, gps(0))], 0, []),
+    "GPS lost": ([(0, gps(3)), (1, gps(0))], 2, [("GPS lost", "the receiver has no fix")]),
+    "GPS found again": ([(0, gps(3)), (1, gps(0)), (2, gps(3))], 3, []),
+    "GPS in an outage": (
+        [(0, gps(3)), (6, HEARTBEAT)], 6, [("GPS lost", "nothing from the receiver for 6 s")]
+    ),
+    "two nodes silent": (
+        [(0, text("IMU node 1 silent")), (0, text("GPS node 12 silent"))], 1,
+        [("IMU node 1 silent", "no radio packets"), ("GPS node 12 silent", "no radio packets")],
+    ),
+    "one node back": (
+        [(0, text("IMU node 1 silent")), (0, text("IMU node 12 silent")),
+         (2, text("IMU node 1 is back", 6))], 3, [("IMU node 12 silent", "no radio packets")],
+    ),
+    "receiver connected": (
+        [(0, text("IMU node 1 silent")), (1, text("Receiver lost: /dev/ttyUSB0")),
+         (4, text("Receiver connected: /dev/ttyUSB0", 6))], 5, [],
+    ),
+    "receiver lost": (
+        [(0, text("Receiver lost: /dev/ttyUSB0"))], 1, [("Receiver lost", "/dev/ttyUSB0")]
+    ),
+    "recording stopped": (
+        [(0, text("Recording stopped: less than 100 MB free", 4))], 1,
+        [("Recording failed", "less than 100 MB free")],
+    ),
+    "recording impossible": (
+        [(0, text("Cannot record: No space left", 4))], 1, [("Recording failed", "No space left")]
+    ),
+    "recording again": (
+        [(0, text("Recording stopped: less than 100 MB free", 4)), (2, text(RECORDING, 5))], 3, []
+    ),
+    "sensor not healthy": (
+        [(0, mavlink.MAVLink_sys_status_message(MAG | GYRO, MAG | GYRO, GYRO, *[0] * 10))], 1,
+        [("Sensors not healthy", "magnetometer")],
+    ),
+    "severe text of any vehicle": (
+        [(0, text("Crash: Disarming"))], 1, [("Crash: Disarming", "")]
+    ),
+    "severe text of half a minute ago": (
+        [(0, text("Crash: Disarming")), (30, HEARTBEAT)], 30, []
+    ),
+    "blank texts": ([(0, text("")), (0, text("  "))], 1, []),
+    "aircraft silent, which hides all others": (
+        [(0, text("IMU node 1 silent"))], 10, [("Aircraft silent", "no heartbeat for 10 s")]
+    ),
+}  # fmt: skip
+"""Messages with their times in s, a time, and titles and details of the alerts then."""
 
 
-def vehicle_at(now_us: int = 0) -> VehicleState:
+@pytest.mark.parametrize("name", CASES)
+def test_messages_begin_and_end_alerts(name: str) -> None:
+    messages, at_s, expected = CASES[name]
     vehicle = VehicleState(1)
-    vehicle.take(HEARTBEAT, now_us)
-    return vehicle
+    vehicle.take(HEARTBEAT, 0)
+    for time_s, message in messages:
+        vehicle.take(message, round(time_s * US_PER_S))
+    found = alerts_of(vehicle, round(at_s * US_PER_S))
+    assert [(alert.title, alert.detail) for alert in found] == expected
+    assert all(
+        alert.level is AlertLevel.CRITICAL for alert in found if "Sensors" not in alert.title
+    )
 
 
-def test_all_is_well() -> None:
-    vehicle = vehicle_at()
-    vehicle.take(gps(3), 0)
-    assert titles(vehicle, US_PER_S) == []
+def status(silent_s: float = 0.0, **changed: Any) -> dict[str, Any]:
+    last_us = NOW_US - round(silent_s * US_PER_S)
+    node = {"vehicle_id": 1, "node_id": 2}
+    report = {
+        "time_us": NOW_US,
+        "connected": True,
+        "port": "/dev/ttyUSB0",
+        "nodes": [{"node": node, "received": 9, "last_time_us": last_us}],
+    }
+    boards = [{"node": node, "sensors_present": 8}]
+    return {
+        "report": report | changed,
+        "recorder": None,
+        "aircraft": [{"vehicle_id": 1, "boards": boards}],
+    }
 
 
-def test_gps_that_was_never_there_is_no_loss() -> None:
-    vehicle = vehicle_at()
-    vehicle.take(gps(0), 0)
-    assert titles(vehicle, 0) == []
+def titles(reported: dict[str, Any] | None, *alerts: Alert, vehicle_id: int = 1) -> list[str]:
+    return [alert.title for alert in with_status(alerts, reported, vehicle_id)]
 
 
-def test_gps_lost_and_found() -> None:
-    vehicle = vehicle_at()
-    vehicle.take(gps(3), 0)
-    vehicle.take(gps(0), 1)
-    [alert] = alerts_of(vehicle, 2)
-    assert (alert.title, alert.level) == ("GPS lost", AlertLevel.CRITICAL)
-    vehicle.take(gps(3), 3)
-    assert titles(vehicle, 4) == []
+def test_node_that_was_silent_before_the_panel_was_opened() -> None:
+    [alert] = with_status([], status(silent_s=30.0), 1)
+    assert (alert.title, alert.detail) == ("GPS node 2 silent", "no radio packets for 30 s")
+    assert alert.level is AlertLevel.CRITICAL
 
 
-def test_gps_that_says_nothing_more() -> None:
-    vehicle = vehicle_at()
-    vehicle.take(gps(3), 0)
-    vehicle.take(HEARTBEAT, 6 * US_PER_S)
-    [alert] = alerts_of(vehicle, 6 * US_PER_S)
-    assert (alert.title, alert.detail) == ("GPS lost", "nothing from the receiver for 6 s")
+def test_node_of_another_aircraft_or_with_a_short_gap_is_none() -> None:
+    assert titles(status(silent_s=30.0), vehicle_id=2) == []
+    assert titles(status(silent_s=1.0)) == []
 
 
-def test_node_silent_until_it_is_back() -> None:
-    vehicle = vehicle_at()
-    say(vehicle, "IMU node 1 silent", 0)
-    say(vehicle, "GPS node 2 silent", 0)
-    assert titles(vehicle, 1) == ["IMU node 1 silent", "GPS node 2 silent"]
-    say(vehicle, "IMU node 1 is back", 2, severity=6)
-    assert titles(vehicle, 3) == ["GPS node 2 silent"]
-    say(vehicle, "Receiver connected: /dev/ttyUSB0", 4, severity=6)
-    assert titles(vehicle, 5) == []
+def test_status_replaces_alerts_of_status_texts() -> None:
+    reported = Alert("node GPS node 2", AlertLevel.CRITICAL, "GPS node 2 silent")
+    assert titles(status(), reported, GPS_LOST) == ["GPS lost"]
+    assert titles(status(silent_s=9.0), reported) == ["GPS node 2 silent"]
+    assert titles(None, reported, GPS_LOST) == ["GPS node 2 silent", "GPS lost"]
 
 
-def test_receiver_lost() -> None:
-    vehicle = vehicle_at()
-    say(vehicle, "Receiver lost: /dev/ttyUSB0", 0)
-    assert titles(vehicle, 1) == ["Receiver lost"]
+def test_receiver_that_is_gone_hides_its_nodes() -> None:
+    assert titles(status(silent_s=30.0, connected=False)) == ["Receiver lost"]
 
 
-def test_recording_failed_until_one_runs() -> None:
-    vehicle = vehicle_at()
-    for text in ("Recording stopped: less than 100 MB free", "Cannot record: No space left"):
-        say(vehicle, text, 0, severity=4)
-        [alert] = alerts_of(vehicle, 1)
-        assert (alert.title, alert.detail) == ("Recording failed", text.partition(": ")[2])
-        say(vehicle, "Recording 2026-11-22_001122", 2, severity=5)
-        assert titles(vehicle, 3) == []
-
-
-def test_sensors_that_are_not_healthy() -> None:
-    vehicle = vehicle_at()
-    mag, gyro = 4, 1
-    vehicle.take(mavlink.MAVLink_sys_status_message(mag | gyro, mag | gyro, gyro, *[0] * 10), 0)
-    [alert] = alerts_of(vehicle, 1)
-    assert alert.detail == "magnetometer"
-
-
-def test_grave_words_of_any_vehicle_stand_for_a_while() -> None:
-    vehicle = vehicle_at()
-    say(vehicle, "Crash: Disarming", 0)
-    assert titles(vehicle, 1) == ["Crash: Disarming"]
-    vehicle.take(HEARTBEAT, 30 * US_PER_S)
-    assert titles(vehicle, 30 * US_PER_S) == []
-
-
-def test_words_of_nothing_are_no_alert() -> None:
-    vehicle = vehicle_at()
-    say(vehicle, "", 0)
-    say(vehicle, "  ", 0)
-    assert titles(vehicle, 1) == []
-    assert not vehicle.texts.all
-
-
-def test_silent_aircraft_hides_its_other_alerts() -> None:
-    vehicle = vehicle_at()
-    say(vehicle, "IMU node 1 silent", 0)
-    assert titles(vehicle, 10 * US_PER_S) == ["Aircraft silent"]
+@pytest.mark.parametrize(("state", "found"), [("blocked", ["Recording failed"]), ("idle", [])])
+def test_recording_that_cannot_go_on(state: str, found: list[str]) -> None:
+    reported = status() | {"recorder": {"state": state, "reason": "less than 100 MB free"}}
+    assert titles(reported) == found

@@ -11,7 +11,7 @@ from gateway.panel.state.vehicle import MAX_TRACK
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 
-RATE_HZ = 10
+RATE_HZ = 5
 HOUR_S = 3600
 
 

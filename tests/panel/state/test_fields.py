@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.fields import MAX_ROWS, SPAN_US, FieldHistory
+from gateway.panel.state.fields import MAX_ROWS, SPAN_US, FieldHistory, fields_csv
 from gateway.units import US_PER_S
 
 
@@ -83,3 +83,20 @@ def test_message_that_comes_faster_later_keeps_its_minutes() -> None:
     time_us, values = history.series(1, "ATTITUDE.roll")
     assert len(time_us) == 7500
     assert values.tolist() == list(range(1500, 9000))
+
+
+def test_fields_that_came_at_other_times_share_a_table() -> None:
+    series = {
+        "A.x": (np.array([0, 500_000]), np.array([1.0, np.nan])),
+        "B.y": (np.array([250_000]), np.array([-0.125])),
+    }
+    assert fields_csv(series, {"A.x": "m/s"}, 1_700_000_000_000_000).splitlines() == [
+        "time_unix_s,A.x (m/s),B.y",
+        "1700000000.000000,1,",
+        "1700000000.250000,,-0.125",
+        "1700000000.500000,,",
+    ]
+
+
+def test_nothing_chosen_is_an_empty_table() -> None:
+    assert fields_csv({}, {}, 0) == "time_unix_s\n"
