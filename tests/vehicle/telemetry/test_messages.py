@@ -16,96 +16,186 @@ from gateway.vehicle.telemetry.health import Health
 from tests.kit.ground_station import GroundStation, decode, kinds
 from tests.kit.records import BARO, FIX, NO_FIX, NOTHING, SAMPLE, STATE
 
+NAN = math.nan
+FIELD = (20.0, -5.0, 43.0)
+NO_FIELD = (NAN,) * 3
+ORIGIN = Location(47.123_456_7, -8.765_432_1 - 0.001, 500.0)
+UPDATED = messages.ACCEL_UPDATED | messages.GYRO_UPDATED | messages.MAG_UPDATED
+
 
 def through_the_wire(message: Any) -> Any:
     [found] = decode([Encoder(1).encode(message)])
     return found
 
 
-def test_attitude_quaternion() -> None:
-    found = through_the_wire(messages.attitude_quaternion(STATE))
-    assert found.time_boot_ms == 1000
-    assert (found.q1, found.q2, found.q3, found.q4) == pytest.approx(STATE.q_nb, abs=1e-7)
-    rates = (found.rollspeed, found.pitchspeed, found.yawspeed)
-    assert rates == pytest.approx(STATE.rate_b_radps)
-    assert found.repr_offset_q == [0.0, 0.0, 0.0, 0.0]
+def named(names: str, values: Any) -> dict[str, Any]:
+    """Return the values of fields, whose names are parted by spaces."""
+    return dict(zip(names.split(), values, strict=True))
 
 
-def test_attitude_is_in_radians_with_the_nose_up_positive() -> None:
-    found = through_the_wire(messages.attitude(STATE))
-    angles = (found.roll, found.pitch, found.yaw)
-    assert angles == pytest.approx((0.1, -0.2, math.radians(-88.5)), abs=1e-6)
-    assert found.yawspeed == pytest.approx(-0.03)
+VALUES = {
+    "attitude-quaternion": (
+        messages.attitude_quaternion(STATE),
+        named("q1 q2 q3 q4 rollspeed pitchspeed yawspeed", (*STATE.q_nb, *STATE.rate_b_radps))
+        | {"time_boot_ms": 1000, "repr_offset_q": [0.0] * 4},
+    ),
+    # In radians, nose up positive.
+    "attitude": (
+        messages.attitude(STATE),
+        named("roll pitch yaw yawspeed", (0.1, -0.2, math.radians(-88.5), -0.03)),
+    ),
+    "global-position": (
+        messages.global_position_int(STATE, 500.0),
+        named("lat lon alt relative_alt", (471_234_567, -87_654_321, 523_456, 23_456))
+        | named("vx vy vz hdg", (300, -400, -125, 27_150)),
+    ),
+    "global-position-without-heading": (
+        messages.global_position_int(
+            replace(STATE, flags=STATE.flags & ~NavFlags.HEADING_VALID), 500.0
+        ),
+        {"hdg": 65535},
+    ),
+    "global-position-saturated": (
+        messages.global_position_int(
+            replace(STATE, vel_n_mps=(1e6, -1e6, NAN), alt_amsl_m=1e9), -1e9
+        ),
+        named("vx vy vz alt relative_alt", (32767, -32768, 0, 2**31 - 1, 2**31 - 1)),
+    ),
+    # Without a sensor the airspeed is the ground speed, as ArduPilot sends it.
+    "vfr-hud": (
+        messages.vfr_hud(STATE),
+        named("groundspeed airspeed climb alt throttle", (5.0, 5.0, 1.25, 523.456, 0)),
+    ),
+    "vfr-hud-unknown": (
+        messages.vfr_hud(NOTHING), named("airspeed groundspeed alt climb", (NAN,) * 4),
+    ),
+    "highres-imu": (
+        messages.highres_imu(SAMPLE, FIELD, BARO, UPDATED),
+        named("xacc yacc zacc", SAMPLE.accel_b_mps2)
+        | named("xgyro ygyro zgyro", SAMPLE.gyro_b_radps)
+        | named("xmag ymag zmag", (0.2, -0.05, 0.43))
+        | named("abs_pressure pressure_alt temperature", (951.23, 529.5, 31.5))
+        | {"time_usec": 1_000_000, "diff_pressure": NAN, "fields_updated": 0b1_1111_1111},
+    ),
+    "highres-imu-alone": (
+        messages.highres_imu(SAMPLE, NO_FIELD, None, 0),
+        named("xmag ymag zmag abs_pressure pressure_alt", (NAN,) * 5),
+    ),
+    "scaled-pressure": (
+        messages.scaled_pressure(BARO),
+        named("press_abs press_diff temperature", (951.23, NAN, -1234)),
+    ),
+    # A PDOP of 1.6, parted as 1.25 m to 2.5 m.
+    "gps-raw": (
+        messages.gps_raw_int(FIX),
+        named("lat lon alt alt_ellipsoid", (471_234_567, -87_654_321, 520_250, 567_750))
+        | named("fix_type satellites_visible eph epv vel yaw", (3, 11, 72, 143, 500, 0))
+        | {"cog": round(math.degrees(math.atan2(-4.0, 3.0)) * 100) % 36000}
+        | named("h_acc v_acc vel_acc hdg_acc", (1250, 2500, 125, 150_000)),
+    ),
+    "gps-raw-at-rest": (
+        messages.gps_raw_int(replace(FIX, vel_n_mps=(0.1, 0.1, 0.0))), {"vel": 14, "cog": 65535},
+    ),
+    "gps-raw-without-accuracies": (
+        messages.gps_raw_int(
+            replace(
+                NO_FIX, alt_ellipsoid_m=NAN, h_acc_m=NAN, v_acc_m=NAN, speed_acc_mps=NAN,
+                course_acc_deg=NAN,
+            )
+        ),
+        named("h_acc v_acc vel_acc hdg_acc alt_ellipsoid vel cog", (*(0,) * 5, 65535, 65535)),
+    ),
+    # The last position is repeated without a fix.
+    "gps-raw-without-fix": (
+        messages.gps_raw_int(replace(NO_FIX, lat_dege7=0, lon_dege7=0), FIX),
+        named("fix_type lat lon alt", (1, 471_234_567, -87_654_321, 520_250)),
+    ),
+    "gps-raw-with-fix": (messages.gps_raw_int(replace(FIX, lat_dege7=5), FIX), {"lat": 5}),
+    "gps-absent": (
+        messages.gps_absent(5_000_000, FIX),
+        named("fix_type lat lon alt", (0, 471_234_567, -87_654_321, 520_250)),
+    ),
+    "gps-never": (
+        messages.gps_absent(5_000_000),
+        named("fix_type satellites_visible eph vel cog", (0, 255, 65535, 65535, 65535)),
+    ),
+    **{
+        f"imu-in-thousandths-{build.__name__}": (
+            build(SAMPLE, FIELD),
+            named("xacc yacc zacc xgyro ygyro zgyro", (51, -25, -994, 500, 250, -125))
+            | named("xmag ymag zmag temperature", (200, -50, 430, 3150)),
+        )
+        for build in (messages.raw_imu, messages.scaled_imu)
+    },
+    # A temperature of 0 means unknown.
+    "imu-at-0-degrees": (
+        messages.raw_imu(replace(SAMPLE, temperature_degc=0.0), NO_FIELD),
+        {"temperature": 1, "xmag": 0},
+    ),
+    "altitude": (
+        messages.altitude(STATE, BARO, 510.0, ORIGIN),
+        named(
+            "altitude_monotonic altitude_amsl altitude_relative altitude_local",
+            (BARO.alt_pressure_m, 523.456, 13.456, 23.456),
+        ),
+    ),
+    "estimator-status": (
+        messages.estimator_status(STATE),
+        named("pos_horiz_accuracy pos_vert_accuracy vel_ratio", (1.0, 2.0, NAN))
+        | {
+            "flags": mavlink.ESTIMATOR_ATTITUDE
+            | mavlink.ESTIMATOR_VELOCITY_HORIZ
+            | mavlink.ESTIMATOR_VELOCITY_VERT
+            | mavlink.ESTIMATOR_POS_HORIZ_REL
+            | mavlink.ESTIMATOR_POS_HORIZ_ABS
+            | mavlink.ESTIMATOR_POS_VERT_ABS
+            | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
+            | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+        },
+    ),
+    "estimator-status-unknown": (
+        messages.estimator_status(NOTHING), {"flags": mavlink.ESTIMATOR_CONST_POS_MODE},
+    ),
+    "estimator-status-rejected": (
+        messages.estimator_status(
+            replace(NOTHING, flags=NavFlags.GPS_REJECTED | NavFlags.DEAD_RECKONING)
+        ),
+        {"flags": mavlink.ESTIMATOR_GPS_GLITCH},
+    ),
+    "home-position": (
+        messages.home_position(Home(Location(47.5, -8.25, 432.1), 7_000_000)),
+        named("latitude longitude altitude", (475_000_000, -82_500_000, 432_100))
+        | named("x y z approach_x approach_z", (0.0, 0.0, 0.0, NAN, NAN))
+        | {"q": [NAN] * 4, "time_usec": 7_000_000},
+    ),
+    "system-time-unknown": (messages.system_time(2_000_000, None), {"time_unix_usec": 0}),
+    "system-time": (
+        messages.system_time(2_000_000, 1_790_000_000_123_456),
+        {"time_unix_usec": 1_790_000_000_123_456, "time_boot_ms": 2000},
+    ),
+}  # fmt: skip
 
 
-def test_global_position_int() -> None:
-    found = through_the_wire(messages.global_position_int(STATE, 500.0))
-    assert (found.lat, found.lon) == (471_234_567, -87_654_321)
-    assert (found.alt, found.relative_alt) == (523_456, 23_456)
-    assert (found.vx, found.vy, found.vz) == (300, -400, -125)
-    assert found.hdg == 27_150
+@pytest.mark.parametrize("name", VALUES)
+def test_values(name: str) -> None:
+    message, expected = VALUES[name]
+    found = through_the_wire(message)
+    for field, value in expected.items():
+        close = pytest.approx(value, rel=1e-6, nan_ok=True)
+        assert getattr(found, field) == (value if isinstance(value, int) else close), field
 
 
-def test_global_position_int_without_heading() -> None:
-    state = replace(STATE, flags=STATE.flags & ~NavFlags.HEADING_VALID)
-    assert through_the_wire(messages.global_position_int(state, 500.0)).hdg == 65535
-
-
-def test_global_position_int_saturates() -> None:
-    state = replace(STATE, vel_n_mps=(1e6, -1e6, math.nan), alt_amsl_m=1e9)
-    found = through_the_wire(messages.global_position_int(state, -1e9))
-    assert (found.vx, found.vy, found.vz) == (32767, -32768, 0)
-    assert found.alt == found.relative_alt == 2**31 - 1
-
-
-def test_vfr_hud() -> None:
-    found = through_the_wire(messages.vfr_hud(STATE))
-    assert found.groundspeed == pytest.approx(5.0)
-    assert found.climb == pytest.approx(1.25)
-    assert found.alt == pytest.approx(523.456, abs=1e-3)
+def test_heading_of_vfr_hud_is_in_whole_degrees() -> None:
     # Half way between two degrees: the float may fall on either side.
-    assert found.heading in (271, 272)
-    assert found.throttle == 0
-    assert found.airspeed == found.groundspeed, "no sensor: as ArduPilot does without one"
-
-
-def test_vfr_hud_of_nothing_is_unknown() -> None:
-    found = through_the_wire(messages.vfr_hud(NOTHING))
-    assert all(math.isnan(v) for v in (found.airspeed, found.groundspeed, found.alt, found.climb))
-
-
-def test_highres_imu() -> None:
-    updated = messages.ACCEL_UPDATED | messages.GYRO_UPDATED | messages.MAG_UPDATED
-    found = through_the_wire(messages.highres_imu(SAMPLE, (20.0, -5.0, 43.0), BARO, updated))
-    assert found.time_usec == 1_000_000
-    assert (found.xacc, found.yacc, found.zacc) == SAMPLE.accel_b_mps2
-    assert (found.xgyro, found.ygyro, found.zgyro) == SAMPLE.gyro_b_radps
-    assert (found.xmag, found.ymag, found.zmag) == pytest.approx((0.2, -0.05, 0.43))
-    assert found.abs_pressure == pytest.approx(951.23)
-    assert found.pressure_alt == pytest.approx(529.5)
-    assert found.temperature == pytest.approx(31.5)
-    assert math.isnan(found.diff_pressure)
-    assert found.fields_updated == 0b1_1111_1111
-
-
-def test_highres_imu_without_magnetometer_and_barometer() -> None:
-    found = through_the_wire(messages.highres_imu(SAMPLE, (math.nan,) * 3, None, 0))
-    unknown = (found.xmag, found.ymag, found.zmag, found.abs_pressure, found.pressure_alt)
-    assert all(math.isnan(value) for value in unknown)
-
-
-def test_scaled_pressure() -> None:
-    found = through_the_wire(messages.scaled_pressure(BARO))
-    assert found.press_abs == pytest.approx(951.23)
-    assert math.isnan(found.press_diff)
-    assert found.temperature == -1234
+    assert through_the_wire(messages.vfr_hud(STATE)).heading in (271, 272)
+    assert not messages.has_position(NOTHING)
 
 
 @pytest.mark.parametrize(
     "change",
     [
-        {"pdop": math.nan},
-        {"h_acc_m": math.nan},
+        {"pdop": NAN},
+        {"h_acc_m": NAN},
         {"h_acc_m": 0.0, "v_acc_m": 0.0},
         {"fix_ok": False},
     ],
@@ -113,27 +203,6 @@ def test_scaled_pressure() -> None:
 def test_dilutions_that_are_not_known(change: dict[str, Any]) -> None:
     found = through_the_wire(messages.gps_raw_int(replace(FIX, **change)))
     assert (found.eph, found.epv) == (65535, 65535)
-
-
-def test_gps_raw_int() -> None:
-    found = through_the_wire(messages.gps_raw_int(FIX))
-    assert found.fix_type == mavlink.GPS_FIX_TYPE_3D_FIX
-    assert (found.lat, found.lon, found.alt) == (471_234_567, -87_654_321, 520_250)
-    assert found.alt_ellipsoid == 567_750
-    # A PDOP of 1.6, parted as 1.25 m to 2.5 m.
-    assert (found.eph, found.epv) == (72, 143)
-    assert math.hypot(found.eph, found.epv) == pytest.approx(160, abs=1)
-    assert found.vel == 500
-    assert found.cog == round(math.degrees(math.atan2(-4.0, 3.0)) * 100) % 36000
-    assert found.satellites_visible == 11
-    assert (found.h_acc, found.v_acc, found.vel_acc) == (1250, 2500, 125)
-    assert found.hdg_acc == 150_000
-    assert found.yaw == 0
-
-
-def test_gps_raw_int_at_rest_has_no_course() -> None:
-    found = through_the_wire(messages.gps_raw_int(replace(FIX, vel_n_mps=(0.1, 0.1, 0.0))))
-    assert (found.vel, found.cog) == (14, 65535)
 
 
 @pytest.mark.parametrize(
@@ -153,15 +222,14 @@ def test_fix_types(fix_type: GpsFixType, fix_ok: bool, expected: int) -> None:
     assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
 
 
-ORIGIN = Location(47.123_456_7, -8.765_432_1 - 0.001, 500.0)
-
-
 def test_local_position_is_north_east_down_of_the_origin() -> None:
     found = through_the_wire(messages.local_position_ned(STATE, ORIGIN))
     assert (found.x, found.y, found.z) == pytest.approx((0.0, 75.9, -23.456), abs=0.1)
     assert (found.vx, found.vy, found.vz) == STATE.vel_n_mps
     north = replace(STATE, lat_deg=STATE.lat_deg + 0.01, lon_deg=ORIGIN.lon_deg)
     assert messages.local_position_m(north, ORIGIN)[:2] == pytest.approx((1111.8, 0.0), abs=0.2)
+    found = through_the_wire(messages.altitude(STATE, BARO, 510.0, ORIGIN))
+    assert (found.altitude_terrain < -1000, found.bottom_clearance < 0) == (True, True)
 
 
 def test_odometry_has_the_velocity_in_the_body_frame_and_its_variances() -> None:
@@ -173,102 +241,14 @@ def test_odometry_has_the_velocity_in_the_body_frame_and_its_variances() -> None
         attitude_std_rad=(0.01, 0.02, 0.05),
     )
     found = through_the_wire(messages.odometry(level_east, ORIGIN))
-    assert (found.frame_id, found.child_frame_id) == (
-        mavlink.MAV_FRAME_LOCAL_NED,
-        mavlink.MAV_FRAME_BODY_FRD,
-    )
+    frames = (mavlink.MAV_FRAME_LOCAL_NED, mavlink.MAV_FRAME_BODY_FRD)
+    assert (found.frame_id, found.child_frame_id) == frames
     assert (found.vx, found.vy, found.vz) == pytest.approx((5.0, 0.0, 0.0), abs=1e-6)
     assert found.q == pytest.approx(level_east.q_nb)
     diagonal = [found.pose_covariance[n] for n in (0, 6, 11, 15, 18, 20)]
     assert diagonal == pytest.approx([0.36, 0.64, 4.0, 4e-4, 1e-4, 25e-4])
     assert [found.velocity_covariance[n] for n in (0, 6, 11)] == pytest.approx([0.04, 0.01, 0.09])
     assert math.isnan(found.velocity_covariance[15])
-
-
-def test_altitude_is_relative_to_home_and_local_to_the_origin() -> None:
-    found = through_the_wire(messages.altitude(STATE, BARO, 510.0, ORIGIN))
-    assert found.altitude_monotonic == BARO.alt_pressure_m
-    heights = (found.altitude_amsl, found.altitude_relative, found.altitude_local)
-    assert heights == pytest.approx((523.456, 13.456, 23.456), abs=1e-3)
-    assert (found.altitude_terrain < -1000, found.bottom_clearance < 0) == (True, True)
-
-
-@pytest.mark.parametrize("build", [messages.raw_imu, messages.scaled_imu])
-def test_imu_in_thousandths(build: Any) -> None:
-    found = through_the_wire(build(SAMPLE, (20.0, -5.0, 43.0)))
-    assert (found.xacc, found.yacc, found.zacc) == (51, -25, -994)
-    assert (found.xgyro, found.ygyro, found.zgyro) == (500, 250, -125)
-    assert (found.xmag, found.ymag, found.zmag) == (200, -50, 430)
-    assert found.temperature == 3150
-    cold = through_the_wire(build(replace(SAMPLE, temperature_degc=0.0), (math.nan,) * 3))
-    assert (cold.temperature, cold.xmag) == (1, 0)
-
-
-def test_gps_raw_int_with_unknown_accuracies() -> None:
-    nan = math.nan
-    fix = replace(
-        NO_FIX, alt_ellipsoid_m=nan, h_acc_m=nan, v_acc_m=nan, speed_acc_mps=nan, course_acc_deg=nan
-    )
-    found = through_the_wire(messages.gps_raw_int(fix))
-    assert (found.h_acc, found.v_acc, found.vel_acc, found.hdg_acc, found.alt_ellipsoid) == (0,) * 5
-    assert (found.vel, found.cog) == (65535, 65535)
-
-
-def test_last_position_is_repeated_without_a_fix() -> None:
-    for message, fix_type in (
-        (messages.gps_raw_int(replace(NO_FIX, lat_dege7=0, lon_dege7=0), FIX), 1),
-        (messages.gps_absent(5_000_000, FIX), 0),
-    ):
-        found = through_the_wire(message)
-        assert (found.fix_type, found.lat, found.lon) == (fix_type, 471_234_567, -87_654_321)
-        assert found.alt == 520_250
-    assert through_the_wire(messages.gps_raw_int(replace(FIX, lat_dege7=5), FIX)).lat == 5
-
-
-def test_gps_absent() -> None:
-    found = through_the_wire(messages.gps_absent(5_000_000))
-    assert found.fix_type == mavlink.GPS_FIX_TYPE_NO_GPS
-    assert found.satellites_visible == 255
-    assert (found.eph, found.vel, found.cog) == (65535,) * 3
-
-
-def test_estimator_status() -> None:
-    found = through_the_wire(messages.estimator_status(STATE))
-    assert found.flags == (
-        mavlink.ESTIMATOR_ATTITUDE
-        | mavlink.ESTIMATOR_VELOCITY_HORIZ
-        | mavlink.ESTIMATOR_VELOCITY_VERT
-        | mavlink.ESTIMATOR_POS_HORIZ_REL
-        | mavlink.ESTIMATOR_POS_HORIZ_ABS
-        | mavlink.ESTIMATOR_POS_VERT_ABS
-        | mavlink.ESTIMATOR_PRED_POS_HORIZ_REL
-        | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-    )
-    assert found.pos_horiz_accuracy == pytest.approx(1.0)
-    assert found.pos_vert_accuracy == pytest.approx(2.0)
-    assert math.isnan(found.vel_ratio)
-
-
-def test_estimator_status_of_nothing() -> None:
-    found = through_the_wire(messages.estimator_status(NOTHING))
-    assert found.flags == mavlink.ESTIMATOR_CONST_POS_MODE
-    rejected = replace(NOTHING, flags=NavFlags.GPS_REJECTED | NavFlags.DEAD_RECKONING)
-    assert messages.estimator_status(rejected).flags == mavlink.ESTIMATOR_GPS_GLITCH
-
-
-def test_home_position() -> None:
-    home = Home(Location(47.5, -8.25, 432.1), 7_000_000)
-    found = through_the_wire(messages.home_position(home))
-    assert (found.latitude, found.longitude, found.altitude) == (475_000_000, -82_500_000, 432_100)
-    assert (found.x, found.y, found.z) == (0.0, 0.0, 0.0)
-    assert all(math.isnan(v) for v in (*found.q, found.approach_x, found.approach_z))
-    assert found.time_usec == 7_000_000
-
-
-def test_system_time() -> None:
-    assert through_the_wire(messages.system_time(2_000_000, None)).time_unix_usec == 0
-    found = through_the_wire(messages.system_time(2_000_000, 1_790_000_000_123_456))
-    assert (found.time_unix_usec, found.time_boot_ms) == (1_790_000_000_123_456, 2000)
 
 
 def test_boot_time_wraps_after_49_days() -> None:
