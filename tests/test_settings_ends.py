@@ -9,14 +9,12 @@ import msgspec
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.aircraft import Action, Aircraft, AircraftSettings
 from gateway.config import GatewaySettings
 from gateway.records import (
     BaroRaw,
     GpsFix,
-    GpsFixType,
     ImuFlags,
     ImuRaw,
     NodeId,
@@ -27,9 +25,12 @@ from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.requests import CalibrationMeasured, SettingsChange
+from tests.kit.ground_station import decode
+from tests.kit.records import FIX
 
 ESTIMATORS = ("paper", "eskf")
-IMU, GPS = NodeId(1, 0), NodeId(1, 1)
+IMU = NodeId(1, 0)
+ATTITUDE = 30
 DENORMAL = sys.float_info.min / 4.0
 SMALL = (0.0, 5e-324, DENORMAL, sys.float_info.min, 1e-300, 1e-15, 1e-9, 1e-6)
 
@@ -121,25 +122,13 @@ def readings(begin_us: int, count: int = 60) -> Iterator[RawRecord]:
 
 
 def fix(time_us: int, n: int) -> GpsFix:
-    return GpsFix(
+    return msgspec.structs.replace(
+        FIX,
         time_us=time_us,
-        node=GPS,
-        node_time_us=time_us,
-        itow_ms=time_us // 1000,
-        fix_type=GpsFixType.FIX_3D,
-        fix_ok=True,
-        satellites=12,
         lat_dege7=470_000_000 + 900 * n,
         lon_dege7=80_000_000,
         alt_amsl_m=500.0 + n,
         vel_n_mps=(0.3 * n, 1.0, -0.5),
-        alt_ellipsoid_m=547.0 + n,
-        h_acc_m=0.9,
-        v_acc_m=1.5,
-        speed_acc_mps=0.2,
-        course_acc_deg=1.0,
-        pdop=1.5,
-        utc_us=1_780_000_000_000_000 + time_us,
     )
 
 
@@ -149,9 +138,7 @@ def fly(aircraft: Aircraft, begin_us: int = 1_000_000, count: int = 60) -> list[
     for record in readings(begin_us, count):
         actions += aircraft.take(record, record.time_us)
         actions += aircraft.perform(aircraft.vehicle.poll(record.time_us), record.time_us)
-    frames = (action.frame for action in actions if isinstance(action, Outgoing))
-    parser = mavlink.MAVLink(None)
-    return [parser.decode(bytearray(frame)) for frame in frames if frame[7:10] == b"\x1e\0\0"]
+    return decode(a for a in actions if isinstance(a, Outgoing) and a.message_id == ATTITUDE)
 
 
 def all_known(found: list[Any]) -> bool:

@@ -11,7 +11,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId, Outgoing
+from gateway.records import FusedSample, ImuFlags, ImuRaw, Incoming, NodeId
+from tests.kit.ground_station import command, decode, of_kind
+from tests.kit.mavlink import packed
 
 LEVEL = ImuRaw(
     time_us=0,
@@ -35,7 +37,6 @@ class Bench:
     def __init__(self, estimator: str = "paper") -> None:
         settings = AircraftSettings(estimation=EstimationSettings(estimator=estimator))
         self.pipeline = Pipeline(PipelineSettings(settings))
-        self.mav = mavlink.MAVLink(None, 255, 190)
         self.time_us = 0
         self.reported: list[Any] = []
 
@@ -47,28 +48,22 @@ class Bench:
             raw = replace(LEVEL, time_us=self.time_us, node_time_us=self.time_us, **changes)
             actions = self.pipeline.take(raw, self.time_us) + self.pipeline.poll(self.time_us)
             fused += [action for action in actions if isinstance(action, FusedSample)]
-            self.read(actions)
+            self.reported += decode(actions)
         return fused[-1]
 
     def send(self, message: Any) -> None:
-        incoming = Incoming(7, message.pack(self.mav), trusted=True)
-        self.read(self.pipeline.handle(incoming, self.time_us))
+        incoming = Incoming(7, packed(message, 255, 190), trusted=True)
+        self.reported += decode(self.pipeline.handle(incoming, self.time_us))
 
     def set(self, name: str, value: float) -> None:
         kind = mavlink.MAV_PARAM_TYPE_REAL32
         self.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, kind))
 
     def calibrate(self, *params: float) -> None:
-        padded = [*params, *[0.0] * (7 - len(params))]
-        self.send(mavlink.MAVLink_command_long_message(1, 1, 241, 0, *padded))
-
-    def read(self, actions: list[Any]) -> None:
-        parser = mavlink.MAVLink(None)
-        frames = (action.frame for action in actions if isinstance(action, Outgoing))
-        self.reported += [parser.decode(bytearray(frame)) for frame in frames]
+        self.send(command(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, *params))
 
     def parameters(self) -> dict[str, float]:
-        return {m.param_id: m.param_value for m in self.reported if m.get_type() == "PARAM_VALUE"}
+        return {m.param_id: m.param_value for m in of_kind(self.reported, "PARAM_VALUE")}
 
 
 @pytest.fixture
