@@ -104,11 +104,6 @@ def is_numeric(host: str) -> bool:
     return _address(host) is not None
 
 
-def is_group(host: str) -> bool:
-    """Return whether a host is the address of a multicast group."""
-    return is_numeric(host) and ipaddress.ip_address(host.partition("%")[0]).is_multicast
-
-
 def is_loopback(host: str) -> bool:
     """Return whether an address is loopback; of the names only `localhost` is."""
     if host == "localhost":
@@ -162,14 +157,7 @@ class EndpointKind(StrEnum):
     SERIAL = "serial"
 
 
-LISTENING: Final = frozenset(
-    {
-        EndpointKind.UDP_LISTEN,
-        EndpointKind.TCP_LISTEN,
-        EndpointKind.WS_LISTEN,
-        EndpointKind.WSS_LISTEN,
-    }
-)
+LISTENING: Final = frozenset(kind for kind in EndpointKind if kind.endswith("-listen"))
 """Kinds that bind to their port; port 0 is any free one."""
 OPEN_TO_ALL: Final = LISTENING | {EndpointKind.UDP_BROADCAST, EndpointKind.UDP_MULTICAST}
 """Kinds that serve unknown peers. They bind to an address; looking up a name would block."""
@@ -266,38 +254,30 @@ class Endpoint:
 
 
 def parse_endpoint(url: str) -> Endpoint:
-    """Read one endpoint URL.
+    """Read one endpoint URL, as in the table above.
 
-    Parameters
-    ----------
-    url : str
-        As in the table above; options are `name`, `allow`, `deny` (message names or numbers,
-        separated by commas), `rate` (`NAME:hertz`, separated by commas), `pack` (bytes),
-        `wait` (milliseconds), `budget` (bytes a second), `trusted` and `monitor` (yes or no),
-        `mavlink` (1 or 2), and
-        of some kinds `origins` (separated by commas) or `path`.
+    Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
+    (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
+    second), `trusted` and `monitor` (yes or no), `mavlink` (1 or 2), and of some kinds `origins`
+    (separated by commas), `path`, `site`, `keys` and `config`.
 
-    Returns
-    -------
-    Endpoint
-        The parsed form.
-
-    Raises
-    ------
-    ValueError
-        If anything in it is not understood; the text says what is allowed.
+    Raises ValueError if anything in it is not understood; the text says what is allowed.
     """
     address, _, query = url.partition("?")
     try:
         kind, rest = _kind_and_rest(address)
         host, port = _split_address(kind, rest)
         options = _options(kind, query)
+        site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
+        if kind == EndpointKind.ZENOH:
+            _check_fleet(site, keys)
         return Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            location=_own_location(kind, rest, options),
+            # One router serves several sites.
+            location=f"{kind}:{rest}?site={site}" if site else f"{kind}:{rest}",
             name=name_from(options.get("name", f"{kind}:{rest}")),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
@@ -310,8 +290,9 @@ def parse_endpoint(url: str) -> Endpoint:
             mavlink=number_from(options.get("mavlink", "0"), "mavlink", 0, 2),
             origins=_origins(options.get("origins", "")),
             path=_path(options.get("path", "/")),
+            site=site,
+            keys=keys,
             config=options.get("config", ""),
-            **_fleet_keys(kind, options),
         )
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
@@ -363,9 +344,10 @@ def _split_address(kind: str, rest: str) -> tuple[str, int]:
 def _check_host(kind: str, host: str) -> None:
     if kind in OPEN_TO_ALL and not is_numeric(host):
         raise ValueError(f"{host!r} is not an address such as 127.0.0.1 or 0.0.0.0")
-    if kind is EndpointKind.UDP_MULTICAST and not is_group(host):
+    address = _address(host)
+    if kind is EndpointKind.UDP_MULTICAST and (address is None or not address.is_multicast):
         raise ValueError(f"{host!r} is not a multicast group such as 239.255.145.50")
-    if not is_numeric(host) and not is_name(host):
+    if address is None and not is_name(host):
         raise ValueError(f"{host!r} is neither an address nor a name")
 
 
@@ -407,21 +389,11 @@ def _origins(text: str) -> frozenset[str]:
     return origins
 
 
-def _fleet_keys(kind: str, options: dict[str, str]) -> dict[str, str]:
-    if kind != EndpointKind.ZENOH:
-        return {}
-    site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
+def _check_fleet(site: str, keys: str) -> None:
     if keys not in (SITE_KEYS, RAW_KEYS, JSON_KEYS):
         raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}, {JSON_KEYS}")
     if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
         raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
-    return {"site": site, "keys": keys}
-
-
-def _own_location(kind: str, rest: str, options: dict[str, str]) -> str:
-    """Return the text that no two endpoints may share: one router serves several sites."""
-    site = options.get("site", "") if kind == EndpointKind.ZENOH else ""
-    return f"{kind}:{rest}?site={site}" if site else f"{kind}:{rest}"
 
 
 def _path(text: str) -> str:
@@ -440,9 +412,10 @@ def respell(address: str) -> tuple[str, str]:
         device, comma, baud = address.partition(",")
         return "serial", f"{device}:{baud}" if comma else address
     word, colon, rest = address.partition(":")
-    if colon and _is_bare(word, rest):
-        return "udp", address
     slashes = rest.startswith("//")
+    if colon and not slashes and (word[:1] == "[" or "." in word or word == "localhost"):
+        # There is no kind: a host has a dot or a bracket.
+        return "udp", address
     kind = ALIASES.get(word, word)
     rest = rest.removeprefix("//")
     if slashes and word == "udp":
@@ -453,13 +426,6 @@ def respell(address: str) -> tuple[str, str]:
     elif kind in HOSTED - LISTENING and port.isdecimal() and host in ("", ANY_ADDRESS, "[::]"):
         raise ValueError(_either(kind, rest))
     return kind, rest
-
-
-def _is_bare(word: str, rest: str) -> bool:
-    """Return whether there is no kind: `HOST:PORT`, where a host has a dot or a bracket."""
-    return (word.startswith("[") or "." in word or word == "localhost") and not (
-        rest.startswith("//")
-    )
 
 
 def _either(kind: str, rest: str) -> str:
