@@ -1,7 +1,7 @@
 """Endpoint URLs: where frames go to and come from, and what may pass.
 
     udp:HOST:PORT            send there; answers come back to the same socket
-    udp-listen:HOST:PORT     serve every client that speaks to this port
+    udp-listen:HOST:PORT     serve every client that sends to this port
     udp-broadcast:HOST:PORT  send to a broadcast address, receive unicast answers
     udp-multicast:GROUP:PORT send to a group and receive from it
     tcp:HOST:PORT            connect, and reconnect when it breaks

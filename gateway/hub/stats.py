@@ -37,7 +37,7 @@ class ClientStats:
     """`open`, or why nothing is sent: `refused`, `unreachable`, `connecting`, `resolving`."""
     trusted: bool
     systems: tuple[tuple[int, int], ...]
-    """System and component ids that were heard from it."""
+    """System and component ids received from it."""
     sent: int
     """Frames handed to the network."""
     dropped: int

@@ -79,7 +79,7 @@ def test_no_message_starves_and_all_of_it_fits(budget: int) -> None:
     assert wide[31] == pytest.approx(50, abs=1)
 
 
-def test_place_and_health_are_thinned_less_than_raw_numbers() -> None:
+def test_position_and_health_are_thinned_less_than_raw_values() -> None:
     flight = Flight("udp:h:1?budget=2000")
     flight.run(10)
     parts = {
@@ -133,7 +133,7 @@ def test_a_link_of_a_few_bytes_gets_one_message_alone(budget: int) -> None:
     assert sum(len(frame) for frame in flight.sinks[0].frames[1:]) <= budget * 60 * 1.1
 
 
-def test_what_another_vehicle_says_over_a_satellite_goes_to_all() -> None:
+def test_message_of_a_foreign_satellite_link_goes_to_all() -> None:
     flight = Flight("udp:h:1", "udp:h:2?budget=20", "udp:h:3?budget=5760")
     frame = b"\xfd\x01\0\0\0\x2a\1\xeb\0\0" + bytes(3)
     source = KeepingClient(9, "udp:h:9")

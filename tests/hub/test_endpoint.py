@@ -30,7 +30,7 @@ from gateway.hub.settings import HubSettings
         ("serial:/dev/ttyUSB1", EndpointKind.SERIAL, "/dev/ttyUSB1", 57600),
     ],
 )
-def test_places(url: str, kind: EndpointKind, host: str, port: int) -> None:
+def test_kind_host_and_port_are_parsed(url: str, kind: EndpointKind, host: str, port: int) -> None:
     endpoint = parse_endpoint(url)
     assert (endpoint.kind, endpoint.host, endpoint.port) == (kind, host, port)
     assert endpoint.name == url
@@ -64,7 +64,7 @@ def test_places(url: str, kind: EndpointKind, host: str, port: int) -> None:
         ("/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
     ],
 )
-def test_what_other_programs_write_means_what_they_mean(written: str, place: str) -> None:
+def test_spellings_of_other_programs_are_understood(written: str, place: str) -> None:
     endpoint = parse_endpoint(written)
     assert endpoint.location == place
     assert parse_endpoint(place).kind is endpoint.kind
@@ -81,15 +81,13 @@ def test_what_other_programs_write_means_what_they_mean(written: str, place: str
         ("tcp:0.0.0.0:5760", ["tcp-listen:0.0.0.0:5760", "tcp:HOST:5760"]),
     ],
 )
-def test_what_programs_differ_about_is_refused_with_both_spellings(
-    written: str, right: list[str]
-) -> None:
+def test_ambiguous_spelling_is_refused_with_both_meanings(written: str, right: list[str]) -> None:
     with pytest.raises(ValueError, match="to wait for clients there") as error:
         parse_endpoint(written)
     assert all(spelling in str(error.value) for spelling in right)
 
 
-def test_one_place_in_two_spellings_is_one_endpoint() -> None:
+def test_same_location_in_two_spellings_is_refused() -> None:
     with pytest.raises(ValueError, match="twice"):
         HubSettings(endpoints=("udp-listen:0.0.0.0:14550", "udpin://:14550"))
 

@@ -83,7 +83,7 @@ async def test_untrusted_clients_share_one_read_rate(rig: Any, kind: str) -> Non
         assert taken() < limit + 2 * UNTRUSTED_READ_RATE
 
 
-async def test_who_becomes_trusted_is_read_at_once(rig: Any) -> None:
+async def test_client_that_becomes_trusted_is_read_at_once(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0?trusted=no")
     sock = await caller(rig, "tcp-listen", hub.listening_ports()[0])
     await rig.until(lambda: bool(rig.incoming))

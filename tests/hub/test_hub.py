@@ -60,20 +60,20 @@ async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
     assert len(world.incoming) == count
 
 
-async def test_a_request_to_us_stays_here(world: Any) -> None:
+async def test_request_to_our_vehicle_is_not_forwarded(world: Any) -> None:
     request = world.first.sender.command(1, 1)
     world.first.say(request)
     await world.until(lambda: world.incoming[-1].frame == request)
     assert world.autopilot.is_silent()
 
 
-async def test_a_request_to_nobody_goes_nowhere(world: Any) -> None:
+async def test_request_to_an_unknown_system_is_unroutable(world: Any) -> None:
     world.first.say(world.first.sender.command(99, 1))
     await world.until(lambda: world.world.counters().unroutable == 1)
     assert world.autopilot.is_silent()
 
 
-async def test_what_a_station_says_to_all_reaches_vehicles_only(world: Any) -> None:
+async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
     said = world.first.sender.heartbeat()
     world.first.say(said)
     assert await world.autopilot.receive() == said
@@ -98,7 +98,7 @@ async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     assert world.incoming[-1].frame != ours
 
 
-async def test_a_program_started_again_and_again_is_heard_at_its_first_word(world: Any) -> None:
+async def test_first_frame_of_a_restarted_program_is_accepted(world: Any) -> None:
     port = world.world.listening_ports()[0]
     for _ in range(4):
         again = world.station(port)
@@ -110,7 +110,7 @@ async def test_a_program_started_again_and_again_is_heard_at_its_first_word(worl
     assert world.world.counters().duplicates == 0
 
 
-async def test_a_copy_goes_round_a_loop_once_at_most(world: Any) -> None:
+async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
     """Whoever echoes from the start is heard as a second way; then its echoes end here."""
     port = world.world.listening_ports()[0]
     echo = world.station(port)
@@ -167,7 +167,7 @@ async def test_nothing_runs_round_a_ring(rig: Any) -> None:
         assert (passed_here, passed_there) == (11, 22), "each of the others' passes a hub once"
 
 
-async def test_our_very_first_frame_is_known_when_it_comes_back(rig: Any) -> None:
+async def test_first_own_frame_that_returns_is_dropped(rig: Any) -> None:
     echo, other = rig.station(), rig.station()
     hub = rig.hub(*(f"udp:127.0.0.1:{station.port}" for station in (echo, other)))
     await rig.until_open(hub)
@@ -362,17 +362,17 @@ class TestChangesAtRunTime:
         assert goes.is_silent()
         assert "laptop" in {client.name for client in hub.clients()}
 
-    async def test_what_was_added_by_hand_survives_a_reload(self, rig: Any) -> None:
+    async def test_endpoint_added_at_run_time_survives_a_reload(self, rig: Any) -> None:
         hub, station = rig.hub(), rig.station()
         hub.add(f"udp:127.0.0.1:{station.port}")
         hub.apply(hub.settings)
         assert len(hub.endpoints()) == 1
 
 
-class TestExpress:
-    """Telemetry that comes often takes a short way; nobody may notice."""
+class TestCachedRoutes:
+    """Telemetry that comes often is forwarded by a cached route, without another effect."""
 
-    async def test_counts_are_right_and_everybody_gets_all(self, world: Any) -> None:
+    async def test_cached_route_counts_and_delivers_every_frame(self, world: Any) -> None:
         hub = world.world
         frames = [world.autopilot.sender.attitude() for _ in range(50)]
         for frame in frames:
@@ -400,7 +400,7 @@ class TestExpress:
         assert gone.sent + gone.dropped + gone.unheard == 22
         assert by_remote[f"127.0.0.1:{world.first.port}"].dropped == 0
 
-    async def test_changes_hold_from_the_next_frame_on(self, world: Any) -> None:
+    async def test_changes_apply_from_the_next_frame_on(self, world: Any) -> None:
         hub = world.world
         world.autopilot.say(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
@@ -418,7 +418,7 @@ class TestExpress:
         assert (await world.first.receive())[7] == 30
         assert late.is_silent()
 
-    async def test_a_second_way_ends_it(self, world: Any) -> None:
+    async def test_second_path_ends_the_cached_route(self, world: Any) -> None:
         hub = world.world
         world.autopilot.say(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
@@ -477,7 +477,7 @@ class TestListeningPorts:
         assert search.call_count == 2
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_out_of_descriptors_nobody_is_let_in_until_there_are_some(
+    async def test_clients_are_admitted_once_descriptors_are_free_again(
         self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", 0.001)

@@ -86,7 +86,7 @@ def _sequences(sock: socket.socket) -> list[int]:
             return found
 
 
-async def test_a_client_is_killed(rig: Any) -> None:
+async def test_killed_client_costs_others_no_frame(rig: Any) -> None:
     flight = Healthy(rig)
     await flight.start()
     victim = rig.station(flight.hub.listening_ports()[0])
@@ -218,7 +218,7 @@ async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
 class TestALinkThatRaises:
     """An error that nobody foresaw costs its own link a second, and nobody else anything."""
 
-    async def test_it_is_named_and_tried_again_and_the_others_go_on(
+    async def test_link_that_raises_is_reported_and_retried_while_others_go_on(
         self, rig: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         gone = rig.station()
@@ -264,7 +264,7 @@ class TestALinkThatRaises:
         assert hub.listeners()[0].state == "open"
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_a_name_that_the_resolver_chokes_on(
+    async def test_invalid_name_is_reported_as_unresolved(
         self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         errors: list[Any] = []
@@ -280,7 +280,7 @@ class TestALinkThatRaises:
         assert (hub.clients()[0].state, errors) == ("resolving", [])
 
 
-async def test_heartbeats_cut_short_do_no_harm(rig: Any) -> None:
+async def test_truncated_heartbeats_are_accepted_without_error(rig: Any) -> None:
     errors: list[Any] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
     hub = rig.hub("udp-listen:127.0.0.1:0?trusted=no")

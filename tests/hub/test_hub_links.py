@@ -73,7 +73,7 @@ async def test_two_gateways_joined_twice_send_every_frame_once(rig: Any) -> None
         assert joined.gaps(system) == 0
 
 
-async def test_a_request_over_two_links_is_answered_and_parts_no_numbers(rig: Any) -> None:
+async def test_request_over_two_links_is_answered_on_both_without_a_gap(rig: Any) -> None:
     joined = Joined(rig)
     await joined.run(4)
     joined.heard = {1: [], 2: []}

@@ -52,7 +52,7 @@ async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(w
         assert await world.station_.receive() == frame
 
 
-async def test_copies_sent_in_advance_eat_no_request(world: Any) -> None:
+async def test_copies_sent_in_advance_drop_no_request(world: Any) -> None:
     seen = world.sender(255, 190)
     seen.heartbeat()
     for _ in range(10):
@@ -64,7 +64,7 @@ async def test_copies_sent_in_advance_eat_no_request(world: Any) -> None:
     assert world.world.counters().duplicates == 0
 
 
-async def test_a_command_goes_to_the_system_and_not_to_who_claims_a_component_of_it(
+async def test_command_goes_to_the_trusted_path_despite_a_forged_component(
     world: Any,
 ) -> None:
     claimed = world.sender(42, 77)
@@ -77,7 +77,7 @@ async def test_a_command_goes_to_the_system_and_not_to_who_claims_a_component_of
         assert world.untrusted.socket.recv(100) != request
 
 
-async def test_forged_stations_without_number_take_nobodys_place(world: Any) -> None:
+async def test_forged_stations_displace_no_other_client(world: Any) -> None:
     for number in range(357):
         forged = world.sender(1 + number % 200, 1 + number // 200)
         forged.is_station = True
@@ -98,7 +98,7 @@ async def test_systems_shown_for_an_untrusted_client_are_bounded(world: Any) -> 
     assert 1 <= len(untrusted.systems) <= 8
 
 
-async def test_trust_that_is_taken_away_takes_the_routes_too(world: Any) -> None:
+async def test_client_no_longer_trusted_loses_its_routes(world: Any) -> None:
     hub = world.world
     request = world.station_.sender.command(42, 1)
     world.station_.say(request)

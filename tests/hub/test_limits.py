@@ -38,7 +38,7 @@ def test_in_turns_and_each_in_its_order() -> None:
     assert queue.wait_us(0) is None
 
 
-def test_a_flood_waits_for_itself() -> None:
+def test_flooding_client_delays_only_itself() -> None:
     queue = RequestQueue()
     assert [queue.offer(asked(1), 0) for _ in range(MAX_WAITING + 1)][-2:] == [True, False]
     assert queue.offer(asked(2), 0)
@@ -46,7 +46,7 @@ def test_a_flood_waits_for_itself() -> None:
     assert queue.take(0) == asked(2)
 
 
-def test_answers_are_paid_for_before_the_next_request() -> None:
+def test_next_request_waits_until_the_answers_are_paid() -> None:
     queue = RequestQueue()
     queue.offer(asked(1), 0)
     queue.offer(asked(1), 0)
@@ -59,7 +59,7 @@ def test_answers_are_paid_for_before_the_next_request() -> None:
     assert queue.take(wait_us) == asked(1)
 
 
-def test_one_in_debt_holds_up_nobody_else() -> None:
+def test_client_beyond_its_quota_delays_no_other() -> None:
     queue = RequestQueue()
     for client_id in (1, 2):
         queue.offer(asked(client_id), 0)
@@ -104,7 +104,7 @@ def test_a_client_no_longer_trusted_uses_the_shared_bucket() -> None:
     assert queue.take(0) is None
 
 
-def test_who_has_gone_leaves_nothing() -> None:
+def test_removed_clients_leave_no_requests() -> None:
     queue = RequestQueue()
     for client_id in range(1000):
         queue.offer(asked(client_id), 0)

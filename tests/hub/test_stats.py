@@ -40,7 +40,7 @@ def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
     assert look(watch, client(), 22 * S) == []
 
 
-def test_a_router_that_has_gone_is_reported_in_plain_words() -> None:
+def test_lost_router_is_reported_as_not_connected() -> None:
     watch = ClientAlerts()
     texts = [text for n in range(20) for text in look(watch, client(state="connecting"), n * S)]
     assert texts == ["tablet: not connected"]
@@ -65,7 +65,7 @@ def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
     assert not watch._away_since_us
 
 
-def test_a_station_that_is_not_running_is_no_trouble() -> None:
+def test_refusing_station_raises_no_alert() -> None:
     watch = ClientAlerts()
     assert all(not look(watch, client(state="refused"), n * S) for n in range(20))
 
@@ -117,7 +117,7 @@ def test_alerts_of_unknown_clients_are_summed_up_and_of_a_configured_one_named()
     assert len(texts) == 8
 
 
-def test_a_few_in_full_and_the_rest_as_a_number() -> None:
+def test_lines_beyond_the_limit_are_counted() -> None:
     limiter = LogRateLimiter(2, "more came")
     assert [limiter.add(line, 0) for line in "abcde"] == [["a"], ["b"], [], [], []]
     assert limiter.poll(WINDOW_US - 1) == []

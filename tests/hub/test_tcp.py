@@ -96,7 +96,7 @@ class TestTcpListen:
         assert hub.clients()[0].queued > 1000
         assert hub.clients()[0].bytes_sent < 10_000
 
-    async def test_what_the_kernel_joins_does_not_wait_there_either(self, rig: Any) -> None:
+    async def test_kernel_holds_few_unsent_bytes_of_joined_writes(self, rig: Any) -> None:
         """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
         hub = rig.hub("tcp-listen:127.0.0.1:0")
         await connect(rig, hub.listening_ports()[0])
@@ -137,7 +137,7 @@ def time_of(frame: bytes) -> int:
 
 
 class TestTcpOut:
-    async def test_a_connection_to_itself_is_a_refusal(
+    async def test_connection_to_itself_counts_as_refused(
         self, rig: Any, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         """The kernel may draw the wanted port, where nobody listens, as our own."""
@@ -238,7 +238,7 @@ class TestSerial:
         assert ids.index(30) <= 17 - waiting + 1
         assert [frame[4] for frame in frames] == list(range(17))
 
-    async def test_a_port_that_goes_and_comes_back(
+    async def test_serial_port_is_opened_again_after_it_was_unplugged(
         self, rig: Any, line: tuple[int, str], tmp_path: Any
     ) -> None:
         device = tmp_path / "radio"

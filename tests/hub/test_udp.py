@@ -31,7 +31,7 @@ async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: An
     assert client.systems == ((255, 190),)
 
 
-async def test_whoever_speaks_to_the_port_is_served_and_greeted_without_a_gap(rig: Any) -> None:
+async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     home, heartbeat = rig.vehicle.home(), rig.vehicle.heartbeat()
     hub.send(rig.out(home))
@@ -76,14 +76,14 @@ async def test_odd_sizes_from_a_client_are_counted(rig: Any) -> None:
     assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
 
 
-async def test_a_silent_client_goes(rig: Any) -> None:
+async def test_client_without_frames_is_removed_after_the_timeout(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=10.0)
     await rig.call(hub)
     rig.clock.us = 11_000_000
     await rig.until(lambda: not hub.clients())
 
 
-async def test_a_killed_client_goes_when_its_machine_says_so(rig: Any) -> None:
+async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     station = await rig.call(hub)
     station.socket.close()
@@ -93,7 +93,7 @@ async def test_a_killed_client_goes_when_its_machine_says_so(rig: Any) -> None:
     await rig.until(lambda: not hub.clients())
 
 
-async def test_a_caller_is_called_by_its_port_too(rig: Any) -> None:
+async def test_client_of_a_named_port_has_its_name(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?name=tablets", "tcp-listen:127.0.0.1:0?name=bench")
     station = rig.station(hub.listening_ports()[0])
     station.say(station.sender.heartbeat())
@@ -103,7 +103,7 @@ async def test_a_caller_is_called_by_its_port_too(rig: Any) -> None:
     assert names == ["bench", "tablets"]
 
 
-async def test_a_caller_that_refuses_is_left_alone_until_it_speaks(rig: Any) -> None:
+async def test_refusing_client_gets_nothing_until_it_sends_again(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = await rig.call(hub)
     station.socket.close()
@@ -185,7 +185,7 @@ async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPa
     await rig.check_passes(hub, station)
 
 
-async def test_of_two_addresses_the_one_that_does_not_refuse(
+async def test_second_address_of_a_name_is_used_when_the_first_refuses(
     rig: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As `localhost` has, whose first address is often not the one that a station listens at."""

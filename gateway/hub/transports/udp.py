@@ -59,8 +59,8 @@ class UdpClient(DatagramClient):
         super().close()
 
     def _wants_look_up(self, now_us: int) -> bool:
-        silent = self.heard_us is None or now_us - self.heard_us > RESOLVE_AGAIN_US
-        return silent and now_us >= self._resolve_us and not is_numeric(self.endpoint.host)
+        idle = self.heard_us is None or now_us - self.heard_us > RESOLVE_AGAIN_US
+        return idle and now_us >= self._resolve_us and not is_numeric(self.endpoint.host)
 
     async def _open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port

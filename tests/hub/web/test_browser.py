@@ -92,7 +92,7 @@ async def test_the_horizon_is_drawn(rig: Rig, page: Page) -> None:
         assert hub.clients()[0].dropped == 0
 
 
-async def test_a_page_of_elsewhere_sees_nothing(rig: Rig, page: Page) -> None:
+async def test_page_of_a_foreign_origin_receives_nothing(rig: Rig, page: Page) -> None:
     """The browser itself sends the page's origin; that of an opened file and a sandbox is null."""
     hub = rig.hub("ws-listen:127.0.0.1:0")
     await page.set_content(documented_page(hub.listening_ports()[0]))

@@ -19,7 +19,7 @@ async def receive(link: Any, kind: str) -> Any:
     return await asyncio.to_thread(link.recv_match, type=kind, blocking=True, timeout=LIMIT_S)
 
 
-async def test_it_calls(rig: Rig) -> None:
+async def test_pymavlink_connects_to_the_hub(rig: Rig) -> None:
     hub = rig.hub("ws-listen:127.0.0.1:0")
     hub.send(rig.out(rig.vehicle.heartbeat()))
     url = f"ws:127.0.0.1:{hub.listening_ports()[0]}"
@@ -40,7 +40,7 @@ async def test_it_calls(rig: Rig) -> None:
         link.close()
 
 
-async def test_it_calls_within_tls(
+async def test_pymavlink_connects_to_the_hub_by_tls(
     rig: Rig, certificate: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
@@ -59,7 +59,7 @@ async def test_it_calls_within_tls(
         link.close()
 
 
-async def test_it_serves(rig: Rig) -> None:
+async def test_hub_connects_to_pymavlink(rig: Rig) -> None:
     port = free_port()
     server = mavutil.mavlink_connection(f"wsserver:127.0.0.1:{port}", source_system=9)
     try:

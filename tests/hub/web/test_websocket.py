@@ -24,7 +24,7 @@ Visit = Callable[..., Any]
 
 
 class TestPages:
-    async def test_both_ways(self, rig: Rig, visit: Visit) -> None:
+    async def test_frames_pass_both_ways(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
         hub.send(rig.out(rig.vehicle.heartbeat()))
         page = await visit(hub.listening_ports()[0], "http://localhost:8080")
@@ -43,14 +43,14 @@ class TestPages:
         assert (client.sent, client.received, client.bytes_received) == (2, 1, len(said))
         assert client.remote.startswith("127.0.0.1:")
 
-    async def test_text_is_counted_and_refused_nobody(self, rig: Rig, visit: Visit) -> None:
+    async def test_text_message_is_counted_as_garbage(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
         page = await visit(hub.listening_ports()[0])
         page.writer.write(page.web.send(TextMessage(data="hello")))
         await rig.until(lambda: hub.clients()[0].bytes_garbage == 5)
         assert hub.clients()[0].state == "open"
 
-    async def test_a_page_of_elsewhere_is_refused_and_reported(
+    async def test_page_of_a_foreign_origin_is_refused_and_reported(
         self, rig: Rig, visit: Visit, caplog: pytest.LogCaptureFixture
     ) -> None:
         hub = rig.hub(LISTEN)
@@ -62,7 +62,7 @@ class TestPages:
         assert hub.listeners()[0].turned_away == 1
         assert "'https://example.org' was refused" in caplog.text
 
-    async def test_a_named_page_may_come(self, rig: Rig, visit: Visit) -> None:
+    async def test_page_of_an_allowed_origin_may_connect(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(f"{LISTEN}?origins=https://example.org,null&trusted=no")
         hub.send(rig.out(rig.vehicle.heartbeat()))
         page = await visit(hub.listening_ports()[0], "https://example.org")
@@ -73,7 +73,7 @@ class TestPages:
         await rig.until(lambda: bool(rig.incoming))
         assert not rig.incoming[0].trusted
 
-    async def test_filters_and_rates_hold(self, rig: Rig, visit: Visit) -> None:
+    async def test_filters_and_rates_apply_to_pages(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(f"{LISTEN}?deny=RAW_IMU&rate=ATTITUDE:1")
         page = await visit(hub.listening_ports()[0])
         for _ in range(4):
@@ -104,7 +104,7 @@ class TestPages:
         other.close()
         await rig.until(lambda: not hub.clients())
 
-    async def test_a_port_that_closes_says_good_bye(self, rig: Rig, visit: Visit) -> None:
+    async def test_closing_port_sends_a_close(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
         page = await visit(hub.listening_ports()[0])
         hub.close()
@@ -134,7 +134,9 @@ class TestTrouble:
         assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
         assert hub.clients()[0].queued == 0
 
-    async def test_who_asks_and_never_reads_is_dropped(self, rig: Rig, plug: Visit) -> None:
+    async def test_client_that_sends_pings_and_never_reads_is_dropped(
+        self, rig: Rig, plug: Visit
+    ) -> None:
         hub = rig.hub(LISTEN)
         sock = await plug(hub.listening_ports()[0], room_bytes=4096)
         await self.shake_hands(rig, hub, sock)
@@ -167,7 +169,7 @@ class TestTrouble:
         (left,) = hub.clients()
         assert left.client_id == 2, "one that never answered pings is left to the kernel"
 
-    async def test_who_never_shakes_hands_is_dropped(self, rig: Rig, plug: Visit) -> None:
+    async def test_connection_without_handshake_is_dropped(self, rig: Rig, plug: Visit) -> None:
         hub = rig.hub(LISTEN)
         sock = await plug(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
@@ -179,7 +181,7 @@ class TestTrouble:
         assert await hung_up(sock)
         assert not listener._handshakes  # type: ignore[union-attr]
 
-    async def test_who_never_shakes_hands_keeps_nobody_out(
+    async def test_connections_without_handshake_keep_no_page_out(
         self, rig: Rig, plug: Visit, visit: Visit
     ) -> None:
         hub = rig.hub(LISTEN, max_clients=3)
@@ -313,7 +315,9 @@ class TestTls:
         await rig.until(lambda: server.listeners()[0].turned_away == 1)
         assert not server.clients()
 
-    async def test_a_certificate_of_another_is_named(self, rig: Rig, certificate: Path) -> None:
+    async def test_certificate_for_another_name_is_reported(
+        self, rig: Rig, certificate: Path
+    ) -> None:
         """What is wrong with it is not the same for who has to mend it: name, date, authority."""
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         port = server.listening_ports()[0]
@@ -321,7 +325,7 @@ class TestTls:
         await rig.until(lambda: hub.clients()[0].state == "refused")
         assert "certificate is not valid for 'localhost'" in hub.clients()[0].reason
 
-    async def test_plain_speech_is_refused(
+    async def test_plain_http_at_a_tls_port_is_refused(
         self, rig: Rig, plug: Visit, certificate: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
@@ -330,7 +334,7 @@ class TestTls:
         await rig.until(lambda: hub.listeners()[0].turned_away == 1)
         assert re.search("tls: http request", caplog.text)
 
-    async def test_a_new_certificate_holds_at_once(
+    async def test_replaced_certificate_applies_to_the_next_connection(
         self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
     ) -> None:
         file = tmp_path / "mine.pem"

@@ -97,7 +97,7 @@ class TestHandshake:
         assert server.feed(REQUEST + twice).ended
 
     @pytest.mark.parametrize(("offered", "agreed"), [(b"mqtt, binary", b"binary"), (b"mqtt", None)])
-    def test_a_page_that_asks_for_a_protocol(self, offered: bytes, agreed: bytes | None) -> None:
+    def test_only_a_known_protocol_is_accepted(self, offered: bytes, agreed: bytes | None) -> None:
         server = WsServer(lambda origin: False)
         reply = server.feed(REQUEST + b"Sec-WebSocket-Protocol: " + offered + b"\r\n\r\n").reply
         assert (b"Sec-WebSocket-Protocol: binary" in reply) == (agreed is not None)
@@ -138,7 +138,7 @@ class TestMessages:
         found = opened().feed(masked(1, "€".encode()) + masked(2, b"\xfd"))
         assert (found.text_size, found.payload, found.ended) == (3, b"\xfd", "")
 
-    def test_of_many_pings_the_last_is_answered(self) -> None:
+    def test_last_of_several_pings_is_answered(self) -> None:
         """So that one who asks without end and never reads cannot fill our memory."""
         found = opened().feed(b"".join(masked(9, b"%d" % n) for n in range(1000)))
         assert found.reply == b"\x8a\x03999"
@@ -164,14 +164,14 @@ class TestMessages:
             "no UTF-8", "oversized", "oversized in fragments", "oversized text",
         ],
     )  # fmt: skip
-    def test_what_ends_a_connection(self, data: bytes, code: CloseReason) -> None:
+    def test_invalid_frames_end_the_connection(self, data: bytes, code: CloseReason) -> None:
         server = opened()
         found = server.feed(data)
         assert close_code(found.reply) == code
         assert found.ended
         assert server.feed(masked(2, b"more")) == WsInput()
 
-    def test_a_length_of_eternity_holds_no_memory(self) -> None:
+    def test_announced_huge_message_allocates_no_memory(self) -> None:
         """The bytes pass as they come; beyond the limit the connection ends."""
         server = opened()
         head = b"\x82\xff" + struct.pack("!Q", 1 << 62) + MASK
@@ -182,7 +182,7 @@ class TestMessages:
             assert passed <= MAX_MESSAGE
         assert close_code(found.reply) == CloseReason.MESSAGE_TOO_BIG
 
-    def test_a_close_is_answered(self) -> None:
+    def test_close_is_answered_with_a_close(self) -> None:
         found = opened().feed(masked(2, b"last") + masked(8, b"\x03\xe9going away"))
         assert found.payload == b"last"
         assert close_code(found.reply) == CloseReason.GOING_AWAY
@@ -214,7 +214,7 @@ class TestAgainstAnotherProgram:
         return list(peer.events())
 
     @pytest.mark.parametrize("size", [0, 1, 125, 126, 1100, 65535])
-    def test_we_serve(self, size: int) -> None:
+    def test_hub_accepts_a_connection(self, size: int) -> None:
         server = WsServer(lambda origin: origin == "http://localhost")
         peer = WSConnection(ConnectionType.CLIENT)
         origin = [(b"Origin", b"http://localhost")]
@@ -232,7 +232,7 @@ class TestAgainstAnotherProgram:
         (bye,) = self.talk(peer, server.close(CloseReason.GOING_AWAY))
         assert isinstance(bye, CloseConnection)
 
-    def test_we_call(self) -> None:
+    def test_hub_connects_to_a_server(self) -> None:
         caller = WsCaller("localhost:56781", "/raw")
         peer = WSConnection(ConnectionType.SERVER)
         (request,) = self.talk(peer, caller.hello)
@@ -248,7 +248,7 @@ class TestAgainstAnotherProgram:
         (pong,) = self.talk(peer, found.reply)
         assert isinstance(pong, Pong)
 
-    def test_we_are_refused(self) -> None:
+    def test_refusal_of_a_server_is_reported(self) -> None:
         caller = WsCaller("localhost:56781", "/")
         peer = WSConnection(ConnectionType.SERVER)
         self.talk(peer, caller.hello)
