@@ -282,7 +282,8 @@ class VehicleAnswers:
         found: dict[str, bytes] = {}
         for number, (value, _, _, name, kind) in enumerate(values):
             payload = _VALUE.pack(value, len(values), number, name, kind)
-            found[_text_of(name)] = _encode(PARAM_VALUE_ID, self.played_as, payload)
+            text = name.split(b"\0", 1)[0].decode("ascii", "replace")
+            found[text] = _encode(PARAM_VALUE_ID, self.played_as, payload)
         return found
 
 
@@ -310,7 +311,3 @@ def _content_of(frame: bytes) -> bytes:
         value, _, _, _, kind = _VALUE.unpack(payload_of(frame, _VALUE.size))
         return bytes((*value, kind))
     return payload_of(frame, _SAME.get(message_id, 255))
-
-
-def _text_of(name: bytes) -> str:
-    return name.split(b"\0", 1)[0].decode("ascii", "replace")

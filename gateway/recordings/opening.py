@@ -18,7 +18,6 @@ from gateway.recordings.files import (
     FlightError,
     Layout,
     Progress,
-    TlogSource,
     format_of,
     is_packed,
     open_descriptor,
@@ -53,7 +52,12 @@ class TlogFile:
         self.remarks = source.remarks
         """Remarks for the user about its times."""
         is_plain = source.layout is Layout.TLOG and not is_packed(path)
-        self._file = open_descriptor(path) if is_plain else _plain_copy(source, unpacked_limit)
+        if is_plain:
+            self._file = open_descriptor(path)
+        else:
+            # Only a plain tlog can be read at any position.
+            with temporary_copy(path, source.chunks(None, unpacked_limit)) as plain:
+                self._file = os.dup(plain.fileno())
         self.index = TlogIndex(source.timeline)
         scanner = TlogScanner()
         offset = 0
@@ -87,12 +91,6 @@ class TlogFile:
     def close(self) -> None:
         """Close the file; its tracks end."""
         os.close(self._file)
-
-
-def _plain_copy(source: TlogSource, limit: int) -> int:
-    """Open a copy, since only a plain tlog can be read at any position."""
-    with temporary_copy(source.path, source.chunks(None, limit)) as plain:
-        return os.dup(plain.fileno())
 
 
 log = logging.getLogger(__name__)

@@ -375,7 +375,12 @@ class RecordedFusion:
         if self._smoothed is not None:
             return self._smoothed
         fusion = self._fusion(follow=False)
-        rows = [fusion.block(block).cells for block in _with_begin(self._table.blocks)]
+        rows = []
+        for number, block in enumerate(self._table.blocks):
+            # Of the lines between rows only a state at the very begin.
+            begin = block.comments[:1] if number == 0 else ()
+            kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
+            rows.append(fusion.block(TableBlock(block.cells, kept)).cells)
         cells = np.concatenate(rows)
         cells = cells[has_group(cells, NAV)]
         return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]
@@ -388,14 +393,6 @@ def header_of_states(known: TableHeader, aircraft: AircraftSettings) -> TableHea
         session=known.session,
         unix_us_at_zero=known.unix_us_at_zero,
     )
-
-
-def _with_begin(blocks: Iterable[TableBlock]) -> Iterator[TableBlock]:
-    """Leave of the lines between rows only a state at the very begin."""
-    for number, block in enumerate(blocks):
-        begin = block.comments[:1] if number == 0 else ()
-        kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
-        yield TableBlock(block.cells, kept)
 
 
 def end_of(file: Path, options: ReadOptions) -> int | None:

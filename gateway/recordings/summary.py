@@ -164,6 +164,8 @@ class TimesSpan:
     """Sum up how long records last; a clock that leaps by days adds nothing."""
 
     first_us: int | None = None
+    gaps: list[Gap] = field(default_factory=list)
+    """The first `MAX_GAPS` between records of `add_all`."""
     _begin_us: int = 0
     """Begin of the stretch since the last leap."""
     _newest_us: int = 0
@@ -188,32 +190,17 @@ class TimesSpan:
         self._last_us = time_us
 
     def add_all(self, times_us: IntArray) -> None:
-        """Take in the times of the next records, at least one."""
-        leaps = np.flatnonzero(np.abs(np.diff(times_us)) > DAY_US) + 1
-        for between in np.split(times_us, leaps):
-            self.add(int(between[0]))
-            self._newest_us = max(self._newest_us, int(between.max()))
-            self._last_us = int(between[-1])
-
-
-@dataclass(slots=True)
-class _Gaps:
-    """Find gaps."""
-
-    last_us: int | None = None
-    found: list[Gap] = field(default_factory=list)
-
-    def add_all(self, times_us: IntArray) -> None:
-        if self.last_us is not None:
-            times_us = np.insert(times_us, 0, self.last_us)
-        steps = np.diff(times_us)
-        for i in np.flatnonzero(steps > GAP_US).tolist():
-            self._note(int(times_us[i]), int(steps[i]))
-        self.last_us = int(times_us[-1])
-
-    def _note(self, time_us: int, duration_us: int) -> None:
-        if len(self.found) < MAX_GAPS:
-            self.found.append(Gap(time_us, duration_us / US_PER_S))
+        """Take in the times of the next records, of which there is at least one."""
+        before_us = times_us[0] if self.first_us is None else self._last_us
+        steps_us = np.diff(times_us, prepend=before_us)
+        for i in np.flatnonzero(steps_us > GAP_US)[: MAX_GAPS - len(self.gaps)].tolist():
+            step_us = int(steps_us[i])
+            self.gaps.append(Gap(int(times_us[i]) - step_us, step_us / US_PER_S))
+        for between in np.split(times_us, np.flatnonzero(np.abs(steps_us) > DAY_US)):
+            if len(between):
+                self.add(int(between[0]))
+                self._newest_us = max(self._newest_us, int(between.max()))
+                self._last_us = int(between[-1])
 
 
 class TlogSummary:
@@ -224,7 +211,7 @@ class TlogSummary:
         self._counts: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[int, tuple[int, int]] = {}
         self._ways: dict[int, GroundDistance] = {}
-        self._span, self._gaps = TimesSpan(), _Gaps()
+        self._span = TimesSpan()
 
     def add(self, batch: Batch) -> None:
         """Take in the next batch of the file."""
@@ -232,7 +219,6 @@ class TlogSummary:
         if not len(batch):
             return
         self._span.add_all(batch.time_us)
-        self._gaps.add_all(batch.time_us)
         keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
         for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
             self._counts[key >> 24, key & 0xFFFFFF] += count
@@ -259,7 +245,7 @@ class TlogSummary:
                 self._vehicle(system_id, duration_s)
                 for system_id in sorted({system_id for system_id, _ in self._counts})
             ),
-            gaps=tuple(self._gaps.found),
+            gaps=tuple(self._span.gaps),
             damaged_bytes=index.damaged_bytes,
             damaged_runs=len(index.damage),
             unfinished_bytes=index.unfinished,
@@ -300,7 +286,7 @@ class TableSummary:
         self._damaged_bytes = self._unfinished_bytes = 0
         self._last_us: int | None = None
         self._of_states, self._of_fixes = GroundDistance(), GroundDistance()
-        self._span, self._gaps = TimesSpan(), _Gaps()
+        self._span = TimesSpan()
 
     def add(self, block: TableBlock, header: TableHeader | None) -> None:
         """Take in the next block of the file."""
@@ -338,7 +324,7 @@ class TableSummary:
             last_us=self._last_us,
             duration_s=duration_s,
             vehicles=(vehicle,),
-            gaps=tuple(self._gaps.found),
+            gaps=tuple(self._span.gaps),
             damaged_bytes=self._damaged_bytes,
             damaged_runs=self._counts["damage"],
             unfinished_bytes=self._unfinished_bytes,
@@ -357,7 +343,6 @@ class TableSummary:
         times_us = cells[:, 0].astype(np.int64)
         self._last_us = max(int(times_us.max()), self._last_us or 0)
         self._span.add_all(times_us)
-        self._gaps.add_all(times_us)
         fixed = cells[:, FIX_OK] == 1.0
         for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
             self._of_fixes.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)

@@ -172,6 +172,7 @@ class Shown:
 class _Vehicle:
     """The newest data of one vehicle."""
 
+    frame: str
     q_nb: Quat = (1.0, 0.0, 0.0, 0.0)
     has_attitude: bool = False
     has_quaternion: bool = False
@@ -193,7 +194,7 @@ class FoxgloveView:
         self.origin: tuple[float, float, float] | None = None
         """Latitude, longitude and height of the frame `map`."""
         self._vehicles: dict[int, _Vehicle] = {}
-        self._handlers: dict[str, Callable[[int, _Vehicle, Any, int], list[Shown]]] = {
+        self._handlers: dict[str, Callable[[_Vehicle, Any, int], list[Shown]]] = {
             "ATTITUDE": self._attitude,
             "ATTITUDE_QUATERNION": self._quaternion,
             "GLOBAL_POSITION_INT": self._position,
@@ -207,24 +208,23 @@ class FoxgloveView:
         handler = self._handlers.get(message.msgname)
         if handler is None or component_id != AUTOPILOT:
             return []
-        vehicle = self._vehicles.setdefault(system_id, _Vehicle())
-        return handler(system_id, vehicle, message, time_us)
+        vehicle = self._vehicles.setdefault(system_id, _Vehicle(f"vehicle_{system_id}"))
+        return handler(vehicle, message, time_us)
 
-    def _attitude(self, system_id: int, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
+    def _attitude(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         if vehicle.has_quaternion or not math.isfinite(m.roll + m.pitch + m.yaw):
             return []
-        return self._turned(system_id, vehicle, from_euler(m.roll, m.pitch, m.yaw), time_us)
+        return self._turned(vehicle, from_euler(m.roll, m.pitch, m.yaw), time_us)
 
-    def _quaternion(self, system_id: int, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
+    def _quaternion(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         q: Quat = (m.q1, m.q2, m.q3, m.q4)
         if not math.isfinite(sum(q)) or not any(q):
             return []
         vehicle.has_quaternion = True
-        return self._turned(system_id, vehicle, normalise(q), time_us)
+        return self._turned(vehicle, normalise(q), time_us)
 
-    def _turned(self, system_id: int, vehicle: _Vehicle, q_nb: Quat, time_us: int) -> list[Shown]:
+    def _turned(self, vehicle: _Vehicle, q_nb: Quat, time_us: int) -> list[Shown]:
         vehicle.q_nb, vehicle.has_attitude = q_nb, True
-        frame = f"vehicle_{system_id}"
         w, x, y, z = multiply(multiply(_ENU_OF_NED, q_nb), _FRD_OF_FLU)
         turned = {"x": x, "y": y, "z": z, "w": w}
         at = {"timestamp": _time(time_us)}
@@ -234,15 +234,15 @@ class FoxgloveView:
                 TF_TOPIC,
                 "foxglove.FrameTransform",
                 at
-                | {"parent_frame_id": MAP, "child_frame_id": frame}
+                | {"parent_frame_id": MAP, "child_frame_id": vehicle.frame}
                 | {"translation": place, "rotation": turned},
             )
         ]
         if vehicle.place is not None:
             pose = {"position": place, "orientation": turned}
             content = at | {"frame_id": MAP, "pose": pose}
-            shown.append(Shown(f"/{frame}/pose", "foxglove.PoseInFrame", content))
-        return [*shown, self._state(system_id, vehicle)]
+            shown.append(Shown(f"/{vehicle.frame}/pose", "foxglove.PoseInFrame", content))
+        return [*shown, self._state(vehicle)]
 
     def _place(self, vehicle: _Vehicle) -> dict[str, float]:
         if vehicle.place is None or self.origin is None:
@@ -251,7 +251,7 @@ class FoxgloveView:
         north, east = displacement_m(*self.origin[:2], lat_deg, lon_deg, self.origin[2])
         return {"x": east, "y": north, "z": alt_m - self.origin[2]}
 
-    def _state(self, system_id: int, vehicle: _Vehicle) -> Shown:
+    def _state(self, vehicle: _Vehicle) -> Shown:
         roll, pitch, yaw = map(math.degrees, to_euler(vehicle.q_nb))
         content: dict[str, float | None] = dict.fromkeys(SCHEMAS["mavgate.State"]["properties"])
         if vehicle.has_attitude:
@@ -264,9 +264,9 @@ class FoxgloveView:
                 "speed_mps": math.hypot(place.vx, place.vy) * M_PER_CM,
                 "climb_mps": -place.vz * M_PER_CM,
             }
-        return Shown(f"/vehicle_{system_id}/state", "mavgate.State", content)
+        return Shown(f"/{vehicle.frame}/state", "mavgate.State", content)
 
-    def _position(self, system_id: int, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
+    def _position(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         if not m.lat and not m.lon:
             return []
         vehicle.place = m
@@ -274,27 +274,27 @@ class FoxgloveView:
             self.origin = _degrees(m)
         known = COVARIANCE_DIAGONAL if vehicle.accuracy_m else COVARIANCE_APPROXIMATED
         accuracy_m = vehicle.accuracy_m or vehicle.gps_accuracy_m
-        fix = _fix(system_id, time_us, _degrees(m), accuracy_m, known)
-        shown = [Shown(f"/vehicle_{system_id}/location", "foxglove.LocationFix", fix)]
-        return shown if vehicle.has_attitude else [*shown, self._state(system_id, vehicle)]
+        fix = _fix(vehicle.frame, time_us, _degrees(m), accuracy_m, known)
+        shown = [Shown(f"/{vehicle.frame}/location", "foxglove.LocationFix", fix)]
+        return shown if vehicle.has_attitude else [*shown, self._state(vehicle)]
 
-    def _gps(self, system_id: int, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
+    def _gps(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         if m.fix_type < 2 or (not m.lat and not m.lon):
             return []
         vehicle.gps_accuracy_m = None
         if 0 < m.h_acc < UNKNOWN_U32 and 0 < m.v_acc < UNKNOWN_U32:
             level_m = m.h_acc * M_PER_MM / math.sqrt(2.0)
             vehicle.gps_accuracy_m = (level_m, m.v_acc * M_PER_MM)
-        fix = _fix(system_id, time_us, _degrees(m), vehicle.gps_accuracy_m, COVARIANCE_DIAGONAL)
-        return [Shown(f"/vehicle_{system_id}/gps", "foxglove.LocationFix", fix)]
+        fix = _fix(vehicle.frame, time_us, _degrees(m), vehicle.gps_accuracy_m, COVARIANCE_DIAGONAL)
+        return [Shown(f"/{vehicle.frame}/gps", "foxglove.LocationFix", fix)]
 
-    def _accuracy(self, _system_id: int, vehicle: _Vehicle, m: Any, _time_us: int) -> list[Shown]:
+    def _accuracy(self, vehicle: _Vehicle, m: Any, _time_us: int) -> list[Shown]:
         level_m, height_m = m.pos_horiz_accuracy, m.pos_vert_accuracy
         known = math.isfinite(level_m) and math.isfinite(height_m)
         vehicle.accuracy_m = (level_m / math.sqrt(2.0), height_m) if known else None
         return []
 
-    def _text(self, system_id: int, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
+    def _text(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         """Put the chunks of a long text together."""
         part = str(_plain(m.text)).partition("\0")[0]
         begun = vehicle.text if m.id and m.id == vehicle.text_id and m.chunk_seq else ""
@@ -305,7 +305,7 @@ class FoxgloveView:
             "timestamp": _time(time_us),
             "level": LOG_LEVELS[min(m.severity, len(LOG_LEVELS) - 1)],
             "message": vehicle.text,
-            "name": f"vehicle_{system_id}",
+            "name": vehicle.frame,
             "file": "",
             "line": 0,
         }
@@ -317,7 +317,7 @@ def _degrees(m: Any) -> tuple[float, float, float]:
 
 
 def _fix(
-    system_id: int,
+    frame: str,
     time_us: int,
     place: tuple[float, float, float],
     accuracy_m: tuple[float, float] | None,
@@ -331,7 +331,7 @@ def _fix(
         covariance[8] = height_m**2
     return {
         "timestamp": _time(time_us),
-        "frame_id": f"vehicle_{system_id}",
+        "frame_id": frame,
         "latitude": lat_deg,
         "longitude": lon_deg,
         "altitude": alt_m,
