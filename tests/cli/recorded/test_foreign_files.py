@@ -17,12 +17,6 @@ DAY_US = 86_400_000_000
 SECONDS = 20
 
 
-@pytest.fixture(autouse=True)
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-
 def info(path: Path, *words: object) -> dict[str, object]:
     found: dict[str, object] = json.loads(run("info", path, "--json", *words))
     return found

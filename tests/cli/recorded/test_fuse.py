@@ -14,7 +14,10 @@ from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableReader, encode_head, encode_line
 from tests.estimation.test_golden import GOLDEN
 from tests.kit.cli import invoke
+from tests.kit.cli import run as run_words
 from tests.recordings.test_replay import fly_from_the_middle
+
+pytestmark = pytest.mark.io
 
 HEAD = "time_s,ax,ay,az,gx,gy,gz,mx,my,mz,gps_time_s,gps_lat,gps_lon,gps_alt_m,gps_vn,gps_ve,gps_vd"
 
@@ -33,15 +36,11 @@ def log(tmp_path: Path) -> Path:
 
 def run(log: Path, *arguments: str) -> list[dict[str, str]]:
     out = log.with_name("out.csv")
-    empty = log.with_name("defaults.toml")
-    empty.write_text("")
-    result = invoke("fuse", log, "-o", out, "--force", *arguments)
-    assert result.exit_code == 0, result.output
+    invoke("fuse", log, "-o", out, "--force", *arguments, code=0)
     lines = out.read_text().splitlines()
     return list(csv.DictReader(line for line in lines if not line.startswith("#")))
 
 
-@pytest.mark.io
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
 def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: str) -> None:
     rows = run(log, "--estimator", estimator)
@@ -56,7 +55,6 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
     assert known == (estimator != "paper")
 
 
-@pytest.mark.io
 def test_a_recording_gives_its_own_states_also_from_its_middle(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
@@ -70,7 +68,6 @@ def test_a_recording_gives_its_own_states_also_from_its_middle(
     assert [row["nav_lat_deg"] for row in again] == [repr(known.lat_deg) for known in recorded]
 
 
-@pytest.mark.io
 def test_written_file_is_a_table(log: Path) -> None:
     run(log)
     reader = TableReader()
@@ -80,14 +77,12 @@ def test_written_file_is_a_table(log: Path) -> None:
     assert all(event.state is not None for event in events if isinstance(event, TableRow))
 
 
-@pytest.mark.io
 def test_blank_before_anything_is_known(log: Path) -> None:
     first = run(log, "--estimator", "eskf")[0]
     assert first["nav_lat_deg"] == ""
     assert first["nav_q_w"] != ""
 
 
-@pytest.mark.io
 def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
@@ -96,36 +91,29 @@ def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
     assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
 
 
-@pytest.mark.io
 def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("a,b\n1,2\n")
-    result = invoke("fuse", path, "-o", tmp_path / "out.csv")
-    assert result.exit_code == 2
+    invoke("fuse", path, "-o", tmp_path / "out.csv", code=2)
     assert not (tmp_path / "out.csv").exists()
 
 
-@pytest.mark.io
 @pytest.mark.parametrize("force", [[], ["--force"]])
 def test_recording_is_not_overwritten_by_its_own_states(log: Path, force: list[str]) -> None:
     before = log.read_bytes()
-    result = invoke("fuse", log, "-o", log, *force)
-    assert result.exit_code == 2
+    result = invoke("fuse", log, "-o", log, *force, code=2)
     assert "is what the output is made of" in result.output
     assert log.read_bytes() == before
 
 
-@pytest.mark.io
 def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
     out = log.with_name("out.csv")
     out.write_text("precious")
-    result = invoke("fuse", log, "-o", out)
-    assert result.exit_code == 2
+    result = invoke("fuse", log, "-o", out, code=2)
     assert "use --force to overwrite" in result.output
     assert out.read_text() == "precious"
 
 
-@pytest.mark.io
 @pytest.mark.slow
 def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> None:
     log, out = tmp_path / "log.csv", tmp_path / "out.csv"
@@ -133,21 +121,15 @@ def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> Non
     log.write_text(flight.replace("gps_latency_s=0.16", ""))
     config = tmp_path / "c.toml"
     config.write_text('[estimation]\nestimator = "eskf"\n')
-    arguments = ["fuse", str(log), "-o", str(out), "--config", str(config)]
-    result = invoke(*arguments)
-    assert result.exit_code == 0, result.output
-    words = " ".join(result.output.split())
+    words = run_words("fuse", log, "-o", out, "--config", config)
     estimate = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
     assert estimate is not None, words
     assert float(estimate[1]) == pytest.approx(0.16, abs=0.02)
     assert f'"gps_latency_s":{estimate[1][:4]}' in out.read_text().replace(" ", "")
 
 
-@pytest.mark.io
 def test_latency_without_manoeuvres_is_assumed(log: Path) -> None:
     log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
-    arguments = ["fuse", str(log), "-o", str(log.with_name("out.csv")), "--force"]
-    words = " ".join(invoke(*arguments).output.split())
-    assert "0.15 s is assumed, since no manoeuvre shows it" in words
-    result = invoke(*arguments, "--gps-latency", "0.2")
-    assert "gives no GPS latency" not in result.output
+    arguments = ("fuse", log, "-o", log.with_name("out.csv"), "--force")
+    assert "0.15 s is assumed, since no manoeuvre shows it" in run_words(*arguments)
+    assert "gives no GPS latency" not in run_words(*arguments, "--gps-latency", 0.2)
