@@ -21,11 +21,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.columns import NAV_COLUMNS as STATE_COLUMNS
 from gateway.estimation.interface import Estimator
-from gateway.estimation.kernel import (
-    Aiding,
-    KernelEstimator,
-    SampleLog,
-)
+from gateway.estimation.kernel import Aiding, KernelEstimator, SampleLog
 from gateway.estimation.select import EstimationSettings
 from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180
@@ -48,22 +44,10 @@ from gateway.recordings.columns import (
     FloatArray,
     has_group,
 )
-from gateway.recordings.reading import (
-    settings_of,
-)
-from gateway.recordings.table import (
-    NO_ROWS,
-    TableBlock,
-    TableComment,
-    TableHeader,
-)
+from gateway.recordings.reading import settings_of
+from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader
 from gateway.recordings.tlog import ORDER_US
-from gateway.records import (
-    BaroSample,
-    FusionState,
-    GpsFix,
-    GpsFixType,
-)
+from gateway.records import BaroSample, FusionState, GpsFix, GpsFixType
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import ImuLog, IntArray, SensorChain
 from gateway.settings import Settings

@@ -18,12 +18,7 @@ import numpy as np
 
 from gateway import __version__
 from gateway.aircraft import Action, Aircraft, AircraftSettings, FusedStates
-from gateway.estimation.kernel import (
-    FoundLatency,
-    KernelEstimator,
-    SampleLog,
-    estimate_latency,
-)
+from gateway.estimation.kernel import FoundLatency, KernelEstimator, SampleLog, estimate_latency
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import make_estimator
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -79,12 +74,7 @@ from gateway.recordings.table import (
     encode_line,
 )
 from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
-from gateway.records import (
-    RECORDED_ONLY,
-    FusionState,
-    NodeStatus,
-    Outgoing,
-)
+from gateway.records import RECORDED_ONLY, FusionState, NodeStatus, Outgoing
 from gateway.sensing.chain import IntArray
 from gateway.vehicle.requests import INFO, StatusText
 

@@ -39,13 +39,7 @@ from gateway.recordings.files import (
     read_blocks,
 )
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
-from gateway.recordings.tlog import (
-    DAY_US,
-    HEARTBEAT_ID,
-    Batch,
-    TlogIndex,
-    fields_of,
-)
+from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, fields_of
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES

@@ -25,9 +25,7 @@ from gateway.recordings.tlog import (
     is_damaged,
     readdress,
 )
-from gateway.recordings.tlog import (
-    STEP_US as STAMP_STEP_US,
-)
+from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH

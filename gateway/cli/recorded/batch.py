@@ -20,11 +20,7 @@ from gateway.cli.support.batch_work import (
     season_options,
 )
 from gateway.cli.support.options import ConfigOption, read_settings
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-    ForceOption,
-    SettingsOption,
-)
+from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
 from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
 from gateway.output import write_new
 from gateway.units import counted

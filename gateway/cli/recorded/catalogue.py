@@ -12,15 +12,8 @@ from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
 from gateway.cli.app import RECORDINGS
 from gateway.cli.support.batch_work import JobsOption
-from gateway.cli.support.options import (
-    ConfigOption,
-    folder_of,
-    read_options,
-    read_settings,
-)
-from gateway.cli.support.recording_options import (
-    ColumnsOption,
-)
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.recording_options import ColumnsOption
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,

@@ -7,11 +7,7 @@ import numpy as np
 import typer
 
 from gateway.cli.app import RECORDINGS
-from gateway.cli.support.options import (
-    ConfigOption,
-    read_options,
-    read_settings,
-)
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,

@@ -13,10 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from gateway.cli.app import RECORDINGS
-from gateway.cli.live.run import (
-    EndpointOption,
-    with_endpoints,
-)
+from gateway.cli.live.run import EndpointOption, with_endpoints
 from gateway.cli.support.options import (
     AskingTyper,
     ConfigOption,
@@ -42,12 +39,7 @@ from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
 from gateway.live.player_edge import PlayerStatus
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
-from gateway.player import (
-    PlayerDaemon,
-    PlayPlan,
-    endpoints_beyond,
-    prepare,
-)
+from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond, prepare
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import (

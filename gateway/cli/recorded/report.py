@@ -10,12 +10,7 @@ from rich.progress import TimeElapsedColumn
 
 from gateway.analysis.flight import Flight
 from gateway.cli.app import RECORDINGS
-from gateway.cli.support.options import (
-    ConfigOption,
-    folder_of,
-    read_options,
-    read_settings,
-)
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     FlightArgument,

@@ -11,22 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gateway.cli.support.options import (
-    ask,
-    folder_of,
-    is_running,
-    read_options,
-    read_settings,
-)
+from gateway.cli.support.options import ask, folder_of, is_running, read_options, read_settings
 from gateway.cli.support.terminal import console_of, progress_bar
-from gateway.recordings.files import (
-    TABLE,
-    TLOG,
-    FlightError,
-    Position,
-    SettingsChoice,
-    format_of,
-)
+from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.recordings.moment import Moment, parse_moment
 

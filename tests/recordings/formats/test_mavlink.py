@@ -11,15 +11,7 @@ from gateway.geometry.quaternion import to_euler
 from gateway.recordings.columns import Imported, TableRow, row_of_cells
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.tlog import TlogScanner, encode_record
-from gateway.records import (
-    BaroRaw,
-    GpsFix,
-    GpsFixType,
-    ImuCalibrated,
-    ImuFlags,
-    NavFlags,
-    NavState,
-)
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
 from tests.kit.mavlink import packed
 from tests.recordings.frames import START_US
 
