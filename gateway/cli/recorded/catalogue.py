@@ -106,14 +106,10 @@ def list_flights(
 ) -> None:
     """List the flights of the catalogue, or those for which a condition holds."""
     place = _place(folder, config)
-    if geojson:
-        print_json(geojson_of(place, where))
-        return
-    rows = find_flights(place, where)
-    if json:
-        print_json(rows)
-        return
-    _show_table(rows)
+    if geojson or json:
+        print_json(geojson_of(place, where) if geojson else find_flights(place, where))
+    else:
+        _show_table(find_flights(place, where))
 
 
 @group.command()
@@ -134,11 +130,8 @@ def show(
     rows = find_flights(place, where)
     if not rows:
         refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
-    if geojson:
-        print_json(geojson_of(place, where))
-        return
-    if json:
-        print_json(rows)
+    if geojson or json:
+        print_json(geojson_of(place, where) if geojson else rows)
         return
     for number, row in enumerate(rows):
         print(end="\n" if number else "")

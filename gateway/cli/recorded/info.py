@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -106,10 +106,7 @@ def recover(
             target, sound(file, advance, left_out.append), overwrite=force, inputs=[file]
         )
         before = file.stat().st_size
-    for line in left_out[:SHOWN]:
-        console.print(line)
-    if len(left_out) > SHOWN:
-        console.print(f"and {counted(len(left_out) - SHOWN, 'more place')}")
+    _print_some(left_out, "more place")
     verdict = (
         "nothing was damaged"
         if not left_out
@@ -152,6 +149,14 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
         raise FlightError(f"{file}: holds no row that can be read")
 
 
+def _print_some(lines: Sequence[str], more: str) -> None:
+    """Print the first lines of a list, and how many more there are."""
+    for line in lines[:SHOWN]:
+        console_of().print(line)
+    if len(lines) > SHOWN:
+        console_of().print(f"and {counted(len(lines) - SHOWN, more)}")
+
+
 def _show(file: Path, found: FileInfo) -> None:
     console = console_of()
     kind = "another program's CSV" if found.kind == CSV else found.kind
@@ -164,14 +169,11 @@ def _show(file: Path, found: FileInfo) -> None:
         )
     for vehicle in found.vehicles:
         console.print(f"\n{_heading(vehicle, found.kind)}", _rates(vehicle), sep="\n")
-    for gap in found.gaps[:SHOWN]:
-        at_s = (gap.time_us - (found.first_us or 0)) / US_PER_S
-        console.print(f"gap of {gap.duration_s:.1f} s at {_clock(at_s)}")
-    if len(found.gaps) > SHOWN:
-        console.print(f"and {counted(len(found.gaps) - SHOWN, 'more gap')}")
+    begin_us = found.first_us or 0
+    gaps = [(gap.duration_s, (gap.time_us - begin_us) / US_PER_S) for gap in found.gaps]
+    _print_some([f"gap of {long_s:.1f} s at {_clock(at_s)}" for long_s, at_s in gaps], "more gap")
     for mark in found.marks:
-        at_s = (mark.time_us - (found.first_us or 0)) / US_PER_S
-        console.print(f"mark at {_clock(at_s)}: {mark.text}")
+        console.print(f"mark at {_clock((mark.time_us - begin_us) / US_PER_S)}: {mark.text}")
     if found.damaged_bytes:
         console.print(
             f"damaged: {counted(found.damaged_bytes, 'byte')} in "

@@ -151,16 +151,16 @@ def seek(
     _show(ask("seek", {"to": to}, of="play"))
 
 
-@group.command()
-def pause() -> None:
-    """Pause."""
-    _show(ask("play.pause", of="play"))
+def _add_verb(name: str, text: str) -> None:
+    """Add a command without arguments."""
+
+    @group.command(name, help=text)
+    def command() -> None:
+        _show(ask(f"play.{name}", of="play"))
 
 
-@group.command()
-def resume() -> None:
-    """Resume."""
-    _show(ask("play.resume", of="play"))
+_add_verb("pause", "Pause.")
+_add_verb("resume", "Resume.")
 
 
 @group.command()
@@ -185,10 +185,7 @@ def set_loop(
     _show(ask("play.loop", {"on": on}, of="play"))
 
 
-@group.command()
-def status() -> None:
-    """Show the status of the player."""
-    _show(ask("play.status", of="play"))
+_add_verb("status", "Show the status of the player.")
 
 
 async def _serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:

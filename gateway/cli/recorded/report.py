@@ -8,7 +8,6 @@ from typing import Annotated, Final
 import typer
 from rich.progress import TimeElapsedColumn
 
-from gateway.analysis.flight import Flight
 from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import (
@@ -66,7 +65,9 @@ def report(
 
     Without a flight the built-in simulated one is used.
     """
-    _refuse_without_packages()
+    if missing := [name for name in NEEDED if find_spec(name) is None]:
+        needed = " and ".join(missing)
+        refuse(f"a report needs {needed}, the extra mavgate[plot]:\n{how_to_add('plot')}")
     # These need an extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
@@ -95,22 +96,10 @@ def report(
             progress.refresh()
 
         page = write_report(made, output, advance)
-    _print_latency(loaded, case.smoothed_latency_s)
+    used_s = case.smoothed_latency_s
+    if used_s is not None and used_s != loaded.latency_s:
+        print_remarks([f"{loaded.name}: {smoothed_latency_in_words(used_s, loaded.latency_s)}"])
     print(page)
-
-
-def _print_latency(flight: Flight, used_s: float | None) -> None:
-    """Print the GPS latency that a flight was smoothed with, if it is not the one that is set."""
-    if used_s is not None and used_s != flight.latency_s:
-        words = smoothed_latency_in_words(used_s, flight.latency_s)
-        print_remarks([f"{flight.name}: {words}"])
-
-
-def _refuse_without_packages() -> None:
-    missing = [name for name in NEEDED if find_spec(name) is None]
-    if missing:
-        needed = " and ".join(missing)
-        refuse(f"a report needs {needed}, the extra mavgate[plot]:\n{how_to_add('plot')}")
 
 
 def page(

@@ -66,7 +66,10 @@ class SeasonWork:
         if any(map(is_url, self.names)):
             if not has_fsspec():
                 refuse(f"URLs need fsspec, the extra mavgate[batch]:\n{how_to_add('batch')}")
-            _quieten_storages()
+            log = logging.getLogger()
+            # Storages log each connection.
+            if log.level == logging.INFO:
+                log.setLevel(logging.WARNING)
         wanted: Wanted = "all" if each_file else "tables"
         names: list[str] = []
         for name in self.names:
@@ -126,13 +129,6 @@ def season_options(
 ) -> ReadOptions:
     """Take what reads a season's flights out of the settings; nothing that must stay secret."""
     return without_secrets(read_options(read_settings(config), columns, choice=choice))
-
-
-def _quieten_storages() -> None:
-    """Leave out what storages log of each connection, unless details are wanted."""
-    log = logging.getLogger()
-    if log.level == logging.INFO:
-        log.setLevel(logging.WARNING)
 
 
 def failures(results: Sequence[FlightResult]) -> int:

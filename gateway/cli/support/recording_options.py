@@ -70,21 +70,15 @@ def read_sensors(texts: Sequence[str] | None) -> tuple[tuple[str, int], ...]:
     return tuple(found)
 
 
-def read_moment(text: str | None) -> Moment | None:
-    """Read a moment of the command line; raises FlightError if it is invalid."""
-    try:
-        return None if text is None else parse_moment(text)
-    except ValueError as error:
-        raise FlightError(str(error)) from error
-
-
 def read_range(begin: str | None, end: str | None) -> tuple[Moment | None, Moment | None]:
     """Read --from and --to; raises FlightError if one is invalid, or nothing lies between them."""
-    first, last = read_moment(begin), read_moment(end)
-    both = None not in (first, last)
+    try:
+        first, last = (None if text is None else parse_moment(text) for text in (begin, end))
+    except ValueError as error:
+        raise FlightError(str(error)) from error
     for unit in ("offset_s", "time_us"):
         low, high = getattr(first, unit, None), getattr(last, unit, None)
-        if both and low is not None and high is not None and low >= high:
+        if low is not None and high is not None and low >= high:
             raise FlightError(f"nothing lies between --from {begin} and --to {end}")
     return first, last
 
