@@ -27,7 +27,7 @@ from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, Node
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
 from gateway.units import US_PER_S, counted
 
-SILENT_US: Final = 2 * US_PER_S
+OUTAGE_US: Final = 2 * US_PER_S
 LOG_LINES: Final = 5
 RATE_SNAPSHOTS: Final = 11
 """Rates are averaged over this many views: a message of 1 Hz must not flicker between 0 and 2."""
@@ -37,7 +37,7 @@ RATE_NAME: Final = 22
 SIDE_BY_SIDE: Final = 150
 """Columns of a terminal from which on two halves are wide enough."""
 GAP: Final = 2
-KEYS: Final = "q quit   r record or stop   space hold the picture"
+KEYS: Final = "q quit   r record or stop   space pause the view"
 FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")
 MB: Final = 1e6
 GB: Final = 1e9
@@ -94,7 +94,7 @@ class LiveView:
         for vehicle_id, state in snapshot.states:
             flying += [Text(), _aircraft(vehicle_id, state, status.get(vehicle_id)), _flags(state)]
         if not snapshot.states:
-            flying.append(Text("No aircraft heard yet.", style="dim"))
+            flying.append(Text("No aircraft yet.", style="dim"))
         others: list[RenderableType] = [_clients(snapshot)]
         others += [*_ports(snapshot), *_troubles(snapshot), Text()]
         others += [Text(line, style=style) for line, style in self.log.lines]
@@ -224,7 +224,7 @@ def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tup
 
 def _age(now_us: int, then_us: int) -> Text:
     age_us = max(0, now_us - then_us)
-    return Text(f"{age_us / US_PER_S:.1f}", style="red" if age_us > SILENT_US else "")
+    return Text(f"{age_us / US_PER_S:.1f}", style="red" if age_us > OUTAGE_US else "")
 
 
 def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) -> _Grid:
@@ -289,9 +289,9 @@ def _message_name(message_id: int) -> str:
 
 
 def _clients(snapshot: Snapshot) -> _Grid:
-    table = _Grid("client", "state", "sent", "dropped", "received", "heard s ago")
+    table = _Grid("client", "state", "sent", "dropped", "received", "received s ago")
     for client in snapshot.clients:
-        table.add_row(*_client_cells(client), _heard(snapshot.time_us, client))
+        table.add_row(*_client_cells(client), _since_received(snapshot.time_us, client))
     return table
 
 
@@ -311,7 +311,7 @@ def _client_cells(client: ClientStats) -> tuple[str, ...]:
     return (name, client.state, *(str(figure) for figure in figures))
 
 
-def _heard(now_us: int, client: ClientStats) -> str:
+def _since_received(now_us: int, client: ClientStats) -> str:
     if client.heard_us is None:
         return "never"
     return f"{max(0, now_us - client.heard_us) / US_PER_S:.1f}"

@@ -226,7 +226,7 @@ def _open_each(devices: list[str], baud: int) -> tuple[dict[str, serial.Serial],
     """Open the ports that can be opened, and describe each so far."""
     opened, answers, ports = {}, {}, list_serial_ports()
     for device in devices:
-        answers[device] = f"{device}: silent"
+        answers[device] = f"{device}: sends nothing"
         try:
             opened[device] = open_port(device, baud, ports)
         except PortNotFoundError as error:
@@ -274,7 +274,7 @@ class SerialPort:
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
         self._search: asyncio.Task[None] | None = None
-        self._silent: set[str] = set()
+        self._rejected: set[str] = set()
         """Ports that were asked and are not the receiver."""
         self._asked_s = 0.0
         self._read_us = 0
@@ -305,7 +305,7 @@ class SerialPort:
         self._settings = replace(self._settings, port=wanted)
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
-        self._silent.clear()
+        self._rejected.clear()
         self._on_lost(wanted)
         self._open()
 
@@ -351,9 +351,9 @@ class SerialPort:
         """List the ports that may be the receiver, without those that were asked lately."""
         fitting = fitting_ports(self._settings.port, ports)
         if asyncio.get_running_loop().time() - self._asked_s > ASK_AGAIN_S:
-            self._silent.clear()
-        self._silent &= {*fitting}  # one that was unplugged may return as another
-        if left := [device for device in fitting if device not in self._silent]:
+            self._rejected.clear()
+        self._rejected &= {*fitting}  # one that was unplugged may return as another
+        if left := [device for device in fitting if device not in self._rejected]:
             return left
         raise PortNotFoundError(
             f"no receiver among {', '.join(fitting)}, which are asked again every "
@@ -364,11 +364,11 @@ class SerialPort:
         try:
             port, data = await search_receiver(devices, self._settings.baud)
         except PortNotFoundError as error:
-            self._silent = {*devices}
+            self._rejected = {*devices}
             self._complain(str(error))
             self._try_later()
         else:
-            self._silent = {*devices} - {port.port}
+            self._rejected = {*devices} - {port.port}
             self._use(port)
             self._on_bytes(data, self._now_us())
         self._search = None

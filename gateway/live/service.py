@@ -30,7 +30,7 @@ class ServiceNotifier:
     """Notify systemd that we are ready, alive, reloading or stopping."""
 
     def __init__(self) -> None:
-        self._place = os.environ.get("NOTIFY_SOCKET", "")
+        self._address = os.environ.get("NOTIFY_SOCKET", "")
         self._interval_s = _watchdog_interval_s()
         self._timer: asyncio.TimerHandle | None = None
 
@@ -62,14 +62,14 @@ class ServiceNotifier:
         self._timer = asyncio.get_running_loop().call_later(self._interval_s, self._beat)
 
     def _send(self, text: str) -> None:
-        if not self._place:
+        if not self._address:
             return
         # A leading @ stands for the zero byte of an abstract socket.
-        place = "\0" + self._place[1:] if self._place.startswith("@") else self._place
+        address = "\0" + self._address[1:] if self._address.startswith("@") else self._address
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
                 sock.setblocking(False)
-                sock.sendto(text.encode(), place)
+                sock.sendto(text.encode(), address)
         except OSError as error:
             log.debug("systemd does not listen: %s", error)
 
@@ -107,10 +107,7 @@ def _watchdog_interval_s() -> float:
     owner = os.environ.get("WATCHDOG_PID", "")
     if owner and owner != str(os.getpid()):
         return 0.0
-    try:
-        return int(os.environ.get("WATCHDOG_USEC", "0")) / US_PER_S / 2
-    except ValueError:
-        return 0.0
+    return int(os.environ.get("WATCHDOG_USEC", "0")) / US_PER_S / 2
 
 
 STALL_US: Final = 500_000

@@ -147,7 +147,7 @@ def test_an_empty_gateway_can_be_drawn() -> None:
     report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
     text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
     assert "auto not connected" in text
-    assert "No aircraft heard yet" in text
+    assert "No aircraft yet" in text
 
 
 def test_the_newest_log_lines_are_on_the_screen() -> None:

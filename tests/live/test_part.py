@@ -25,7 +25,7 @@ pytestmark = pytest.mark.io
 SECOND_US = 1_000_000
 
 
-def taken(budget: RecordingBudget, clients: list[int], seconds: int, size: int = 100) -> int:
+def taken(budget: RecordingBudget, clients: list[int], seconds: int, size: int = 500) -> int:
     """Let clients send 2 MB/s each; return the bytes that are recorded."""
     total = 0
     for step in range(seconds * 100):

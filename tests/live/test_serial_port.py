@@ -343,7 +343,7 @@ async def test_no_receiver_among_several_adapters_is_reported_with_each_answer(
         with pytest.raises(PortNotFoundError) as raised:
             await search
     for text in (
-        f"{silent}: silent",
+        f"{silent}: sends nothing",
         f"{noisy}: sends no frames at 500000 baud",
         f"{held}: another program has it open",
     ):
