@@ -55,10 +55,23 @@ def test_every_setting_is_explained(path: str, field: Field) -> None:
             assert field.unit == unit
 
 
+def load_text(folder: Path, text: str) -> GatewaySettings:
+    file = folder / "gateway.toml"
+    file.write_text(text)
+    return load(file)
+
+
+def errors_in(folder: Path, text: str) -> list[str]:
+    """Return the errors in a settings file, without its name."""
+    with pytest.raises(ConfigError) as caught:
+        load_text(folder, text)
+    lines = str(caught.value).splitlines()
+    assert all(line.startswith(f"{folder / 'gateway.toml'}: ") for line in lines)
+    return [line.removeprefix(f"{folder / 'gateway.toml'}: ") for line in lines]
+
+
 def test_empty_file_is_the_defaults(tmp_path: Path) -> None:
-    file = tmp_path / "empty.toml"
-    file.write_text("")
-    assert load(file) == GatewaySettings()
+    assert load_text(tmp_path, "") == GatewaySettings()
 
 
 def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
@@ -67,9 +80,7 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
     rates = msgspec.structs.replace(settings.vehicle.rates, attitude_hz=12.5)
     vehicle = msgspec.structs.replace(settings.vehicle, rates=rates, type="quadrotor")
     settings = msgspec.structs.replace(settings, serial=serial, vehicle=vehicle)
-    file = tmp_path / "changed.toml"
-    file.write_text(render(settings))
-    assert load(file) == settings
+    assert load_text(tmp_path, render(settings)) == settings
 
 
 @pytest.mark.parametrize(
@@ -100,41 +111,26 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
 def test_refusals_name_file_key_value_and_what_is_allowed(
     text: str, message: str, tmp_path: Path
 ) -> None:
-    file = tmp_path / "wrong.toml"
-    file.write_text(text)
-    with pytest.raises(ConfigError) as caught:
-        load(file)
-    assert str(caught.value).startswith(f"{file}: ")
-    assert message in str(caught.value)
+    assert message in "\n".join(errors_in(tmp_path, text))
 
 
 def test_all_errors_are_reported_at_once(tmp_path: Path) -> None:
-    file = tmp_path / "wrong.toml"
-    file.write_text("[serial]\nbaud = 1\nport = 2\n[vehicle]\nnope = 3\n")
-    with pytest.raises(ConfigError) as caught:
-        load(file)
-    assert len(str(caught.value).splitlines()) == 3
+    text = "[serial]\nbaud = 1\nport = 2\n[vehicle]\nnope = 3\n"
+    assert len(errors_in(tmp_path, text)) == 3
 
 
 def test_every_endpoint_is_reported_next_to_other_errors(tmp_path: Path) -> None:
-    file = tmp_path / "wrong.toml"
     urls = ["udp:", "tcp:host:99999", "udp:127.0.0.1:14550", "udp:127.0.0.1:14550?name=b"]
-    file.write_text(f"[hub]\nmax_clients = 0\nendpoints = {urls}\n[serial]\nbaud = 1\n")
-    with pytest.raises(ConfigError) as caught:
-        load(file)
-    lines = str(caught.value).splitlines()
+    text = f"[hub]\nmax_clients = 0\nendpoints = {urls}\n[serial]\nbaud = 1\n"
+    lines = errors_in(tmp_path, text)
     assert len(lines) == 5
-    assert all(line.startswith(f"{file}: ") for line in lines)
-    for text in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
-        assert sum(text in line for line in lines) == 1
+    for words in ("max_clients", "'udp:'", "99999", "is given twice", "serial.baud"):
+        assert sum(words in line for line in lines) == 1
 
 
 def test_error_of_a_choice_lists_the_allowed_values(tmp_path: Path) -> None:
-    file = tmp_path / "wrong.toml"
-    file.write_text('[estimation.paper]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n')
-    with pytest.raises(ConfigError) as caught:
-        load(file)
-    chosen, vehicle = sorted(str(caught.value).splitlines())
+    text = '[estimation.paper]\naccel_filter = "chebishev"\n[vehicle]\ntype = "ufo"\n'
+    chosen, vehicle = sorted(errors_in(tmp_path, text))
     assert "did you mean 'chebyshev'? allowed: " in chosen
     assert "butterworth" in chosen
     assert "allowed: " in vehicle

@@ -26,6 +26,9 @@ from gateway.vehicle.requests import Answer, Reply, Request, RequestReader, Serv
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
+    HEARTBEAT,
+    KEEPS_CLIENTS_US,
+    NONE,
     REQUEST_MESSAGE,
     SHORTHANDS,
     UNSUPPORTED,
@@ -37,7 +40,6 @@ from gateway.vehicle.services.commands import (
     whole,
 )
 from gateway.vehicle.services.ftp import FtpService
-from gateway.vehicle.services.intervals import HEARTBEAT, KEEPS_CLIENTS_US, NONE
 from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.services.parameter_service import ReadOnlyParameters
 from gateway.vehicle.services.parameters import Metadata

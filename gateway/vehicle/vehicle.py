@@ -49,12 +49,12 @@ from gateway.vehicle.services.commands import (
     ACCEPTED,
     FAILED,
     CommandService,
+    IntervalService,
     QueryService,
     RecordingService,
     read_command,
 )
 from gateway.vehicle.services.ftp import FtpService
-from gateway.vehicle.services.intervals import IntervalService
 from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
 from gateway.vehicle.services.parameter_service import PACKED_PATH, ParameterService
 from gateway.vehicle.services.parameters import (
