@@ -180,10 +180,8 @@ URGENT_RUN: Final = 4
 """Urgent frames in a row before a frame of another queue."""
 
 SEQUENCE_MASK: Final = 0xFF
-Waiting = tuple[MavFrame, int | None]
-"""A frame and its step."""
 _Queue = deque[tuple[MavFrame, int | None, int]]
-"""Frames, their steps, and the time at which they were added."""
+"""Frames, their steps (see `Numbering`), and the time at which they were added."""
 
 
 class Numbering:
@@ -220,34 +218,20 @@ class Numbering:
         return wanted
 
 
-class LinkEncoder:
-    """Number and sign our own frames on one link, in the order in which they leave.
-
-    A frame that was overtaken is signed again, since its timestamp is too early.
-    """
-
-    def __init__(self, is_own: Callable[[Origin], bool], signer: FrameSigner) -> None:
-        self._numbering = Numbering(is_own)
-        self._signer = signer
-        self.enter = self._numbering.enter
-
-    def encode(self, frame: MavFrame, step: int | None, now_us: int) -> bytes:
-        """Return the bytes of a frame to send; `step` is the result of `enter`."""
-        if step is None:
-            return frame.data
-        sequence = self._numbering.leave(frame, step)
-        return self._signer.sequence_and_sign(frame, sequence, now_us).data
-
-
 class SendQueue:
     """A queue in front of one slow link: at most `max_bytes` wait, in addition to bulk.
 
-    The newest frame is always accepted.
+    The newest frame is always accepted. Our own frames are numbered and signed as they leave; one
+    that was overtaken is signed again, since its timestamp is too early.
     """
 
-    def __init__(self, max_bytes: int) -> None:
+    def __init__(
+        self, max_bytes: int, is_own: Callable[[Origin], bool], signer: FrameSigner
+    ) -> None:
         self.max_bytes = max_bytes
         self.max_bulk_bytes = max(max_bytes, BULK_BYTES)
+        self._numbering = Numbering(is_own)
+        self._signer = signer
         self._sizes = [0, 0]
         """Waiting bytes of all but bulk, and of bulk."""
         self._answers: _Queue = deque()
@@ -265,7 +249,11 @@ class SendQueue:
         """Waiting bytes."""
         return sum(self._sizes)
 
-    def push(self, frame: MavFrame, step: int | None = None, now_us: int = 0) -> int:
+    def encode(self, frame: MavFrame, now_us: int) -> bytes:
+        """Return the bytes of a frame that leaves at once, because none waits."""
+        return self._encode(frame, self._numbering.enter(frame), now_us)
+
+    def push(self, frame: MavFrame, now_us: int) -> int:
         """Add a frame to the queue of its message; return how many older ones were dropped."""
         message_id, size, dropped = frame.message_id, len(frame.data), 0
         if message_id in BULK_IDS:
@@ -282,7 +270,7 @@ class SendQueue:
             while self._sizes[0] and self._sizes[0] + size > self.max_bytes:
                 self._take(self._usual or self._urgent or self._answers)
                 dropped += 1
-        queue.append((frame, step, now_us))
+        queue.append((frame, self._numbering.enter(frame), now_us))
         self._sizes[queue is self._bulk] += size
         return dropped
 
@@ -295,13 +283,13 @@ class SendQueue:
                 dropped += 1
         return dropped
 
-    def pop(self) -> Waiting | None:
-        """Return the frame that leaves next with its step, or None if the queue is empty."""
+    def pop(self, now_us: int) -> bytes | None:
+        """Return the bytes of the frame that leaves next, or None if the queue is empty."""
         urgent = self._answers or self._urgent
         others = bool(self._usual or self._bulk)
         if urgent and not (others and self._run >= URGENT_RUN):
             self._run += 1
-            return self._take(urgent)
+            return self._encode(*self._take(urgent), now_us)
         if not others:
             return None
         self._run = 0
@@ -309,7 +297,7 @@ class SendQueue:
         first, second = self._usual, self._bulk
         if self._bulk_turn:
             first, second = second, first
-        return self._take(first or second)
+        return self._encode(*self._take(first or second), now_us)
 
     def clear(self) -> int:
         """Discard all frames; return their number."""
@@ -319,10 +307,16 @@ class SendQueue:
         self._sizes = [0, 0]
         return count
 
-    def _take(self, queue: "_Queue") -> Waiting:
+    def _take(self, queue: "_Queue") -> tuple[MavFrame, int | None]:
         frame, step, _ = queue.popleft()
         self._sizes[queue is self._bulk] -= len(frame.data)
         return frame, step
+
+    def _encode(self, frame: MavFrame, step: int | None, now_us: int) -> bytes:
+        if step is None:
+            return frame.data
+        sequence = self._numbering.leave(frame, step)
+        return self._signer.sequence_and_sign(frame, sequence, now_us).data
 
 
 class Packer:

@@ -4,11 +4,11 @@ import random
 from collections.abc import Callable
 
 import pytest
+from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.send_queue import (
     BULK_BYTES,
     URGENT_RUN,
-    LinkEncoder,
     Pacer,
     Packer,
     SendQueue,
@@ -20,20 +20,25 @@ from tests.kit.mavlink import frames_in, numbered, raw_frame
 HEARTBEAT, ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK = 0, 30, 27, 22, 77
 
 
+def queue_of(max_bytes: int, *own: tuple[int, int]) -> SendQueue:
+    """Return a queue that numbers the frames of some origins."""
+    return SendQueue(max_bytes, own.__contains__, FrameSigner())
+
+
 def drain(queue: SendQueue) -> list[bytes]:
     frames = []
-    while (waiting := queue.pop()) is not None:
-        frames.append(waiting[0].data)
+    while (frame := queue.pop(0)) is not None:
+        frames.append(frame)
     return frames
 
 
 class TestSendQueue:
     def test_urgent_first_yet_bulk_ends(self) -> None:
-        queue = SendQueue(10_000)
+        queue = queue_of(10_000)
         for n in range(8):
-            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n))
+            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
         for n in range(20):
-            queue.push(raw_frame(ATTITUDE, b"a%02d" % n))
+            queue.push(raw_frame(ATTITUDE, b"a%02d" % n), 0)
         order = drain(queue)
         assert order[:URGENT_RUN] == [b"a00", b"a01", b"a02", b"a03"]
         assert order[URGENT_RUN] == b"b0"
@@ -42,45 +47,45 @@ class TestSendQueue:
         assert queue.size == 0
 
     def test_bulk_and_usual_take_turns(self) -> None:
-        queue = SendQueue(10_000)
+        queue = queue_of(10_000)
         for n in range(3):
-            queue.push(raw_frame(RAW_IMU, b"u%d" % n))
-            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n))
+            queue.push(raw_frame(RAW_IMU, b"u%d" % n), 0)
+            queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
         assert drain(queue) == [b"b0", b"u0", b"b1", b"u1", b"b2", b"u2"]
 
     def test_oldest_telemetry_goes_first_and_answers_last(self) -> None:
-        queue = SendQueue(30)
-        queue.push(raw_frame(COMMAND_ACK, b"c" * 10))
-        queue.push(raw_frame(ATTITUDE, b"a" * 10))
-        queue.push(raw_frame(RAW_IMU, b"1" * 10))
-        assert queue.push(raw_frame(RAW_IMU, b"2" * 10)) == 1
-        assert queue.push(raw_frame(ATTITUDE, b"A" * 10)) == 1
-        assert queue.push(raw_frame(COMMAND_ACK, b"C" * 10)) == 1
+        queue = queue_of(30)
+        queue.push(raw_frame(COMMAND_ACK, b"c" * 10), 0)
+        queue.push(raw_frame(ATTITUDE, b"a" * 10), 0)
+        queue.push(raw_frame(RAW_IMU, b"1" * 10), 0)
+        assert queue.push(raw_frame(RAW_IMU, b"2" * 10), 0) == 1
+        assert queue.push(raw_frame(ATTITUDE, b"A" * 10), 0) == 1
+        assert queue.push(raw_frame(COMMAND_ACK, b"C" * 10), 0) == 1
         assert drain(queue) == [b"c" * 10, b"C" * 10, b"A" * 10]
 
     def test_an_answer_overtakes_the_attitude(self) -> None:
-        queue = SendQueue(1000)
+        queue = queue_of(1000)
         for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK, HEARTBEAT):
-            queue.push(raw_frame(message_id, bytes([message_id])))
+            queue.push(raw_frame(message_id, bytes([message_id])), 0)
         order = [frame[0] for frame in drain(queue)]
         assert order == [COMMAND_ACK, HEARTBEAT, ATTITUDE, PARAM_VALUE, RAW_IMU]
 
     def test_all_parameters_fit_next_to_the_telemetry_of_the_slowest_line(self) -> None:
-        queue = SendQueue(100)
+        queue = queue_of(100)
         for n in range(300):
-            assert queue.push(raw_frame(PARAM_VALUE, n.to_bytes(2, "big") * 18)) == 0
-            queue.push(raw_frame(ATTITUDE, b"a" * 44))
+            assert queue.push(raw_frame(PARAM_VALUE, n.to_bytes(2, "big") * 18), 0) == 0
+            queue.push(raw_frame(ATTITUDE, b"a" * 44), 0)
         parameters = [frame for frame in drain(queue) if frame[:1] != b"a"]
         assert parameters == [n.to_bytes(2, "big") * 18 for n in range(300)]
         for _ in range(BULK_BYTES // 36 + 1):
-            queue.push(raw_frame(PARAM_VALUE, b"b" * 36))
+            queue.push(raw_frame(PARAM_VALUE, b"b" * 36), 0)
         assert queue.size <= BULK_BYTES
 
     def test_old_telemetry_expires_and_answers_do_not(self) -> None:
-        queue = SendQueue(1000)
+        queue = queue_of(1000)
         for now_us in (1, 2, 3):
             for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK):
-                queue.push(raw_frame(message_id, bytes([message_id, now_us])), None, now_us)
+                queue.push(raw_frame(message_id, bytes([message_id, now_us])), now_us)
         assert queue.expire(3) == 4
         assert sorted(drain(queue)) == [
             bytes([PARAM_VALUE, 1]),
@@ -94,63 +99,69 @@ class TestSendQueue:
 
     @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, COMMAND_ACK])
     def test_the_newest_is_always_taken(self, message_id: int) -> None:
-        queue = SendQueue(30)
+        queue = queue_of(30)
         for n in range(3):
-            queue.push(raw_frame((ATTITUDE, RAW_IMU, COMMAND_ACK)[n], bytes((n,)) * 10))
-        assert queue.push(raw_frame(message_id, b"n" * 30)) == 3
+            queue.push(raw_frame((ATTITUDE, RAW_IMU, COMMAND_ACK)[n], bytes((n,)) * 10), 0)
+        assert queue.push(raw_frame(message_id, b"n" * 30), 0) == 3
         assert drain(queue) == [b"n" * 30]
 
     @pytest.mark.parametrize("seed", range(5))
     def test_every_frame_leaves_or_is_counted_and_the_bound_holds(self, seed: int) -> None:
         rng = random.Random(seed)
-        queue, pushed, dropped, left = SendQueue(500), 0, 0, 0
+        queue, pushed, dropped, left = queue_of(500), 0, 0, 0
         for _ in range(2000):
             if rng.random() < 0.6:
                 frame = bytes(rng.randrange(8, 60))
                 kinds = (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK)
-                dropped += queue.push(raw_frame(rng.choice(kinds), frame), None, pushed)
+                dropped += queue.push(raw_frame(rng.choice(kinds), frame), pushed)
                 pushed += 1
             elif rng.random() < 0.05:
                 dropped += queue.expire(pushed - 3)
-            elif queue.pop() is not None:
+            elif queue.pop(0) is not None:
                 left += 1
             assert queue.size <= 500 + BULK_BYTES
         assert pushed == dropped + left + len(queue)
         assert queue.clear() == pushed - dropped - left
-        assert (len(queue), queue.size, queue.pop()) == (0, 0, None)
+        assert (len(queue), queue.size, queue.pop(0)) == (0, 0, None)
 
 
-class TestLinkEncoder:
-    """Numbers of our own frames, and frames of others."""
+class TestNumbers:
+    """Numbers of our own frames, which are sent without a gap, and frames of others."""
 
     @pytest.fixture
-    def encoder(self) -> LinkEncoder:
-        return LinkEncoder(lambda origin: origin == (1, 1), FrameSigner())
+    def queue(self) -> SendQueue:
+        return queue_of(10_000, (1, 1))
 
-    def test_without_drops_every_frame_is_sent_unchanged(self, encoder: LinkEncoder) -> None:
+    def test_without_drops_every_frame_is_sent_unchanged(self, queue: SendQueue) -> None:
         for sequence in (254, 255, 0, 9, 9, 3):
             frame = numbered(1, sequence)
-            assert encoder.encode(frame, encoder.enter(frame), 0) is frame.data
+            assert queue.encode(frame, 0) is frame.data
 
-    def test_dropped_frames_leave_no_gap(self, encoder: LinkEncoder) -> None:
-        frames = [numbered(1, sequence & 0xFF) for sequence in range(250, 262)]
-        steps = [encoder.enter(frame) for frame in frames]
-        left = [encoder.encode(frames[n], steps[n], 0) for n in (0, 3, 4, 9, 11)]
-        assert [frame_of(data).sequence for data in left] == [250, 251, 252, 253, 254]
+    def test_dropped_frames_leave_no_gap(self) -> None:
+        frames = [numbered(1, sequence & 0xFF, raw_imu()) for sequence in range(250, 262)]
+        queue = queue_of(3 * len(frames[0].data), (1, 1))
+        assert queue.encode(frames[0], 0) is frames[0].data
+        assert sum(queue.push(frame, 0) for frame in frames[1:]) == 8
+        left = drain(queue)
+        assert [frame_of(data).sequence for data in left] == [251, 252, 253]
         assert all(frames_in(data) == [data] for data in left)
 
-    def test_an_overtaking_frame_gets_the_next_number(self, encoder: LinkEncoder) -> None:
-        first = numbered(1, 7)
-        encoder.encode(first, encoder.enter(first), 0)
-        frames = [numbered(1, sequence) for sequence in (8, 9, 10)]
-        steps = [encoder.enter(frame) for frame in frames]
-        left = [encoder.encode(frames[n], steps[n], 0) for n in (2, 0, 1)]
-        assert [frame_of(data).sequence for data in left] == [8, 9, 10]
+    def test_an_overtaking_frame_gets_the_next_number(self, queue: SendQueue) -> None:
+        queue.encode(numbered(1, 7), 0)
+        messages = (raw_imu(), raw_imu(), dialect.MAVLink_command_ack_message(512, 0))
+        for sequence, message in enumerate(messages, start=8):
+            queue.push(numbered(1, sequence, message), 0)
+        found = [(frame_of(data).message_id, frame_of(data).sequence) for data in drain(queue)]
+        assert found == [(COMMAND_ACK, 8), (RAW_IMU, 9), (RAW_IMU, 10)]
 
-    def test_frames_of_others_are_unchanged(self, encoder: LinkEncoder) -> None:
+    def test_frames_of_others_are_unchanged(self, queue: SendQueue) -> None:
         for sequence in (5, 9):
             frame = numbered(2, sequence)
-            assert encoder.encode(frame, encoder.enter(frame), 0) is frame.data
+            assert queue.encode(frame, 0) is frame.data
+
+
+def raw_imu() -> dialect.MAVLink_message:
+    return dialect.MAVLink_raw_imu_message(0, 0, 0, 0, 0, 0, 0, 0, 0, 9)
 
 
 def test_packer_sends_full_datagrams_and_the_rest_when_it_is_flushed() -> None:

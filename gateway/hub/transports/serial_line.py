@@ -50,8 +50,7 @@ class SerialClient(QueuedClient):
         if self._port is None:
             self.counters.dropped += 1
             return
-        self.counters.sent += 1
-        self._push(frame, self._encoder.enter(frame))
+        self._push(frame)
         if self._timer is None and not self._partial:
             self._pump()
 
@@ -106,10 +105,9 @@ class SerialClient(QueuedClient):
         now_us = self.context.now_us()
         if not self._partial:
             self._drop(self._queue.expire(now_us - QUEUE_US))
-            waiting = self._queue.pop()
-            if waiting is None:
+            self._partial = self._queue.pop(now_us) or b""
+            if not self._partial:
                 return False
-            self._partial = self._encoder.encode(*waiting, now_us)
         try:
             taken = os.write(port.fileno(), self._partial)
         except BlockingIOError:

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, Final
 
 from gateway.hub.endpoint import host_and_port
-from gateway.hub.send_queue import LinkEncoder, SendQueue
+from gateway.hub.send_queue import SendQueue
 from gateway.hub.transports.base import Client, Listener, Peer, new_socket
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
@@ -97,8 +97,7 @@ class QueuedClient(Client):
     def __post_init__(self) -> None:
         """Start with an empty queue."""
         super().__post_init__()
-        self._queue = SendQueue(self.queue_bytes)
-        self._encoder = LinkEncoder(self.context.is_own, self.context.signer)
+        self._queue = SendQueue(self.queue_bytes, self.context.is_own, self.context.signer)
         self._splitter = MavlinkSplitter()
 
     @property
@@ -111,9 +110,10 @@ class QueuedClient(Client):
         """Frames that wait."""
         return len(self._queue)
 
-    def _push(self, frame: MavFrame, step: int | None) -> None:
-        """Queue a frame that is counted as sent."""
-        self._drop(self._queue.push(frame, step, self.context.now_us()))
+    def _push(self, frame: MavFrame) -> None:
+        """Queue a frame, and count it as sent."""
+        self.counters.sent += 1
+        self._drop(self._queue.push(frame, self.context.now_us()))
 
     def _drop(self, frames: int) -> None:
         self.counters.dropped += frames
@@ -140,12 +140,11 @@ class StreamClient(QueuedClient):
         if self._socket is None:
             self.counters.dropped += 1
             return
-        self.counters.sent += 1
-        step = self._encoder.enter(frame)
         if self._partial or self._queue:
-            self._push(frame, step)
+            self._push(frame)
         else:
-            data = self._encoder.encode(frame, step, self.context.now_us())
+            self.counters.sent += 1
+            data = self._queue.encode(frame, self.context.now_us())
             self._write(self._socket, self._wrap(data))
 
     def adopt(self, sock: socket.socket) -> None:
@@ -230,8 +229,7 @@ class StreamClient(QueuedClient):
 
     def _next_chunk(self) -> bytes:
         messages, frames, size, now_us = [], b"", 0, self.context.now_us()
-        while size < self._chunk_bytes and (waiting := self._queue.pop()) is not None:
-            frame = self._encoder.encode(*waiting, now_us)
+        while size < self._chunk_bytes and (frame := self._queue.pop(now_us)) is not None:
             if frames and len(frames) + len(frame) > self.endpoint.pack_bytes:
                 messages.append(self._wrap(frames))
                 frames = b""

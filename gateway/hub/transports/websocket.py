@@ -85,8 +85,7 @@ class WebStream(StreamClient):
         if not self.endpoint.pack_bytes:
             super().transmit(frame)
             return
-        self.counters.sent += 1
-        self._push(frame, self._encoder.enter(frame))
+        self._push(frame)
         if self._queue.size >= self.endpoint.pack_bytes:
             self._flush()
         elif not self._is_gathering:

@@ -2,8 +2,6 @@
 
 import logging
 import socket
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.hub.endpoint import TLS_KINDS, Endpoint, admits_page
@@ -19,15 +17,12 @@ REFUSED_IN_FULL: Final = 5
 """Refused connections that are logged one by one in a minute."""
 
 
-@dataclass(eq=False)
 class WsPeer(WebStream):
     """A connection that a page or a program made."""
 
-    local_host: str = field(kw_only=True)
+    listener: "WsListener"
+    local_host: str
     """Our address to which it has connected."""
-    welcome: Callable[["WsPeer"], None] = field(kw_only=True)
-    refuse: Callable[[str], None] = field(kw_only=True)
-    """Called with the reason when a connection is refused."""
 
     def _protocol(self) -> WsProtocol:
         return WsServer(lambda origin: admits_page(origin, self.local_host, self.endpoint.origins))
@@ -36,18 +31,17 @@ class WsPeer(WebStream):
         return TlsLayer(server_context(self.context.settings))
 
     def _opened(self) -> None:
-        self.welcome(self)
+        self.listener.welcome(self)
         super()._opened()
 
     def give_up(self, reason: str) -> None:
         """Close the connection for good."""
         if self.state != "open":
-            self.refuse(f"{self.remote}: {reason}")
+            self.listener.count_refusal(f"{self.remote}: {reason}")
         self._broke()
 
     def _broke(self) -> None:
-        assert self.leave is not None
-        self.leave(self)
+        self.listener.leave(self)
 
 
 class WsListener(StreamListener[WsPeer]):
@@ -94,26 +88,20 @@ class WsListener(StreamListener[WsPeer]):
                 "no handshake yet, and other connections wait"
             )
         client_id = self._context.new_client_id()
-        handshake = WsPeer(
-            self._context,
-            client_id,
-            self.endpoint,
-            peer,
-            self.endpoint.name_of(peer),
-            local_host=str(connection.getsockname()[0]),
-            welcome=self._welcome,
-            leave=self.leave,
-            refuse=self._count_refusal,
-        )
+        name = self.endpoint.name_of(peer)
+        handshake = WsPeer(self._context, client_id, self.endpoint, peer, name, self.leave)
+        handshake.listener, handshake.local_host = self, str(connection.getsockname()[0])
         self._handshakes[client_id] = handshake
         handshake.adopt(connection)
 
-    def _welcome(self, peer: WsPeer) -> None:
+    def welcome(self, peer: WsPeer) -> None:
+        """Add a client whose handshake is done."""
         self._handshakes.pop(peer.client_id, None)
         self._clients[peer.client_id] = peer
         self._context.appear(peer)
 
-    def _count_refusal(self, text: str) -> None:
+    def count_refusal(self, text: str) -> None:
+        """Count and log a connection that was refused."""
         self.turned_away += 1
         self._warn(self._refused.add(text, self._context.now_us()))
 
