@@ -167,7 +167,7 @@ class RecordedVehicle:
             _Missions(answers),
             FtpService({} if self.metadata is None else self.metadata.files),
         )
-        queries: Service = QueryService(lambda *_: [], lambda *_: [])
+        queries: Service = QueryService(lambda *_: None, lambda *_: [])
         self._by_message = dict.fromkeys(("PING", "TIMESYNC"), queries)
         for service in self._services:
             self._by_message |= dict.fromkeys(service.types, service)

@@ -95,18 +95,15 @@ class Vehicle:
         Parameters
         ----------
         settings : VehicleSettings
-            The `[vehicle]` section.
         system_id : int
             MAVLink system id, 1 to 250, which is also the id in the radio payloads.
         sections : mapping of str to Settings, optional
             Other settings of this aircraft that ground stations may change as parameters, by the
             key under which the change comes back.
-        clock : SigningClock, optional
-            Civil time; needed for signing only.
-        stamps : SigningTimestamps, optional
-            The signing timestamps accepted before.
+        clock, stamps : optional
+            Civil time and the timestamps accepted before; needed for signing only.
         stored : StoredPlan, optional
-            What was kept from an earlier run.
+            The plan of an earlier run.
         """
         self.system_id = system_id
         self.refusals = 0
@@ -143,20 +140,8 @@ class Vehicle:
         self._control = OperatorControl(
             self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
         )
-        self._identity = {
-            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: lambda _: encoding.autopilot_version(
-                self.system_id, self.health.firmware, self.telemetry.autopilot
-            ),
-            MAVLINK_MSG_ID_PROTOCOL_VERSION: lambda _: encoding.protocol_version(),
-            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES: lambda _: encoding.available_modes(
-                self.telemetry.autopilot
-            ),
-            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: lambda _: encoding.current_mode(
-                self.telemetry.autopilot
-            ),
-            MAVLINK_MSG_ID_COMPONENT_METADATA: self._metadata.announcement,
-        }
-        commands = CommandService(self._intervals, self._build, self._knows, self._explain)
+        self._add_identity()
+        commands = CommandService(self._intervals, self.telemetry, self._explain)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         commands.register(FIXED_MAG_CAL_YAW, self._calibrator.start_by_yaw)
@@ -164,6 +149,22 @@ class Vehicle:
         self._recording.register(commands)
         commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)
         self._route(commands)
+
+    def _add_identity(self) -> None:
+        """Let clients request the versions, modes and metadata of the vehicle."""
+        of, add = self.telemetry, self.telemetry.add
+        add(
+            mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION,
+            lambda _: encoding.autopilot_version(
+                self.system_id, self.health.firmware, of.autopilot
+            ),
+        )
+        add(MAVLINK_MSG_ID_PROTOCOL_VERSION, lambda _: encoding.protocol_version())
+        add(
+            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, lambda _: encoding.available_modes(of.autopilot)
+        )
+        add(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, lambda _: encoding.current_mode(of.autopilot))
+        add(MAVLINK_MSG_ID_COMPONENT_METADATA, self._metadata.announcement)
 
     def _route(self, commands: CommandService) -> None:
         """Register which service handles which message, and which are polled."""
@@ -176,7 +177,7 @@ class Vehicle:
             self._recording,
             self._control,
         )
-        services = (commands, QueryService(self._build, self._explain), *self._timed)
+        services = (commands, QueryService(self.telemetry.build, self._explain), *self._timed)
         self._services = {kind: service for service in services for kind in service.types}
 
     @property
@@ -288,7 +289,8 @@ class Vehicle:
             mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION,
         )
-        known = [message for number in asked for message in self._build(number, 0)]
+        built = [self.telemetry.build(number, 0) for number in asked]
+        known = [message for message in built if message is not None]
         known += self._parameters.values()
         known += self.plan.missions.download()
         return [encoder.encode(message, RECORDED_ONLY) for message in known]
@@ -320,23 +322,7 @@ class Vehicle:
         return self._finish(answers) if answers else []
 
     def on_saved(self, request: Request, text: str, now_us: int, *, stored: bool) -> list[Action]:
-        """Acknowledge a request to store, and announce the outcome.
-
-        Parameters
-        ----------
-        request : Request
-            The one of `SaveSettings`.
-        text : str
-            Name of the file, or why it could not be written.
-        now_us : int
-            Gateway clock.
-        stored : bool
-            Whether the disk has the settings.
-
-        Returns
-        -------
-        list of Action
-        """
+        """Acknowledge the request of `SaveSettings`; the text names the file, or the error."""
         ack = read_command(request).ack(ACCEPTED if stored else FAILED)
         saved = StatusText(INFO, f"Settings saved: {text}")
         status = saved if stored else StatusText(WARNING, f"Settings not saved: {text}")
@@ -358,14 +344,6 @@ class Vehicle:
         if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
             self._reconfigure(settings)
         return self._finish(self._parameters.take(section, settings))
-
-    def _knows(self, message_id: int) -> bool:
-        return message_id in self._identity or self.telemetry.knows(message_id)
-
-    def _build(self, message_id: int, now_us: int) -> list[Any]:
-        own = self._identity.get(message_id)
-        message = own(now_us) if own else self.telemetry.build(message_id, now_us)
-        return [] if message is None else [message]
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
         return self._replies(self._announcements.say(StatusText(NOTICE, text), now_us))

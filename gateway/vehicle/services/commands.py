@@ -89,8 +89,8 @@ Outcome = tuple[int, list[Answer]]
 Handler = Callable[[Command, int], Outcome]
 Explain = Callable[[str, int], list[Answer]]
 """Announces a text to all at a time: why something was refused."""
-Build = Callable[[int, int], list[Any]]
-"""Builds the messages of an id at a time; an empty list if there is nothing yet."""
+Build = Callable[[int, int], Any]
+"""Builds the message of an id at a time; None if there is nothing yet."""
 
 
 def read_command(request: Request) -> Command:
@@ -277,8 +277,8 @@ class CommandService(Service):
     ----------
     intervals : IntervalService
         For the rates of single clients.
-    build, knows : callable
-        Build a message, and whether a message of that id is ever sent.
+    telemetry : Telemetry
+        Builds the messages that clients request.
     explain : callable
         Announces to all why something was refused.
     """
@@ -288,13 +288,11 @@ class CommandService(Service):
     def __init__(
         self,
         intervals: IntervalService,
-        build: Build,
-        knows: Callable[[int], bool],
+        telemetry: Telemetry,
         explain: Explain,
     ) -> None:
         self._intervals = intervals
-        self._build = build
-        self._knows = knows
+        self._telemetry = telemetry
         self._explain = explain
         self._handlers: dict[int, Handler] = {
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
@@ -334,19 +332,19 @@ class CommandService(Service):
         message_id, request = requested_message(command), command.request
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             return self._report_interval(request, whole(command.params[1]))
-        if not self._knows(message_id):
+        if not self._telemetry.knows(message_id):
             return UNSUPPORTED, []
         # The answer to an untrusted client must not load the links of others.
         to_all = command.number == REQUEST_MESSAGE and whole(command.params[6]) == RESPOND_TO_ALL
         client_id = None if to_all and request.may_change else request.client_id
-        answers: list[Answer] = [Reply(m, client_id) for m in self._build(message_id, now_us)]
-        return (ACCEPTED, answers) if answers else (NOT_NOW, [])
+        message = self._telemetry.build(message_id, now_us)
+        return (NOT_NOW, []) if message is None else (ACCEPTED, [Reply(message, client_id)])
 
     def _set_interval(self, command: Command, _now_us: int) -> Outcome:
         message_id, interval_us = whole(command.params[0]), command.params[1]
         if not math.isfinite(interval_us):
             return DENIED, []
-        if not self._knows(message_id):
+        if not self._telemetry.knows(message_id):
             return UNSUPPORTED, []
         answers = self._intervals.set_interval(command.request, message_id, round(interval_us))
         return (DENIED, []) if answers is None else (ACCEPTED, answers)
@@ -506,7 +504,7 @@ class QueryService(Service):
         if kind == "SETUP_SIGNING":
             return self._explain(SIGNING_SETUP, now_us)
         if kind in SINGLE:
-            found = self._build(SINGLE[kind], now_us)
+            found = [self._build(SINGLE[kind], now_us)]
         elif kind in NOTHING:
             found = [NOTHING[kind](message)]
         elif kind == "TIMESYNC":
@@ -517,4 +515,4 @@ class QueryService(Service):
             pong = mavlink.MAVLink_ping_message(message.time_usec, message.seq, *sender)
             # One with a target is an answer.
             found = [] if message.target_system or message.target_component else [pong]
-        return [request.reply(answer) for answer in found]
+        return [request.reply(answer) for answer in found if answer is not None]

@@ -209,7 +209,7 @@ class Telemetry:
         }
 
     def add(self, message_id: int, builder: Builder) -> None:
-        """Add a timed message that another service builds."""
+        """Add a message that another service builds."""
         self._builders[message_id] = builder
 
     def _take_added(self) -> None:
