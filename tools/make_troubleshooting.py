@@ -22,8 +22,13 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 PAGE: Final = ROOT / "docs" / "troubleshooting.md"
 EXPLANATIONS: Final = ROOT / "docs" / "troubleshooting.toml"
 LOG_LEVELS: Final = frozenset({"warning", "error", "critical", "exception"})
-TEXT_CALLS: Final = {"StatusText": 1, "MAVLink_statustext_message": 1, "ClientAlert": 1}
-"""Constructors of texts for ground stations, and the position of the text."""
+TEXT_CALLS: Final = {
+    "StatusText": (1,),
+    "status_text": (1, 2),
+    "MAVLink_statustext_message": (1,),
+    "ClientAlert": (1,),
+}
+"""Functions that make texts for ground stations, and the positions of the texts."""
 HOLE: Final = "…"
 """Stands for a value that is known only at run time."""
 MAX_DEPTH: Final = 4
@@ -65,45 +70,60 @@ class Sources:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._trees = {path: ast.parse(path.read_text()) for path in sorted(folder.rglob("*.py"))}
-        self._trees_by_package = [
-            (path.relative_to(folder).parts[0], tree) for path, tree in self._trees.items()
-        ]
+        self._calls = {path: list(_calls(tree)) for path, tree in self._trees.items()}
 
     def messages(self) -> list[Message]:
         """Return all messages, in the order of their wording."""
         found: set[Message] = set()
-        for path, tree in self._trees.items():
-            package = path.relative_to(self._folder).parts[0]
-            for call, function in _calls(tree, None):
-                if (text := _text_of(call)) is None:
-                    continue
-                kind, expression = text
+        for path, calls in self._calls.items():
+            package = self._package_of(path)
+            for call, function in calls:
+                kind, expressions = _texts_of(call)
                 source = f"{path.relative_to(self._folder.parent)}:{call.lineno}"
-                for pattern in self._patterns(expression, function, package, 0):
-                    found.add(Message(kind, _tidied(pattern), source))
-        return sorted(found)
+                for expression in expressions:
+                    for pattern in self._patterns(expression, function, package, 0):
+                        found.add(Message(kind, _tidied(pattern), source))
+        # "Receiver: bus OK again" is one of "…: bus OK again".
+        general = {each.pattern for each in found if not _is_dynamic(each)}
+        return sorted(
+            each
+            for each in found
+            if each.pattern.startswith(HOLE)
+            or f"{HOLE}: {each.pattern.partition(': ')[2]}" not in general
+        )
+
+    def _package_of(self, path: Path) -> str:
+        return path.relative_to(self._folder).parts[0]
 
     @cached_property
     def _calls_by_name(self) -> dict[tuple[str, str], list["_Call"]]:
         """Calls by package and name of the called function."""
         found: dict[tuple[str, str], list[_Call]] = {}
-        for package, tree in self._trees_by_package:
-            for call, function in _calls(tree, None):
+        for path, calls in self._calls.items():
+            package = self._package_of(path)
+            for call, function in calls:
                 key = (package, _name_of(call.func))
                 found.setdefault(key, []).append(_Call(call, function, package))
         return found
 
     @cached_property
+    def _values(self) -> dict[str, ast.expr]:
+        """Annotated values of module level, by name."""
+        return {
+            node.target.id: node.value
+            for tree in self._trees.values()
+            for node in tree.body
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and node.value
+        }
+
+    @cached_property
     def _constants(self) -> dict[str, str]:
         """Texts of module level, by name."""
-        found = {}
-        for tree in self._trees.values():
-            for node in tree.body:
-                target = node.target if isinstance(node, ast.AnnAssign) else None
-                value = getattr(node, "value", None)
-                if isinstance(target, ast.Name) and isinstance(value, ast.Constant):
-                    found[target.id] = value.value
-        return {name: value for name, value in found.items() if isinstance(value, str)}
+        return {
+            name: value.value
+            for name, value in self._values.items()
+            if isinstance(value, ast.Constant) and isinstance(value.value, str)
+        }
 
     def _patterns(
         self, node: ast.expr, function: Function | None, package: str, depth: int
@@ -158,12 +178,23 @@ class Sources:
         assigned = [
             pattern
             for node in ast.walk(function)
-            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None
-            for target in (node.targets if isinstance(node, ast.Assign) else [node.target])
-            if isinstance(target, ast.Name) and target.id == name
-            for pattern in self._patterns(node.value, function, package, depth)
+            for value in self._assigned(node, name)
+            for pattern in self._patterns(value, function, package, depth)
         ]
         return assigned or self._passed(name, function, package, depth)
+
+    def _assigned(self, node: ast.AST, name: str) -> list[ast.expr]:
+        """Return the values that a statement gives to a name: by assignment, or row by row."""
+        match node:
+            case ast.Assign(targets=[target], value=ast.expr() as value):
+                rows = [value]
+            case ast.AnnAssign(target=target, value=ast.expr() as value):
+                rows = [value]
+            case ast.For(target=target, iter=ast.Name(id=table)):
+                rows = getattr(self._values.get(table), "elts", [])
+            case _:
+                return []
+        return [value for row in rows for value in _unpacked(target, row, name)]
 
     def _passed(self, name: str, function: Function, package: str, depth: int) -> list[str]:
         """Return the values of a parameter in all calls of its function."""
@@ -181,29 +212,44 @@ class Sources:
         return found
 
 
-def _calls(node: ast.AST, function: Function | None) -> Iterator[tuple[ast.Call, Function | None]]:
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.Call):
-            yield child, function
-        inner = child if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
-        yield from _calls(child, inner)
+def _calls(tree: ast.AST) -> Iterator[tuple[ast.Call, Function | None]]:
+    """Yield each call with the function around it."""
+    nodes: list[tuple[ast.AST, Function | None]] = [(tree, None)]
+    while nodes:
+        node, function = nodes.pop()
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.Call):
+                yield child, function
+            inner = child if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) else function
+            nodes.append((child, inner))
+
+
+def _unpacked(target: ast.expr, value: ast.expr, name: str) -> list[ast.expr]:
+    """Return the parts of a value that unpacking gives to a name."""
+    if isinstance(target, ast.Name):
+        return [value] if target.id == name else []
+    if isinstance(value, ast.IfExp):
+        return _unpacked(target, value.body, name) + _unpacked(target, value.orelse, name)
+    if not (isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)):
+        return []
+    pairs = zip(target.elts, value.elts, strict=False)
+    return [part for inner, element in pairs for part in _unpacked(inner, element, name)]
 
 
 def _name_of(function: ast.expr) -> str:
     return getattr(function, "id", getattr(function, "attr", ""))
 
 
-def _text_of(call: ast.Call) -> tuple[str, ast.expr] | None:
-    """Return the kind and the wording of a call that emits a message."""
+def _texts_of(call: ast.Call) -> tuple[str, list[ast.expr]]:
+    """Return the kind and the wordings of a call that emits a message."""
     name = _name_of(call.func)
     owner = getattr(call.func, "value", None)
     if name in LOG_LEVELS and isinstance(owner, ast.Name) and owner.id == "log" and call.args:
         first = call.args[0]
         if isinstance(first, ast.Constant) and first.value == "%s" and len(call.args) > 1:
             first = call.args[1]
-        return "log", first
-    at = TEXT_CALLS.get(name)
-    return None if at is None or len(call.args) <= at else ("text", call.args[at])
+        return "log", [first]
+    return "text", [call.args[at] for at in TEXT_CALLS.get(name, ()) if at < len(call.args)]
 
 
 def _tidied(pattern: str) -> str:
@@ -251,9 +297,9 @@ def explained(messages: list[Message], entries: list[dict[str, str]]) -> tuple[s
     return page, wrong
 
 
-def page_of(folder: Path, explanations: dict[str, Any]) -> tuple[str, list[str]]:
+def page_of(sources: Sources, explanations: dict[str, Any]) -> tuple[str, list[str]]:
     """Return the whole page, and the messages without an explanation."""
-    messages = with_dynamic(Sources(folder).messages(), explanations["dynamic"])
+    messages = with_dynamic(sources.messages(), explanations["dynamic"])
     tables, wrong = explained(messages, explanations["message"])
     note = "<!-- Written by `python -m tools.make_troubleshooting`; edit troubleshooting.toml. -->"
     return f"{note}\n\n{explanations['intro'].strip()}\n\n{tables}", wrong
@@ -261,7 +307,7 @@ def page_of(folder: Path, explanations: dict[str, Any]) -> tuple[str, list[str]]
 
 def main() -> None:
     """Write the page, or check it."""
-    page, wrong = page_of(ROOT / "gateway", tomllib.loads(EXPLANATIONS.read_text()))
+    page, wrong = page_of(Sources(ROOT / "gateway"), tomllib.loads(EXPLANATIONS.read_text()))
     if "--check" not in sys.argv:
         PAGE.write_text(page)
     elif PAGE.read_text() != page:
