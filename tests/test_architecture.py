@@ -93,13 +93,19 @@ def tree_of(path: Path) -> ast.Module:
     return ast.parse(path.read_text())
 
 
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(tree_of(path)))
+
+
 def package_of(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
-def imported_modules(tree: ast.AST) -> set[str]:
+@cache
+def imported_modules(path: Path) -> set[str]:
     found: set[str] = set()
-    for node in ast.walk(tree):
+    for node in nodes_of(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -121,7 +127,7 @@ def test_imports_follow_the_flow() -> None:
         package = package_of(path)
         imported = {
             parts[1]
-            for module in imported_modules(tree_of(path))
+            for module in imported_modules(path)
             if (parts := module.split("."))[0] == "gateway" and len(parts) > 1
         } - {"__version__", package}
         if package != "__init__" and (beyond := imported - MAY_IMPORT[package]):
@@ -138,11 +144,10 @@ def test_pure_packages_do_no_io() -> None:
             continue
         if {str(name), str(name.parent)} & IMPURE_PARTS:
             continue
-        tree = tree_of(path)
-        tops = {module.split(".")[0] for module in imported_modules(tree)}
+        tops = {module.split(".")[0] for module in imported_modules(path)}
         calls = {
             node.func.id
-            for node in ast.walk(tree)
+            for node in nodes_of(path)
             if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
         }
         if found := tops & IMPURE_MODULES | calls & {"open", "print", "input"}:
@@ -151,7 +156,7 @@ def test_pure_packages_do_no_io() -> None:
 
 
 def test_no_module_wide_state_from_mavutil() -> None:
-    users = [path for path in SOURCES if "pymavlink.mavutil" in imported_modules(tree_of(path))]
+    users = [path for path in SOURCES if "pymavlink.mavutil" in imported_modules(path)]
     assert names_of(users) == []
 
 
@@ -165,7 +170,7 @@ def test_short_functions() -> None:
     long = {
         f"{path.relative_to(ROOT)}: {node.name}": lines_of(node)
         for path in SOURCES
-        for node in ast.walk(tree_of(path))
+        for node in nodes_of(path)
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         and lines_of(node) > MAX_FUNCTION_LINES
     }
@@ -177,7 +182,7 @@ def test_no_stage_knows_an_edge() -> None:
     knowing = {
         package_of(path)
         for path in SOURCES
-        for module in imported_modules(tree_of(path))
+        for module in imported_modules(path)
         if module.startswith(("gateway.live", "gateway.hub.transports"))
     }
     assert knowing <= (
@@ -201,7 +206,7 @@ def test_imports_go_in_no_circle() -> None:
         ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in SOURCES
     }
     graph = {
-        name: imported_modules(tree_of(path)) & modules.keys() - {name}
+        name: imported_modules(path) & modules.keys() - {name}
         for name, path in modules.items()
     }
     TopologicalSorter(graph).prepare()
