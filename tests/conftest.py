@@ -1,5 +1,6 @@
 """Fixtures for every test: seeded chance, a manual clock, real flights where there are any."""
 
+import gc
 import os
 import signal
 import subprocess
@@ -33,6 +34,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
 
 def pytest_configure() -> None:
     """Let children begin with the default action of SIGHUP, which `nohup` has pytest ignore."""
+    # Collecting makes a million objects that stay: the garbage collector need not look at them.
+    gc.disable()
     if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
         # A handler is not inherited by a new program; an ignored signal is.
         signal.signal(signal.SIGHUP, lambda *_: None)
@@ -43,6 +46,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     slow = Counter(item.path for item in items if item.get_closest_marker("slow"))
     all_of = Counter(item.path for item in items)
     items.sort(key=lambda item: (-slow[item.path], -all_of[item.path]))
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(optionalhook=True)

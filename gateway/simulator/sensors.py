@@ -18,11 +18,11 @@ References
 import math
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import accumulate
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from gateway.geometry.geomagnetism import magnetic_field
 from gateway.records import ImuFlags, Vec3
@@ -72,10 +72,13 @@ class Wander:
         steps = self._step * self._rng.standard_normal((size, AXES))
         if size == 0:
             return steps
-        start = (self._retain * self._last)[np.newaxis]
-        values, _ = lfilter([1.0], [1.0, -self._retain], steps, axis=0, zi=start)
+        columns = [
+            list(accumulate(axis, lambda last, step: step + self._retain * last, initial=last))
+            for axis, last in zip(steps.T.tolist(), self._last.tolist(), strict=True)
+        ]
+        values = np.array(columns).T
         self._last = values[-1]
-        return np.asarray(values)
+        return values[1:]
 
 
 class Walk:

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import lsq_linear
-from scipy.signal import butter, sosfilt
 from scipy.spatial.transform import Rotation
 
 from gateway.geometry.geodesy import radii_m
@@ -368,9 +367,13 @@ def _round(values: FloatArray, width_s: float) -> FloatArray:
 
 def _coloured(rng: np.random.Generator, size: int, bandwidth_hz: float) -> FloatArray:
     """Draw smooth noise of unit variance on three axes, shape (size, 3)."""
-    sos = butter(3, bandwidth_hz, fs=GRID_HZ, output="sos")
     settled = round(5.0 * GRID_HZ / bandwidth_hz)
-    noise = sosfilt(sos, rng.standard_normal((settled + size, 3)), axis=0)[settled:]
+    white = rng.standard_normal((settled + size, 3))
+    # Third-order Butterworth by the bilinear transform; its wrap-around has settled by then.
+    half_rad = np.pi * np.fft.rfftfreq(len(white))
+    s = 1j * np.tan(half_rad)[:, np.newaxis] / math.tan(math.pi * bandwidth_hz / GRID_HZ)
+    gain = 1.0 / ((1.0 + s) * (1.0 + s + s**2))
+    noise = np.fft.irfft(gain * np.fft.rfft(white, axis=0), len(white), axis=0)[settled:]
     # A third-order Butterworth passes pi / 3 of its bandwidth's noise power.
     return np.asarray(noise / math.sqrt(bandwidth_hz * math.pi / 3.0 / (0.5 * GRID_HZ)))
 
