@@ -206,8 +206,7 @@ def test_imports_go_in_no_circle() -> None:
         ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in SOURCES
     }
     graph = {
-        name: imported_modules(path) & modules.keys() - {name}
-        for name, path in modules.items()
+        name: imported_modules(path) & modules.keys() - {name} for name, path in modules.items()
     }
     TopologicalSorter(graph).prepare()
 
