@@ -1,4 +1,4 @@
-"""Quotas of answers, rates of messages, and which clients a full listening port serves.
+"""Quotas of answers and rates of messages.
 
 Theory of operation. Requests wait in a bounded queue for each client and are taken in turn: a
 client that asks a thousand times a second delays only itself. Answers are limited by a token
@@ -9,18 +9,11 @@ return from another address.
 
 What a ground station does in a session (a parameter list, files of metadata, a mission of two
 thousand items) fits into a full bucket; the rate matters only after that.
-
-A UDP port identifies its clients only by the addresses they send from. A client is removed after a
-timeout; one that returns on another port (a restarted ground station) replaces its old entry as
-soon as that has missed a few heartbeats, so that no client is served twice; and a port never serves
-more than a bounded number. In a full port a silent client is removed for a new one, and so is a
-client of a host that holds more than its share, for a host that holds less.
 """
 
-from collections import Counter, deque
-from collections.abc import Collection
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Final, Protocol, TypeVar
+from typing import Final
 
 from gateway.records import Incoming
 from gateway.units import US_PER_S
@@ -150,74 +143,3 @@ class RateLimit:
         if self.due_us:
             self.due_us += interval_us - self.interval_us
         self.interval_us = interval_us
-
-
-SILENT_AFTER_US: Final = 3 * US_PER_S
-"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
-SHARE: Final = 4
-"""One host is left a quarter of the clients when others want them,"""
-FEW: Final = 4
-"""and at least these: a ground station, a script and a display."""
-
-
-class PortClient(Protocol):
-    """A client of a listening port."""
-
-    @property
-    def host(self) -> str:
-        """The peer's host."""
-
-    @property
-    def last_us(self) -> int:
-        """When it was received last, or else appeared."""
-
-
-class UdpPortClient(PortClient, Protocol):
-    """A client that is identified by its address and by its first frame."""
-
-    identity: tuple[int, int]
-    """System and component of its first frame."""
-
-
-Present = TypeVar("Present", bound=PortClient)
-UdpPresent = TypeVar("UdpPresent", bound=UdpPortClient)
-
-
-def gone_clients(
-    present: Collection[UdpPresent], idle_timeout_us: int, now_us: int
-) -> list[UdpPresent]:
-    """Return the clients that have gone or have come back on another port."""
-    newest: dict[tuple[str, tuple[int, int]], UdpPresent] = {}
-    for client in present:
-        key = (client.host, client.identity)
-        if key not in newest or client.last_us > newest[key].last_us:
-            newest[key] = client
-    return [
-        client
-        for client in present
-        if (idle_us := now_us - client.last_us) >= idle_timeout_us
-        or (idle_us >= SILENT_AFTER_US and newest[client.host, client.identity] is not client)
-    ]
-
-
-def client_to_remove(
-    present: Collection[Present], host: str, max_clients: int, now_us: int
-) -> Present | None:
-    """Choose the client to remove from a full port for a new one from `host`.
-
-    It is the one that has sent nothing for longest, else the newest of the host that holds more
-    than its share; None if all are alive and no host, or only the new client's, holds more.
-    """
-    stalest = min(present, key=lambda client: client.last_us)
-    if now_us - stalest.last_us >= SILENT_AFTER_US:
-        return stalest
-    crowded = crowded_host(present, max_clients)
-    if crowded in (None, host):
-        return None
-    return [client for client in present if client.host == crowded][-1]
-
-
-def crowded_host(present: Collection[PortClient], max_clients: int) -> str | None:
-    """Return the host with the most clients if those are more than its share."""
-    host, count = Counter(client.host for client in present).most_common(1)[0]
-    return host if count > max(FEW, max_clients // SHARE) else None

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.limits import SILENT_AFTER_US
 from gateway.hub.transports import base
 from gateway.hub.transports import stream as accepting
 from gateway.wire.mavlink_splitter import frame_of
@@ -471,7 +470,7 @@ class TestListeningPorts:
         for turned_away in (0, 1, 2, 3):
             await call(turned_away)
         assert search.call_count == 1
-        rig.clock.us += SILENT_AFTER_US
+        rig.clock.us += base.SILENT_AFTER_US
         await call(3)
         await rig.until(lambda: [client.client_id for client in hub.clients()] == [2])
         assert search.call_count == 2

@@ -9,13 +9,12 @@ from gateway.hub.limits import (
     CLIENT_RATE,
     MAX_WAITING,
     REQUEST_COST,
-    SILENT_AFTER_US,
     UNTRUSTED_BURST,
     UNTRUSTED_RATE,
     RequestQueue,
-    client_to_remove,
-    gone_clients,
 )
+from gateway.hub.transports.base import SILENT_AFTER_US, client_to_remove
+from gateway.hub.transports.datagram import gone_clients
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 

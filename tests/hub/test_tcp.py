@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.limits import SILENT_AFTER_US
+from gateway.hub.transports.base import SILENT_AFTER_US
 from gateway.hub.transports.stream import UNSENT_BYTES
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 from tests.hub.conftest import LIMIT_S

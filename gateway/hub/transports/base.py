@@ -3,14 +3,15 @@
 import asyncio
 import logging
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
-from gateway.hub.limits import RateLimit, TokenBucket, client_to_remove
+from gateway.hub.limits import RateLimit, TokenBucket
 from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
@@ -427,8 +428,39 @@ class Client:
 Peer = TypeVar("Peer", bound=Client)
 
 
+SILENT_AFTER_US: Final = 3 * US_PER_S
+"""Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
+SHARE: Final = 4
+"""One host is left a quarter of the clients when others want them,"""
+FEW: Final = 4
+"""and at least these: a ground station, a script and a display."""
+
+
+def client_to_remove(
+    present: Collection[Peer], host: str, max_clients: int, now_us: int
+) -> Peer | None:
+    """Choose the client to remove from a full port for a new one from `host`.
+
+    It is the one that has sent nothing for longest, else the newest of the host that holds more
+    than its share; None if all are alive and no host, or only the new client's, holds more.
+    """
+    stalest = min(present, key=lambda client: client.last_us)
+    if now_us - stalest.last_us >= SILENT_AFTER_US:
+        return stalest
+    crowded = crowded_host(present, max_clients)
+    if crowded in (None, host):
+        return None
+    return [client for client in present if client.host == crowded][-1]
+
+
+def crowded_host(present: Collection[Client], max_clients: int) -> str | None:
+    """Return the host with the most clients if those are more than its share."""
+    host, count = Counter(client.host for client in present).most_common(1)[0]
+    return host if count > max(FEW, max_clients // SHARE) else None
+
+
 class Listener(Generic[Peer]):
-    """An endpoint that makes a client of every peer that connects."""
+    """An endpoint that makes a client of every peer that connects, up to a bounded number."""
 
     def __init__(self, context: HubContext, endpoint: Endpoint) -> None:
         self.endpoint = endpoint

@@ -4,15 +4,21 @@ import asyncio
 import socket
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint
-from gateway.hub.limits import SILENT_AFTER_US
 from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
-from gateway.hub.transports.base import RETRY_US, Client, Write, new_socket, not_open
+from gateway.hub.transports.base import (
+    RETRY_US,
+    SILENT_AFTER_US,
+    Client,
+    Write,
+    new_socket,
+    not_open,
+)
 from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram
 
 NOBODY_LISTENS: Final = "nobody listens there"
@@ -276,6 +282,23 @@ class DatagramPeer(DatagramClient):
         if self._socket is None:
             return True
         return self.refused_us is not None and now_us - self.last_us >= SILENT_AFTER_US
+
+
+def gone_clients(
+    present: Collection[DatagramPeer], idle_timeout_us: int, now_us: int
+) -> list[DatagramPeer]:
+    """Return the clients that have gone or have come back on another port."""
+    newest: dict[tuple[str, Origin], DatagramPeer] = {}
+    for client in present:
+        key = (client.host, client.identity)
+        if key not in newest or client.last_us > newest[key].last_us:
+            newest[key] = client
+    return [
+        client
+        for client in present
+        if (idle_us := now_us - client.last_us) >= idle_timeout_us
+        or (idle_us >= SILENT_AFTER_US and newest[client.host, client.identity] is not client)
+    ]
 
 
 def bound_socket(address: tuple[str, int], *, shared: bool) -> socket.socket:

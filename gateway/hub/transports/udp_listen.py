@@ -3,6 +3,10 @@
 The port's own socket receives only from unknown peers: each new client gets a connected socket on
 the same port, which the kernel prefers for that client's datagrams. `SO_REUSEPORT` allows that,
 and is set only after the bind, so that a second gateway on the same port still gets an error.
+
+Clients are identified only by the addresses they send from. One is removed after a timeout; one
+that returns on another port (a restarted ground station) replaces its old entry as soon as that has
+missed a few heartbeats, so that no client is served twice.
 """
 
 import itertools
@@ -10,8 +14,15 @@ import socket
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint, host_and_port
-from gateway.hub.limits import SILENT_AFTER_US, crowded_host, gone_clients
-from gateway.hub.transports.base import READ_BYTES, RETRY_US, Client, HubContext, Listener
+from gateway.hub.transports.base import (
+    READ_BYTES,
+    RETRY_US,
+    SILENT_AFTER_US,
+    Client,
+    HubContext,
+    Listener,
+    crowded_host,
+)
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,
     MAX_DATAGRAM,
@@ -19,6 +30,7 @@ from gateway.hub.transports.datagram import (
     Address,
     DatagramPeer,
     bound_socket,
+    gone_clients,
     local_host_of,
 )
 from gateway.units import US_PER_S
