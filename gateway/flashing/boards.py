@@ -39,8 +39,8 @@ SIZE: Final = _LAYOUT.size + _CRC.size
 PIPES_PER_VEHICLE: Final = 2
 
 
-class SettingsBlockError(ValueError):
-    """An image without a settings block, or with one that cannot be used; the text says why."""
+class FlashError(Exception):
+    """A board or an image that cannot be used; the text says why, and what to do."""
 
 
 class Program(IntEnum):
@@ -110,21 +110,9 @@ def default_pipe(program: Program, vehicle_id: int) -> int:
 
 
 def find_block(image: bytes) -> SettingsBlock:
-    """Find and decode the settings block of an image.
+    """Find and decode the settings block of a program, or of all that was read from a chip.
 
-    Parameters
-    ----------
-    image : bytes
-        A program, or all that was read from a chip.
-
-    Returns
-    -------
-    SettingsBlock
-
-    Raises
-    ------
-    SettingsBlockError
-        If there is none, or one that is damaged, of another version or out of range.
+    Raises FlashError if there is none, or one that is damaged, of another version or out of range.
     """
     damaged = None
     offset = image.find(MAGIC)
@@ -135,8 +123,8 @@ def find_block(image: bytes) -> SettingsBlock:
         damaged = offset if damaged is None else damaged
         offset = image.find(MAGIC, offset + 1)
     if damaged is not None:
-        raise SettingsBlockError(f"the settings block at {damaged:#x} is damaged (CRC)")
-    raise SettingsBlockError("no settings block: not a mavgate program, or one before version 1.1")
+        raise FlashError(f"the settings block at {damaged:#x} is damaged (CRC)")
+    raise FlashError("no settings block: not a mavgate program, or one before version 1.1")
 
 
 def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
@@ -149,9 +137,7 @@ def _decode(block: bytes, offset: int) -> SettingsBlock:
     values = _LAYOUT.unpack(block[: _LAYOUT.size])
     version, program, clock_mhz, major, minor = values[1:6]
     if version != VERSION:
-        raise SettingsBlockError(
-            f"the settings block has version {version}, this mavgate knows {VERSION}"
-        )
+        raise FlashError(f"the settings block has version {version}, this mavgate knows {VERSION}")
     names = BoardSettings.__struct_fields__
     found = dict(zip(names, values[6:], strict=True))
     try:
@@ -163,9 +149,7 @@ def _decode(block: bytes, offset: int) -> SettingsBlock:
         settings = msgspec.convert(found, BoardSettings)
         kind = Program(program)
     except (IndexError, ValueError) as error:
-        raise SettingsBlockError(f"the settings block holds a value out of range: {error}") from (
-            error
-        )
+        raise FlashError(f"the settings block holds a value out of range: {error}") from (error)
     return SettingsBlock(offset, kind, clock_mhz, (major, minor), settings)
 
 
@@ -194,10 +178,6 @@ SYNC_WAIT_S: Final = 0.1
 AVRDUDE_LIMIT_S: Final = 180.0
 AVRDUDE_TRIES: Final = 3
 """A board that restarts slowly can miss the first requests."""
-
-
-class FlashError(Exception):
-    """A board that cannot be flashed or read; the text says why, and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,11 +215,8 @@ def read_image(path: Path) -> IntelHex:
 
 
 def block_of(image: IntelHex) -> SettingsBlock:
-    """Find the settings block of an image; raises FlashError if there is none to use."""
-    try:
-        return find_block(image.tobinstr(start=0))
-    except SettingsBlockError as error:
-        raise FlashError(str(error)) from error
+    """Find the settings block of an image; raises as `find_block`."""
+    return find_block(image.tobinstr(start=0))
 
 
 def with_settings(image: IntelHex, settings: BoardSettings) -> bytes:

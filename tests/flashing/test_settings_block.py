@@ -10,8 +10,8 @@ from gateway.flashing.boards import (
     SIZE,
     USED_BY,
     BoardSettings,
+    FlashError,
     Program,
-    SettingsBlockError,
     default_pipe,
     find_block,
     patch,
@@ -77,7 +77,7 @@ def test_any_damaged_byte_is_detected() -> None:
     for place in range(SIZE):
         damaged = bytearray(block)
         damaged[place] ^= 0x10
-        with pytest.raises(SettingsBlockError, match=r"damaged|no settings block"):
+        with pytest.raises(FlashError, match=r"damaged|no settings block"):
             find_block(image_with(bytes(damaged)))
 
 
@@ -95,7 +95,7 @@ def test_any_damaged_byte_is_detected() -> None:
     ids=["empty", "erased", "cut", "version", "program", "vehicle", "power"],
 )
 def test_unusable_block_is_refused_with_the_reason(image: bytes, message: str) -> None:
-    with pytest.raises(SettingsBlockError, match=message):
+    with pytest.raises(FlashError, match=message):
         find_block(image)
 
 
