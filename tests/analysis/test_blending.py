@@ -90,11 +90,7 @@ def test_the_truth_is_near_the_fixes_at_their_time_of_validity() -> None:
     error = error_at_fixes_m(flight.reference.track, fixes_of(flight))
     assert np.hypot(*error.T).max() < 5.0
     late = fixes_of(flight)
-    shifted = Fixes(
-        late.arrival_us, late.arrival_us, late.lat_deg, late.lon_deg, late.alt_amsl_m,
-        late.vel_n_mps,
-    )  # fmt: skip
-    worse = error_at_fixes_m(flight.reference.track, shifted)
+    worse = error_at_fixes_m(flight.reference.track, replace(late, valid_us=late.arrival_us))
     assert np.nanmean(np.hypot(*worse.T)) > np.nanmean(np.hypot(*error.T))
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -59,13 +61,7 @@ def test_position_error_is_north_east_up() -> None:
     reference = short_flight().reference
     assert reference is not None
     track = reference.track
-    moved = type(track)(
-        track.time_us,
-        track.q_nb,
-        track.lat_deg + 1e-5,
-        track.lon_deg - 1e-5,
-        track.alt_amsl_m + 2.0,
-        track.vel_n_mps,
-    )
+    lat_deg, lon_deg = track.lat_deg + 1e-5, track.lon_deg - 1e-5
+    moved = replace(track, lat_deg=lat_deg, lon_deg=lon_deg, alt_amsl_m=track.alt_amsl_m + 2.0)
     error = position_error_m(moved, track)
     assert error[0] == pytest.approx([1.106, -1.103, 2.0], abs=2e-3)
