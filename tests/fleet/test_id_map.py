@@ -26,19 +26,8 @@ def test_first_vehicle_keeps_its_id_and_second_gets_the_lowest_free_one() -> Non
     assert [ids.id_of(site, 1) for site in "abc"] == [1, 2, 3]
     assert ids.vehicle_of(2) == ("b", 1)
     assert ids.vehicle_of(9) is None
-
-
-def test_saved_ids_are_used_again() -> None:
-    first = IdMap()
-    for site in "abc":
-        first.id_of(site, 1)
-    again = IdMap(dict(first.items()))
-    assert again.id_of("c", 1) == 3
-    assert again.id_of("a", 1) == 1
-
-
-def test_ids_of_ground_stations_are_not_assigned() -> None:
-    assert IdMap().id_of("a", 255) == 1
+    assert ids.id_of("c", 255) == 4, "no id of a ground station"
+    assert IdMap(dict(ids.items())).items() == ids.items()
 
 
 def test_id_of_an_excluded_vehicle_goes_to_a_waiting_one() -> None:

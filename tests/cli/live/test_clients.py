@@ -222,7 +222,3 @@ async def test_an_added_client_is_kept_on_demand(asked: list[object], tmp_path: 
 def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert "nothing runs" in invoke("status", code=2).output
-
-
-def test_unknown_numbers_are_shown_as_such() -> None:
-    assert clients._number(None, ".1f") == "—"
