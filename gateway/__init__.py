@@ -2,7 +2,7 @@
 
 The names that a program needs to run the stages by itself, imported at their first use:
 
-    from gateway import AircraftSettings, Outgoing, Pipeline, PipelineSettings
+    from gateway import AircraftSettings, Outputs, Pipeline, PipelineSettings
 """
 
 from importlib import import_module
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from gateway.aircraft import Aircraft as Aircraft
     from gateway.aircraft import AircraftSettings as AircraftSettings
+    from gateway.aircraft import Outputs as Outputs
     from gateway.pipeline import Pipeline as Pipeline
     from gateway.pipeline import PipelineSettings as PipelineSettings
     from gateway.records import BaroRaw as BaroRaw
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES: Final = {
-    "aircraft": ("Aircraft", "AircraftSettings"),
+    "aircraft": ("Aircraft", "AircraftSettings", "Outputs"),
     "pipeline": ("Pipeline", "PipelineSettings"),
     "records": (
         "BaroRaw", "FusedSample", "GpsFix", "ImuCalibrated", "ImuRaw", "Incoming", "NavState",

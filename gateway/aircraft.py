@@ -1,11 +1,11 @@
 """One aircraft: `sensing → estimation → vehicle`, and changes of their settings as they run.
 
-Pure: time is an argument, and effects are returned as a list of actions.
+Pure: time is an argument, and results are added to the `Outputs` of the caller.
 """
 
 import zlib
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 
 import msgspec
@@ -39,6 +39,7 @@ from gateway.settings import Settings
 from gateway.vehicle.plan import Home, Location, StoredPlan
 from gateway.vehicle.requests import (
     WARNING,
+    Action,
     CalibrationMeasured,
     RecordingRequest,
     SavePlan,
@@ -48,7 +49,6 @@ from gateway.vehicle.requests import (
     SigningTimestamps,
     StatusText,
 )
-from gateway.vehicle.requests import Action as VehicleAction
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -61,8 +61,18 @@ class SettingsChanged:
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
-Action = Outgoing | ClientInterval | RecordingRequest | SaveSettings | SavePlan | Recorded
-"""Frames to send, clients' rates, and records for a recording, in the order of its fusion."""
+Order = ClientInterval | RecordingRequest | SaveSettings | SavePlan
+
+
+class Outputs(msgspec.Struct):
+    """Results of one call of the stages, to be carried out kind by kind, each in its order."""
+
+    frames: list[Outgoing] = []
+    """To send."""
+    records: list[Recorded] = []
+    """For a recording, in the order of the fusion."""
+    orders: list[Order] = []
+    """Clients' rates, and files to write."""
 
 
 class AircraftSettings(Settings, frozen=True):
@@ -105,6 +115,8 @@ class Aircraft:
         self.vehicle_id = vehicle_id
         self.settings = settings
         self.state: NavState | None = None
+        self.received_us: int | None = None
+        """Arrival of the newest record."""
         sections = {name: getattr(settings, name) for name in ("estimation", "calibration")}
         self.vehicle = Vehicle(
             settings.vehicle,
@@ -141,103 +153,73 @@ class Aircraft:
         if self._fused is None:
             self.chain, self.estimator = make_fusion(self.settings, state)
 
-    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
-        """Run one raw record through the stages."""
-        match record:
-            case ImuRaw():
-                return self._take_imu(record, self.chain.imu(record), now_us)
-            case ImuCalibrated():
-                return self._take_imu(None, self.chain.imu_calibrated(record), now_us)
-            case BaroRaw():
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int, out: Outputs) -> None:
+        """Run one raw record through the stages, and add what results."""
+        vehicle = self.vehicle
+        if isinstance(record, ImuRaw):
+            self._take_imu(record, self.chain.imu(record), now_us, out)
+        elif isinstance(record, ImuCalibrated):
+            self._take_imu(None, self.chain.imu_calibrated(record), now_us, out)
+        else:
+            # Before its effects: they may change the settings, which applies to the next record.
+            out.records.append(record)
+            if isinstance(record, BaroRaw):
                 baro = self.chain.baro(record)
                 self.estimator.update_baro(baro)
-                return self._recorded(record, self.vehicle.on_baro(baro, now_us), now_us)
-            case GpsFix():
+                self.perform(vehicle.on_baro(baro, now_us), now_us, out)
+            elif isinstance(record, GpsFix):
                 self.estimator.update_gps(record)
-                wanted = self.vehicle.on_gps(record, now_us)
+                self.perform(vehicle.on_gps(record, now_us), now_us, out)
                 latency_s = latency_in_use(self.estimator)
                 if latency_s is not None:
-                    wanted += self.vehicle.on_latency(*latency_s, now_us)
-                return self._recorded(record, wanted, now_us)
-            case NodeStatus():
-                return self._recorded(record, self.vehicle.on_node_status(record, now_us), now_us)
-
-    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int) -> list[Action]:
-        self.state = state = self.estimator.update_imu(sample)
-        fused = FusedSample(self.vehicle_id, raw, sample, state)
-        return self._recorded(fused, self.vehicle.on_state(state, sample, now_us), now_us)
-
-    def _recorded(
-        self,
-        record: FusedSample | BaroRaw | GpsFix | NodeStatus,
-        wanted: Sequence[VehicleAction],
-        now_us: int,
-    ) -> list[Action]:
-        """Add the record to the actions, before changes of the settings of the next one."""
-        return self.perform(wanted, now_us, record) if wanted else [record]
-
-    def perform(
-        self,
-        wanted: Iterable[VehicleAction],
-        now_us: int,
-        record: FusedSample | BaroRaw | GpsFix | NodeStatus | None = None,
-    ) -> list[Action]:
-        """Carry out the vehicle's actions on the other stages; return the rest.
-
-        Parameters
-        ----------
-        wanted : iterable of VehicleAction
-        now_us : int
-            Gateway clock.
-        record : FusedSample, BaroRaw, GpsFix or NodeStatus, optional
-            Its cause, which is recorded before the settings change.
-
-        Returns
-        -------
-        list of Action
-        """
-        actions: list[Action] = []
-        changed: list[Action] = []
-        for action in wanted:
-            if isinstance(action, SettingsChange):
-                changed += self._change(action.section, action.settings)
-            elif isinstance(action, CalibrationMeasured):
-                changed += self._recalibrate(action, now_us)
+                    self.perform(vehicle.on_latency(*latency_s, now_us), now_us, out)
             else:
-                actions.append(action)
-        if record is not None:
-            actions.append(record)
-        return actions + changed if changed else actions
+                self.perform(vehicle.on_node_status(record, now_us), now_us, out)
 
-    def _recalibrate(self, measured: CalibrationMeasured, now_us: int) -> list[Action]:
+    def _take_imu(self, raw: ImuRaw | None, sample: ImuSample, now_us: int, out: Outputs) -> None:
+        self.state = state = self.estimator.update_imu(sample)
+        out.records.append(FusedSample(self.vehicle_id, raw, sample, state))
+        self.perform(self.vehicle.on_state(state, sample, now_us), now_us, out)
+
+    def perform(self, wanted: Iterable[Action], now_us: int, out: Outputs) -> None:
+        """Carry out the vehicle's actions on the other stages, and add the rest to the outputs."""
+        for action in wanted:
+            if isinstance(action, Outgoing):
+                out.frames.append(action)
+            elif isinstance(action, SettingsChange):
+                self._change(action.section, action.settings, out)
+            elif isinstance(action, CalibrationMeasured):
+                self._recalibrate(action, now_us, out)
+            else:
+                out.orders.append(action)
+
+    def _recalibrate(self, measured: CalibrationMeasured, now_us: int, out: Outputs) -> None:
         """Join the calibration with a measured one, unless no sensor has such errors."""
         try:
             fresh = corrected_by(self.settings.calibration, measured.correction)
             calibration = msgspec.convert(msgspec.to_builtins(fresh), NodeCalibration)
         except ValueError as error:
             text = StatusText(WARNING, f"Calibration refused: {error}")
-            return self.perform(self.vehicle.say(text, now_us), now_us)
-        changed = self._change("calibration", calibration)
-        found = self.vehicle.take_settings("calibration", calibration)
-        return changed + self.perform(found, now_us)
+            self.perform(self.vehicle.say(text, now_us), now_us, out)
+            return
+        self._change("calibration", calibration, out)
+        self.perform(self.vehicle.take_settings("calibration", calibration), now_us, out)
 
-    def change(self, settings: AircraftSettings, now_us: int) -> list[Action]:
+    def change(self, settings: AircraftSettings, now_us: int, out: Outputs) -> None:
         """Apply what differs from the present settings, and send the parameters that differ."""
-        actions: list[Action] = []
         for section in ("calibration", "estimation"):
             wanted = getattr(settings, section)
             if wanted != getattr(self.settings, section):
-                actions += self._change(section, wanted)
-                actions += self.perform(self.vehicle.take_settings(section, wanted), now_us)
-        return actions
+                self._change(section, wanted, out)
+                self.perform(self.vehicle.take_settings(section, wanted), now_us, out)
 
-    def sign_by(self, passphrase: str, now_us: int) -> list[Action]:
+    def sign_by(self, passphrase: str, now_us: int, out: Outputs) -> None:
         """Sign, and check signatures, with another passphrase from now on."""
         self.settings = with_passphrase(self.settings, passphrase)
         vehicle = self.settings.vehicle
-        return self.perform(self.vehicle.take_settings("vehicle", vehicle), now_us)
+        self.perform(self.vehicle.take_settings("vehicle", vehicle), now_us, out)
 
-    def _change(self, section: str, settings: Settings) -> list[Action]:
+    def _change(self, section: str, settings: Settings, out: Outputs) -> None:
         """Rebuild the stage whose settings changed; the others keep their state."""
         wanted = msgspec.structs.replace(self.settings, **{section: settings})
         if section == "calibration":
@@ -249,7 +231,8 @@ class Aircraft:
             self.estimator = fresh
         # Only now, so that a stage that cannot be built changes no settings.
         self.settings = wanted
-        return [] if section == "vehicle" else [SettingsChanged(self.vehicle_id)]
+        if section != "vehicle":
+            out.records.append(SettingsChanged(self.vehicle_id))
 
 
 def make_fusion(

@@ -3,11 +3,11 @@
     receiver's bytes ─ Link ─ raw records ─┬─ Aircraft 1: SensorChain ─ Estimator ─ Vehicle ─┐
                                            └─ Aircraft 2: …                                  │
     client's frames ──────────────────────────────────────────────────────────── Vehicle ────┤
-                                                                                          actions
+                                                                                          Outputs
 
-Pure: time is an argument, and effects are returned as a list of actions, in order. An aircraft is
-created with its first record. One that is silent for `GONE_US` disappears, and returns with its
-state when it is heard again. Live, demo and playback differ only in who calls `feed` (bytes) or
+Pure: time is an argument, and results are returned as `Outputs`. An aircraft is created with its
+first record. One that sends nothing for `GONE_US` disappears, and returns with its state when a
+record of it is received again. Live, demo and playback differ only in who calls `feed` (bytes) or
 `take` (raw records of a recording).
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from gateway.aircraft import Action, Aircraft, AircraftSettings, FusedStates, with_passphrase
+from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs, with_passphrase
 from gateway.records import (
     FusionState,
     GpsFix,
@@ -83,32 +83,35 @@ class Pipeline:
         self.aircraft: dict[int, Aircraft] = {}
         """The present aircraft, by vehicle id."""
         self._gone: dict[int, Aircraft] = {}
-        self._heard_us: dict[int, int] = {}
         self.report: LinkReport = self._link.report(0, connected=False, port="")
         """The newest link report, renewed once a second."""
 
-    def feed(self, data: bytes, now_us: int) -> list[Action]:
+    def feed(self, data: bytes, now_us: int) -> Outputs:
         """Process bytes of the receiver, read at `now_us`."""
-        actions: list[Action] = []
+        out = Outputs()
         for record in self._link.feed(data, now_us):
-            actions += self.take(record, now_us)
-        return actions
+            self._take(record, now_us, out)
+        return out
 
-    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> list[Action]:
-        """Process one raw record, from the link or from a recording."""
+    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> Outputs:
+        """Process one raw record of a recording."""
+        out = Outputs()
+        self._take(record, now_us, out)
+        return out
+
+    def _take(self, record: RawRecord | ImuCalibrated, now_us: int, out: Outputs) -> None:
         vehicle_id = record.node.vehicle_id
         if isinstance(record, GpsFix) and record.utc_us is not None:
             at_zero_us = self._gps_time.update(vehicle_id, record.utc_us, record.time_us)
             if at_zero_us is not None:
                 self._signing_clock.set_gps_time(at_zero_us)
-        self._heard_us[vehicle_id] = now_us
         aircraft = self.aircraft.get(vehicle_id)
-        if aircraft is not None:
-            return aircraft.take(record, now_us)
-        aircraft = self._aircraft_of(vehicle_id)
-        # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
-        first = aircraft.perform(aircraft.vehicle.poll(now_us), now_us)
-        return first + aircraft.take(record, now_us)
+        if aircraft is None:
+            aircraft = self._aircraft_of(vehicle_id)
+            # Its heartbeat comes first: before it ground stations ignore an aircraft's messages.
+            aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
+        aircraft.received_us = now_us
+        aircraft.take(record, now_us, out)
 
     def _aircraft_of(self, vehicle_id: int) -> Aircraft:
         aircraft = self.aircraft.get(vehicle_id)
@@ -146,16 +149,18 @@ class Pipeline:
     def _ever(self) -> list[Aircraft]:
         return [*self.aircraft.values(), *self._gone.values()]
 
-    def change(self, vehicle_id: int, settings: AircraftSettings, now_us: int) -> list[Action]:
+    def change(self, vehicle_id: int, settings: AircraftSettings, now_us: int) -> Outputs:
         """Change an aircraft's settings, as when it was recorded."""
-        aircraft = self.aircraft.get(vehicle_id)
-        return [] if aircraft is None else aircraft.change(settings, now_us)
+        out = Outputs()
+        if (aircraft := self.aircraft.get(vehicle_id)) is not None:
+            aircraft.change(settings, now_us, out)
+        return out
 
     def restore(self, state: FusionState) -> None:
         """Restore an aircraft's fusion from a state; raises ValueError as `make_fusion`."""
         self._aircraft_of(state.vehicle_id).restore(state)
 
-    def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> list[Action]:
+    def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> Outputs:
         """Sign, and check signatures, with other passphrases from now on.
 
         Parameters
@@ -169,7 +174,7 @@ class Pipeline:
 
         Returns
         -------
-        list of Action
+        Outputs
         """
         known = self._settings
         aircraft = {
@@ -178,11 +183,11 @@ class Pipeline:
         }
         default = with_passphrase(known.default, common)
         self._settings = replace(known, default=default, aircraft=aircraft)
-        actions: list[Action] = []
+        out = Outputs()
         for each in self._ever():
-            actions += each.sign_by(own.get(each.vehicle_id, common), now_us)
+            each.sign_by(own.get(each.vehicle_id, common), now_us, out)
             self._set_key(each)
-        return actions
+        return out
 
     def stamps_to_keep(self) -> dict[int, KeptTimestamps] | None:
         """Return the signing timestamps of all aircraft if they must be written now."""
@@ -205,26 +210,26 @@ class Pipeline:
         self._connected, self._port = False, port
         self._report_due_us = 0
 
-    def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
+    def handle(self, incoming: Incoming, now_us: int) -> Outputs:
         """Pass a client's frame to every aircraft; the addressed one answers."""
-        actions: list[Action] = []
+        out = Outputs()
         for aircraft in self.aircraft.values():
-            actions += aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us)
-        return actions
+            aircraft.perform(aircraft.vehicle.handle(incoming, now_us), now_us, out)
+        return out
 
     def remove_client(self, client_id: int) -> None:
         """Drop what was kept for a client that has gone."""
         for aircraft in self._ever():
             aircraft.vehicle.remove_client(client_id)
 
-    def say(self, status: StatusText, now_us: int) -> list[Action]:
+    def say(self, status: StatusText, now_us: int) -> Outputs:
         """Send a text from every aircraft."""
-        actions: list[Action] = []
+        out = Outputs()
         for aircraft in self.aircraft.values():
-            actions += aircraft.perform(aircraft.vehicle.say(status, now_us), now_us)
-        return actions
+            aircraft.perform(aircraft.vehicle.say(status, now_us), now_us, out)
+        return out
 
-    def mark(self, place: Location | None, vehicle_id: int | None, now_us: int) -> list[Action]:
+    def mark(self, place: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
         """Mark a location for one aircraft, or for all, or clear the mark.
 
         Raises
@@ -236,10 +241,10 @@ class Pipeline:
         if not wanted:
             heard = ", ".join(str(known) for known in sorted(self.aircraft)) or "none yet"
             raise ValueError(f"no such aircraft; heard so far: {heard}")
-        actions: list[Action] = []
+        out = Outputs()
         for aircraft in wanted:
-            actions += aircraft.perform(aircraft.vehicle.put_mark(place, now_us), now_us)
-        return actions
+            aircraft.perform(aircraft.vehicle.put_mark(place, now_us), now_us, out)
+        return out
 
     @property
     def in_flight(self) -> bool:
@@ -266,19 +271,20 @@ class Pipeline:
         """Excuse sensors and nodes for a time in which this program was not running."""
         for each in self._ever():
             each.vehicle.health.on_stall(stalled_us, now_us)
-        self._heard_us = {key: us + stalled_us for key, us in self._heard_us.items()}
+            if each.received_us is not None:
+                each.received_us += stalled_us
 
-    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
+    def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> Outputs:
         """Note whether a recording runs, or why not; this is announced."""
-        actions: list[Action] = []
+        out = Outputs()
         for each in self.aircraft.values():
             found = each.vehicle.on_recorder(trouble, now_us, recording=recording)
-            actions += each.perform(found, now_us)
-        return actions
+            each.perform(found, now_us, out)
+        return out
 
-    def poll(self, now_us: int) -> list[Action]:
-        """Return the actions that are due by time."""
-        actions: list[Action] = []
+    def poll(self, now_us: int) -> Outputs:
+        """Return what is due by time."""
+        out = Outputs()
         reporting = now_us >= self._report_due_us
         if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
@@ -286,13 +292,15 @@ class Pipeline:
             self._let_go(now_us)
         for aircraft in self.aircraft.values():
             if reporting:
-                actions += aircraft.perform(aircraft.vehicle.on_link(self.report, now_us), now_us)
-            actions += aircraft.perform(aircraft.vehicle.poll(now_us), now_us)
-        return actions
+                aircraft.perform(aircraft.vehicle.on_link(self.report, now_us), now_us, out)
+            aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
+        return out
 
     def _let_go(self, now_us: int) -> None:
-        for vehicle_id in list(self.aircraft):
-            if now_us - self._heard_us.setdefault(vehicle_id, now_us) > GONE_US:
+        for vehicle_id, aircraft in list(self.aircraft.items()):
+            if aircraft.received_us is None:
+                aircraft.received_us = now_us
+            if now_us - aircraft.received_us > GONE_US:
                 self._gone[vehicle_id] = self.aircraft.pop(vehicle_id)
 
     def next_due_us(self) -> int:

@@ -89,8 +89,8 @@ def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
     frames = []
     for record in fly(SimulatorSettings(), duration_s=seconds).records():
         now_us = record.time_us
-        actions = [*pipeline.take(record, now_us), *pipeline.poll(now_us)]
-        frames += [action.frame for action in actions if isinstance(action, Outgoing)]
+        for out in (pipeline.take(record, now_us), pipeline.poll(now_us)):
+            frames += [sent.frame for sent in out.frames]
     return frames
 
 

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.aircraft import Action, AircraftSettings
+from gateway.aircraft import AircraftSettings, Outputs
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
 from gateway.records import (
@@ -17,7 +17,6 @@ from gateway.records import (
     ImuFlags,
     Incoming,
     NodeId,
-    Outgoing,
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.plan import Location
@@ -72,14 +71,13 @@ def pipeline() -> Pipeline:
     return Pipeline(PipelineSettings(default, {2: second}))
 
 
-def decode(actions: list[Action]) -> list[mavlink.MAVLink_message]:
+def decode(out: Outputs) -> list[mavlink.MAVLink_message]:
     parser = mavlink.MAVLink(None)
-    frames = [action.frame for action in actions if isinstance(action, Outgoing)]
-    return [parser.decode(bytearray(frame)) for frame in frames]
+    return [parser.decode(bytearray(sent.frame)) for sent in out.frames]
 
 
-def named(actions: list[Action], name: str) -> list[mavlink.MAVLink_message]:
-    return [message for message in decode(actions) if message.get_type() == name]
+def named(out: Outputs, name: str) -> list[mavlink.MAVLink_message]:
+    return [message for message in decode(out) if message.get_type() == name]
 
 
 def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
@@ -94,14 +92,14 @@ def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
 def test_a_single_frame_makes_no_aircraft(pipeline: Pipeline) -> None:
     """Noise may pass the check of a frame; two of it that agree do not come."""
     ghost, true = Tracker(7), Tracker()
-    assert pipeline.feed(ghost._frame(0, LEVEL, 0), 5_000) == []
+    assert pipeline.feed(ghost._frame(0, LEVEL, 0), 5_000) == Outputs()
     pipeline.feed(true.frame(0, LEVEL), 6_000)
     assert list(pipeline.aircraft) == [1]
     late = ghost._frame(3_000_000_000, LEVEL, 0)
-    assert pipeline.feed(late, 20_000) == [], "their clocks do not agree"
+    assert pipeline.feed(late, 20_000) == Outputs(), "their clocks do not agree"
     assert list(pipeline.aircraft) == [1]
-    actions = pipeline.feed(ghost._frame(3_000_010_000, LEVEL, 0), 30_000)
-    assert sum(isinstance(action, FusedSample) for action in actions) == 2, "nothing is lost"
+    out = pipeline.feed(ghost._frame(3_000_010_000, LEVEL, 0), 30_000)
+    assert sum(isinstance(record, FusedSample) for record in out.records) == 2, "nothing is lost"
     assert sorted(pipeline.aircraft) == [1, 7]
 
 
@@ -130,19 +128,15 @@ def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> 
     assert "HEARTBEAT" not in [m.get_type() for m in later]
 
 
-def test_frames_are_sent_before_the_sample_is_recorded(pipeline: Pipeline) -> None:
-    actions = pipeline.feed(Tracker().frame(0, LEVEL), 5_000)
-    assert isinstance(actions[-1], FusedSample)
-    assert all(isinstance(action, Outgoing) for action in actions[:-1])
-
-
 def test_records_come_out_in_the_order_of_their_fusion(pipeline: Pipeline) -> None:
     tracker = Tracker()
-    actions = pipeline.feed(tracker.frame(0, LEVEL), 0)
-    actions += pipeline.feed(tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250)), 5_000)
-    actions += pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 8_000)
-    actions += pipeline.feed(tracker.frame(10_000, LEVEL), 10_000)
-    first, baro, fix, second = (a for a in actions if not isinstance(a, Outgoing))
+    records = pipeline.feed(tracker.frame(0, LEVEL), 0).records
+    baro_frame = tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250))
+    records += pipeline.feed(baro_frame, 5_000).records
+    line = tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1)
+    records += pipeline.feed(line, 8_000).records
+    records += pipeline.feed(tracker.frame(10_000, LEVEL), 10_000).records
+    first, baro, fix, second = records
     assert isinstance(first, FusedSample)
     assert isinstance(baro, BaroRaw)
     assert isinstance(fix, GpsFix)
@@ -194,9 +188,8 @@ def test_a_mark_shows_distance_and_bearing(pipeline: Pipeline) -> None:
     pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
     pipeline.feed(tracker.frame(0, LEVEL), 0)
     pipeline.mark(Location(-7.7656 + 0.001, 110.3728, math.nan), 1, 1_000)
-    actions = [a for t in range(10_000, 3_000_000, 10_000) for a in pipeline.poll(t)]
-    actions += pipeline.feed(tracker.frame(3_000_000, LEVEL), 3_000_000)
-    message = named(actions, "NAV_CONTROLLER_OUTPUT")[-1]
+    times_us = range(10_000, 3_000_000, 10_000)
+    *_, message = (m for t in times_us for m in named(pipeline.poll(t), "NAV_CONTROLLER_OUTPUT"))
     assert message.wp_dist == pytest.approx(111, abs=2)
     assert message.target_bearing == 0
 
@@ -211,11 +204,11 @@ def test_marks_that_cannot_be_are_refused(
 
 
 def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> None:
-    assert pipeline.poll(0) == []
+    assert pipeline.poll(0) == Outputs()
     assert pipeline.next_due_us() == 1_000_000
     pipeline.feed(b"\x05garbage\x00" * 100, 0)
     assert pipeline.aircraft == {}
-    assert pipeline.poll(1_000_000) == []
+    assert pipeline.poll(1_000_000) == Outputs()
     assert dict(pipeline.report.faults)
 
 
@@ -227,21 +220,21 @@ def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None
     receiver.signing.timestamp = (UNIX_US - EPOCH_2015_US) // 10
     station = mavlink.MAVLink(None, 255, 190)
     for time_us in range(0, 3_000_000, 10_000):
-        actions = pipeline.feed(tracker.frame(time_us, LEVEL), time_us) + pipeline.poll(time_us)
+        frames = pipeline.feed(tracker.frame(time_us, LEVEL), time_us).frames
+        frames += pipeline.poll(time_us).frames
         wanted = 148 + time_us // 10_000
         ask = mavlink.MAVLink_command_long_message(1, 1, 512, 0, wanted, 0, 0, 0, 0, 0, 0)
         read = mavlink.MAVLink_param_request_read_message(1, 1, b"", 0)
         for question in (ask, read):
             incoming = Incoming(7, bytes(question.pack(station)), trusted=True)
-            actions += pipeline.handle(incoming, time_us)
-        for action in actions:
-            if isinstance(action, Outgoing):
-                frame = frame_of(action.frame)
-                signed = pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us).data
-                # It steps over the signatures of messages that it does not know.
-                assert receiver.decode(bytearray(signed)) is not None
-                assert signed[2] & 1
-                kinds.add(action.message_id)
+            frames += pipeline.handle(incoming, time_us).frames
+        for sent in frames:
+            frame = frame_of(sent.frame)
+            signed = pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us).data
+            # It steps over the signatures of messages that it does not know.
+            assert receiver.decode(bytearray(signed)) is not None
+            assert signed[2] & 1
+            kinds.add(sent.message_id)
     assert kinds > {0, 22, 30, 31, 77, 300, 397, 435}
 
 
@@ -262,10 +255,8 @@ def test_other_passphrases_reach_aircraft_heard_and_not_yet_heard(pipeline: Pipe
     trackers = {vehicle_id: Tracker(vehicle_id) for vehicle_id in (1, 2, 3)}
 
     def signers(time_us: int) -> dict[int, bool]:
-        actions = []
-        for tracker in trackers.values():
-            actions += pipeline.feed(tracker.frame(time_us, LEVEL), time_us)
-        frames = [frame_of(a.frame) for a in actions if isinstance(a, Outgoing)]
+        outs = [pipeline.feed(each.frame(time_us, LEVEL), time_us) for each in trackers.values()]
+        frames = [frame_of(sent.frame) for out in outs for sent in out.frames]
         signed = [
             pipeline.signer.sequence_and_sign(frame, frame.sequence, time_us) for frame in frames
         ]

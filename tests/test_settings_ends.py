@@ -10,7 +10,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from gateway.aircraft import Action, Aircraft, AircraftSettings
+from gateway.aircraft import Aircraft, AircraftSettings, Outputs
 from gateway.config import GatewaySettings
 from gateway.records import (
     BaroRaw,
@@ -18,7 +18,6 @@ from gateway.records import (
     ImuFlags,
     ImuRaw,
     NodeId,
-    Outgoing,
     RawRecord,
 )
 from gateway.sensing.calibrating import IN_BODY_AXES
@@ -134,11 +133,11 @@ def fix(time_us: int, n: int) -> GpsFix:
 
 def fly(aircraft: Aircraft, begin_us: int = 1_000_000, count: int = 60) -> list[Any]:
     """Take in readings; give the ATTITUDEs that come of them."""
-    actions: list[Action] = []
+    out = Outputs()
     for record in readings(begin_us, count):
-        actions += aircraft.take(record, record.time_us)
-        actions += aircraft.perform(aircraft.vehicle.poll(record.time_us), record.time_us)
-    return decode(a for a in actions if isinstance(a, Outgoing) and a.message_id == ATTITUDE)
+        aircraft.take(record, record.time_us, out)
+        aircraft.perform(aircraft.vehicle.poll(record.time_us), record.time_us, out)
+    return decode(sent for sent in out.frames if sent.message_id == ATTITUDE)
 
 
 def all_known(found: list[Any]) -> bool:
@@ -175,7 +174,7 @@ def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> No
         for n, value in enumerate(ends(field), 1):
             section = path.partition(".")[0]
             wanted = getattr(with_value(plain, path, field, value), section)
-            aircraft.perform([SettingsChange(section, wanted)], 0)
+            aircraft.perform([SettingsChange(section, wanted)], 0, Outputs())
             assert all_known(fly(aircraft, 1_000_000 + 5_000_000 * n, 14)), (path, value)
 
 
@@ -196,7 +195,7 @@ def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after:
     aircraft = Aircraft(1, with_estimator(before))
     fly(aircraft)
     wanted = with_estimator(after).estimation
-    aircraft.perform([SettingsChange("estimation", wanted)], 0)
+    aircraft.perform([SettingsChange("estimation", wanted)], 0, Outputs())
     assert aircraft.settings.estimation == wanted
     assert all_known(fly(aircraft, 6_000_000)[5:])
 
@@ -206,7 +205,7 @@ def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
     aircraft = Aircraft(1, with_estimator(name))
     before = fly(aircraft)[-1]
     wanted = replaced(with_estimator(name), "estimation.reference.gps_latency_s", 0.3).estimation
-    aircraft.perform([SettingsChange("estimation", wanted)], 0)
+    aircraft.perform([SettingsChange("estimation", wanted)], 0, Outputs())
     after = fly(aircraft, 3_700_000, 2)[0]
     assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
 
@@ -221,8 +220,9 @@ def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
 
     monkeypatch.setattr("gateway.aircraft.make_estimator", fail)
     before = aircraft.settings
+    wanted = SettingsChange("estimation", with_estimator("paper").estimation)
     with pytest.raises(ArithmeticError):
-        aircraft.perform([SettingsChange("estimation", with_estimator("paper").estimation)], 0)
+        aircraft.perform([wanted], 0, Outputs())
     assert aircraft.settings == before
 
 
@@ -246,7 +246,8 @@ def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
     aircraft = Aircraft(1, AircraftSettings())
     fly(aircraft)
     correction = msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0))
-    actions = aircraft.perform([CalibrationMeasured(correction)], 0)
-    assert b"Calibration refused" in actions[0].frame
-    assert all(isinstance(action, Outgoing) for action in actions)
+    out = Outputs()
+    aircraft.perform([CalibrationMeasured(correction)], 0, out)
+    assert b"Calibration refused" in out.frames[0].frame
+    assert not out.records
     assert aircraft.settings.calibration == NodeCalibration()

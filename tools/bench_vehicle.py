@@ -22,7 +22,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -70,12 +69,10 @@ def run_pipeline(rate_hz: int, seconds: int, sleep_s: float = 0.0) -> tuple[floa
             time.sleep(sleep_s)
             slept_s += time.process_time() - before_s
         now_us += US_PER_S // rate_hz
-        actions = pipeline.feed(frame, now_us)
+        sent += len(pipeline.feed(frame, now_us).frames)
         if due_us <= now_us:
-            actions += pipeline.poll(now_us)
+            sent += len(pipeline.poll(now_us).frames)
             due_us = min(pipeline.next_due_us(), now_us + LONGEST_WAIT_US)
-        for action in actions:
-            sent += isinstance(action, Outgoing)
     return time.process_time() - began_s - slept_s, sent
 
 

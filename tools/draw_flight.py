@@ -11,7 +11,6 @@ from gateway.config import GatewaySettings
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import to_euler
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import Outgoing
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.receiver import simulate
 from gateway.simulator.trajectory import FLIGHT_S
@@ -31,10 +30,8 @@ def fly(settings: GatewaySettings) -> dict[str, np.ndarray]:
     parser = mavlink.MAVLink(None)
     rows: dict[str, list[tuple[float, ...]]] = {"fix": [], "place": [], "attitude": []}
     for frame in simulate(settings.simulator).frames(FLIGHT_S):
-        for action in pipeline.feed(frame.data, round(frame.time_s * US_PER_S)):
-            if not isinstance(action, Outgoing):
-                continue
-            m = parser.decode(bytearray(action.frame))
+        for sent in pipeline.feed(frame.data, round(frame.time_s * US_PER_S)).frames:
+            m = parser.decode(bytearray(sent.frame))
             if m.get_type() == "GPS_RAW_INT" and m.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
                 rows["fix"].append(
                     (m.time_usec / 1e6, m.lat * DEG_PER_DEGE7, m.lon * DEG_PER_DEGE7)

@@ -28,7 +28,6 @@ from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.flown import open_flown
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.reading import ReadOptions
-from gateway.records import Outgoing
 from gateway.simulator.recorded import replay
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from tools.flights import Flight, north_east_m, read_flight
@@ -48,9 +47,8 @@ def through_pipeline(file: Path) -> Iterator[mavlink.MAVLink_message]:
     parser = mavlink.MAVLink(None)
     frames = list(replay(settings.simulator, log).frames(log.duration_s))
     for frame in track(frames, "fusing"):
-        for action in pipeline.feed(frame.data, round(frame.time_s * US_PER_S)):
-            if isinstance(action, Outgoing):
-                yield parser.decode(bytearray(action.frame))
+        for sent in pipeline.feed(frame.data, round(frame.time_s * US_PER_S)).frames:
+            yield parser.decode(bytearray(sent.frame))
 
 
 def through_sockets(file: Path) -> Iterator[mavlink.MAVLink_message]:

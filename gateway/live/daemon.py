@@ -11,7 +11,7 @@ from typing import Final
 
 import msgspec
 
-from gateway.aircraft import Action, Aircraft, AircraftSettings, SettingsChanged
+from gateway.aircraft import Aircraft, AircraftSettings, Order, Outputs, SettingsChanged
 from gateway.clock import GatewayClock, unix_time_us
 from gateway.config import (
     ConfigError,
@@ -38,12 +38,9 @@ from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
 from gateway.records import (
     RECORDED_ONLY,
-    BaroRaw,
     ClientInterval,
     FusedSample,
-    GpsFix,
     Incoming,
-    NodeStatus,
     Outgoing,
 )
 from gateway.sensing.calibration import NodeCalibration
@@ -54,6 +51,7 @@ from gateway.vehicle.plan import Location
 from gateway.vehicle.requests import (
     INFO,
     WARNING,
+    Action,
     RecordingRequest,
     Request,
     SavePlan,
@@ -308,15 +306,15 @@ class Daemon:
     def _on_frame(self, incoming: Incoming) -> None:
         frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()
         self._budget.note(client_id, now_us, trusted=incoming.trusted)
-        actions = self._pipeline.handle(incoming, now_us)
+        out = self._pipeline.handle(incoming, now_us)
         if (stamps := self._pipeline.stamps_to_keep()) is not None:
             self._stamps.save(stamps)
         # A ground station's broadcast is both handled and forwarded: it is recorded once. Frames of
         # untrusted clients are recorded only if they had an effect.
-        kept = incoming.trusted or bool(actions)
+        kept = incoming.trusted or bool(out.frames or out.records or out.orders)
         if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
             self._record(frame)
-        self._perform(actions)
+        self._perform(out)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""
@@ -372,36 +370,30 @@ class Daemon:
             log.info(text)
         self._announce(self._lag.is_slow, text)
 
-    def _perform(self, actions: Sequence[Action]) -> None:
-        """Carry out the actions of the pure stages, frames first."""
-        frames: list[Outgoing] = []
-        others: list[Action] = []
-        for action in actions:
-            if isinstance(action, Outgoing):
-                frames.append(action)
-            else:
-                others.append(action)
-        if frames:
-            self._send(frames)
-        for action in others:
-            self._carry_out(action)
+    def _perform(self, out: Outputs) -> None:
+        """Carry out the results of the pure stages, frames first."""
+        if out.frames:
+            self._send(out.frames)
+        for record in out.records:
+            if isinstance(record, SettingsChanged):
+                self._recorder.settings_changed(record.vehicle_id)
+                continue
+            self._recorder.flight(record)
+            if isinstance(record, FusedSample):
+                self._imu.add(record)
+        for order in out.orders:
+            self._carry_out(order)
 
-    def _carry_out(self, action: Action) -> None:
-        match action:
-            case FusedSample() | BaroRaw() | GpsFix() | NodeStatus():
-                self._recorder.flight(action)
-                if isinstance(action, FusedSample):
-                    self._imu.add(action)
+    def _carry_out(self, order: Order) -> None:
+        match order:
             case ClientInterval():
-                self._hub.set_interval(action)
+                self._hub.set_interval(order)
             case SaveSettings():
-                self._save(action)
+                self._save(order)
             case SavePlan():
-                self._places.save(action.vehicle_id, action.plan)
+                self._places.save(order.vehicle_id, order.plan)
             case RecordingRequest():
-                (self._recorder.record if action.start else self._recorder.stop)()
-            case SettingsChanged():
-                self._recorder.settings_changed(action.vehicle_id)
+                (self._recorder.record if order.start else self._recorder.stop)()
 
     def _calibrate(self, vehicle_id: int, calibration: NodeCalibration) -> None:
         """Use a calibration from now on, and write it to the aircraft's file."""
@@ -429,18 +421,19 @@ class Daemon:
             text, stored = reason_of(error), False
         else:
             log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
-        actions = aircraft.vehicle.on_saved(request, text, now_us, stored=stored)
-        self._perform(aircraft.perform(actions, now_us))
+        self._perform_for(aircraft, aircraft.vehicle.on_saved(request, text, now_us, stored=stored))
 
     def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
         status = StatusText(INFO, "Mission, mark and home are kept again")
         if trouble is not None:
             status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")
-        self._announce_for(self._pipeline.find(vehicle_id), status)
+        aircraft = self._pipeline.find(vehicle_id)
+        self._perform_for(aircraft, aircraft.vehicle.say(status, self.now_us()))
 
-    def _announce_for(self, aircraft: Aircraft, status: StatusText) -> None:
-        now_us = self.now_us()
-        self._perform(aircraft.perform(aircraft.vehicle.say(status, now_us), now_us))
+    def _perform_for(self, aircraft: Aircraft, actions: Sequence[Action]) -> None:
+        out = Outputs()
+        aircraft.perform(actions, self.now_us(), out)
+        self._perform(out)
 
 
 def _report_saved(saving: Future[Path]) -> None:

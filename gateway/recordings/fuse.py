@@ -9,7 +9,7 @@ from typing import Final, NamedTuple, TypeVar
 import msgspec
 import numpy as np
 
-from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, latency_in_use
+from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs, latency_in_use
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     NAV_ALT,
@@ -292,7 +292,7 @@ class Fusion:
         """Handle a line that is not a row; return whether it stays in the file."""
         if isinstance(comment, TableHeader):
             if self._follow:
-                self._aircraft.change(settings_of(comment), 0)
+                self._aircraft.change(settings_of(comment), 0, Outputs())
             return self._follow
         if isinstance(comment, FusionState):
             try:

@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from gateway import __version__
-from gateway.aircraft import Action, Aircraft, AircraftSettings, FusedStates
+from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs
 from gateway.estimation.kernel import FoundLatency, KernelEstimator, SampleLog, estimate_latency
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import make_estimator
@@ -74,7 +74,7 @@ from gateway.recordings.table import (
     encode_line,
 )
 from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
-from gateway.records import RECORDED_ONLY, FusionState, NodeStatus, Outgoing
+from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray
 from gateway.vehicle.requests import INFO, StatusText
 
@@ -92,19 +92,17 @@ class Replay:
         self._follow = follow
         self._now_us: int | None = None
 
-    def take(self, row: Line) -> Iterator[tuple[int, Action]]:
+    def take(self, row: Line) -> Iterator[tuple[int, Outputs]]:
         """Process one row, a change of settings, a mark, or a state to restore."""
         if isinstance(row, TableHeader):
             if self._follow:
                 now_us = self._now_us or 0
-                for action in self._pipeline.change(row.vehicle_id, settings_of(row), now_us):
-                    yield now_us, action
+                yield now_us, self._pipeline.change(row.vehicle_id, settings_of(row), now_us)
             return
         if isinstance(row, TableMark):
             yield from self._wait(row.time_us)
             now_us = self._now_us or 0
-            for action in self._pipeline.say(StatusText(INFO, REMARK + row.text), now_us):
-                yield now_us, action
+            yield now_us, self._pipeline.say(StatusText(INFO, REMARK + row.text), now_us)
             return
         if isinstance(row, FusionState):
             self._pipeline.restore(row)
@@ -116,18 +114,16 @@ class Replay:
                 continue
             yield from self._wait(record.time_us)
             now_us = self._now_us if self._now_us is not None else record.time_us
-            for action in self._pipeline.take(record, now_us):
-                yield now_us, action
+            yield now_us, self._pipeline.take(record, now_us)
 
-    def _wait(self, until_us: int) -> Iterator[tuple[int, Action]]:
+    def _wait(self, until_us: int) -> Iterator[tuple[int, Outputs]]:
         """Run the timed actions before the next record; the clock never goes back."""
         now_us = until_us if self._now_us is None else max(self._now_us, until_us)
         if self._now_us is None or now_us - self._now_us > LONGEST_GAP_US:
             self._now_us = now_us
         while (due_us := max(self._pipeline.next_due_us(), self._now_us)) < now_us:
             self._now_us = due_us
-            for action in self._pipeline.poll(due_us):
-                yield due_us, action
+            yield due_us, self._pipeline.poll(due_us)
             if self._pipeline.next_due_us() <= due_us:
                 break
         self._now_us = now_us
@@ -338,11 +334,11 @@ class RecordedFusion:
         for piece in (piece for block in self._table.blocks for piece in block.pieces(PIECE)):
             fusion.block(piece)
             lines = (e for e in piece.events(header.vehicle_id) if isinstance(e, Line))
-            for now_us, action in (sent for line in lines for sent in replay.take(line)):
-                if not isinstance(action, Outgoing) or action.message_id in UNRECORDED:
-                    continue
-                if action.client_id in (None, RECORDED_ONLY):
-                    yield TlogRecord(stamper.stamp(now_us), action.frame)
+            for now_us, out in (each for line in lines for each in replay.take(line)):
+                for sent in out.frames:
+                    is_kept = sent.client_id in (None, RECORDED_ONLY)
+                    if is_kept and sent.message_id not in UNRECORDED:
+                        yield TlogRecord(stamper.stamp(now_us), sent.frame)
 
     def table(self) -> RecordedTable:
         """Return the rows with the new states, under a head that says how they were fused."""

@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Callable
-from functools import reduce
+from functools import cache, reduce
 from typing import Annotated, Final, TypeVar
 
 import msgspec
@@ -148,16 +148,28 @@ def compose(left: Matrix3, right: Matrix3) -> Matrix3:
     return ((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2]))
 
 
+@cache
+def accel_scale(range_g: int) -> float:
+    """Return m/s2 per count of the accelerometer."""
+    return range_g * STANDARD_GRAVITY_MPS2 / FULL_SCALE_COUNTS
+
+
+@cache
+def gyro_scale(range_dps: int) -> float:
+    """Return rad/s per count of the gyroscope."""
+    per_count_dps = 1.0 / GYRO_LSB_PER_DPS.get(range_dps, FULL_SCALE_COUNTS / max(range_dps, 1))
+    return per_count_dps * RAD_PER_DEG
+
+
 def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
     """Scale accelerometer counts to m/s2 in sensor axes."""
-    scale = range_g * STANDARD_GRAVITY_MPS2 / FULL_SCALE_COUNTS
+    scale = accel_scale(range_g)
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
 def gyro_from_counts(raw: Int3, range_dps: int) -> Vec3:
     """Scale gyroscope counts to rad/s in sensor axes."""
-    per_count_dps = 1.0 / GYRO_LSB_PER_DPS.get(range_dps, FULL_SCALE_COUNTS / max(range_dps, 1))
-    scale = per_count_dps * RAD_PER_DEG
+    scale = gyro_scale(range_dps)
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
@@ -204,14 +216,15 @@ class Correction:
     def __init__(self, mounting: Matrix3, matrix: Matrix3, bias: Vec3) -> None:
         self._matrix = compose(mounting, matrix)
         self._bias = bias
-
-    def apply(self, v: Vec3) -> Vec3:
-        """Correct one vector and turn it into body axes."""
-        x, y, z = v
-        bias_x, bias_y, bias_z = self._bias
-        x, y, z = x - bias_x, y - bias_y, z - bias_z
-        # `transform` without the call: this runs for every sensor of every sample.
         (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._matrix
+        self._numbers = (xx, xy, xz, yx, yy, yz, zx, zy, zz, *bias)
+
+    def apply(self, v: Vec3, scale: float = 1.0) -> Vec3:
+        """Scale and correct one vector, such as one of counts, and turn it into body axes."""
+        # `transform` without the call: this runs for every sensor of every sample.
+        xx, xy, xz, yx, yy, yz, zx, zy, zz, bias_x, bias_y, bias_z = self._numbers
+        x, y, z = v
+        x, y, z = x * scale - bias_x, y * scale - bias_y, z * scale - bias_z
         return (
             xx * x + xy * y + xz * z,
             yx * x + yy * y + yz * z,

@@ -21,7 +21,9 @@ from gateway.sensing.calibration import (
     Correction,
     NodeCalibration,
     accel_from_counts,
+    accel_scale,
     gyro_from_counts,
+    gyro_scale,
     mag_from_counts,
     new_field_ut,
     temperature_from_counts,
@@ -89,19 +91,19 @@ class SensorChain:
         """Turn one IMU payload into a sample in body FRD."""
         accel = gyro = UNKNOWN_VEC3
         if raw.accel_raw != BLANK:
-            accel = self._accel.apply(accel_from_counts(raw.accel_raw, raw.accel_range_g))
-            gyro = self._gyro.apply(gyro_from_counts(raw.gyro_raw, raw.gyro_range_dps))
-        mag = None
-        if raw.flags & FIELD_FLAGS == NEW_FIELD:
-            counts = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
-            mag = None if counts is None else self._mag.apply(counts)
+            accel = self._accel.apply(raw.accel_raw, accel_scale(raw.accel_range_g))
+            gyro = self._gyro.apply(raw.gyro_raw, gyro_scale(raw.gyro_range_dps))
+        flags, mag = raw.flags, None
+        if flags & FIELD_FLAGS == NEW_FIELD:
+            field = mag_from_counts(raw.mag_raw, raw.mag_lsb_per_gauss)
+            mag = None if field is None else self._mag.apply(field)
         return ImuSample(
-            time_us=raw.time_us,
-            accel_b_mps2=accel,
-            gyro_b_radps=gyro,
-            mag_b_ut=mag,
-            temperature_degc=temperature_from_counts(raw.temperature_raw),
-            flags=self._flags.get(raw.flags & ALL_FLAGS) or self._join(raw.flags),
+            raw.time_us,
+            accel,
+            gyro,
+            mag,
+            temperature_from_counts(raw.temperature_raw),
+            self._flags.get(flags & ALL_FLAGS) or self._join(flags),
         )
 
     def _join(self, flags: ImuFlags) -> ImuFlags:

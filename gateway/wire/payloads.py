@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from functools import cache
-from operator import itemgetter
 from typing import Final
 
 import msgspec
@@ -156,8 +155,6 @@ _LEAST_ADDRESS: Final = 1 << 3
 _RADIO_FIRST: Final = PROTOCOL_VERSION << 4 | FrameKind.RADIO
 _imu_flags = cache(ImuFlags)
 """They are the same for many samples; a lookup costs a tenth of making them."""
-_imu_parts: Final = itemgetter(slice(0, 3), slice(3, 6), slice(6, 9), 9, 10, 11)
-"""Vectors of accelerometer, gyroscope and magnetometer, temperature, flags and ranges."""
 
 _MAG_SHIFT: Final = 4
 _GYRO_SHIFT: Final = 2
@@ -463,10 +460,17 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
 
 
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:
-    accel, gyro, mag, temperature, flags, ranges = _imu_parts(words)
+    ax, ay, az, gx, gy, gz, mx, my, mz, temperature, flags, ranges = words
     accel_range, gyro_range, mag_gain = _RANGES[ranges]
     return ImuPayload(
-        accel, gyro, mag, temperature, _imu_flags(flags), accel_range, gyro_range, mag_gain
+        (ax, ay, az),
+        (gx, gy, gz),
+        (mx, my, mz),
+        temperature,
+        _imu_flags(flags),
+        accel_range,
+        gyro_range,
+        mag_gain,
     )
 
 

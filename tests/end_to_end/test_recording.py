@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from gateway.aircraft import Action
+from gateway.aircraft import Outputs
 from gateway.cli.live.demo import calibrated_aircraft
 from gateway.config import GatewaySettings
 from gateway.live.recorder import Recorder
@@ -20,7 +20,7 @@ from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
-from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState, Outgoing
+from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState
 from gateway.simulator.receiver import simulate
 from tests.conftest import ManualClock
 from tests.kit.cli import invoke
@@ -44,7 +44,7 @@ class Flight:
             PipelineSettings(self.settings.default_aircraft, self.aircraft, START_UNIX_US)
         )
 
-    def actions(self) -> Iterator[list[Action]]:
+    def outputs(self) -> Iterator[Outputs]:
         frames = simulate(self.settings.simulator, START_UNIX_US).frames()
         for frame in takewhile(lambda frame: frame.time_s < FLIGHT_S, frames):
             self.clock.now_us = round(frame.time_s * 1e6)
@@ -93,15 +93,15 @@ async def recorded(
     frames: list[bytes] = []
     states: list[NavState] = []
     async with recording as recorder:
-        for actions in flight.actions():
-            for action in actions:
-                if isinstance(action, Outgoing):
-                    frames.append(action.frame)
-                    recorder.frame(action.frame)
-                elif isinstance(action, FusedSample | BaroRaw | GpsFix):
-                    recorder.flight(action)
-                if isinstance(action, FusedSample):
-                    states.append(action.state)
+        for out in flight.outputs():
+            for sent in out.frames:
+                frames.append(sent.frame)
+                recorder.frame(sent.frame)
+            for record in out.records:
+                if isinstance(record, FusedSample | BaroRaw | GpsFix):
+                    recorder.flight(record)
+                if isinstance(record, FusedSample):
+                    states.append(record.state)
             await recording.turn()
     return tmp_path / "first", frames, states, flight
 

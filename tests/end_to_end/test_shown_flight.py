@@ -75,15 +75,13 @@ async def folder(tmp_path: Path, clock: ManualClock) -> Path:
 
     recording.recorder._introduction_of = introduction
     async with recording as recorder:
-        for actions in flight.actions():
-            for action in actions:
-                if not isinstance(action, Outgoing):
-                    recorder.flight(action)  # type: ignore[arg-type]
-                elif action.message_id not in UNRECORDED and action.client_id in (
-                    None,
-                    RECORDED_ONLY,
-                ):
-                    recorder.frame(action.frame)
+        for out in flight.outputs():
+            for sent in out.frames:
+                is_kept = sent.client_id in (None, RECORDED_ONLY)
+                if is_kept and sent.message_id not in UNRECORDED:
+                    recorder.frame(sent.frame)
+            for record in out.records:
+                recorder.flight(record)  # type: ignore[arg-type]
             await recording.turn()
     return tmp_path
 

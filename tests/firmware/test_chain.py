@@ -19,7 +19,6 @@ from firmware.rig.line import frames
 from firmware.rig.tracker import Tracker
 from gateway.config import GatewaySettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.flight import START_UNIX_US
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -78,12 +77,8 @@ def fly(programs: Path, parts: Parts, disturb: Disturb) -> Flown:
     for number, (time_us, data) in enumerate(chunks(tracker)):
         disturb(tracker, number * CHUNK_S)
         fixes += count_fixes(decoder, data) if number * CHUNK_S >= FLOWN_S - COUNTED_S else 0
-        actions = [*pipeline.feed(data, time_us), *pipeline.poll(time_us)]
-        heard += [
-            parser.decode(bytearray(action.frame))
-            for action in actions
-            if isinstance(action, Outgoing)
-        ]
+        frames = [*pipeline.feed(data, time_us).frames, *pipeline.poll(time_us).frames]
+        heard += [parser.decode(bytearray(sent.frame)) for sent in frames]
     tracker.close()
     attitudes = [m for m in heard if m.get_type() == "ATTITUDE_QUATERNION"]
     positions = [m for m in heard if m.get_type() == "GLOBAL_POSITION_INT" and m.lat]

@@ -13,6 +13,7 @@ from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
 import gateway.live.daemon
+from gateway.aircraft import Outputs
 from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
@@ -99,7 +100,7 @@ def test_untrusted_client_that_floods_requests_fills_no_disk(
         daemon._on_frame(Incoming(5, frame(PING, n % 256), False))
     assert sum(map(len, recorded)) <= UNTRUSTED_RATE * (BURST_S + 1)
     telemetry = Outgoing(b"telemetry", 30, None)
-    daemon._perform([telemetry])
+    daemon._perform(Outputs(frames=[telemetry]))
     assert recorded[-1] == b"telemetry", "all the same"
 
 
@@ -211,7 +212,7 @@ async def test_files_of_settings_are_read_and_written_off_the_loop(
     monkeypatch.setattr(daemon, "_read", noting(daemon._read))
     outcome = asyncio.get_running_loop().create_future()
     monkeypatch.setattr(daemon, "_on_saved", lambda *_: outcome.set_result(_[-1]))
-    daemon._perform([SaveSettings(1, Request(5, 255, 190, STORE, True))])
+    daemon._perform(Outputs(orders=[SaveSettings(1, Request(5, 255, 190, STORE, True))]))
     await daemon.reload()
     assert (await outcome).result() == tmp_path / "1.toml"
     assert len(threads) == 3

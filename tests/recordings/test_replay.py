@@ -36,7 +36,6 @@ from gateway.records import (
     ImuRaw,
     NavState,
     NodeId,
-    Outgoing,
     RawRecord,
 )
 from gateway.sensing.calibration import NodeCalibration
@@ -108,7 +107,7 @@ def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, li
     pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
     lines, states = [encode_head(header_for(settings, 1))], []
     for record in records:
-        for action in pipeline.take(record, record.time_us):
+        for action in pipeline.take(record, record.time_us).records:
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 lines += map(row_to_line, rows.add(action))
             if isinstance(action, FusedSample):
@@ -155,11 +154,10 @@ def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) 
     }
     records = make_flight(rng, 30)
     for number, record in enumerate(records):
-        actions = pipeline.take(record, record.time_us)
+        out = pipeline.take(record, record.time_us)
         if number in changes:
-            aircraft = pipeline.aircraft[1]
-            actions += aircraft.perform([changes[number]], record.time_us)
-        for action in actions:
+            pipeline.aircraft[1].perform([changes[number]], record.time_us, out)
+        for action in out.records:
             if isinstance(action, SettingsChanged):
                 text += "".join(map(row_to_line, rows.flush()))
                 text += encode_line(header_for(pipeline.aircraft[1].settings, 1))
@@ -188,7 +186,7 @@ def fly_from_the_middle(
             state = pipeline.aircraft[1].fusion_state
             builder.flush()
             rows.clear()
-        for action in pipeline.take(record, record.time_us):
+        for action in pipeline.take(record, record.time_us).records:
             if isinstance(action, FusedSample | BaroRaw | GpsFix):
                 rows += builder.add(action)
     assert state is not None
@@ -265,10 +263,10 @@ def test_replay_sends_messages_at_their_rates(rng: np.random.Generator) -> None:
     table, _ = fly(settings, make_flight(rng, 10))
     replay = Replay(Pipeline(PipelineSettings(settings)))
     sent = [
-        (now_us, action.message_id)
+        (now_us, sent.message_id)
         for row in read(table)[1]
-        for now_us, action in replay.take(row)
-        if isinstance(action, Outgoing)
+        for now_us, out in replay.take(row)
+        for sent in out.frames
     ]
     times = [now_us for now_us, _ in sent]
     assert times == sorted(times)
@@ -286,9 +284,10 @@ def test_marks_and_settings_of_the_flight_are_replayed_at_their_time(
         for row in rows:
             *_, (last_us, _) = playing.take(row)
         texts = [
-            (now_us, action.message_id)
-            for now_us, action in playing.take(TableMark(last_us + 40_000, "over the gate"))
-            if isinstance(action, Outgoing) and b"over the gate" in action.frame
+            (now_us, sent.message_id)
+            for now_us, out in playing.take(TableMark(last_us + 40_000, "over the gate"))
+            for sent in out.frames
+            if b"over the gate" in sent.frame
         ]
         assert texts == [(last_us + 40_000, 253)]
         changed = list(playing.take(header_for(make_settings("paper"), 1)))

@@ -46,14 +46,15 @@ class Bench:
         for _ in range(round(seconds * 100)):
             self.time_us += 10_000
             raw = replace(LEVEL, time_us=self.time_us, node_time_us=self.time_us, **changes)
-            actions = self.pipeline.take(raw, self.time_us) + self.pipeline.poll(self.time_us)
-            fused += [action for action in actions if isinstance(action, FusedSample)]
-            self.reported += decode(actions)
+            out = self.pipeline.take(raw, self.time_us)
+            fused += [record for record in out.records if isinstance(record, FusedSample)]
+            self.reported += decode(out.frames)
+            self.reported += decode(self.pipeline.poll(self.time_us).frames)
         return fused[-1]
 
     def send(self, message: Any) -> None:
         incoming = Incoming(7, packed(message, 255, 190), trusted=True)
-        self.reported += decode(self.pipeline.handle(incoming, self.time_us))
+        self.reported += decode(self.pipeline.handle(incoming, self.time_us).frames)
 
     def set(self, name: str, value: float) -> None:
         kind = mavlink.MAV_PARAM_TYPE_REAL32

@@ -51,11 +51,12 @@ class Pace:
 
     def take(self, time_us: int) -> int:
         """Take in the time of a sample, and return the present period in us; 0 at the first."""
-        last_us, self._last_us = self._last_us, time_us
-        if last_us is not None and 0 < (gap_us := time_us - last_us) <= MAX_PERIOD_US:
-            period_us = self._period_us or gap_us
-            self._period_us = period_us + (gap_us - period_us) // PACE_WEIGHT
-        return self._period_us
+        period_us = self._period_us
+        if self._last_us is not None and 0 < (gap_us := time_us - self._last_us) <= MAX_PERIOD_US:
+            period_us = period_us or gap_us
+            self._period_us = period_us = period_us + (gap_us - period_us) // PACE_WEIGHT
+        self._last_us = time_us
+        return period_us
 
 
 class Stream:
@@ -83,31 +84,29 @@ class Stream:
 
     def offer_paced(self, time_us: int, period_us: int) -> bool:
         """Do the same where several streams are carried by the same samples, of a known pace."""
-        if self.interval_us == OFF:
+        interval_us = self.interval_us
+        if interval_us == OFF:
             return False
-        late = 0 if self.due_us is None else time_us - self.due_us
+        due_us = time_us if self.due_us is None else self.due_us
+        late = time_us - due_us
         if late < -(period_us // 2):
             return False
-        self._advance(time_us, late, late // LEAN)
+        if late > interval_us:
+            self.due_us = due_us + late // interval_us * interval_us + interval_us
+        else:
+            self.due_us = due_us + interval_us + late // LEAN
         return True
 
     def tick(self, now_us: int) -> bool:
         """Return whether a message that no sample carries is due."""
         if self.interval_us == OFF:
             return False
-        late = 0 if self.due_us is None else now_us - self.due_us
-        if late < 0:
+        due_us = now_us if self.due_us is None else self.due_us
+        if now_us < due_us:
             return False
-        self._advance(now_us, late, 0)
+        missed = (now_us - due_us) // self.interval_us if now_us > due_us + self.interval_us else 0
+        self.due_us = due_us + (missed + 1) * self.interval_us
         return True
-
-    def _advance(self, time_us: int, late: int, lean: int) -> None:
-        if self.due_us is None:
-            self.due_us = time_us
-        if late > self.interval_us:
-            self.due_us += late // self.interval_us * self.interval_us
-            lean = 0
-        self.due_us += self.interval_us + lean
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,27 +75,21 @@ class Motion:
 
     def update(self, state: NavState, ground_alt_m: float) -> None:
         """Update the landed state from one navigation state."""
-        candidate = UNDEFINED
-        if state.flags & VELOCITY_VALID:
-            candidate = self._candidate_of(state, ground_alt_m)
+        candidate, flags = UNDEFINED, state.flags
+        if flags & VELOCITY_VALID:
+            north, east, _ = state.vel_n_mps
+            most = math.hypot(north, east) / self.takeoff_speed_mps
+            if flags & ALTITUDE_VALID and ground_alt_m == ground_alt_m:
+                height = (state.alt_amsl_m - ground_alt_m) / self.takeoff_height_m
+                most = height if height > most else most
+            candidate = IN_AIR if most > 1.0 else ON_GROUND if most < SLOW else UNDEFINED
         if candidate != self._candidate:
             self._candidate, self._since_us = candidate, state.time_us
-        if candidate == UNDEFINED or candidate == self.landed_state:
+        if candidate in (self.landed_state, UNDEFINED):
             return
         hold_us = LANDING_US if self.landed_state == IN_AIR else HOLD_US
         if state.time_us - self._since_us >= hold_us:
             self.landed_state = candidate
-
-    def _candidate_of(self, state: NavState, ground_alt_m: float) -> int:
-        north, east, _ = state.vel_n_mps
-        speed = math.hypot(north, east) / self.takeoff_speed_mps
-        height = 0.0
-        if state.flags & ALTITUDE_VALID and not math.isnan(ground_alt_m):
-            height = (state.alt_amsl_m - ground_alt_m) / self.takeoff_height_m
-        most = max(speed, height)
-        if most > 1.0:
-            return IN_AIR
-        return ON_GROUND if most < SLOW else UNDEFINED
 
 
 STATE_MESSAGES: Final = {
@@ -168,14 +162,13 @@ class Telemetry:
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
         self._pace = Pace()
         """Of the IMU samples."""
-        self._state_streams = [
-            (message_id, self.streams[message_id]) for message_id in STATE_MESSAGES
-        ]
         self._timed_due_us: int | None = None
         """When the next timed message is due; None if that must be computed."""
         self._state_due_us = 0
         """No sample before it carries a message."""
         self._builders = self._own_builders()
+        self._state_streams = [(self.streams[m], self._builders[m]) for m in STATE_MESSAGES]
+        """Schedule and builder of each message that IMU samples carry."""
         self._timed = [*TIMED_MESSAGES]
         self._take_added()
         self._polled = False
@@ -247,9 +240,10 @@ class Telemetry:
 
     def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
         """Take in a navigation state and its IMU sample, and return the messages due."""
+        time_us = state.time_us
         if self.state is None:
-            for message_id, stream in self._state_streams:
-                stream.begin(state.time_us + STATE_MESSAGES[message_id])
+            for message_id, after_us in STATE_MESSAGES.items():
+                self.streams[message_id].begin(time_us + after_us)
         self.state, self._sample = state, sample
         self._updated |= messages.IMU_UPDATED
         if sample.mag_b_ut is not None:
@@ -263,21 +257,25 @@ class Telemetry:
         ):
             self._reference_alt_m = state.alt_amsl_m
         self.motion.update(state, self._ground_alt_m)
-        time_us = state.time_us
         period_us = self._pace.take(time_us)
-        if time_us + period_us < self._state_due_us:
-            return []
-        next_us, due = time_us + US_PER_S, []
-        for message_id, stream in self._state_streams:
+        return [] if time_us + period_us < self._state_due_us else self._carried(time_us, period_us)
+
+    def _carried(self, time_us: int, period_us: int) -> list[Any]:
+        """Build the messages that a sample carries, and note when the next one is due."""
+        found: list[Any] = []
+        soon_us, next_us = time_us + period_us, time_us + US_PER_S
+        for stream, build in self._state_streams:
             due_us = stream.due_us
-            if due_us is None or due_us <= time_us + period_us:
+            if due_us is None or due_us <= soon_us:
                 if stream.offer_paced(time_us, period_us):
-                    due.append(message_id)
+                    message = build(time_us)
+                    if message is not None:
+                        found.append(message)
                 due_us = stream.due_us
             if due_us is not None and due_us < next_us:
                 next_us = due_us
         self._state_due_us = next_us
-        return self._build_all(due, time_us) if due else []
+        return found
 
     def on_baro(self, sample: BaroSample) -> list[Any]:
         """Take in a barometer sample, and return its message if due."""
