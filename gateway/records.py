@@ -10,6 +10,7 @@ are not tracked by the garbage collector. `msgspec.structs.replace` copies one w
 """
 
 from enum import IntEnum, IntFlag
+from typing import Final
 
 import msgspec
 
@@ -337,6 +338,50 @@ class LinkReport(msgspec.Struct, frozen=True, gc=False):
     receiver: ReceiverStatus | None
 
 
+START_V2: Final = 0xFD
+PAYLOAD_V1: Final = 6
+PAYLOAD_V2: Final = 10
+"""Where the payload of a MAVLink frame begins."""
+HEARTBEAT_TYPE_OFFSET: Final = 4
+_TYPE_GCS: Final = bytes((6,))
+"""MAV_TYPE_GCS."""
+TXBUF_OFFSET: Final = 6
+"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
+
+
+class MavFrame(msgspec.Struct, frozen=True, gc=False):
+    """One complete frame with its header read; made once, then passed on unchanged."""
+
+    data: bytes
+    """The frame, byte for byte."""
+    key: bytes
+    """System, component and message as header bytes: the kind of frame, as a dictionary key."""
+    message_id: int
+    origin: tuple[int, int]
+    """System and component that sent it."""
+    target: tuple[int, int]
+    """System and component that it addresses; 0 is everybody."""
+    sequence: int
+    signed: bool
+
+    @property
+    def payload(self) -> bytes:
+        """The payload as sent: version 2 cuts trailing zeros off."""
+        begin = PAYLOAD_V2 if self.data[0] == START_V2 else PAYLOAD_V1
+        return self.data[begin : begin + self.data[1]]
+
+    @property
+    def is_station_heartbeat(self) -> bool:
+        """Whether this HEARTBEAT reports that its sender is a ground station."""
+        return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_GCS
+
+    @property
+    def free_percent(self) -> int:
+        """Free part of the transmit buffer in this RADIO_STATUS."""
+        payload = self.payload
+        return payload[TXBUF_OFFSET] if len(payload) > TXBUF_OFFSET else 0
+
+
 class Outgoing(msgspec.Struct, frozen=True, gc=False):
     """One encoded MAVLink frame and where it goes."""
 
@@ -344,6 +389,8 @@ class Outgoing(msgspec.Struct, frozen=True, gc=False):
     message_id: int
     client_id: int | None = None
     """The one client it answers, None for every client, or `RECORDED_ONLY`."""
+    header: MavFrame | None = None
+    """The same frame with its header, if the encoder has provided it."""
 
 
 class ClientInterval(msgspec.Struct, frozen=True, gc=False):

@@ -195,26 +195,30 @@ class Numbering:
 
     def __init__(self, is_own: Callable[[Origin], bool] | None = None) -> None:
         self._is_own = is_own
-        self._entered: dict[Origin, int] = {}
-        self._left: dict[Origin, int] = {}
+        self._last: dict[Origin, list[int | None]] = {}
+        """The last number of each origin that entered, and the last with which a frame left."""
 
     def enter(self, frame: MavFrame) -> int | None:
         """Return a frame's step, to be passed to `leave`; None for a frame of others."""
         origin, sequence = frame.origin, frame.sequence
         if self._is_own is not None and not self._is_own(origin):
             return None
-        entered = self._entered
-        before = entered.get(origin, sequence - 1)
-        if len(entered) < MAX_ORIGINS or origin in entered:
-            entered[origin] = sequence
+        last = self._last.get(origin)
+        if last is None:
+            if len(self._last) < MAX_ORIGINS:
+                self._last[origin] = [sequence, None]
+            return 1
+        before, last[0] = last[0], sequence
+        assert before is not None
         return sequence - before & SEQUENCE_MASK
 
     def leave(self, frame: MavFrame, step: int) -> int:
         """Return the sequence number with which a frame is sent."""
-        origin = frame.origin
-        wanted = self._left.get(origin, frame.sequence - step) + step & SEQUENCE_MASK
-        if len(self._left) < MAX_ORIGINS or origin in self._left:
-            self._left[origin] = wanted
+        last = self._last.get(frame.origin)
+        if last is None:
+            return frame.sequence
+        before = last[1]
+        wanted = last[1] = frame.sequence if before is None else before + step & SEQUENCE_MASK
         return wanted
 
 

@@ -329,12 +329,14 @@ class Daemon:
         # Also those that are only recorded: their numbers leave no gap at the clients.
         self._hub.send_all(frames)
         for sent in frames:
-            self._sent[sent.message_id] += 1
-            if sent.message_id in UNRECORDED:
-                continue
-            frame, to = sent.frame, sent.client_id
-            if to in (None, RECORDED_ONLY) or self._budget.takes(to, len(frame), self.now_us()):
-                self._recorder.frame(frame)
+            message_id, to = sent.message_id, sent.client_id
+            self._sent[message_id] += 1
+            if message_id not in UNRECORDED and (
+                to is None
+                or to == RECORDED_ONLY
+                or self._budget.takes(to, len(sent.frame), self.now_us())
+            ):
+                self._recorder.frame(sent.frame)
 
     def _poll(self) -> None:
         # First, so that the next turn comes whatever happens below.

@@ -19,7 +19,7 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.records import Outgoing
+from gateway.records import START_V2, MavFrame, Outgoing
 
 INT16_MAX: Final = 2**15 - 1
 INT32_MAX: Final = 2**31 - 1
@@ -157,7 +157,7 @@ class MessagePacker:
         Class of pymavlink's dialect whose fields are all numbers or arrays of numbers.
     """
 
-    __slots__ = ("crc_extra", "message_id", "name", "pack", "types", "wire_order")
+    __slots__ = ("crc_extra", "has_target", "message_id", "name", "pack", "types", "wire_order")
 
     def __init__(self, kind: Any) -> None:
         lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
@@ -167,6 +167,7 @@ class MessagePacker:
         self.message_id: int = kind.id
         self.name: str = kind.msgname
         self.crc_extra: int = kind.crc_extra
+        self.has_target = _has_target(kind)
         self.pack = kind.unpacker.pack
         self.wire_order = itemgetter(*(places.index(place) for place in wire))
         self.types = [types[name] for name, _ in places]
@@ -200,9 +201,11 @@ class PackedMessage(msgspec.Struct, frozen=True, gc=False):
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
 
-_START: Final = b"\xfd"
-_HEAD: Final = struct.Struct("<BBBBBBHB")
-"""Length, two flag bytes, sequence, system, component, message id in three bytes."""
+_pack_head: Final = struct.Struct("<BBBBBBBHB").pack
+"""Start, length, two flag bytes, sequence, system, component, message id in three bytes."""
+KEY: Final = slice(5, 10)
+"""System, component and message in a frame."""
+NO_TARGET: Final = (0, 0)
 _INTEGER_LIMITS: Final = {
     "int8_t": (-(2**7), 2**7 - 1),
     "int16_t": (-(2**15), 2**15 - 1),
@@ -221,6 +224,7 @@ class Encoder:
     def __init__(self, system_id: int) -> None:
         """Start the sequence."""
         self.system_id = system_id
+        self._origin = (system_id, AUTOPILOT_COMPONENT)
         self._sequence = 0
 
     def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
@@ -240,9 +244,9 @@ class Encoder:
         """
         if isinstance(message, PackedMessage):
             packer = message.packer
-            frame = self._frame(packer.message_id, packer.crc_extra, message.payload())
-            self._sequence = self._sequence + 1 & 0xFF
-            return Outgoing(frame, packer.message_id, client_id)
+            message_id, has_target = packer.message_id, packer.has_target
+            frame = self._frame(message_id, packer.crc_extra, message.payload())
+            return self._outgoing(frame, message_id, client_id, has_target)
         # Not message.id: HIGHRES_IMU and others have a field of that name.
         message_id = message.get_msgId()
         # pymavlink packs the payload; header and checksum would take it six times as long as here.
@@ -252,8 +256,18 @@ class Encoder:
         except (struct.error, OverflowError):
             _saturate(message)
             frame = message.pack(message_id)
-        self._sequence = (self._sequence + 1) % 256
-        return Outgoing(frame, message_id, client_id)
+        return self._outgoing(frame, message_id, client_id, _has_target(message))
+
+    def _outgoing(
+        self, frame: bytes, message_id: int, client_id: int | None, has_target: bool
+    ) -> Outgoing:
+        """Advance the sequence, and describe a frame of the present number for the hub."""
+        header, sequence = None, self._sequence
+        self._sequence = sequence + 1 & 0xFF
+        if not has_target:
+            key = frame[KEY]
+            header = MavFrame(frame, key, message_id, self._origin, NO_TARGET, sequence, False)
+        return Outgoing(frame, message_id, client_id, header)
 
     def _frame(
         self, message_id: int, crc_extra: int, payload: bytes, *, force_mavlink1: bool = False
@@ -261,19 +275,27 @@ class Encoder:
         """Put header and checksum around a payload; `force_mavlink1` is pymavlink's own."""
         del force_mavlink1
         body = payload.rstrip(b"\0") or payload[:1]
-        content = _HEAD.pack(
-            len(body),
-            0,
-            0,
-            self._sequence,
-            self.system_id,
-            AUTOPILOT_COMPONENT,
-            message_id & 0xFFFF,
-            message_id >> 16,
+        content = (
+            _pack_head(
+                START_V2,
+                len(body),
+                0,
+                0,
+                self._sequence,
+                self.system_id,
+                AUTOPILOT_COMPONENT,
+                message_id & 0xFFFF,
+                message_id >> 16,
+            )
+            + body
         )
-        content += body
-        crc = mcrf4xx(content + crc_extra.to_bytes())
-        return _START + content + crc.to_bytes(2, "little")
+        crc = mcrf4xx(content[1:] + crc_extra.to_bytes())
+        return content + crc.to_bytes(2, "little")
+
+
+def _has_target(message: Any) -> bool:
+    """Return whether a message may be addressed to a system."""
+    return any(name.startswith("target") for name in message.fieldnames)
 
 
 def _saturate(message: Any) -> None:

@@ -21,32 +21,27 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-import msgspec
 from fastcrc.crc16 import mcrf4xx
 
+from gateway.records import PAYLOAD_V1 as PAYLOAD_V1
+from gateway.records import PAYLOAD_V2 as PAYLOAD_V2
+from gateway.records import START_V2 as START_V2
+from gateway.records import MavFrame as MavFrame
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
 
 START_V1: Final = 0xFE
-START_V2: Final = 0xFD
 SIGNED: Final = 0x01
 """The only incompatibility flag that is defined."""
 OVERHEAD_V1: Final = 8
 OVERHEAD_V2: Final = 12
+SEQUENCE_V1: Final = 2
 SEQUENCE_V2: Final = 4
 KEY_V2: Final = slice(5, 10)
 """Place of `MavFrame.key` in a frame of version 2."""
 SIGNATURE_SIZE: Final = 13
-HEARTBEAT_TYPE_OFFSET: Final = 4
-_TYPE_GCS: Final = bytes((6,))
-"""MAV_TYPE_GCS."""
-TXBUF_OFFSET: Final = 6
-"""Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
 
-PAYLOAD_V1: Final = 6
-PAYLOAD_V2: Final = 10
-"""Where the payload begins."""
 EVERYBODY: Final = (0, 0)
 """Target of a message without one."""
 
@@ -72,39 +67,6 @@ class SplitFault:
 
     kind: SplitFaultKind
     size: int
-
-
-class MavFrame(msgspec.Struct, frozen=True, gc=False):
-    """One complete frame with its header read; made once, then passed on unchanged."""
-
-    data: bytes
-    """The frame, byte for byte."""
-    key: bytes
-    """System, component and message as header bytes: the kind of frame, as a dictionary key."""
-    message_id: int
-    origin: tuple[int, int]
-    """System and component that sent it."""
-    target: tuple[int, int]
-    """System and component that it addresses; 0 is everybody."""
-    sequence: int
-    signed: bool
-
-    @property
-    def payload(self) -> bytes:
-        """The payload as sent: version 2 cuts trailing zeros off."""
-        begin = PAYLOAD_V2 if self.data[0] == START_V2 else PAYLOAD_V1
-        return self.data[begin : begin + self.data[1]]
-
-    @property
-    def is_station_heartbeat(self) -> bool:
-        """Whether this HEARTBEAT reports that its sender is a ground station."""
-        return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_GCS
-
-    @property
-    def free_percent(self) -> int:
-        """Free part of the transmit buffer in this RADIO_STATUS."""
-        payload = self.payload
-        return payload[TXBUF_OFFSET] if len(payload) > TXBUF_OFFSET else 0
 
 
 Event = MavFrame | SplitFault
@@ -260,16 +222,13 @@ def with_sequence(data: bytes, sequence: int) -> bytes:
 
 def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
     """Return a frame with another sequence number; a signed or an unknown one as it is."""
-    data = frame.data
-    extra = CRC_EXTRA.get(frame.message_id)
-    if extra is None or frame.signed or frame.sequence == sequence:
+    message_id = frame.message_id
+    if frame.signed or frame.sequence == sequence or message_id not in CRC_EXTRA:
         return frame
-    at = 4 if data[0] == START_V2 else 2
-    body = b"%b%c%b" % (data[1:at], sequence, data[at + 1 : -2])
-    data = data[:1] + body + mcrf4xx(body + extra).to_bytes(2, "little")
-    return MavFrame(
-        data, frame.key, frame.message_id, frame.origin, frame.target, sequence, signed=False
-    )
+    data = bytearray(frame.data)
+    data[SEQUENCE_V2 if data[0] == START_V2 else SEQUENCE_V1] = sequence
+    data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[message_id]).to_bytes(2, "little")
+    return MavFrame(bytes(data), frame.key, message_id, frame.origin, frame.target, sequence, False)
 
 
 def _split(data: bytes, *, final: bool) -> tuple[list[Event], int]:
