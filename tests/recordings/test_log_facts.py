@@ -9,7 +9,8 @@ import pytest
 from gateway.analysis.case import make_case
 from gateway.analysis.reporting.estimators import estimators
 from gateway.batch.tasks import read_season_flight
-from gateway.cli.support.recording_options import Loading, load_flight
+from gateway.cli.support.options import read_options
+from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
@@ -18,6 +19,8 @@ from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
 from tests.kit.cli import invoke
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+TODAY = GatewaySettings()
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "take_off.csv.gz"
 SETTINGS = GatewaySettings().default_aircraft
@@ -37,7 +40,7 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
     assert latency_s == pytest.approx(0.16, abs=0.02)
     assert "gives no GPS latency; 0.1" in table.remarks[0]
     assert "s is estimated from its manoeuvres" in table.remarks[0]
-    assert load_flight(without_latency, Loading(GatewaySettings())).latency_s == latency_s
+    assert load_flight(without_latency, TODAY, read_options(TODAY)).latency_s == latency_s
     assert (
         read_season_flight(
             [without_latency], OPTIONS, "log"
@@ -66,7 +69,7 @@ def test_a_recording_that_was_fused_with_another_latency_is_reported(
     config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
     convert = ["convert", str(without_latency), "-o", str(own), "--fuse", "--config", str(config)]
     assert invoke(*convert).exit_code == 0
-    assert load_flight(own, Loading(GatewaySettings())).latency_s == set_s
+    assert load_flight(own, TODAY, read_options(TODAY)).latency_s == set_s
     words = " ".join(capsys.readouterr().err.split())
     assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)
 
@@ -102,7 +105,7 @@ def test_every_command_smooths_with_the_latency_that_contradicts_the_one_set(
     assert remark in fusion.remarks[0]
     settings = settings_of(fusion.table().header)
     assert settings.estimation.reference.gps_latency_s == latency_s
-    case = make_case(load_flight(path, Loading(GatewaySettings())), smooth=True)
+    case = make_case(load_flight(path, TODAY, read_options(TODAY)), smooth=True)
     assert case.smoothed_latency_s == latency_s
     section = estimators(case)
     assert section is not None

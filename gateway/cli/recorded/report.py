@@ -14,7 +14,6 @@ from gateway.cli.support.recording_options import (
     ColumnsOption,
     FlightArgument,
     ForceOption,
-    Loading,
     ReferenceOption,
     SettingsOption,
     SmoothOption,
@@ -74,9 +73,10 @@ def report(
     from gateway.analysis.reporting.page import count_pictures, write_report
 
     check_folder(output, overwrite=force)
-    loading = Loading(read_settings(config), settings, columns, system, reference)
-    loaded = load_flight(flight, loading)
-    other = loaded if against is None else load_flight(against, replace(loading, reference=None))
+    gateway = read_settings(config)
+    options = read_options(gateway, columns, choice=settings, system_id=system)
+    loaded = load_flight(flight, gateway, options, reference)
+    other = loaded if against is None else load_flight(against, gateway, options)
     others = None
     if against_config is not None:
         others = fusion_of(read_settings(against_config))

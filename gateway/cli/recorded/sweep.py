@@ -1,6 +1,6 @@
 """`mavgate sweep`: try settings on one flight or many, and write the best as a settings file."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -11,6 +11,7 @@ import pandas as pd
 import typer
 
 from gateway.analysis import sweep as sweeping
+from gateway.analysis.flight import Flight
 from gateway.analysis.sweep import (
     COLUMN_OF,
     ESTIMATOR_KEY,
@@ -37,11 +38,10 @@ from gateway.cli.support.batch_work import (
     SeasonWork,
     season_options,
 )
-from gateway.cli.support.options import ConfigOption, read_settings
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
-    Loading,
     ReferenceOption,
     SettingsOption,
     SystemOption,
@@ -121,11 +121,9 @@ def sweep(
         read = season_options(config, columns, settings)
         run_season_sweep(SeasonWork(given, config, jobs), read, current, options)
         return
-    run_sweep(
-        Path(given[0]) if given else None,
-        Loading(current, settings, columns, system, reference),
-        options,
-    )
+    path = Path(given[0]) if given else None
+    read = read_options(current, columns, choice=settings, system_id=system)
+    run_sweep(path, current, options, lambda: load_flight(path, current, read, reference))
 
 
 SHOWN: Final = 10
@@ -159,11 +157,16 @@ class SweepOptions:
     overwrite: bool
 
 
-def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> None:
+def run_sweep(
+    path: Path | None,
+    settings: GatewaySettings,
+    options: SweepOptions,
+    load: Callable[[], Flight],
+) -> None:
     """Try the settings, show the best, and write it as a settings file."""
     _check_outputs(options, path)
     axes = _parse_axes(options)
-    flight = load_flight(path, loading)
+    flight = load()
     contest = sweeping.make_contest(
         flight,
         flight.fusion,
@@ -180,7 +183,7 @@ def run_sweep(path: Path | None, loading: Loading, options: SweepOptions) -> Non
     results = sweeping.tabulate(contest.keys, trials, options.metric)
     _show(results, contest, options.metric)
     best = with_values(contest.fusion, contest.keys, sweeping.best_of(trials, options.metric))
-    _write(options, loading.settings, best, results, path)
+    _write(options, settings, best, results, path)
 
 
 def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:

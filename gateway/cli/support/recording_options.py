@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gateway.cli.support.options import ask, folder_of, is_running, read_options, read_settings
+from gateway.cli.support.options import ask, folder_of, is_running, read_settings
 from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
 from gateway.recordings.index import RecordingError, find_recording
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gateway.analysis.flight import Flight
     from gateway.config import GatewaySettings
     from gateway.recordings.fuse import FusionSettings
+    from gateway.recordings.reading import ReadOptions
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
 SmoothOption = Annotated[
@@ -163,17 +164,6 @@ STORIES: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Loading:
-    """How to read a command's flights."""
-
-    settings: GatewaySettings
-    choice: SettingsChoice = "recorded"
-    columns: Path | None = None
-    system: int | None = None
-    reference: Path | None = None
-
-
 def fusion_of(settings: GatewaySettings) -> FusionSettings:
     """Return the part of the settings that fuses a flight."""
     from gateway.recordings.fuse import FusionSettings
@@ -181,26 +171,23 @@ def fusion_of(settings: GatewaySettings) -> FusionSettings:
     return FusionSettings(estimation=settings.estimation)
 
 
-def load_flight(path: Path | None, loading: Loading) -> Flight:
+def load_flight(
+    path: Path | None,
+    settings: GatewaySettings,
+    options: ReadOptions,
+    reference: Path | None = None,
+) -> Flight:
     """Read a recording, or the simulated flight; raises FlightError if a file holds none."""
     # Imported here: they import all stages, for which commands that fuse nothing must not wait.
     from gateway.analysis.flight import flight_of_files, judged_by
     from gateway.analysis.simulated import simulated_flight
     from gateway.recordings.reading import is_table, open_rows
 
-    settings = loading.settings
     if path is None:
         return simulated_flight(settings.simulator, fusion_of(settings))
     parts = files_of([path], folder_of(settings), "tables")
-    files = [*parts, loading.reference] if loading.reference is not None else parts
-    with progress_of(files) as advance:
-        options = read_options(
-            settings,
-            loading.columns,
-            choice=loading.choice,
-            system_id=loading.system,
-            progress=advance,
-        )
+    with progress_of([*parts, reference] if reference else parts) as advance:
+        options = replace(options, progress=advance)
         story = STORIES.get(TABLE if is_table(parts[0]) else format_of(parts[0]), OTHER_STORY)
         try:
             flight, table, _ = flight_of_files(
@@ -209,8 +196,6 @@ def load_flight(path: Path | None, loading: Loading) -> Flight:
         except ValueError as error:
             raise FlightError(str(error)) from error
         print_remarks(table.remarks)
-        if loading.reference is None:
+        if reference is None:
             return flight
-        return judged_by(
-            flight, open_rows(loading.reference, options).blocks, loading.reference.name
-        )
+        return judged_by(flight, open_rows(reference, options).blocks, reference.name)

@@ -1,12 +1,12 @@
 """Flights loaded for the analysis commands."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from gateway.aircraft import AircraftSettings
-from gateway.cli.support.recording_options import STORIES, Loading, load_flight
+from gateway.cli.support.options import read_options
+from gateway.cli.support.recording_options import STORIES, load_flight
 from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
@@ -20,7 +20,7 @@ from gateway.records import ImuCalibrated, ImuFlags, NodeId
 pytestmark = pytest.mark.io
 
 RECORDED = AircraftSettings(estimation=EstimationSettings(estimator="paper"))
-TODAY = Loading(GatewaySettings())
+TODAY = GatewaySettings()
 
 
 def recording(path: Path, samples: int) -> Path:
@@ -35,21 +35,21 @@ def recording(path: Path, samples: int) -> Path:
 
 
 def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
-    flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
+    flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
     assert flight.fusion.estimation == RECORDED.estimation
     assert flight.story == STORIES[TABLE]
-    today = load_flight(tmp_path / "flight.csv", replace(TODAY, choice="current"))
-    assert today.fusion.estimation == TODAY.settings.default_aircraft.estimation
+    today = load_flight(tmp_path / "flight.csv", TODAY, read_options(TODAY, choice="current"))
+    assert today.fusion.estimation == TODAY.default_aircraft.estimation
 
 
 def test_latency_contradicted_by_the_motion_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01, 0.9))
-    load_flight(recording(tmp_path / "flight.csv", 20), TODAY)
+    load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
     assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
 
 
 def test_too_short_a_recording_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FlightError, match=r"flight\.csv: 1 IMU samples are no flight"):
-        load_flight(recording(tmp_path / "flight.csv", 1), TODAY)
+        load_flight(recording(tmp_path / "flight.csv", 1), TODAY, read_options(TODAY))

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from gateway.analysis.metrics import rms, rotation_error, total_error_rad
-from gateway.cli.support.recording_options import Loading, load_flight
+from gateway.cli.support.options import read_options
+from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
@@ -28,6 +29,8 @@ from tests.kit.cli import run
 from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
+
+TODAY = GatewaySettings()
 
 OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 MAKERS: dict[str, tuple[Callable[[], bytes], int]] = {
@@ -169,7 +172,7 @@ def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
     run("convert", packed, "-o", tmp_path / "a.kml")
     assert (tmp_path / "a.kml").read_text().count("<gx:coord>") > 100
     # What `report` and `sweep` make of it: the autopilot's own attitude is one more row.
-    loaded = load_flight(folder / "flight.bin", Loading(GatewaySettings()))
+    loaded = load_flight(folder / "flight.bin", TODAY, read_options(TODAY))
     assert loaded.recorded is not None
     assert np.isfinite(loaded.recorded.q_nb).all(axis=1).mean() > 0.9
     with ExitStack() as opened:
