@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from tempfile import NamedTemporaryFile, gettempdir
-from typing import IO, Any, BinaryIO, Final, Literal, cast
+from typing import IO, BinaryIO, Final, Literal, cast
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -34,8 +34,7 @@ from gateway.recordings.tlog import (
     Timeline,
     TlogScanner,
     encode_record,
-    layout_of,
-    payload_of,
+    fields_of,
 )
 from gateway.recordings.tlog_scan import TIME_SIZE
 from gateway.units import US_PER_S, counted
@@ -242,26 +241,14 @@ LINE_BPS: Final = 57_600
 """The usual telemetry radio; ten bits a byte."""
 LAST_CIVIL_US: Final = 4_102_444_800 * US_PER_S
 """The year 2100."""
-_FIELDS: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
-"""Fields with the sender's time, and their unit in us."""
-
-
-def _time_fields(kind: Any) -> list[tuple[int, int, int]]:
-    """Return offset, size and unit in us of each time in a message's payload."""
-    fields: Any = layout_of(kind).fields or {}
-    return [
-        (int(fields[name][1]), int(fields[name][0].itemsize), unit_us)
-        for name, unit_us in _FIELDS.items()
-        if name in fields
-    ]
-
-
+_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
+"""Fields with the sender's time, and their unit."""
 _TIMES: Final = {
-    message_id: found
+    message_id: names
     for message_id, kind in mavlink.mavlink_map.items()
-    if (found := _time_fields(kind))
+    if (names := [name for name in _UNITS_US if name in kind.fieldnames])
 }
-"""By message id."""
+"""Fields of each message with a time."""
 
 
 class FrameClock:
@@ -275,21 +262,21 @@ class FrameClock:
         """Whether any message held a time."""
         self._now_us = 0
         self._line_us = 0.0
-        self._bases_us: dict[tuple[int, ...], tuple[int, int]] = {}
-        """Of each kind and sender: time at its own zero, and its newest own time."""
+        self._bases_us: dict[tuple[int | str, ...], tuple[int, int]] = {}
+        """Of each sender and field: time at its own zero, and its newest own time."""
 
     def time_us(self, frame: bytes) -> int:
         """Return the time of the next frame."""
         self._line_us += len(frame) * 10 * US_PER_S / LINE_BPS
         message_id = message_id_of(frame)
-        for offset, size, unit_us in _TIMES.get(message_id, ()):
-            payload = payload_of(frame, offset + size)
-            own_us = int.from_bytes(payload[offset:], "little") * unit_us
-            if own_us:
-                self._take(own_us, (*origin_of(frame), message_id, offset))
+        if names := _TIMES.get(message_id):
+            fields = fields_of(frame)
+            for name in names:
+                if own_us := fields[name] * _UNITS_US[name]:
+                    self._take(own_us, (*origin_of(frame), message_id, name))
         return round(self._line_us) if self._by_size else self._now_us
 
-    def _take(self, own_us: int, key: tuple[int, ...]) -> None:
+    def _take(self, own_us: int, key: tuple[int | str, ...]) -> None:
         is_civil = FIRST_CIVIL_US < own_us < LAST_CIVIL_US
         if is_civil and self.civil_us_at_zero is None:
             self.civil_us_at_zero = own_us - self._now_us

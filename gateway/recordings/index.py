@@ -102,7 +102,14 @@ def list_recordings(folder: Path) -> list[Recording]:
         for path in sorted(folder.iterdir()):
             if (match := _FILE_NAME.fullmatch(path.name)) and path.is_file():
                 files.setdefault(match["name"], []).append(path)
-    found = [_describe(name, paths) for name, paths in files.items()]
+    found = []
+    for name, paths in files.items():
+        stats = []
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):
+                stats.append(path.stat())
+        size, modified_s = sum(s.st_size for s in stats), [s.st_mtime for s in stats]
+        found.append(Recording(name, tuple(paths), size, max(modified_s, default=0.0)))
     return sorted(found, key=lambda recording: (recording.modified_s, recording.name))
 
 
@@ -152,7 +159,13 @@ def move_recording(folder: Path, name: str, to_name: str) -> Recording:
     recording = find_recording(folder, name)
     check_free(folder, to_name)
     for path in recording.files:
-        _move(path, folder / (to_name + path.name.removeprefix(recording.name)))
+        target = folder / (to_name + path.name.removeprefix(recording.name))
+        try:
+            # So that nothing is overwritten, also on file systems without hard links.
+            target.touch(exist_ok=False)
+        except FileExistsError as error:
+            raise RecordingError(f"{target} already exists") from error
+        path.replace(target)
     return find_recording(folder, to_name)
 
 
@@ -166,25 +179,3 @@ def delete_recording(folder: Path, name: str) -> Recording:
         path.unlink()
     sync_folder(folder)
     return recording
-
-
-def _describe(name: str, paths: list[Path]) -> Recording:
-    stats = []
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            stats.append(path.stat())
-    return Recording(
-        name,
-        tuple(paths),
-        sum(stat.st_size for stat in stats),
-        max((stat.st_mtime for stat in stats), default=0.0),
-    )
-
-
-def _move(path: Path, target: Path) -> None:
-    """Rename without overwriting, also on file systems without hard links."""
-    try:
-        target.touch(exist_ok=False)
-    except FileExistsError as error:
-        raise RecordingError(f"{target} is there already") from error
-    path.replace(target)

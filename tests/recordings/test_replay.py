@@ -31,7 +31,6 @@ from gateway.records import (
     FusedSample,
     FusionState,
     GpsFix,
-    GpsFixType,
     ImuFlags,
     ImuRaw,
     NavState,
@@ -41,6 +40,7 @@ from gateway.records import (
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.requests import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.kit.records import fix_at
 
 IMU_US = 16_000
 CALIBRATION = NodeCalibration(
@@ -80,24 +80,15 @@ def make_flight(rng: np.random.Generator, seconds: float) -> list[RawRecord]:
 
 def make_fix(time_us: int, rng: np.random.Generator) -> GpsFix:
     angle = time_us * 1e-6 * 0.2
-    return GpsFix(
-        time_us=time_us,
-        node=NodeId(1, 1),
+    return fix_at(
+        time_us,
         node_time_us=time_us,
         itow_ms=time_us // 1000,
-        fix_type=GpsFixType.FIX_3D,
-        fix_ok=True,
-        satellites=11,
         lat_dege7=471_234_567 + round(9000 * math.sin(angle)),
         lon_dege7=85_678_901 + round(13_000 * math.cos(angle)),
         alt_amsl_m=430.123 + float(rng.normal()),
         vel_n_mps=(20 * math.cos(angle), -20 * math.sin(angle), 0.1),
         alt_ellipsoid_m=math.nan,
-        h_acc_m=1.5,
-        v_acc_m=2.5,
-        speed_acc_mps=0.3,
-        course_acc_deg=2.0,
-        pdop=1.4,
         utc_us=1_781_187_930_000_000 + time_us,
     )
 
