@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from gateway import __version__
 from gateway.estimation.columns import nav_state
-from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
-from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
 from gateway.records import (
     BaroRaw,
     BaroSample,

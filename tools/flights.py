@@ -20,7 +20,7 @@ from gateway.estimation.columns import (
     nav_row,
 )
 from gateway.estimation.kernel import SampleLog
-from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.geometry.geodesy import radii_m
 from gateway.records import (

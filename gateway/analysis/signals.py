@@ -9,8 +9,8 @@ import pandas as pd
 from scipy import signal
 
 from gateway.analysis.flight import FloatArray
-from gateway.estimation.paper.filters import Coefficients, Kind, VectorFilter, design_lowpass
-from gateway.estimation.paper.paper import PaperSettings
+from gateway.estimation.paper import PaperSettings
+from gateway.estimation.vector_filter import Coefficients, Kind, VectorFilter, design_lowpass
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 PAPER_RATE_HZ: Final = 1000.0

@@ -1,14 +1,47 @@
-"""The choice of an estimator: the settings of all, and one made from them."""
+"""Estimators: the interface of all, their settings, and the choice of one."""
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Protocol
 
 from gateway.estimation.eskf.settings import EskfSettings, make_gains
-from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator
-from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
+from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 from gateway.settings import Settings, setting
+
+
+class Estimator(Protocol):
+    """A causal fusion of samples into navigation states, one aircraft each.
+
+    Samples come in the order of their `time_us`; the estimator handles a sample from the past, a
+    gap, and a value that is not finite. No method raises on data.
+    """
+
+    def update_imu(self, sample: ImuSample) -> NavState:
+        """Advance by one IMU sample and return the state at its time."""
+        ...
+
+    def update_baro(self, sample: BaroSample) -> None:
+        """Use one barometer sample."""
+        ...
+
+    def update_gps(self, fix: GpsFix) -> None:
+        """Use one GPS fix at its arrival; the estimator compensates the latency."""
+        ...
+
+    def snapshot(self) -> bytes:
+        """Return the whole state."""
+        ...
+
+    def restore(self, snapshot: bytes) -> None:
+        """Continue from a snapshot to the last bit; raises ValueError for another estimator's."""
+        ...
+
+    def reset(self) -> None:
+        """Discard everything except the settings."""
+        ...
+
 
 Maker = Callable[["EstimationSettings"], Estimator]
 

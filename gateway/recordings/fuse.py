@@ -20,9 +20,8 @@ from gateway.estimation.columns import (
     nav_row,
 )
 from gateway.estimation.columns import NAV_COLUMNS as STATE_COLUMNS
-from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import Aiding, KernelEstimator, SampleLog
-from gateway.estimation.select import EstimationSettings
+from gateway.estimation.select import EstimationSettings, Estimator
 from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180
 from gateway.recordings.columns import (

@@ -12,7 +12,7 @@ from gateway.analysis.signals import (
     power_density,
     response,
 )
-from gateway.estimation.paper.paper import PaperSettings
+from gateway.estimation.paper import PaperSettings
 from tests.analysis.flights import short_flight
 
 SETTINGS = PaperSettings()

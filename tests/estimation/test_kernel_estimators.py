@@ -21,10 +21,9 @@ from gateway.estimation.columns import (
     nav_row,
 )
 from gateway.estimation.eskf import filter as kernels
-from gateway.estimation.interface import Estimator
 from gateway.estimation.kernel import KernelEstimator, SampleLog
 from gateway.estimation.reference import ReferenceSettings
-from gateway.estimation.select import EstimationSettings, make_estimator
+from gateway.estimation.select import EstimationSettings, Estimator, make_estimator
 from gateway.geometry.geodesy import displacement_m
 from gateway.records import BaroSample, GpsFix, GpsFixType, ImuSample, NavFlags, NavState
 from tests.estimation.samples import ALT_M, LAT_DEG, LON_DEG, G, fix, imu, times

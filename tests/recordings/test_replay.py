@@ -10,7 +10,7 @@ import pytest
 
 from gateway.aircraft import AircraftSettings, FusedStates, SettingsChanged
 from gateway.estimation.columns import NAV_ALT, NAV_LAT, NAV_LON, NAV_QUAT, nav_row
-from gateway.estimation.paper.paper import PaperSettings
+from gateway.estimation.paper import PaperSettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import GPS_CODEC, RowBuilder, TableRow, row_to_line

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from gateway.estimation.paper.filters import (
+from gateway.estimation.vector_filter import (
     PASS_THROUGH,
     Coefficients,
     VectorFilter,

@@ -27,8 +27,8 @@ from typing import Annotated, Final, Literal
 import msgspec
 
 from gateway.estimation.columns import FRESH_GPS_S
-from gateway.estimation.paper.filters import Kind, VectorFilter, design_highpass, design_lowpass
 from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings, is_usable
+from gateway.estimation.vector_filter import Kind, VectorFilter, design_highpass, design_lowpass
 from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import (

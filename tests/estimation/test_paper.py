@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from gateway.estimation.paper.paper import PaperEstimator, PaperSettings
+from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import ReferenceSettings
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import from_euler, rotate_inverse, to_euler
