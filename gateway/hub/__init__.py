@@ -12,10 +12,11 @@ Theory of operation
 
 1. A transport turns bytes into `MavFrame`s with the splitter. A frame's header is read once, there;
    after that everything uses the fields of the record, and the bytes are sent on unchanged.
-2. `fanout.Fanout` keeps, for each source and kind of frame, the clients that get it. A hit is
-   one dictionary look-up and one send per client. The one rule: any change on which a route depends
-   (clients, options, requested intervals, bandwidths, paths to a system, our vehicles) clears the
-   cache, and the next frame of each kind is routed again.
+2. `fanout.Fanout` keeps, for each source and kind of frame, a `Route`: the clients that get it. A
+   hit is one dictionary look-up and one send per client; frames that need nothing else are counted
+   in bulk, a few times a second (`Route.settle`). The one rule: any change on which a route depends
+   (clients, options, requested intervals, bandwidths, paths to a system, our vehicles) clears all
+   routes, and the next frame of each kind is routed again.
 3. `router.Router` handles frames without a cached route: our own that came back, round-trip
    requests, requests to our vehicles, frames that address a system, and the first broadcast of each
    kind. `routing_table.RoutingTable` has the paths to each system. `routing_table.DuplicateFilter`
@@ -29,8 +30,8 @@ Theory of operation
    routing table, and reach our vehicles only.
 
 An endpoint kind is one file in `transports/` over `base.Client` or `base.Listener`, with
-`datagram` and `stream` between for what datagram sockets and byte streams share. No transport
-blocks or raises; each closes itself on an error, and `tick` opens it again. Everything but
-`transports/`, `hub.py` and `router.py` is pure: time is an argument, and nothing is
-read or written.
+`datagram` and `stream` between for the common part of datagram sockets and of byte streams. No
+transport blocks or raises; each closes itself on an error, and `tick` opens it again. Everything
+but `transports/`, `hub.py` and `router.py` is pure: time is an argument, and nothing is read or
+written.
 """

@@ -65,7 +65,7 @@ class World:
                 self.rig.tick(hub)
                 hub.send(self.rig.out(self.vehicles[name].heartbeat()))
                 hub.send(self.rig.out(self.vehicles[name].attitude()))
-        self.station.say(self.station.sender.heartbeat())
+        self.station.send(self.station.sender.heartbeat())
         reader = mavlink.MAVLink(None)
         while True:
             try:

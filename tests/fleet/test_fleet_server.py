@@ -39,7 +39,7 @@ async def test_two_aircraft_1_get_two_ids_and_a_command_reaches_the_right_one(wo
     ids = {site["name"]: site["vehicles"][0]["id"] for site in world.fleet.status()["sites"]}
     assert set(ids) == {"field-a", "field-b"}
     assert set(ids.values()) == world.systems() == {1, 2}
-    world.station.say(world.station.sender.command(ids["field-b"], 1))
+    world.station.send(world.station.sender.command(ids["field-b"], 1))
     await world.until(lambda: bool(world.commands("field-b")))
     (command,) = world.commands("field-b")
     assert (command.target_system, command.get_srcSystem()) == (1, 255)
@@ -123,7 +123,7 @@ async def test_frames_fed_back_through_a_site_end_after_one_round(world: World) 
     world.fleet._ids.set_by_hand("field-a", 1, 7)
     world.fleet._hub.add(f"udp:127.0.0.1:{hub.listening_ports()[0]}")
     await world.until(lambda: world.fleet.status()["sites"][0:1] != [] and 7 in world.systems())
-    world.station.say(world.station.sender.command(7, 1))
+    world.station.send(world.station.sender.command(7, 1))
     await world.until(lambda: world.fleet.status()["sites"][0]["looped"] > 50)
     (site,) = world.fleet.status()["sites"]
     assert [(each["system_id"], each["id"]) for each in site["vehicles"]] == [(1, 7)]

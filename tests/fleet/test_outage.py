@@ -21,7 +21,7 @@ def settings(settings: FleetSettings, router: Router) -> FleetSettings:
 async def test_router_outage_loses_old_frames_and_recovers(world: World, router: Router) -> None:
     site = world.open_site("field-a", extra="udp-listen:127.0.0.1:0")
     local = world.rig.station(site.listening_ports()[0])
-    local.say(local.sender.heartbeat())
+    local.send(local.sender.heartbeat())
     await world.until(lambda: bool(world.systems()))
     router.kill()
     await world.until(
@@ -31,7 +31,7 @@ async def test_router_outage_loses_old_frames_and_recovers(world: World, router:
     await world.until(lambda: site.clients()[0].dropped > 20)
     before = len(world.got)
     for _ in range(50):
-        world.station.say(world.station.sender.command(1, 1))
+        world.station.send(world.station.sender.command(1, 1))
     await world.until(lambda: site.clients()[0].dropped > 150)
     texts = [m.text for m in world.got[before:] if m.get_type() == "STATUSTEXT"]
     assert {m.get_type() for m in world.got[before:]} <= {"STATUSTEXT"}, "nothing of the vehicle"
@@ -41,7 +41,7 @@ async def test_router_outage_loses_old_frames_and_recovers(world: World, router:
     del world.got[:]
     await world.until(lambda: bool(world.systems()))
     assert not world.commands("field-a"), "what is old is not delivered as new"
-    world.station.say(world.station.sender.command(1, 1))
+    world.station.send(world.station.sender.command(1, 1))
     await world.until(lambda: bool(world.commands("field-a")))
     assert len(world.commands("field-a")) == 1
     assert [each["id"] for each in world.fleet.status()["sites"][0]["vehicles"]] == [1]

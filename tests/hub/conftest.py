@@ -61,7 +61,7 @@ class Station:
             return True
         return False
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         assert self.target
         self.socket.sendto(data, self.target)
 
@@ -161,7 +161,7 @@ class Rig:
     async def call(self, hub: Hub, number: int = 0) -> Station:
         """Return a station that is served by a listening port, after its first heartbeat."""
         station, before = self.station(hub.listening_ports()[number]), len(self.incoming)
-        station.say(station.sender.heartbeat())
+        station.send(station.sender.heartbeat())
         await self.until(lambda: len(self.incoming) > before)
         return station
 

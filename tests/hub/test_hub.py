@@ -31,7 +31,7 @@ async def world(rig: Any) -> Any:
     rig.world = hub
     for station in (rig.first, rig.second, rig.autopilot):
         before = len(rig.incoming)
-        station.say(station.sender.heartbeat())
+        station.send(station.sender.heartbeat())
         await rig.until(lambda count=before: len(rig.incoming) > count)
     for station in (rig.first, rig.second):
         assert (await station.receive())[5] == 42
@@ -42,7 +42,7 @@ async def world(rig: Any) -> Any:
 async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -> None:
     signed = world.sender(42, 1, signed=True)
     for frame in (world.autopilot.sender.attitude(), signed.attitude()):
-        world.autopilot.say(frame)
+        world.autopilot.send(frame)
         assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
         assert world.foreign[-1] == frame
 
@@ -50,10 +50,10 @@ async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -
 async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
     count = len(world.incoming)
     request = world.first.sender.command(42, 1)
-    world.first.say(request)
+    world.first.send(request)
     assert await world.autopilot.receive() == request
     answer = world.autopilot.sender.command(255, 190)
-    world.autopilot.say(answer)
+    world.autopilot.send(answer)
     assert await world.first.receive() == answer
     assert world.second.is_silent()
     assert len(world.incoming) == count
@@ -61,20 +61,20 @@ async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
 
 async def test_request_to_our_vehicle_is_not_forwarded(world: Any) -> None:
     request = world.first.sender.command(1, 1)
-    world.first.say(request)
+    world.first.send(request)
     await world.until(lambda: world.incoming[-1].frame == request)
     assert world.autopilot.is_silent()
 
 
 async def test_request_to_an_unknown_system_is_unroutable(world: Any) -> None:
-    world.first.say(world.first.sender.command(99, 1))
+    world.first.send(world.first.sender.command(99, 1))
     await world.until(lambda: world.world.counters().unroutable == 1)
     assert world.autopilot.is_silent()
 
 
 async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
     said = world.first.sender.heartbeat()
-    world.first.say(said)
+    world.first.send(said)
     assert await world.autopilot.receive() == said
     assert world.second.is_silent()
 
@@ -82,16 +82,16 @@ async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
 async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     hub = world.world
     echo = world.autopilot.sender.attitude()
-    world.second.say(echo)
+    world.second.send(echo)
     assert [await world.first.receive(), await world.autopilot.receive()] == [echo, echo]
     frame = world.autopilot.sender.attitude()
-    world.autopilot.say(frame)
+    world.autopilot.send(frame)
     assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
-    world.second.say(frame)
+    world.second.send(frame)
     await world.until(lambda: hub.counters().duplicates == 1)
     assert world.first.is_silent()
     ours = world.vehicle.attitude()
-    world.first.say(ours)
+    world.first.send(ours)
     await world.until(lambda: hub.counters().looped == 1)
     assert world.second.is_silent()
     assert world.incoming[-1].frame != ours
@@ -102,7 +102,7 @@ async def test_first_frame_of_a_restarted_program_is_accepted(world: Any) -> Non
     for _ in range(4):
         again = world.station(port)
         request = again.sender.command(42, 1)
-        again.say(request)
+        again.send(request)
         assert await world.autopilot.receive() == request
         again.socket.close()
         world.clock.us += 100_000
@@ -114,16 +114,16 @@ async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
     port = world.world.listening_ports()[0]
     echo = world.station(port)
     said = [world.autopilot.sender.attitude() for _ in range(5)]
-    world.autopilot.say(said[0])
+    world.autopilot.send(said[0])
     assert await world.first.receive() == said[0]
     world.clock.us += 1000
-    echo.say(said[0])
+    echo.send(said[0])
     assert [await world.first.receive(), await world.autopilot.receive()] == [said[0], said[0]]
     for count, frame in enumerate(said[1:], start=1):
         world.clock.us += 1000
-        world.autopilot.say(frame)
+        world.autopilot.send(frame)
         assert [await world.first.receive(), await echo.receive()] == [frame, frame]
-        echo.say(frame)
+        echo.send(frame)
         await world.until(lambda count=count: world.world.counters().duplicates == count)
     assert world.first.is_silent()
 
@@ -146,10 +146,10 @@ async def test_nothing_runs_round_a_ring(rig: Any) -> None:
     for turn in range(6):
         before = counted()
         rig.clock.us += 1_000_000
-        autopilot.say(autopilot.sender.heartbeat())
+        autopilot.send(autopilot.sender.heartbeat())
         first.send(rig.out(rig.vehicle.heartbeat()))
         for _ in range(10):
-            autopilot.say(autopilot.sender.attitude())
+            autopilot.send(autopilot.sender.attitude())
             first.send(rig.out(rig.vehicle.attitude()))
         rig.tick(first)
         if turn > 2:
@@ -186,10 +186,10 @@ async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     hub.send(rig.out(rig.vehicle.heartbeat()))
     assert await trusted.receive()
     for frame in (outsider.sender.heartbeat(), outsider.sender.command(1, 1)):
-        outsider.say(frame)
+        outsider.send(frame)
         await rig.until(lambda frame=frame: [i.frame for i in rig.incoming][-1:] == [frame])
         assert not rig.incoming[-1].trusted
-    outsider.say(outsider.sender.command(255, 190))
+    outsider.send(outsider.sender.command(255, 190))
     await rig.until(lambda: hub.counters().unroutable == 1)
     assert trusted.is_silent()
     assert rig.foreign == []
@@ -203,24 +203,24 @@ async def test_a_monitor_gets_all_traffic_and_what_it_sends_is_ignored(world: An
     client = hub._clients[hub.clients()[-1].client_id]
     monitor.target = ("127.0.0.1", client._port)
     request = world.first.sender.command(42, 1)
-    world.first.say(request)
+    world.first.send(request)
     assert await world.autopilot.receive() == await monitor.receive() == request
     to_us = world.first.sender.command(1, 1)
-    world.first.say(to_us)
+    world.first.send(to_us)
     assert await monitor.receive() == to_us
     answer = world.vehicle.ack()
     hub.send(world.out(answer, hub.clients()[0].client_id))
     telemetry = world.autopilot.sender.attitude()
-    world.autopilot.say(telemetry)
+    world.autopilot.send(telemetry)
     beat = world.second.sender.heartbeat()
-    world.second.say(beat)
+    world.second.send(beat)
     got = [await monitor.receive() for _ in range(3)]
     assert got[0] == answer
     assert sorted(got[1:]) == sorted([telemetry, beat])
     count, forwarded = len(world.incoming), hub.counters().forwarded
     sender = world.sender(77)
     for frame in (sender.heartbeat(), sender.command(42, 1), sender.command(1, 1)):
-        monitor.say(frame)
+        monitor.send(frame)
     await world.until(lambda: client.counters.received == 3)
     assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
     await world.quiet()
@@ -261,9 +261,9 @@ async def test_a_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> 
         frame = pilot.attitude(time_ms=number)
         delayed.append(frame)
         if number % 10 != 5:
-            world.autopilot.say(frame)
+            world.autopilot.send(frame)
         if number >= 150:
-            slow.say(delayed[number - 150])
+            slow.send(delayed[number - 150])
         await world.quiet_some()
         while not world.first.is_empty():
             got = frame_of(await world.first.receive())
@@ -289,10 +289,12 @@ async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
     ping, sync = [reader.parse_buffer(await station.receive())[0] for _ in range(2)]
     rig.clock.us += 1_500
     asker = (ping.get_srcSystem(), ping.get_srcComponent())
-    station.say(station.sender.pack(dialect.MAVLink_ping_message(ping.time_usec, ping.seq, *asker)))
+    station.send(
+        station.sender.pack(dialect.MAVLink_ping_message(ping.time_usec, ping.seq, *asker))
+    )
     await rig.until(lambda: hub.clients()[0].round_trip_us == 1_500)
     rig.clock.us += 500
-    station.say(station.sender.pack(dialect.MAVLink_timesync_message(77, sync.ts1)))
+    station.send(station.sender.pack(dialect.MAVLink_timesync_message(77, sync.ts1)))
     await rig.until(lambda: hub.clients()[0].round_trip_us == 2_000)
     assert len(rig.incoming) == 1
     # mavros has the id of a UDP bridge in the system of its vehicle, and asks as well.
@@ -302,7 +304,7 @@ async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
         dialect.MAVLink_command_long_message(1, 1, 512, 0, 1, 0, 0, 0, 0, 0, 0),
     ]
     for number, message in enumerate(asked, 2):
-        station.say(bytes(message.pack(mavros)))
+        station.send(bytes(message.pack(mavros)))
         await rig.until(lambda number=number: len(rig.incoming) == number)
 
 
@@ -329,7 +331,7 @@ class TestChangesAtRunTime:
             f"udp:127.0.0.1:{goes.port}",
         )
         caller = rig.station(hub.listening_ports()[0])
-        caller.say(caller.sender.heartbeat())
+        caller.send(caller.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 3)
         await rig.until_open(hub)
         before = {client.remote: client.client_id for client in hub.clients()}
@@ -375,7 +377,7 @@ class TestCachedRoutes:
         hub = world.world
         frames = [world.autopilot.sender.attitude() for _ in range(50)]
         for frame in frames:
-            world.autopilot.say(frame)
+            world.autopilot.send(frame)
             assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
         assert hub.counters().forwarded == 50 + 3
         by_remote = {client.remote: client for client in hub.clients()}
@@ -386,12 +388,12 @@ class TestCachedRoutes:
 
     async def test_a_refusal_on_the_way_is_counted_and_hurts_nobody(self, world: Any) -> None:
         hub = world.world
-        world.autopilot.say(world.autopilot.sender.attitude())
+        world.autopilot.send(world.autopilot.sender.attitude())
         assert [(await s.receive())[7] for s in (world.first, world.second)] == [30, 30]
         world.second.socket.close()
         for _ in range(20):
             frame = world.autopilot.sender.attitude()
-            world.autopilot.say(frame)
+            world.autopilot.send(frame)
             assert await world.first.receive() == frame
         by_remote = {client.remote: client for client in hub.clients()}
         gone = by_remote[f"127.0.0.1:{world.second.port}"]
@@ -401,34 +403,34 @@ class TestCachedRoutes:
 
     async def test_changes_apply_from_the_next_frame_on(self, world: Any) -> None:
         hub = world.world
-        world.autopilot.say(world.autopilot.sender.attitude())
+        world.autopilot.send(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
         late = world.station()
         hub.add(f"udp:127.0.0.1:{late.port}?deny=RAW_IMU")
         await world.until_open(hub)
         for frame in (world.autopilot.sender.raw_imu(), world.autopilot.sender.attitude()):
-            world.autopilot.say(frame)
+            world.autopilot.send(frame)
             assert await world.first.receive() == frame
         assert (await late.receive())[7] == 30
         late_client = hub._clients[hub.clients()[-1].client_id]
         hub.reconfigure(late_client)
         hub.remove(f"udp:127.0.0.1:{late.port}")
-        world.autopilot.say(world.autopilot.sender.attitude())
+        world.autopilot.send(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
         assert late.is_silent()
 
     async def test_second_path_ends_the_cached_route(self, world: Any) -> None:
         hub = world.world
-        world.autopilot.say(world.autopilot.sender.attitude())
+        world.autopilot.send(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
         other = world.station(hub.listening_ports()[0])
-        other.say(world.autopilot.sender.attitude())
+        other.send(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
         for _ in range(5):
             frame = world.autopilot.sender.attitude()
-            world.autopilot.say(frame)
+            world.autopilot.send(frame)
             assert await world.first.receive() == frame
-            other.say(frame)
+            other.send(frame)
         await world.until(lambda: hub.counters().duplicates == 5)
         assert world.first.is_silent()
 
@@ -463,7 +465,7 @@ class TestListeningPorts:
 
         async def call(turned_away: int) -> None:
             caller = rig.station(hub.listening_ports()[0])
-            caller.say(caller.sender.heartbeat())
+            caller.send(caller.sender.heartbeat())
             await rig.until(lambda: hub.listeners()[0].turned_away == turned_away)
             await rig.until(lambda: hub.listeners()[0].clients == 1)
 
@@ -489,7 +491,7 @@ class TestListeningPorts:
             if kind == "tcp":
                 caller.socket.connect_ex(caller.target)
             else:
-                caller.say(caller.sender.heartbeat())
+                caller.send(caller.sender.heartbeat())
             await rig.until(lambda: hub.listeners()[0].reason == "Too many open files")
             rig.tick(hub)
             assert hub.listeners()[0].reason == "Too many open files", "no tick hides it"
@@ -499,7 +501,7 @@ class TestListeningPorts:
         rig.clock.us += 2_000_000
         rig.tick(hub)
         if kind == "udp":
-            caller.say(caller.sender.heartbeat())
+            caller.send(caller.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 1)
         assert hub.listeners()[0].state == "open"
 

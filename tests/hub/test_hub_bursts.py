@@ -97,7 +97,7 @@ async def test_simultaneous_clients_are_admitted_one_a_turn(rig: Any, kind: str)
     for _ in range(STATIONS):
         if kind == "udp":
             station = rig.station(port)
-            station.say(station.sender.heartbeat())
+            station.send(station.sender.heartbeat())
         else:
             rig.closing.append(socket.create_connection(("127.0.0.1", port)).close)
     (listener,) = hub._endpoints.values()
@@ -157,7 +157,7 @@ async def test_a_slow_loop_answers_within_0_3_s_and_sheds_telemetry(crowd: Any) 
         hub.send_all(map(crowd.out, burst(crowd, 20)))
         if asked_us is None:
             asked_us = crowd.clock.us
-            station.say(station.sender.command(1, 1))
+            station.send(station.sender.command(1, 1))
         await asyncio.sleep(0)
         while not station.is_empty():
             frame = frame_of(await station.receive())

@@ -50,7 +50,7 @@ class Healthy:
 
     async def start(self) -> None:
         caller = self.stations[-1]
-        caller.say(caller.sender.heartbeat())
+        caller.send(caller.sender.heartbeat())
         await self.rig.until(lambda: len(self.hub.clients()) >= 3)
         await self.rig.until(lambda: all(c.state == "open" for c in self.hub.clients()[:2]))
 
@@ -90,7 +90,7 @@ async def test_killed_client_costs_others_no_frame(rig: Any) -> None:
     flight = Healthy(rig)
     await flight.start()
     victim = rig.station(flight.hub.listening_ports()[0])
-    victim.say(rig.sender(200, 190).heartbeat())
+    victim.send(rig.sender(200, 190).heartbeat())
     await rig.until(lambda: len(flight.hub.clients()) == 4)
     await flight.fly(FRAMES // 2)
     victim.socket.close()
@@ -161,7 +161,7 @@ async def test_hundreds_of_clients_appear_and_vanish(rig: Any, room: int) -> Non
         if visit % 10 == 0:
             rig.clock.us += 1_000_000
             caller = flight.stations[-1]
-            caller.say(caller.sender.heartbeat())
+            caller.send(caller.sender.heartbeat())
         await flight.fly(1)
     assert await flight.lost() == 0
     assert len(flight.hub.clients()) <= 2 + room
@@ -289,7 +289,7 @@ async def test_truncated_heartbeats_are_accepted_without_error(rig: Any) -> None
         payload = bytes((0, 0, 0, 0, 6, 8, 0, 4, 3))[:length]
         body = bytes((len(payload), 0, 0, length, 255, 190, 0, 0, 0)) + payload
         crc = mcrf4xx(CRC_EXTRA[0], mcrf4xx(body))
-        caller.say(b"\xfd" + body + crc.to_bytes(2, "little"))
+        caller.send(b"\xfd" + body + crc.to_bytes(2, "little"))
     await rig.until(lambda: len(rig.incoming) == 10)
     assert errors == []
 
@@ -302,7 +302,7 @@ async def test_unlimited_new_clients_do_not_flood_the_log(
     hub = rig.hub("udp-listen:127.0.0.1:0", max_clients=many, idle_timeout_s=3600)
     for _ in range(many):
         client = rig.station(hub.listening_ports()[0])
-        client.say(client.sender.heartbeat())
+        client.send(client.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == many)
     assert len(caplog.messages) == CONNECTIONS_IN_FULL
     hub.add("udp:127.0.0.1:9")

@@ -44,7 +44,7 @@ class Joined:
                 self.rig.tick(self.first.hub)
                 self.rig.tick(self.second.hub)
             if step % 50 == 0:
-                self.station.say(self.station.sender.heartbeat())
+                self.station.send(self.station.sender.heartbeat())
             for _ in range(8):
                 await asyncio.sleep(0)
             self.listen()
@@ -78,7 +78,7 @@ async def test_request_over_two_links_is_answered_on_both_without_a_gap(rig: Any
     await joined.run(4)
     joined.heard = {1: [], 2: []}
     for _ in range(10):
-        joined.station.say(joined.station.sender.command(1, 1))
+        joined.station.send(joined.station.sender.command(1, 1))
         await joined.run(0.2)
     acks = [frame for frame in joined.heard[1] if message_id_of(frame) == 77]
     assert len(acks) == 10
@@ -94,8 +94,8 @@ async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
         rig.clock.us += 100_000
         for twin in twins:
             if step % 10 == 0:
-                twin.say(twin.sender.heartbeat())
-            twin.say(twin.sender.command(1, 1))
+                twin.send(twin.sender.heartbeat())
+            twin.send(twin.sender.command(1, 1))
         await rig.quiet()
         for number, twin in enumerate(twins):
             while True:

@@ -50,7 +50,7 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
     hub.send(rig.out(rig.vehicle.heartbeat()))
     hub.send(rig.out(rig.vehicle.home()))
     station, receiver = rig.station(hub.listening_ports()[0]), Strict()
-    station.say(station.sender.heartbeat())
+    station.send(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 1)
     (client,) = hub.clients()
     got = []
@@ -101,10 +101,10 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     hub.send(rig.out(rig.vehicle.heartbeat()))
     port = hub.listening_ports()[0]
     source, station, receiver = rig.station(port), rig.station(port), Strict()
-    station.say(station.sender.heartbeat())
+    station.send(station.sender.heartbeat())
     autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
     for said in [pilot.heartbeat() for pilot in autopilots]:
-        source.say(said)
+        source.send(said)
 
     def received() -> int:
         return sum(client.received for client in hub.clients())
@@ -112,7 +112,7 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     await rig.until(lambda: received() == 1 + len(autopilots))
     said = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
     for frame in said:
-        source.say(frame)
+        source.send(frame)
     await rig.until(lambda: received() == 1 + len(autopilots) + len(said))
     hub.send(rig.out(rig.vehicle.raw_imu()))
     got = []

@@ -121,7 +121,7 @@ class HubMachine(RuleBasedStateMachine):
         self.gateway.fly()
         beat = self.autopilot.sender.heartbeat()
         self.telemetry.append(beat)
-        self.autopilot.say(beat)
+        self.autopilot.send(beat)
         self._ask(self.good.sender.heartbeat())
         self.rig.tick(self.hub)
         await self._settle()
@@ -129,7 +129,7 @@ class HubMachine(RuleBasedStateMachine):
     def _ask(self, frame: bytes) -> None:
         self.said.add(frame)
         self.requests.append(frame)
-        self.good.say(frame)
+        self.good.send(frame)
 
     async def _settle(self) -> None:
         """Let everything arrive."""
@@ -172,7 +172,7 @@ class HubMachine(RuleBasedStateMachine):
                 self.rig.clock.us += 5_000
                 self.gateway.fly()
                 self.telemetry.append(self.autopilot.sender.attitude())
-                self.autopilot.say(self.telemetry[-1])
+                self.autopilot.send(self.telemetry[-1])
             await self._settle()
 
         self.run(steps())
@@ -183,7 +183,7 @@ class HubMachine(RuleBasedStateMachine):
             before = self.answers
             frame = self.good.sender.command(*OURS)
             self.said.add(frame)
-            self.good.say(frame)
+            self.good.send(frame)
 
             def answered() -> bool:
                 self._listen()
@@ -231,7 +231,7 @@ class HubMachine(RuleBasedStateMachine):
                 frame = lies(sender, guessed)[kind]
                 if kind != "copy in advance":
                     self.lies.add(frame)
-                outsider.say(frame)
+                outsider.send(frame)
                 await asyncio.sleep(0)
             await self._settle()
 

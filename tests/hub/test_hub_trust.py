@@ -22,7 +22,7 @@ async def world(rig: Any) -> Any:
     rig.untrusted.target = ("127.0.0.2", untrusted)
     rig.untrusted.sender = rig.sender(200, 190)
     for number, client in enumerate((rig.untrusted, rig.station_, rig.autopilot), start=1):
-        client.say(client.sender.heartbeat())
+        client.send(client.sender.heartbeat())
         await rig.until(lambda number=number: len(rig.incoming) == number)
     for client in (rig.untrusted, rig.station_):
         assert (await client.receive())[5] == 42
@@ -38,7 +38,7 @@ async def lie(world: Any, *frames: bytes) -> None:
 
     before = heard()
     for frame in frames:
-        world.untrusted.say(frame)
+        world.untrusted.send(frame)
     await world.until(lambda: heard() == before + len(frames))
 
 
@@ -48,7 +48,7 @@ async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(w
     for _ in range(20):
         await lie(world, forged.heartbeat())
         frame = world.autopilot.sender.attitude()
-        world.autopilot.say(frame)
+        world.autopilot.send(frame)
         assert await world.station_.receive() == frame
 
 
@@ -59,7 +59,7 @@ async def test_copies_sent_in_advance_drop_no_request(world: Any) -> None:
         request = world.station_.sender.command(42, 1)
         assert seen.command(42, 1) == request, "numbers are easily guessed"
         await lie(world, request)
-        world.station_.say(request)
+        world.station_.send(request)
         assert await world.autopilot.receive() == request
     assert world.world.counters().duplicates == 0
 
@@ -70,7 +70,7 @@ async def test_command_goes_to_the_trusted_path_despite_a_forged_component(
     claimed = world.sender(42, 77)
     await lie(world, claimed.heartbeat(), claimed.attitude())
     request = world.station_.sender.command(42, 77)
-    world.station_.say(request)
+    world.station_.send(request)
     assert await world.autopilot.receive() == request
     await world.quiet()
     while not world.untrusted.is_silent():
@@ -86,7 +86,7 @@ async def test_forged_stations_displace_no_other_client(world: Any) -> None:
     late = world.station(world.world.listening_ports()[0])
     late.sender = world.sender(253, 190)
     said = late.sender.heartbeat()
-    late.say(said)
+    late.send(said)
     assert await world.autopilot.receive() == said
     assert world.station_.is_silent(), "what a station says to all goes to vehicles only"
 
@@ -101,13 +101,13 @@ async def test_systems_shown_for_an_untrusted_client_are_bounded(world: Any) -> 
 async def test_client_no_longer_trusted_loses_its_routes(world: Any) -> None:
     hub = world.world
     request = world.station_.sender.command(42, 1)
-    world.station_.say(request)
+    world.station_.send(request)
     assert await world.autopilot.receive() == request
     client = hub._clients[hub.clients()[-1].client_id]
     client.trusted = False
     hub.reconfigure(client)
     count = hub.counters().unroutable
-    world.station_.say(world.station_.sender.command(42, 1))
+    world.station_.send(world.station_.sender.command(42, 1))
     await world.until(lambda: hub.counters().unroutable == count + 1)
     assert world.autopilot.is_silent()
 
@@ -122,7 +122,7 @@ class TestRequests:
         assert len(world.incoming) == before
         assert hub.counters().unserved == 100 - 64
         request = world.station_.sender.command(1, 1)
-        world.station_.say(request)
+        world.station_.send(request)
         await world.until(lambda: world.incoming[-1].frame == request)
 
     async def test_telemetry_passes_between_two_answers(self, world: Any) -> None:
@@ -130,9 +130,9 @@ class TestRequests:
         order: list[Any] = []
         world.world._router._on_frame = order.append
         for _ in range(50):
-            world.station_.say(world.station_.sender.command(1, 1))
+            world.station_.send(world.station_.sender.command(1, 1))
         frame = world.autopilot.sender.attitude()
-        world.autopilot.say(frame)
+        world.autopilot.send(frame)
 
         def heard() -> bool:
             if not world.station_.is_silent():

@@ -47,21 +47,21 @@ async def test_client_that_only_sends_version_1_gets_it_after_a_probe(rig: Any) 
     """Programs that know both versions answer version 2 by version 2 within the probe."""
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
-    station.say(heartbeat(0))
+    station.send(heartbeat(0))
     await rig.until(lambda: len(hub.clients()) == 1)
     assert (await next_attitude(rig, hub, station))[0] == V2
     rig.clock.us += PROBE_US
     count = len(rig.incoming)
-    station.say(heartbeat(1))
+    station.send(heartbeat(1))
     await rig.until(lambda: len(rig.incoming) > count)
     assert (await next_attitude(rig, hub, station))[0] == V1
     count = len(rig.incoming)
-    station.say(station.sender.heartbeat())
+    station.send(station.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) > count)
     assert (await next_attitude(rig, hub, station))[0] == V2
-    station.say(heartbeat(2))
+    station.send(heartbeat(2))
     rig.clock.us += PROBE_US
-    station.say(heartbeat(3))
+    station.send(heartbeat(3))
     await rig.quiet()
     assert (await next_attitude(rig, hub, station))[0] == V2, "it has shown that it knows both"
 
@@ -70,7 +70,7 @@ async def test_option_of_version_2_is_kept_for_a_client_that_sends_version_1(rig
     hub = rig.hub("udp-listen:127.0.0.1:0?mavlink=2")
     station = rig.station(hub.listening_ports()[0])
     for sequence in range(3):
-        station.say(heartbeat(sequence))
+        station.send(heartbeat(sequence))
         await rig.until(lambda count=sequence: len(rig.incoming) > count)
         rig.clock.us += PROBE_US
     assert (await next_attitude(rig, hub, station))[0] == V2

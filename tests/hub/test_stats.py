@@ -2,6 +2,8 @@
 
 import dataclasses
 
+import pytest
+
 from gateway.hub.stats import (
     ALERT_AFTER_US,
     SLOW_FOR_US,
@@ -24,33 +26,56 @@ def look(watch: ClientAlerts, clients: tuple[ClientStats, ...], now_us: int) -> 
     return [text for _, text in watch.update(clients, (), now_us)]
 
 
-def test_a_short_absence_is_not_reported() -> None:
+AWAY = client(state="unreachable")
+
+
+@pytest.mark.parametrize(
+    ("looks", "texts"),
+    [
+        pytest.param(
+            [(0, AWAY), (ALERT_AFTER_US - 1, AWAY), (ALERT_AFTER_US, client()),
+             (ALERT_AFTER_US + 1, AWAY)],
+            [],
+            id="short outages",
+        ),
+        pytest.param(
+            [*((n * S, AWAY) for n in range(20)), (21 * S, client()), (22 * S, client())],
+            ["tablet: unreachable", "tablet is back"],
+            id="one long outage",
+        ),
+        pytest.param(
+            [(n * S, client(state="connecting")) for n in range(20)],
+            ["tablet: not connected"],
+            id="lost router",
+        ),
+        pytest.param(
+            [(n * S, client(state="unreachable", reason="Permission denied")) for n in range(20)],
+            ["tablet: Permission denied"],
+            id="known reason",
+        ),
+        pytest.param(
+            [(n * S, client(state="refused")) for n in range(20)], [], id="refusing station"
+        ),
+        pytest.param(
+            [*((n * S, client(dropped=n * 10)) for n in range(10)),
+             *((n * S, client(dropped=90)) for n in range(10, 50)), (60 * S, client(dropped=91))],
+            ["tablet is too slow: telemetry dropped"] * 2,
+            id="drops before and after a pause",
+        ),
+        pytest.param(
+            [(0, client(state="unreachable", dropped=10)), (S, client(dropped=20)),
+             (2 * S, client(dropped=20))],
+            [],
+            id="drops during an outage",
+        ),
+    ],
+)  # fmt: skip
+def test_problems_that_last_are_reported_once_and_so_is_their_end(
+    looks: list[tuple[int, tuple[ClientStats, ...]]], texts: list[str]
+) -> None:
     watch = ClientAlerts()
-    assert look(watch, client(state="unreachable"), 0) == []
-    assert look(watch, client(state="unreachable"), ALERT_AFTER_US - 1) == []
-    assert look(watch, client(), ALERT_AFTER_US) == []
-    assert look(watch, client(state="unreachable"), ALERT_AFTER_US + 1) == []
-
-
-def test_a_long_absence_is_reported_once_and_so_is_the_return() -> None:
-    watch = ClientAlerts()
-    texts = [text for n in range(20) for text in look(watch, client(state="unreachable"), n * S)]
-    assert texts == ["tablet: unreachable"]
-    assert look(watch, client(), 21 * S) == ["tablet is back"]
-    assert look(watch, client(), 22 * S) == []
-
-
-def test_lost_router_is_reported_as_not_connected() -> None:
-    watch = ClientAlerts()
-    texts = [text for n in range(20) for text in look(watch, client(state="connecting"), n * S)]
-    assert texts == ["tablet: not connected"]
-
-
-def test_the_reason_is_reported_if_it_is_known() -> None:
-    watch = ClientAlerts()
-    away = client(state="unreachable", reason="Permission denied")
-    texts = [text for n in range(20) for text in look(watch, away, n * S)]
-    assert texts == ["tablet: Permission denied"]
+    assert [text for now_us, clients in looks for text in look(watch, clients, now_us)] == texts
+    assert SLOW_FOR_US < 40 * S
 
 
 def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
@@ -63,28 +88,6 @@ def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
     watch.update((), (closed,), 22 * S)
     assert watch.update((), (), 23 * S) == []
     assert not watch._away_since_us
-
-
-def test_refusing_station_raises_no_alert() -> None:
-    watch = ClientAlerts()
-    assert all(not look(watch, client(state="refused"), n * S) for n in range(20))
-
-
-def test_drops_are_reported_once_until_they_have_ceased() -> None:
-    watch = ClientAlerts()
-    texts = [text for n in range(10) for text in look(watch, client(dropped=n * 10), n * S)]
-    assert texts == ["tablet is too slow: telemetry dropped"]
-    for n in range(40):
-        assert look(watch, client(dropped=90), 10 * S + n * S) == []
-    assert SLOW_FOR_US < 40 * S
-    assert len(look(watch, client(dropped=91), 60 * S)) == 1
-
-
-def test_drops_while_it_was_away_do_not_make_it_slow() -> None:
-    watch = ClientAlerts()
-    look(watch, client(state="unreachable", dropped=10), 0)
-    assert look(watch, client(dropped=20), S) == []
-    assert look(watch, client(dropped=20), 2 * S) == []
 
 
 def test_state_of_a_client_that_left_is_discarded() -> None:

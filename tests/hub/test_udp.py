@@ -22,7 +22,7 @@ async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: An
     data, station.target = await asyncio.get_running_loop().sock_recvfrom(station.socket, 100)
     assert data == heartbeat
     said = station.sender.heartbeat()
-    station.say(said)
+    station.send(said)
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub.clients()
     assert rig.incoming == [Incoming(client.client_id, said, trusted=True, forwarded=True)]
@@ -50,11 +50,11 @@ async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
     for place, station in enumerate(stations):
         station.sender.link.srcSystem = 200 + place
-        station.say(station.sender.heartbeat())
+        station.send(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 5)
     for _ in range(3):
         for station in stations:
-            station.say(station.sender.heartbeat())
+            station.send(station.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 20)
     assert [client.received for client in hub.clients()] == [4] * 5
     assert {client.systems for client in hub.clients()} == {
@@ -71,7 +71,7 @@ async def test_odd_sizes_from_a_client_are_counted(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
     for data in (station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat()):
-        station.say(data)
+        station.send(data)
     await rig.until(lambda: len(rig.incoming) == 2)
     assert hub.clients()[0].bytes_garbage == MAX_DATAGRAM
 
@@ -96,7 +96,7 @@ async def test_client_is_removed_after_its_host_refuses(rig: Any) -> None:
 async def test_client_of_a_named_port_has_its_name(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?name=tablets", "tcp-listen:127.0.0.1:0?name=bench")
     station = rig.station(hub.listening_ports()[0])
-    station.say(station.sender.heartbeat())
+    station.send(station.sender.heartbeat())
     with socket.create_connection(("127.0.0.1", hub.listening_ports()[1])):
         await rig.until(lambda: len(hub.clients()) == 2)
         names = sorted(client.name.partition(" ")[0] for client in hub.clients())
@@ -129,10 +129,10 @@ async def test_refusing_client_gets_nothing_until_it_sends_again(rig: Any) -> No
 async def test_back_on_another_port_replaces_itself(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     before, after = (rig.station(hub.listening_ports()[0]) for _ in range(2))
-    before.say(before.sender.heartbeat())
+    before.send(before.sender.heartbeat())
     await rig.until(lambda: len(rig.incoming) == 1)
     rig.clock.us = 4_000_000
-    after.say(after.sender.attitude())
+    after.send(after.sender.attitude())
     await rig.until(lambda: len(rig.incoming) == 2)
     await rig.until(lambda: len(hub.clients()) == 1)
     assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"
@@ -302,14 +302,14 @@ async def test_packing_waits_for_nothing_but_what_comes_at_once(
     hub = await rig.open("udp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}?pack=1100")
     source = rig.station(hub.listening_ports()[0])
     source.sender = rig.sender(42, 1)
-    source.say(source.sender.heartbeat())
+    source.send(source.sender.heartbeat())
     assert (await station.receive())[5] == 42
     frames = [source.sender.attitude() for _ in range(3)]
     loop = asyncio.get_running_loop()
     now_s = loop.time()
     monkeypatch.setattr(loop, "time", lambda: now_s)
     for frame in frames:
-        source.say(frame)
+        source.send(frame)
     assert await station.receive() == b"".join(frames)
     assert hub._gathering == {}
 

@@ -188,7 +188,7 @@ class TestSite:
         autopilot = rig.sender(7)
 
         def heard() -> bool:
-            station.say(autopilot.heartbeat())
+            station.send(autopilot.heartbeat())
             hub.send(rig.out(rig.vehicle.command(1, 1)))
             hub.send(rig.out(rig.vehicle.heartbeat()))
             return far.marks.keys() >= {"mavlink/field/7/out"} and bool(far.messages(76))
@@ -341,7 +341,7 @@ class TestTrouble:
         hub = await open_site(rig, router, f"site=field&config={patient}")
         hub.add("udp-listen:127.0.0.1:0")
         station = rig.station(hub.listening_ports()[0])
-        station.say(station.sender.heartbeat())
+        station.send(station.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 2)
         hub.send(rig.out(rig.vehicle.attitude()))
         while not station.is_silent():

@@ -97,7 +97,7 @@ class Page:
             while await self.take():
                 pass
 
-    def say(self, data: bytes) -> None:
+    def send(self, data: bytes) -> None:
         self.writer.write(self.web.send(BytesMessage(data=data)))
 
     def close(self) -> None:

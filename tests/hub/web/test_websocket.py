@@ -33,8 +33,8 @@ class TestPages:
         assert [(message_id_of(frame), frame[4]) for frame in frames] == [(0, 0), (30, 1)]
         assert len(page.messages) == 2
         said = rig.sender(255, 190).heartbeat()
-        page.say(said[:5])
-        page.say(said[5:])
+        page.send(said[:5])
+        page.send(said[5:])
         await rig.until(lambda: bool(rig.incoming))
         assert rig.incoming[0].frame == said
         assert rig.incoming[0].trusted
@@ -69,7 +69,7 @@ class TestPages:
         assert page.is_open
         assert (await visit(hub.listening_ports()[0], "null")).is_open
         assert not (await visit(hub.listening_ports()[0], "https://example.com")).is_open
-        page.say(rig.sender(255, 190).command(1, 1))
+        page.send(rig.sender(255, 190).command(1, 1))
         await rig.until(lambda: bool(rig.incoming))
         assert not rig.incoming[0].trusted
 
