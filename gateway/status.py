@@ -24,7 +24,7 @@ class RecorderStatus:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """Distance and bearing to a place."""
+    """Distance and bearing to a location."""
 
     lat_deg: float
     lon_deg: float

@@ -395,7 +395,7 @@ class RequestLog:
         """All entries, the newest last."""
         return tuple(self._entries.values())
 
-    def note(self, request: Request, outcome: str, now_us: int) -> None:
+    def add(self, request: Request, outcome: str, now_us: int) -> None:
         """Add a request that failed."""
         sender = (request.system_id, request.component_id)
         key = (*sender, describe(request.message), outcome)
@@ -407,13 +407,13 @@ class RequestLog:
             self._vehicle_id, *sender, key[2], outcome, count, now_us
         )
 
-    def note_answers(self, request: Request, answers: list[Answer], now_us: int) -> None:
+    def add_failed(self, request: Request, answers: list[Answer], now_us: int) -> None:
         """Add a request if one of its answers is negative."""
         for answer in answers:
             if isinstance(answer, Reply) and answer.client_id == request.client_id:
                 outcome = failure_of(answer.message)
                 if outcome is not None:
-                    self.note(request, outcome, now_us)
+                    self.add(request, outcome, now_us)
                     return
 
 

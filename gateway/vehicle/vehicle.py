@@ -250,7 +250,7 @@ class Vehicle:
         service = self._services.get(request.message.get_type())
         if service is None:
             if getattr(request.message, "target_system", None) == self.system_id:
-                self.requests.note(request, "no answer", now_us)
+                self.requests.add(request, "no answer", now_us)
             return []
         if service.changes_state(request):
             if not request.may_change:
@@ -258,13 +258,13 @@ class Vehicle:
             if not self._control.permits(request):
                 return self._refuse(service, request, f": {self._control.denial()}", now_us)
         answers = service.handle(request, now_us)
-        self.requests.note_answers(request, answers, now_us)
+        self.requests.add_failed(request, answers, now_us)
         return self._finish(answers)
 
     def _refuse(self, service: Service, request: Request, reason: str, now_us: int) -> list[Action]:
         """Answer and announce a request that the sender may not make."""
         self.refusals += 1
-        self.requests.note(request, f"refused{reason or ': not trusted'}", now_us)
+        self.requests.add(request, f"refused{reason or ': not trusted'}", now_us)
         name = _describe(request)
         status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}{reason}")
         answers = service.refuse(request)
@@ -343,7 +343,7 @@ class Vehicle:
         """Apply a section that was changed elsewhere, and send the parameters that differ."""
         if isinstance(settings, VehicleSettings) and section == OWN_SECTION:
             self._reconfigure(settings)
-        return self._finish(self._parameters.take(section, settings))
+        return self._finish(self._parameters.update(section, settings))
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
         return self._replies(self._announcements.say(StatusText(NOTICE, text), now_us))
@@ -371,7 +371,7 @@ class Vehicle:
         actions: list[Action] = []
         if self.telemetry.home is not self._published_home:
             self._published_home = self.telemetry.home
-            home = self._parameters.take(HOME_SECTION, self.plan.home_parameters())
+            home = self._parameters.update(HOME_SECTION, self.plan.home_parameters())
             answers = [*answers, *home]
         for answer in answers:
             if isinstance(answer, Reply):

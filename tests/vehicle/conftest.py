@@ -4,11 +4,12 @@ import pytest
 
 from gateway.records import Vec3
 from gateway.settings import Settings, setting
+from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.kit.ground_station import GroundStation
-from tests.kit.records import BARO, FIX, sample_at, state_at
+from tests.kit.records import BARO, FIX, SAMPLE, STATE, sample_at, state_at
 
 
 class InnerSettings(Settings, frozen=True):
@@ -41,3 +42,13 @@ def station(vehicle: Vehicle, clock: ManualClock) -> GroundStation:
     vehicle.on_baro(BARO, clock.now_us)
     vehicle.on_state(state_at(clock.now_us), sample_at(clock.now_us), clock.now_us)
     return GroundStation(vehicle, clock)
+
+
+@pytest.fixture
+def health() -> Health:
+    """All sensors of an aircraft have just sent a good sample."""
+    health = Health(1, 2.0)
+    health.on_state(STATE, SAMPLE)
+    health.on_baro(BARO)
+    health.on_gps(FIX)
+    return health

@@ -118,7 +118,7 @@ class _Run:
     def deadline_us(self) -> int:
         return self.began_us + (SIX_SIDES_TIMEOUT_US if self.has_sides else TIMEOUT_US)
 
-    def take(self, sample: ImuSample) -> int:
+    def add(self, sample: ImuSample) -> int:
         """Collect a sample; return how long they span."""
         self.samples.append(sample)
         if sample.mag_b_ut is not None and len(self.mag) < MAG_SAMPLES:
@@ -197,7 +197,7 @@ class Calibrator(Service):
             return []
         if self._in_flight():
             return self._fail("in flight")
-        passed_us = run.take(sample)
+        passed_us = run.add(sample)
         if run.is_turned:
             return self._on_mag(run, passed_us) if sample.mag_b_ut is not None else []
         if run.has_sides:

@@ -181,7 +181,7 @@ class IntervalService(Service):
         for message_id in ids:
             common_us = self._telemetry.streams[message_id].interval_us
             faster = 0 <= wanted_us <= common_us
-            answers += self._take(request.client_id, message_id, DEFAULT if faster else wanted_us)
+            answers += self._apply(request.client_id, message_id, DEFAULT if faster else wanted_us)
         return answers
 
     def set_interval(
@@ -206,7 +206,7 @@ class IntervalService(Service):
             requested_us = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, requested_us)
         if _is_faster(requested_us, stream.interval_us) and not request.may_change:
             return None
-        return self._take(request.client_id, message_id, requested_us)
+        return self._apply(request.client_id, message_id, requested_us)
 
     def interval_us(self, client_id: int, message_id: int) -> int:
         """Return a client's MESSAGE_INTERVAL: -1 if it gets none, 0 if it is never sent."""
@@ -242,7 +242,7 @@ class IntervalService(Service):
         due = [s.due_us or 0 for (_, m), s in self._fast.items() if m not in CARRIED_MESSAGES]
         return min(due, default=None)
 
-    def _take(self, client_id: int, message_id: int, requested_us: int) -> list[Answer]:
+    def _apply(self, client_id: int, message_id: int, requested_us: int) -> list[Answer]:
         key = (client_id, message_id)
         self._fast.pop(key, None)
         self._requested.pop(key, None)

@@ -128,8 +128,8 @@ class MissionService(Service):
             "MISSION_REQUEST_INT": self._send_item,
             "MISSION_REQUEST": self._send_item,
             "MISSION_COUNT": self._begin,
-            "MISSION_ITEM_INT": self._take_item,
-            "MISSION_ITEM": self._take_item,
+            "MISSION_ITEM_INT": self._receive_item,
+            "MISSION_ITEM": self._receive_item,
             "MISSION_CLEAR_ALL": self._clear,
             "MISSION_SET_CURRENT": self._set_current,
             "MISSION_ACK": self._end,
@@ -149,9 +149,9 @@ class MissionService(Service):
         """Answer one message."""
         kind = request.message.get_type()
         if kind in ("MISSION_REQUEST_INT", "MISSION_ITEM_INT"):
-            self._note_form(request, uses_int=True)
+            self._set_form(request, uses_int=True)
         elif kind in ("MISSION_REQUEST", "MISSION_ITEM"):
-            self._note_form(request, uses_int=self._forms.get(_sender(request), False))
+            self._set_form(request, uses_int=self._forms.get(_sender(request), False))
         handler = self._handlers.get(kind)
         if handler is None:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
@@ -190,7 +190,7 @@ class MissionService(Service):
         upload = self._upload
         return upload if upload and upload.request.client_id == request.client_id else None
 
-    def _note_form(self, request: Request, *, uses_int: bool) -> None:
+    def _set_form(self, request: Request, *, uses_int: bool) -> None:
         sender = _sender(request)
         if sender not in self._forms and len(self._forms) >= MAX_CLIENTS:
             self._forms.pop(next(iter(self._forms)))
@@ -271,7 +271,7 @@ class MissionService(Service):
         wanted = request_of(request.system_id, request.component_id, upload.wanted, upload.kind)
         return [request.reply(wanted)]
 
-    def _take_item(self, request: Request, now_us: int) -> list[Answer]:
+    def _receive_item(self, request: Request, now_us: int) -> list[Answer]:
         message, upload = request.message, self._upload_of(request)
         if upload is None or upload.is_complete:
             return self._stray_item(request, upload)
@@ -338,7 +338,7 @@ class MissionService(Service):
             return []
         is_probed = _sender(request) not in self._forms and upload.repeats >= OLD_FORM_EVERY - 1
         if request.message.type == mavlink.MAV_MISSION_UNSUPPORTED and is_probed:
-            self._note_form(request, uses_int=True)
+            self._set_form(request, uses_int=True)
             return self._ask(upload, now_us)
         self._upload = None
         return []

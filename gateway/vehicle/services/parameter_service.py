@@ -206,7 +206,7 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         self.listen(request.client_id)
         return packed_parameters(self.table, query)
 
-    def take(self, section: str, settings: Any) -> list[Answer]:
+    def update(self, section: str, settings: Any) -> list[Answer]:
         """Apply a section that was changed elsewhere, and send what differs."""
         before = self._numbers()
         self.table.sections[section] = settings

@@ -274,8 +274,8 @@ class PlanService:
         announced = self._put_home(location, now_us)
         self._keep_home()
         self.mark.put(location)
-        said = self._explain("Home set by a ground station", now_us)
-        return ACCEPTED, [*announced, *said, self._save()]
+        texts = self._explain("Home set by a ground station", now_us)
+        return ACCEPTED, [*announced, *texts, self._save()]
 
     def _set_roi(self, command: Command, now_us: int) -> Outcome:
         mode = whole(command.params[0])

@@ -72,7 +72,7 @@ class _Trouble:
 
     quiet: int = QUIET_REPORTS
 
-    def note(self, worse: bool) -> bool:
+    def update(self, worse: bool) -> bool:
         self.quiet = 0 if worse else min(self.quiet + 1, QUIET_REPORTS)
         return self.quiet < QUIET_REPORTS
 
@@ -85,7 +85,7 @@ class _Radio:
     """Time of each report and what it added."""
     is_bad: bool = False
 
-    def note(self, time_us: int, failed: int, rate_hz: int) -> int:
+    def update(self, time_us: int, failed: int, rate_hz: int) -> int:
         """Take in a report, and return how many sends failed in `RADIO_SPAN_US`."""
         self.failed.append((time_us, failed))
         while self.failed[0][0] <= time_us - RADIO_SPAN_US:
@@ -201,11 +201,11 @@ class Health:
             before = status
         errors = status.bus_errors - before.bus_errors & WORD
         failed = status.radio_failed - before.radio_failed & WORD
-        failed = known.radio.note(status.time_us, failed, status.sample_rate_hz)
+        failed = known.radio.update(status.time_us, failed, status.sample_rate_hz)
         if status.sensors_present & NODE_IMU:
             # The share of a sample's time that the node's longest loop took.
             self._load_permille = status.loop_max_us * status.sample_rate_hz // 1000
-        name, bus_errors = self.node_name(number), known.bus.note(errors > 0)
+        name, bus_errors = self.node_name(number), known.bus.update(errors > 0)
         supply_v = status.supply_mv / MV
         known.low = self._is_low(supply_v, was_low=known.low)
         low, good = f"supply low, {supply_v:.2f} V", f"supply OK again, {supply_v:.2f} V"
@@ -245,7 +245,7 @@ class Health:
             if board is None:
                 continue
             overruns = receiver.pipes[link.pipe].overruns
-            is_bad = board.pipe.note(board.overruns is not None and overruns > board.overruns)
+            is_bad = board.pipe.update(board.overruns is not None and overruns > board.overruns)
             board.overruns = overruns
             bad, good = f"receiver overrun, {overruns} so far", "receiver keeps up again"
             found.append(_finding(f"pipe {number}", self.node_name(number), is_bad, bad, good))

@@ -7,8 +7,6 @@ from gateway.records import ImuFlags, NavFlags, NodeId
 from gateway.vehicle.telemetry import health as bits
 from gateway.vehicle.telemetry.health import AHRS, GEOFENCE, GPS, LOGGING, MAG, PREARM, Health
 from tests.kit.records import (
-    BARO,
-    FIX,
     GPS_NODE,
     IMU_NODE,
     NO_FIX,
@@ -22,15 +20,6 @@ from tests.kit.records import (
 INERTIAL = bits.GYRO | bits.ACCEL
 ALL = INERTIAL | MAG | bits.PRESSURE | GPS | AHRS
 NOW_US = 1_500_000
-
-
-@pytest.fixture
-def health() -> Health:
-    health = Health(1, 2.0)
-    health.on_state(STATE, SAMPLE)
-    health.on_baro(BARO)
-    health.on_gps(FIX)
-    return health
 
 
 def with_flags(sample: ImuFlags, state: NavFlags = STATE.flags) -> Callable[[Health], object]:

@@ -255,15 +255,6 @@ def test_boot_time_wraps_after_49_days() -> None:
     assert messages.boot_ms(2**32 * 1000 + 5_000) == 5
 
 
-@pytest.fixture
-def well() -> Health:
-    health = Health(1, 2.0)
-    health.on_state(STATE, SAMPLE)
-    health.on_baro(BARO)
-    health.on_gps(FIX)
-    return health
-
-
 def summary(
     state: NavState | None, fix: GpsFix | None, health: Health, now_us: int = 1_500_000
 ) -> Any:
@@ -271,8 +262,8 @@ def summary(
     return through_the_wire(messages.high_latency2(kind, 0, state, fix, health, now_us))
 
 
-def test_high_latency2(well: Health) -> None:
-    message = summary(STATE, FIX, well)
+def test_high_latency2(health: Health) -> None:
+    message = summary(STATE, FIX, health)
     assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
     assert (message.altitude, message.heading * 2) == (523, 272)
     assert message.groundspeed / 5 == 5.0
@@ -303,22 +294,22 @@ def test_no_position_is_reported_before_the_first_fix(
     assert message.failure_flags & mavlink.HL_FAILURE_FLAG_3D_ACCEL
 
 
-def test_barometric_altitude_is_reported_before_the_first_fix(well: Health) -> None:
-    message = summary(replace(NOTHING, alt_amsl_m=523.456), SEARCHING, well)
+def test_barometric_altitude_is_reported_before_the_first_fix(health: Health) -> None:
+    message = summary(replace(NOTHING, alt_amsl_m=523.456), SEARCHING, health)
     assert (message.latitude, message.longitude, message.altitude) == (0, 0, 523)
 
 
-def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(well: Health) -> None:
-    message = summary(STATE, FIX, well, now_us=FIX.time_us + 60_000_000)
+def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(health: Health) -> None:
+    message = summary(STATE, FIX, health, now_us=FIX.time_us + 60_000_000)
     assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
     assert (message.eph, message.epv) == (255, 255)
     assert message.failure_flags & mavlink.HL_FAILURE_FLAG_GPS
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e30])
-def test_wild_values_are_saturated(well: Health, value: float) -> None:
+def test_wild_values_are_saturated(health: Health, value: float) -> None:
     wild = replace(STATE, lat_deg=value, alt_amsl_m=value, vel_n_mps=(value, value, value))
-    assert summary(wild, replace(FIX, h_acc_m=abs(value)), well)
+    assert summary(wild, replace(FIX, h_acc_m=abs(value)), health)
 
 
 def test_high_latency2_is_sent_every_five_seconds(station: GroundStation) -> None:
