@@ -28,10 +28,10 @@ from gateway.recordings.files import OTHER_FORMATS
 from gateway.recordings.reading import READERS, ReadOptions, header_for
 from gateway.recordings.table import encode_head
 from gateway.records import ImuRaw, Incoming, NavState
-from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.telemetry.streams import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
+from tools.simulated_flight import fly
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "extend.md"
 REGISTRIES: tuple[dict, ...] = (

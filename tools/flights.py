@@ -34,8 +34,8 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
-from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tools.simulated_flight import fly
 
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
 QUAT_NAMES = ["ref_qw", "ref_qx", "ref_qy", "ref_qz"]

@@ -22,8 +22,8 @@ from gateway.cli.app import app
 from gateway.records import BaroRaw, GpsFix
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
-from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tools.simulated_flight import fly
 
 GOLDEN = Path(__file__).resolve().parent.parent / "tests" / "golden"
 SEED = 77

@@ -37,9 +37,9 @@ from gateway.records import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
-from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import DURATION_S, short_case, short_flight, with_imu
+from tools.simulated_flight import SimulatedFlight, fly
 
 
 def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:

@@ -14,8 +14,8 @@ from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import encode_head
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
-from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tools.simulated_flight import SimulatedFlight, fly
 
 OUTAGE_S = (28.0, 3.0)
 DURATION_S = 40.0

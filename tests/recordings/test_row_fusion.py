@@ -15,8 +15,8 @@ from gateway.recordings.reading import Line, header_for
 from gateway.recordings.recorded_fusion import Replay
 from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
-from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tools.simulated_flight import fly
 
 DURATION_S = 25.0
 BLOCK = 700

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw
-from gateway.simulator.flight import SimulatedAircraft, SimulatedFlight, fly
+from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.sensors import DeviceClock
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
+from tools.simulated_flight import SimulatedFlight, fly
 
 SETTINGS = SimulatorSettings()
 

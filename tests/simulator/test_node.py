@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
-from gateway.simulator.flight import SimulatedAircraft, fly
+from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.node import GpsNode, ImuNode, Node, Sent, nodes_of
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
@@ -19,6 +19,7 @@ from gateway.wire.payloads import (
     decode_payload,
     encode_payload,
 )
+from tools.simulated_flight import fly
 
 SETTINGS = SimulatorSettings()
 SECONDS = 20.0

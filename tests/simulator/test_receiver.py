@@ -13,7 +13,6 @@ import pytest
 
 import gateway
 from gateway.records import BaroRaw, GpsFix, ImuRaw, NodeId
-from gateway.simulator.flight import fly
 from gateway.simulator.gps import GpsSampler
 from gateway.simulator.receiver import damage, simulate
 from gateway.simulator.sensors import BaroSampler, ImuSampler
@@ -22,6 +21,7 @@ from gateway.simulator.timed_frame import TimedFrame
 from gateway.wire.framing import Fault, FaultKind, FrameDecoder, encode_frame
 from gateway.wire.link import Link
 from gateway.wire.payloads import RadioFrame, ReceiverStatusFrame, decode_content
+from tools.simulated_flight import fly
 
 SECONDS = 20.0
 

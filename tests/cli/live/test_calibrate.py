@@ -11,11 +11,11 @@ from gateway.config import load, load_aircraft
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.records import GpsFix, ImuFlags, ImuRaw, NodeId, Vec3
 from gateway.sensing.calibrating import NodeSamples
-from gateway.simulator.flight import fly
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.batch.season_flights import line_of
 from tests.estimation.samples import fix
 from tests.kit.cli import invoke
+from tools.simulated_flight import fly
 
 pytestmark = pytest.mark.io
 

@@ -12,8 +12,8 @@ from gateway.analysis.simulated import ideal_calibration
 from gateway.geometry.quaternion import to_euler
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from gateway.sensing.chain import SensorChain
-from gateway.simulator.flight import SimulatedFlight, fly
 from gateway.simulator.simulator_settings import SimulatorSettings
+from tools.simulated_flight import SimulatedFlight, fly
 
 DURATION_S = 75.0
 """Rest, take-off and the first turns."""
