@@ -26,7 +26,7 @@ from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
-from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
+from gateway.live.serial_port import SerialPort, SerialSettings, find_receiver
 from gateway.recordings.reading import open_rows
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import (
@@ -282,12 +282,9 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
 
 
 def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
-    """Return a capture from the receiver's port; ends the command if that cannot be opened."""
-    try:
-        # Nobody shall lay an aircraft on its sides for a port that is not there.
-        device = asyncio.run(find_receiver(serial))
-    except PortNotFoundError as error:
-        refuse(str(error))
+    """Return a capture from the receiver's port; raises PortNotFoundError if there is none."""
+    # Nobody shall lay an aircraft on its sides for a port that is not there.
+    device = asyncio.run(find_receiver(serial))
     serial = msgspec.structs.replace(serial, port=device)
     shown: tuple[str, ...] = ()
 

@@ -309,11 +309,8 @@ def check_config(
     if file is None:
         print(render(GatewaySettings()), end="")
         return
-    try:
-        settings = load(file)
-        aircraft = load_aircraft(settings)
-    except ConfigError as error:
-        refuse(str(error))
+    settings = load(file)
+    aircraft = load_aircraft(settings)
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if endpoint.port == 0 and endpoint.kind in LISTENING:
             refuse(

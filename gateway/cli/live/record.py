@@ -21,13 +21,11 @@ from gateway.cli.support.terminal import (
     JsonOption,
     console_of,
     print_json,
-    refuse,
     table_of,
 )
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,
-    RecordingError,
     delete_recording,
     find_recording,
     list_recordings,
@@ -94,11 +92,7 @@ def save(
     if recording is None and is_running():
         _show(ask("record.save", {"name": name}))
         return
-    try:
-        found = rename_recording(_folder(config), recording or "last", name)
-    except RecordingError as error:
-        refuse(str(error))
-    _list([found])
+    _list([rename_recording(_folder(config), recording or "last", name)])
 
 
 @group.command()
@@ -111,18 +105,15 @@ def delete(
     """Delete a recording, after asking."""
     running = is_running()
     folder = Path(ask("record.status")["folder"]) if running else _folder(config)
-    try:
-        # `last` may have become another one while the user was asked.
-        found = find_recording(folder, name)
-        if not yes:
-            what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
-            typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
-        if running:
-            deleted = ask("record.delete", {"name": found.name})["files"]
-        else:
-            deleted = delete_recording(folder, found.name).files
-    except RecordingError as error:
-        refuse(str(error))
+    # `last` may have become another one while the user was asked.
+    found = find_recording(folder, name)
+    if not yes:
+        what = f"{found.name!r}: {counted(len(found.files), 'file')}, {found.size / 1e6:.2f} MB"
+        typer.confirm(f"Delete the recording {what}, for ever?", abort=True)
+    if running:
+        deleted = ask("record.delete", {"name": found.name})["files"]
+    else:
+        deleted = delete_recording(folder, found.name).files
     for path in deleted:
         console_of().print(f"deleted {path}")
 
