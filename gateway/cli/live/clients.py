@@ -87,7 +87,7 @@ def add(
     config: ConfigOption = None,
 ) -> None:
     """Add a client or a source, until the gateway ends or permanently."""
-    _show_endpoints(ask("clients.add", {"url": url}))
+    print(*ask("clients.add", {"url": url}), sep="\n")
     if save:
         _save(config or USER_CONFIG.expanduser(), url)
     snapshot = ask("status")
@@ -110,7 +110,7 @@ def _save(file: Path, url: str) -> None:
 @group.command()
 def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -> None:
     """Remove a client, a source or a listening port."""
-    _show_endpoints(ask("clients.remove", {"name": name}))
+    print(*ask("clients.remove", {"name": name}), sep="\n")
 
 
 def mark(
@@ -128,18 +128,13 @@ def mark(
             refuse(
                 f"{name} {value}: write a number; without LAT_DEG and LON_DEG the mark is cleared"
             )
-    place = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
-    print(ask("mark", place))
+    location = {"lat_deg": lat_deg, "lon_deg": lon_deg, "alt_amsl_m": alt, "vehicle_id": aircraft}
+    print(ask("mark", location))
 
 
 def reload() -> None:
     """Apply changed settings of the hub and of signing; other clients stay connected."""
     print(ask("reload"))
-
-
-def _show_endpoints(urls: Sequence[str]) -> None:
-    for url in urls:
-        print(url)
 
 
 def _summary(snapshot: Record) -> str:
@@ -166,7 +161,7 @@ def _summary(snapshot: Record) -> str:
             f"this computer is too slow: up to {snapshot['slow_s']:.1f} s late, samples are lost"
         )
     lines += [
-        f"aircraft {vehicle_id}: {_place(state['lat_deg'], state['lon_deg'])}, "
+        f"aircraft {vehicle_id}: {_position(state['lat_deg'], state['lon_deg'])}, "
         f"{_number(state['alt_amsl_m'], '.1f')} m"
         for vehicle_id, state in snapshot["states"]
     ]
@@ -261,7 +256,7 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
     return table
 
 
-def _place(lat_deg: float | None, lon_deg: float | None) -> str:
+def _position(lat_deg: float | None, lon_deg: float | None) -> str:
     return f"{_number(lat_deg, '.6f')} {_number(lon_deg, '.6f')}"
 
 

@@ -149,7 +149,7 @@ def flash(
                 settings = _changed(program, block_of(image).settings, changes)
                 write_new(output, [with_settings(image, settings)], overwrite=force)
     except FileExistsError:
-        refuse(f"{output} is there already; --force replaces it")
+        refuse(f"{output} already exists; use --force to overwrite")
     except OSError as error:
         refuse(f"{error.filename or port}: {reason_of(error)}")
     except (FlashError, PortNotFoundError) as error:

@@ -55,18 +55,18 @@ def get(
     except ModuleNotFoundError as error:
         refuse(f"maps belong to the panel, and {error.name} is missing: {how_to_add('panel')}")
     settings = read_settings(config)
-    places: list[tuple[float, float]] = []
+    positions: list[tuple[float, float]] = []
     if (pair := _coordinates(around)) is not None:
-        places = [pair]
+        positions = [pair]
     else:
         files = files_of([Path(around)], folder_of(settings), "tlogs")
         flight = read_flight(files, read_options(settings), around)
         for history in flight.histories.values():
-            places += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)
+            positions += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)
     folder = Path(settings.panel.tiles_folder).expanduser()
     target = folder / f"{_file_name(name or around)}.pmtiles"
     try:
-        box = map_area.box_around(places, map_area.length_m(radius))
+        box = map_area.box_around(positions, map_area.length_m(radius))
         folder.mkdir(parents=True, exist_ok=True)
         with Progress(console=console_of(stderr=True), transient=True) as progress:
             task = progress.add_task("fetching tiles", total=None)
@@ -78,7 +78,7 @@ def get(
                 lambda done, total: progress.update(task, completed=done, total=total),
             )
     except FileExistsError:
-        refuse(f"{target} is there already; delete it, or choose another --name")
+        refuse(f"{target} already exists; delete it, or choose another --name")
     except (map_area.MapAreaError, ValueError, OSError) as error:
         with suppress(FileNotFoundError):
             target.unlink()

@@ -50,7 +50,7 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
     assert before[138:] == after[138:]
     again = flash("imu", "-o", str(out))
     assert again.exit_code == 2
-    assert f"{out} is there already; --force replaces it" in again.output
+    assert f"{out} already exists; use --force to overwrite" in again.output
     assert flash("imu", "-o", str(out), "--force").exit_code == 0
 
 
