@@ -102,16 +102,17 @@ class ParameterRow:
 
 def _range_of(meta: ParameterMeta) -> str:
     parts = []
+    # Adding zero removes the sign of a negative zero.
     if math.isfinite(meta.low) or math.isfinite(meta.high):
-        low = f"{meta.low:g}" if math.isfinite(meta.low) else "any"
-        high = f"{meta.high:g}" if math.isfinite(meta.high) else "any"
+        low = f"{meta.low + 0.0:g}" if math.isfinite(meta.low) else "any"
+        high = f"{meta.high + 0.0:g}" if math.isfinite(meta.high) else "any"
         parts.append(f"{low} to {high} {unit_text(meta.unit)}".strip())
     elif meta.unit:
         parts.append(unit_text(meta.unit))
     if math.isfinite(meta.default):
         words = (each.description for each in meta.choices if each.value == meta.default)
         word = next(words, "")
-        parts.append(f"default {word or f'{meta.default:g}'}")
+        parts.append(f"default {word or f'{meta.default + 0.0:g}'}")
     return " · ".join(parts)
 
 
