@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
 from gateway.panel.state.calibration import CalibrationRun, CalibrationStep, RunState
-from gateway.panel.state.fleet import FleetState
+from gateway.panel.state.fleet import FleetState, command_long
 from gateway.panel.state.parameters import (
     GENERAL_PATHS,
     FileClient,
@@ -22,7 +22,6 @@ from gateway.panel.state.parameters import (
     parameter_path,
     parse_parameters,
 )
-from gateway.panel.state.vehicle import command_long
 
 POLL_S: Final = 0.05
 SAMPLES_US: Final = 20_000

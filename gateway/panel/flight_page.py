@@ -25,7 +25,7 @@ from gateway import __version__
 from gateway.analysis.case import make_case
 from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
 from gateway.analysis.metrics import euler_rad
-from gateway.panel.state.vehicle import FlightHistory, VehicleState
+from gateway.panel.state.fleet import FlightHistory, VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import open_flights

@@ -12,7 +12,7 @@ from nicegui.element import Element
 from gateway.panel.access import Role
 from gateway.panel.added_views import ADDED_VIEWS, View
 from gateway.panel.playback import Playback
-from gateway.panel.view_context import LIVE, WEB, PanelParts, ViewContext
+from gateway.panel.view_context import WEB, PanelParts, ViewContext
 from gateway.panel.views.calibration_view import CalibrationView
 from gateway.panel.views.events_view import EventsView, build_banner
 from gateway.panel.views.flight_view import build_flight, build_map
@@ -212,7 +212,7 @@ def _state_of(context: ViewContext) -> list[tuple[str, str]]:
     has_fix = now.fix_type >= 3
     fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
     gps = (fix, "good" if has_fix else "bad")
-    if vehicle.origin != LIVE:
+    if not vehicle.is_live:
         return [("recording", "recorded"), (fix, "" if has_fix else "bad")]
     if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
         return [(f"silent for {now.silent_s:.0f} s", "bad")]

@@ -21,8 +21,7 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
-from gateway.panel.state.fleet import FleetState
-from gateway.panel.state.vehicle import Spot, command_long
+from gateway.panel.state.fleet import FleetState, Spot, command_long
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of

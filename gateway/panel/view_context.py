@@ -42,8 +42,7 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_files import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import FleetState, SampleMemory
-from gateway.panel.state.vehicle import Spot, VehicleState
+from gateway.panel.state.fleet import FleetState, SampleMemory, Spot, VehicleState
 from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink
 
 WEB: Final = Path(__file__).parent / "web"
@@ -52,10 +51,6 @@ WEB: Final = Path(__file__).parent / "web"
 
 class NotAllowedError(Exception):
     """A viewer asked for a change."""
-
-
-LIVE: Final = "live"
-"""Origin of an aircraft that is not played."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +123,7 @@ class ViewContext:
     @property
     def is_recording(self) -> bool:
         """Whether the selected aircraft is played from a recording."""
-        return self.vehicle is not None and self.vehicle.origin != LIVE
+        return self.vehicle is not None and not self.vehicle.is_live
 
     @property
     def now_us(self) -> int:

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.vehicle import VehicleState
+from gateway.panel.state.fleet import VehicleState
 from gateway.units import US_PER_S
 from gateway.vehicle.telemetry.health import node_role
 

@@ -1,15 +1,433 @@
-"""All known aircraft, the listeners to their messages, and their newest sensor frames."""
+"""State of all aircraft from MAVLink: the newest messages, histories, texts, sensor frames."""
 
+import math
+from array import array
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
+import msgspec
+import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.panel.state.vehicle import VehicleState
+from gateway.geometry.angle import wrap_180
+from gateway.geometry.quaternion import from_euler
 from gateway.recordings.answers import FIRST_GROUND_STATION
+from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
+from gateway.vehicle.plan import is_on_earth
+
+
+def command_long(system_id: int, number: int, *params: float) -> Any:
+    """Make a COMMAND_LONG for an autopilot; parameters that are not given are zero."""
+    filled = (*map(float, params), *(0.0,) * (7 - len(params)))
+    autopilot = mavlink.MAV_COMP_ID_AUTOPILOT1
+    return mavlink.MAVLink_command_long_message(system_id, autopilot, number, 0, *filled)
+
+
+LIVE: Final = "live"
+"""Origin of an aircraft that is not played."""
+
+
+class Spot(msgspec.Struct, frozen=True):
+    """A position; its height is NaN if unknown."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float = NAN
+
+
+class Instant(msgspec.Struct, frozen=True, kw_only=True):
+    """State of an aircraft at one moment.
+
+    Everything is the newest from MAVLink, of any sender; NaN (null in the browser) means unknown.
+    """
+
+    system_id: int
+    time_us: int
+    """When the newest attitude or position came, on the panel's clock."""
+    model: str
+    """Its 3D model, see `VehicleState.model`."""
+    origin: str
+    """`live`, `recorded` or `fused again`."""
+    generation: int
+    """How often its path was restarted."""
+    silent_s: float
+    """Since the newest heartbeat."""
+    q_nb: tuple[float, float, float, float]
+    """Attitude, scalar first, body FRD to NED."""
+    rate_b_radps: tuple[float, float, float]
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+    alt_home_m: float
+    """Above home."""
+    vel_n_mps: tuple[float, float, float]
+    groundspeed_mps: float
+    airspeed_mps: float
+    """Unknown where the vehicle sends its ground speed for want of a sensor."""
+    climb_mps: float
+    heading_deg: float
+    pos_std_m: float
+    """Horizontal standard deviation of the position, root of the sum of both axes."""
+    fix_type: int
+    """GPS_FIX_TYPE; 0 without a GPS."""
+    satellites: int
+    fix: Spot | None
+    """Newest GPS fix of two dimensions or more."""
+    home: Spot | None
+    mark: Spot | None
+    mark_distance_m: float
+    mark_bearing_deg: float
+    battery_v: float
+    battery_percent: float
+    armed: bool
+    attitude_s: float
+    """Age of the newest attitude, as the others below."""
+    position_s: float
+    hud_s: float
+    gps_s: float
+    battery_s: float
+
+
+CHUNK: Final = 50
+"""Letters of one message; a shorter one, or one with a zero, ends its text."""
+MAX_TEXTS: Final = 500
+MAX_LETTERS: Final = 2_000
+"""Longer texts are cut there."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedText:
+    """One text."""
+
+    number: int
+    """Counts up from 1, so that a page knows which are new."""
+    time_us: int
+    """On the panel's clock."""
+    severity: int
+    """MAV_SEVERITY: 0 emergency to 7 debug."""
+    text: str
+
+
+class StatusTexts:
+    """The texts of one aircraft, the oldest first."""
+
+    def __init__(self) -> None:
+        self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
+        self._count = 0
+        self._open: tuple[int, int] | None = None
+        """Id and next chunk of the newest entry, while it is incomplete."""
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
+        text, number, chunk = message.text, message.id, message.chunk_seq
+        if self._open == (number, chunk) and self.all:
+            joined = (self.all[-1].text + text)[:MAX_LETTERS]
+            self.all[-1] = replace(self.all[-1], text=joined)
+        elif text.strip():
+            self._count += 1
+            self.all.append(TimedText(self._count, now_us, message.severity, text))
+        else:
+            self._open = None
+            return
+        continues = number and len(text) == CHUNK
+        self._open = (number, chunk + 1) if continues else None
+
+
+DEGE7: Final = 1e7
+MM: Final = 1e3
+CM: Final = 1e2
+UNKNOWN_MV: Final = 65535
+UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
+
+MAX_TRACK: Final = 20_000
+"""Moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
+TRACK_INTERVAL_US: Final = 200_000
+ATTITUDE_FRESH_US: Final = US_PER_S
+"""The quaternion is preferred to the angles unless it is older than this."""
+
+PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
+COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
+OTHERS: Final = {4: "heli", 7: "balloon", 8: "balloon", 10: "rover", 11: "boat", 12: "boat"}
+
+
+HISTORY_COLUMNS: Final = {
+    "lat_deg": "d", "lon_deg": "d",
+    **dict.fromkeys(
+        (
+            "alt_amsl_m", "alt_home_m", "q_nb.0", "q_nb.1", "q_nb.2", "q_nb.3", "rate_b_radps.0",
+            "rate_b_radps.1", "rate_b_radps.2", "vel_n_mps.0", "vel_n_mps.1", "vel_n_mps.2",
+            "groundspeed_mps", "airspeed_mps", "climb_mps", "heading_deg", "pos_std_m", "fix_type",
+            "satellites", "mark_distance_m", "mark_bearing_deg", "battery_v", "battery_percent",
+        ),
+        "f",
+    ),
+}  # fmt: skip
+"""Columns of a history and their type: fields of `Instant`, `.n` for one of several numbers."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathPoint:
+    """One point of a path."""
+
+    time_us: int
+    """On the panel's clock."""
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float
+
+
+class FlightHistory:
+    """States of one aircraft as columns over time."""
+
+    def __init__(self, limit: int = MAX_TRACK) -> None:
+        self._limit = limit
+        self.time_us = array("q")
+        self.columns = {name: array(kind) for name, kind in HISTORY_COLUMNS.items()}
+
+    def __len__(self) -> int:
+        return len(self.time_us)
+
+    @property
+    def newest_us(self) -> int:
+        """Time of the newest state; far in the past without any."""
+        return self.time_us[-1] if self.time_us else -TRACK_INTERVAL_US
+
+    def add(self, time_us: int, now: Instant) -> None:
+        """Add the state of one moment."""
+        self.time_us.append(time_us)
+        for name, column in self.columns.items():
+            field, _, index = name.partition(".")
+            value = getattr(now, field)
+            column.append(value[int(index)] if index else value)
+        if len(self.time_us) > self._limit:
+            # A quarter at once, so that moving the rest is seldom.
+            for column in (self.time_us, *self.columns.values()):
+                del column[: self._limit // 4]
+
+    def clear(self) -> None:
+        """Delete all states."""
+        for column in (self.time_us, *self.columns.values()):
+            del column[:]
+
+    def track(self) -> list[tuple[float, float, float]]:
+        """Return latitude, longitude and height AMSL of all moments."""
+        names = ("lat_deg", "lon_deg", "alt_amsl_m")
+        return list(zip(*(self.columns[name] for name in names), strict=True))
+
+
+class VehicleState:
+    """Everything known about one system."""
+
+    def __init__(self, system_id: int, origin: str = LIVE, number: int | None = None) -> None:
+        self.system_id = system_id
+        self.origin = origin
+        self.number = system_id if number is None else number
+        self.generation = 0
+        """How often the path was restarted."""
+        self.newest: dict[str, Any] = {}
+        """The newest message of its autopilot by name, as pymavlink decodes it."""
+        self.heard_us: dict[str, int] = {}
+        """When that came, on the panel's clock in µs."""
+        self.history = FlightHistory()
+        """Its states so far, a few a second."""
+        self.fixes: deque[PathPoint] = deque(maxlen=MAX_TRACK)
+        """GPS fixes."""
+        self.texts = StatusTexts()
+        """STATUSTEXT, the newest last."""
+        self.exact_mark: Spot | None = None
+        """The mark from the gateway's control socket, exact where MAVLink is rounded."""
+        self._moved_us = 0
+        self._takers: dict[str, Callable[[Any, int], None]] = {
+            "STATUSTEXT": self.texts.take,
+            "GLOBAL_POSITION_INT": self._take_position,
+            "GPS_RAW_INT": self._take_fix,
+            "ATTITUDE": self._note_motion,
+            "ATTITUDE_QUATERNION": self._note_motion,
+        }
+
+    def take(self, message: Any, now_us: int) -> None:
+        """Take in one decoded message of this system's autopilot."""
+        name = message.get_type()
+        self.newest[name] = message
+        self.heard_us[name] = now_us
+        if taker := self._takers.get(name):
+            taker(message, now_us)
+
+    @property
+    def title(self) -> str:
+        """Displayed name."""
+        kind = "Aircraft" if self.model == "none" else self.model.capitalize()
+        name = f"{kind} {self.number}"
+        return name if self.is_live else f"{name}, {self.origin}"
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it is not played from a recording."""
+        return self.origin == LIVE
+
+    def restart_path(self) -> None:
+        """Restart the path, as after a seek in a recording."""
+        self.history.clear()
+        self.fixes.clear()
+        self.generation += 1
+
+    def _age_s(self, now_us: int, *names: str) -> float:
+        """Return the age of the newest of some messages; NaN if none came."""
+        heard_us = max((self.heard_us[name] for name in names if name in self.heard_us), default=0)
+        return (now_us - heard_us) / US_PER_S if heard_us else NAN
+
+    def silent_s(self, now_us: int) -> float:
+        """Return how long no heartbeat came; infinite if none ever did."""
+        heard_us = self.heard_us.get("HEARTBEAT")
+        return math.inf if heard_us is None else (now_us - heard_us) / US_PER_S
+
+    @property
+    def model(self) -> str:
+        """Its 3D model: `plane`, `copter`, `heli`, `rover`, `boat`, `balloon`, `none`."""
+        heartbeat = self.newest.get("HEARTBEAT")
+        kind = -1 if heartbeat is None else heartbeat.type
+        if kind in PLANES:
+            return "plane"
+        return "copter" if kind in COPTERS else OTHERS.get(kind, "none")
+
+    @property
+    def home(self) -> Spot | None:
+        """Home, if known."""
+        message = self.newest.get("HOME_POSITION")
+        if message is None:
+            return None
+        return Spot(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
+
+    def instant(self, now_us: int) -> Instant:
+        """Return the present state."""
+        get = self.newest.get
+        q_nb, rates = self._attitude()
+        place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
+        fix, beat = get("GPS_RAW_INT"), get("HEARTBEAT")
+        mark, distance_m, bearing_deg = self._mark()
+        return Instant(
+            system_id=self.system_id,
+            time_us=self._moved_us,
+            model=self.model,
+            origin=self.origin,
+            generation=self.generation,
+            silent_s=self.silent_s(now_us),
+            q_nb=q_nb,
+            rate_b_radps=rates,
+            lat_deg=place.lat / DEGE7 if place else NAN,
+            lon_deg=place.lon / DEGE7 if place else NAN,
+            alt_amsl_m=place.alt / MM if place else (hud.alt if hud else NAN),
+            alt_home_m=place.relative_alt / MM if place else NAN,
+            vel_n_mps=(place.vx / CM, place.vy / CM, place.vz / CM) if place else UNKNOWN_VEC3,
+            groundspeed_mps=hud.groundspeed if hud else NAN,
+            airspeed_mps=_airspeed_mps(hud),
+            climb_mps=hud.climb if hud else NAN,
+            heading_deg=_heading_deg(place, hud),
+            pos_std_m=self._pos_std_m(),
+            fix_type=fix.fix_type if fix else 0,
+            satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else 0,
+            fix=_spot_of_fix(fix),
+            home=self.home,
+            mark=mark,
+            mark_distance_m=distance_m,
+            mark_bearing_deg=bearing_deg,
+            **_battery(get("BATTERY_STATUS"), get("SYS_STATUS")),
+            attitude_s=self._age_s(now_us, "ATTITUDE_QUATERNION", "ATTITUDE"),
+            position_s=self._age_s(now_us, "GLOBAL_POSITION_INT"),
+            hud_s=self._age_s(now_us, "VFR_HUD"),
+            gps_s=self._age_s(now_us, "GPS_RAW_INT"),
+            battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
+            armed=bool(beat and beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+        )
+
+    def _attitude(self) -> tuple[tuple[float, float, float, float], tuple[float, float, float]]:
+        quaternion, angles = self.newest.get("ATTITUDE_QUATERNION"), self.newest.get("ATTITUDE")
+        age_us = self.heard_us.get("ATTITUDE", 0) - self.heard_us.get("ATTITUDE_QUATERNION", 0)
+        if quaternion is not None and age_us < ATTITUDE_FRESH_US:
+            q_nb = (quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4)
+            return q_nb, _rates(quaternion)
+        if angles is None:
+            return UNKNOWN_QUAT, UNKNOWN_VEC3
+        turned = (angles.roll, angles.pitch, angles.yaw)
+        q_nb = from_euler(*turned) if all(map(math.isfinite, turned)) else UNKNOWN_QUAT
+        return q_nb, _rates(angles)
+
+    def _pos_std_m(self) -> float:
+        """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
+        estimator, fix = self.newest.get("ESTIMATOR_STATUS"), self.newest.get("GPS_RAW_INT")
+        if estimator and math.isfinite(estimator.pos_horiz_accuracy):
+            return float(estimator.pos_horiz_accuracy)
+        return fix.h_acc / MM if fix and fix.h_acc else NAN
+
+    def _mark(self) -> tuple[Spot | None, float, float]:
+        """Return the mark, and the distance and bearing reported by the aircraft."""
+        way, place = (
+            self.newest.get("NAV_CONTROLLER_OUTPUT"),
+            self.newest.get("GLOBAL_POSITION_INT"),
+        )
+        if way is None or place is None or not way.wp_dist:
+            return self.exact_mark, NAN, NAN
+        bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
+        if self.exact_mark is not None:
+            return self.exact_mark, distance_m, bearing_deg
+        if not is_on_earth(place.lat / DEGE7, place.lon / DEGE7):
+            return None, distance_m, bearing_deg
+        lat_deg, lon_deg = vincenty.vreckon(
+            place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
+        )
+        lon_deg = wrap_180(float(lon_deg))
+        return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
+
+    def _note_motion(self, _message: Any, now_us: int) -> None:
+        self._moved_us = now_us
+
+    def _take_position(self, _message: Any, now_us: int) -> None:
+        self._moved_us = now_us
+        if now_us - self.history.newest_us >= TRACK_INTERVAL_US:
+            self.history.add(now_us, self.instant(now_us))
+
+    def _take_fix(self, message: Any, now_us: int) -> None:
+        spot = _spot_of_fix(message)
+        if spot is None:
+            return
+        last = self.fixes[-1] if self.fixes else None
+        if last is None or (last.lat_deg, last.lon_deg) != (spot.lat_deg, spot.lon_deg):
+            self.fixes.append(PathPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
+
+
+def _battery(battery: Any, system: Any) -> dict[str, float]:
+    """Return voltage and remaining charge, each NaN if unknown."""
+    volts = [mv / MM for mv in battery.voltages if mv != UNKNOWN_MV] if battery else []
+    if not volts and system and system.voltage_battery != UNKNOWN_MV:
+        volts = [system.voltage_battery / MM]
+    sources = [source.battery_remaining for source in (battery, system) if source]
+    percent = next((value for value in sources if value >= 0), NAN)
+    return {"battery_v": sum(volts) if volts else NAN, "battery_percent": float(percent)}
+
+
+def _rates(message: Any) -> tuple[float, float, float]:
+    return (message.rollspeed, message.pitchspeed, message.yawspeed)
+
+
+def _airspeed_mps(hud: Any) -> float:
+    """Return the airspeed; unknown where the field repeats the ground speed: there is no sensor."""
+    return NAN if hud is None or hud.airspeed == hud.groundspeed else float(hud.airspeed)
+
+
+def _heading_deg(place: Any, hud: Any) -> float:
+    if place is not None and place.hdg != 65535:
+        return float(place.hdg / CM)
+    return float(hud.heading % 360) if hud is not None else NAN
+
+
+def _spot_of_fix(message: Any) -> Spot | None:
+    if message is None or message.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
+        return None
+    return Spot(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
+
 
 MAX_VEHICLES: Final = 32
 """More are forged; each may take some MB."""

@@ -18,7 +18,7 @@ from gateway.panel.state.calibration import (
 )
 from gateway.panel.state.fields import FloatArray, unit_text
 from gateway.panel.state.parameters import ListState
-from gateway.panel.view_context import LIVE, WEB, ViewContext
+from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import DataTable, heading, store_parameters
 from gateway.printable import printable
 
@@ -228,13 +228,13 @@ class CalibrationView:
     @property
     def _may_calibrate(self) -> bool:
         vehicle = self._context.vehicle
-        return self._context.may_change and vehicle is not None and vehicle.origin == LIVE
+        return self._context.may_change and vehicle is not None and vehicle.is_live
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
         if vehicle is None:
             return "No aircraft is heard."
-        if vehicle.origin != LIVE:
+        if not vehicle.is_live:
             return "This aircraft is played from a recording. Choose a live one to calibrate it."
         if run is None or run.state is RunState.ASKED:
             waits = "" if ready else " Reading the parameters first, so that it can be undone …"

@@ -7,8 +7,8 @@ from nicegui import ui
 
 from gateway.clock import unix_time_us
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
-from gateway.panel.state.vehicle import TimedText
-from gateway.panel.view_context import LIVE, ViewContext
+from gateway.panel.state.fleet import TimedText
+from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import Cells, DataTable
 from gateway.printable import printable
 
@@ -31,7 +31,7 @@ def build_banner(context: ViewContext) -> None:
     def refresh() -> None:
         nonlocal shown
         vehicle = context.vehicle
-        if vehicle is None or vehicle.origin != LIVE:
+        if vehicle is None or not vehicle.is_live:
             # What was wrong in a recording must not look like a problem of now.
             alerts = []
         else:

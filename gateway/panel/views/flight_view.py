@@ -11,7 +11,7 @@ from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.access import MAPS
-from gateway.panel.state.vehicle import Spot
+from gateway.panel.state.fleet import Spot
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import RecorderControls, UploadButton, asking, closing, notify_failure
 

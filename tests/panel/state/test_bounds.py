@@ -6,8 +6,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import SPAN_US, FleetState, SampleMemory
-from gateway.panel.state.vehicle import MAX_TRACK
+from gateway.panel.state.fleet import MAX_TRACK, SPAN_US, FleetState, SampleMemory
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, heartbeat, position
 

@@ -4,8 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.panel.state.fleet import MAX_VEHICLES, FleetState
-from gateway.panel.state.vehicle import Spot, VehicleState
+from gateway.panel.state.fleet import MAX_VEHICLES, FleetState, Spot, VehicleState
 from gateway.units import US_PER_S
 from tests.panel.messages import decoded, fix, heartbeat, position
 
