@@ -10,6 +10,7 @@ so that neither the gateway nor the page waits for them.
 """
 
 import asyncio
+import json
 import logging
 import math
 import os
@@ -19,8 +20,7 @@ import stat
 import tempfile
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path
@@ -324,17 +324,12 @@ class ExportError(Exception):
     """A recording cannot be exported; the text says why."""
 
 
-@dataclass(slots=True)
-class _Made:
-    file: Path
-    made_s: float
-
-
 class RecordingJobs:
     """The catalogue and the exports of all pages."""
 
     def __init__(self) -> None:
-        self._made: dict[str, _Made] = {}
+        self._made: dict[str, tuple[Path, float]] = {}
+        """File and time of each export that was made, by its token."""
         self._folder: Path | None = None
         self._exporting = asyncio.Lock()
         self._waiting = 0
@@ -383,10 +378,10 @@ class RecordingJobs:
 
         @app.get(EXPORTS + "{token}")
         async def _fetch(token: str) -> Response:
-            made = self._made.get(token)
-            if made is None or not made.file.is_file():
+            file, _ = self._made.get(token, (None, 0.0))
+            if file is None or not file.is_file():
                 return PlainTextResponse("this file is no longer there: export it again", 404)
-            return FileResponse(made.file, filename=made.file.name)
+            return FileResponse(file, filename=file.name)
 
     async def _export(self, folder: Path, name: str, kind: str) -> str:
         self._delete_old()
@@ -401,13 +396,13 @@ class RecordingJobs:
             # Half a file of a large recording may take gigabytes.
             shutil.rmtree(place, ignore_errors=True)
             raise
-        self._made[token] = _Made(target, time.monotonic())
+        self._made[token] = (target, time.monotonic())
         return f"{EXPORTS}{token}"
 
     def _delete_old(self) -> None:
-        for token, made in list(self._made.items()):
-            if time.monotonic() - made.made_s > KEPT_S:
-                shutil.rmtree(made.file.parent, ignore_errors=True)
+        for token, (file, made_s) in list(self._made.items()):
+            if time.monotonic() - made_s > KEPT_S:
+                shutil.rmtree(file.parent, ignore_errors=True)
                 del self._made[token]
 
     async def _index(self, folder: Path) -> None:
@@ -422,26 +417,16 @@ async def _make(folder: Path, place: Path, name: str, kind: str) -> Path:
     _, command, suffix = FORMATS[kind]
     target = place / f"{name}{suffix}"
     output = place / name if kind == "report" else target
-    with _settings_for(folder, place) as config:
-        arguments = ["--config", str(config), "-o", str(output), "--", name]
-        await _run([*own_command(command), *arguments])
+    # Settings with the folder of the recordings, which commands take names from.
+    config = place / "settings.toml"
+    config.write_text(f"[recording]\nfolder = {json.dumps(str(folder), ensure_ascii=False)}\n")
+    arguments = ["--config", str(config), "-o", str(output), "--", name]
+    await _run([*own_command(command), *arguments])
+    config.unlink()
     if kind == "report":
         await asyncio.to_thread(_pack, output, target)
         shutil.rmtree(output, ignore_errors=True)
     return target
-
-
-@contextmanager
-def _settings_for(folder: Path, place: Path) -> Iterator[Path]:
-    """Write settings with the folder of the recordings, which commands take names from."""
-    config = place / "settings.toml"
-    quoted = str(folder).replace("\\", "\\\\").replace('"', '\\"')
-    config.write_text(f'[recording]\nfolder = "{quoted}"\n')
-    try:
-        yield config
-    finally:
-        with suppress(FileNotFoundError):
-            config.unlink()
 
 
 async def _run(command: list[str]) -> None:

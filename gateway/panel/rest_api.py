@@ -277,11 +277,14 @@ class RestApi:
 
     async def read_all(self) -> Response:
         """Return the newest message of each kind of every system and component."""
-        return self._read("")
+        return await self.read("")
 
     async def read(self, path: str) -> Response:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
-        return self._read(path)
+        try:
+            return _json(self._book.look_up(path))
+        except KeyError:
+            return Response(NOTHING, media_type="application/json")
 
     async def helper(self, name: str | None = None) -> Response:
         """Return an empty message of a name, to be filled in and sent."""
@@ -337,12 +340,6 @@ class RestApi:
             router.add_api_route(path, answer, methods=[method], include_in_schema=shown)
         router.add_api_websocket_route("/ws/mavlink", self.follow)
         return router
-
-    def _read(self, path: str) -> Response:
-        try:
-            return _json(self._book.look_up(path))
-        except KeyError:
-            return Response(NOTHING, media_type="application/json")
 
     async def _read_all(self, socket: WebSocket, subscriber: Subscriber) -> None:
         """Carry out what an operator sends; end the connection of a viewer that sends."""

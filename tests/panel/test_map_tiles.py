@@ -17,11 +17,11 @@ import pytest
 from fastapi import FastAPI
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
-from starlette.types import Receive, Scope, Send
 
-from gateway.panel.access import ROLE, Role
+from gateway.panel.access import Role
 from gateway.panel.map_tiles import MAX_FILES, MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
+from tests.panel.test_recording_files import client_as
 
 pytestmark = pytest.mark.io
 
@@ -200,13 +200,7 @@ def hostile_maps(folder: Path) -> dict[str, tuple[bytes, str]]:
 def client_of(tiles: MapTiles, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
     app = FastAPI()
     tiles.serve(app)
-
-    async def with_role(scope: Scope, receive: Receive, send: Send) -> None:
-        scope[ROLE] = role
-        await app(scope, receive, send)
-
-    transport = httpx.ASGITransport(app=with_role)
-    return httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1")
+    return client_as(role, app)
 
 
 async def test_uploaded_map_is_a_style_at_once_and_hostile_ones_are_refused(tmp_path: Path) -> None:

@@ -47,10 +47,7 @@ def flight() -> bytes:
     )
 
 
-def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
-    app = FastAPI()
-    add_recording_files(app, lambda: folder)
-
+def client_as(role: Role, app: FastAPI) -> httpx.AsyncClient:
     async def with_role(scope: Scope, receive: Receive, send: Send) -> None:
         scope[ROLE] = role
         await app(scope, receive, send)
@@ -58,6 +55,12 @@ def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
     return httpx.AsyncClient(
         transport=httpx.ASGITransport(app=with_role), base_url="http://127.0.0.1"
     )
+
+
+def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
+    app = FastAPI()
+    add_recording_files(app, lambda: folder)
+    return client_as(role, app)
 
 
 @pytest.fixture

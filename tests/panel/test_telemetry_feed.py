@@ -3,6 +3,8 @@
 import asyncio
 import inspect
 import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -52,42 +54,43 @@ class Browser:
                 await self.arrived.wait()
 
 
-async def test_slow_browser_gets_the_newest_only() -> None:
+@asynccontextmanager
+async def served() -> AsyncIterator[tuple[FleetState, Browser]]:
     fleet, browser = FleetState(), Browser()
     feed = TelemetryFeed(fleet, GatewayClock())
     serving = asyncio.create_task(feed.serve(cast(WebSocket, browser)))
-    fleet.take(position(10.0, 20.0), 0)
-    await browser.until(GRANTS)
-    for step in range(200):
-        fleet.take(position(10.0 + step / 1000, 20.0), step)
-        await asyncio.sleep(0)
-    assert len(browser.frames) == GRANTS
-    await browser.grants.put("1")
-    await browser.until(GRANTS + 1)
-    assert browser.frames[-1]["vehicles"]["1"]["lat_deg"] == 10.199
+    yield fleet, browser
     await browser.grants.put(None)
     async with asyncio.timeout(LIMIT_S):
         await serving
+
+
+async def test_slow_browser_gets_the_newest_only() -> None:
+    async with served() as (fleet, browser):
+        fleet.take(position(10.0, 20.0), 0)
+        await browser.until(GRANTS)
+        for step in range(200):
+            fleet.take(position(10.0 + step / 1000, 20.0), step)
+            await asyncio.sleep(0)
+        assert len(browser.frames) == GRANTS
+        await browser.grants.put("1")
+        await browser.until(GRANTS + 1)
+        assert browser.frames[-1]["vehicles"]["1"]["lat_deg"] == 10.199
 
 
 async def test_page_cannot_save_up_grants() -> None:
-    fleet, browser = FleetState(), Browser()
-    feed = TelemetryFeed(fleet, GatewayClock())
-    serving = asyncio.create_task(feed.serve(cast(WebSocket, browser)))
-    await browser.until(GRANTS)
-    for _ in range(50):
-        await browser.grants.put("1")
-    while not browser.grants.empty():
-        await asyncio.sleep(0)
-    await browser.until(2 * GRANTS)
-    before = len(browser.frames)
-    for step in range(50):
-        fleet.take(position(10.0 + step / 1000, 20.0), step)
-        await asyncio.sleep(0)
-    assert len(browser.frames) <= before + GRANTS
-    await browser.grants.put(None)
-    async with asyncio.timeout(LIMIT_S):
-        await serving
+    async with served() as (fleet, browser):
+        await browser.until(GRANTS)
+        for _ in range(50):
+            await browser.grants.put("1")
+        while not browser.grants.empty():
+            await asyncio.sleep(0)
+        await browser.until(2 * GRANTS)
+        before = len(browser.frames)
+        for step in range(50):
+            fleet.take(position(10.0 + step / 1000, 20.0), step)
+            await asyncio.sleep(0)
+        assert len(browser.frames) <= before + GRANTS
 
 
 async def test_history_and_path_are_served_while_the_aircraft_moves() -> None:

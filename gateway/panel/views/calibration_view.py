@@ -129,9 +129,8 @@ class CalibrationView:
         with self._steps:
             for step, (title, icon, short) in TITLES.items():
                 outcome, look = self._outcomes.get(step, ("", ""))
-                card = (
-                    ui.element("button").classes("card step").on("click", partial(self._show, step))
-                )
+                card = ui.element("button").classes("card step")
+                card.on("click", partial(self._show, step))
                 if step is self._step:
                     card.props("aria-current=step")
                 with card:
@@ -185,12 +184,8 @@ class CalibrationView:
         self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
         with ui.element("div").classes("buttons"):
             may = self._may_calibrate and ready
-            use = ui.button("Use it", icon="check", on_click=self._mount).props(
-                "no-caps unelevated"
-            )
-            use.set_enabled(may)
-            store = ui.button("Store it", icon="save", on_click=self._store)
-            store.props("no-caps unelevated").classes("quiet").set_enabled(may)
+            _button("Use it", "check", self._mount, enabled=may)
+            _button("Store it", "save", self._store, quiet=True, enabled=may)
         ui.label(GUIDE[self._step]).classes("soft guide-note")
 
     def _orientation(self) -> str:
@@ -276,20 +271,14 @@ class CalibrationView:
         may = self._may_calibrate
         with ui.element("div").classes("buttons"):
             if run is not None and not run.state.is_over:
-                ui.button("Cancel", on_click=self._cancel).props("no-caps unelevated").classes(
-                    "quiet"
-                )
+                _button("Cancel", None, self._cancel, quiet=True)
                 return
             if run is not None and run.state is RunState.DONE:
-                ui.button("Store it", icon="save", on_click=self._store).props("no-caps unelevated")
-                undo = ui.button("Undo it", icon="undo", on_click=self._undo)
-                undo.props("no-caps unelevated").classes("quiet")
+                _button("Store it", "save", self._store)
+                _button("Undo it", "undo", self._undo, quiet=True)
             again = run is not None
-            start = ui.button(
-                "Again" if again else "Start", icon="play_arrow", on_click=self._start
-            )
-            start.props("no-caps unelevated").classes("quiet" if again else "")
-            start.set_enabled(may and ready)
+            text = "Again" if again else "Start"
+            _button(text, "play_arrow", self._start, quiet=again, enabled=may and ready)
 
     def _build_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
@@ -389,6 +378,13 @@ class CalibrationView:
         if stored:
             self._outcomes[self._step] = ("stored", "good")
         self._refresh()
+
+
+def _button(
+    text: str, icon: str | None, act: Any, *, quiet: bool = False, enabled: bool = True
+) -> None:
+    button = ui.button(text, icon=icon, on_click=act).props("no-caps unelevated")
+    button.classes("quiet" if quiet else "").set_enabled(enabled)
 
 
 def _figure(value: float) -> str:

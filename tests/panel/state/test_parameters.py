@@ -53,6 +53,14 @@ class Bench:
         return bool(self._lose_every) and self._count % self._lose_every == 0
 
 
+def loaded(*, may_change: bool = True) -> tuple[ParameterClient, Bench]:
+    """Return a client that has all parameters."""
+    client = ParameterClient(1)
+    bench = Bench(client, may_change=may_change)
+    bench.run(client.load(bench.now_us), 2.0)
+    return client, bench
+
+
 @pytest.mark.parametrize("lose_every", [0, 3])
 def test_the_whole_list_comes_in_spite_of_losses(lose_every: int) -> None:
     client = ParameterClient(1)
@@ -63,9 +71,7 @@ def test_the_whole_list_comes_in_spite_of_losses(lose_every: int) -> None:
 
 
 def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
-    client = ParameterClient(1)
-    bench = Bench(client)
-    bench.run(client.load(bench.now_us), 2.0)
+    client, bench = loaded()
     old = client.entries["PAPER_ALPHA_GYRO"].value
     bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
     assert (client.entries["PAPER_ALPHA_GYRO"].value, old) != (old, 0.75)
@@ -78,9 +84,7 @@ def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
 
 
 def test_a_value_changed_again_before_the_answer_is_not_called_refused() -> None:
-    client = ParameterClient(1)
-    bench = Bench(client)
-    bench.run(client.load(bench.now_us), 2.0)
+    client, bench = loaded()
     first = client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us)
     bench.run(first + client.change("PAPER_ALPHA_GYRO", 0.5, bench.now_us), 0.02)
     assert not client.refused
@@ -136,9 +140,7 @@ def test_a_change_without_an_answer_is_given_up() -> None:
 
 
 def test_a_client_that_may_not_change_is_refused_with_the_reason() -> None:
-    client = ParameterClient(1)
-    bench = Bench(client, may_change=False)
-    bench.run(client.load(bench.now_us), 2.0)
+    client, bench = loaded(may_change=False)
     bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
     assert "may not change" in client.refused["PAPER_ALPHA_GYRO"]
 
@@ -191,9 +193,7 @@ def test_integers_travel_as_the_vehicle_has_them() -> None:
 
 @pytest.mark.parametrize("lose_every", [0, 5])
 def test_the_metadata_explains_every_parameter(lose_every: int) -> None:
-    parameters, files = ParameterClient(1), FileClient(1)
-    bench = Bench(parameters)
-    bench.run(parameters.load(bench.now_us), 2.0)
+    (parameters, _), files = loaded(), FileClient(1)
     bench = Bench(files, lose_every=lose_every)
     bench.run(files.read("/general.json", bench.now_us), 5.0)
     path = parameter_path(files.files["/general.json"])
