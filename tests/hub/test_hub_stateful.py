@@ -288,12 +288,16 @@ class HubMachine(RuleBasedStateMachine):
     def another_client_requests_an_interval(self, client_id: int, interval_us: int) -> None:
         self.hub.set_interval(ClientInterval(client_id, OURS[0], 30, interval_us))
 
-    @rule(options=st.sampled_from(["", "&deny=ATTITUDE", "&rate=ATTITUDE:5", "&pack=300"]))
-    def settings_are_reloaded(self, options: str) -> None:
+    @rule(
+        options=st.sampled_from(["", "&deny=ATTITUDE", "&rate=ATTITUDE:5", "&pack=300"]),
+        most=st.integers(3, 5),
+    )
+    def settings_are_reloaded(self, options: str, most: int) -> None:
         async def steps() -> None:
             endpoints = list(self.hub.settings.endpoints)
             endpoints[2] = f"udp-listen:{UNTRUSTED}:0?trusted=no{options}"
-            self.hub.apply(msgspec.structs.replace(self.hub.settings, endpoints=tuple(endpoints)))
+            changed = {"endpoints": tuple(endpoints), "max_clients": most}
+            self.hub.apply(msgspec.structs.replace(self.hub.settings, **changed))
             await self._settle()
 
         self.run(steps())

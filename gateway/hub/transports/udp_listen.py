@@ -58,10 +58,8 @@ class UdpListener(Listener[DatagramPeer]):
             self.reason, self._retry_us = "", now_us + RETRY_US
         clients = self._by_address.values()
         idle_us = round(self._context.settings.idle_timeout_s * US_PER_S)
-        dead = list(itertools.islice((each for each in clients if each.has_died(now_us)), REMOVALS))
-        for client in dead:
-            self.leave(client)
-        for client in gone_clients(clients, idle_us, now_us):
+        dead = itertools.islice((each for each in clients if each.has_died(now_us)), REMOVALS)
+        for client in dict.fromkeys([*dead, *gone_clients(clients, idle_us, now_us)]):
             self.leave(client)
 
     def leave(self, client: Client) -> None:
