@@ -30,6 +30,7 @@ from gateway.vehicle.services.commands import (
     KEEPS_CLIENTS_US,
     NONE,
     REQUEST_MESSAGE,
+    SET_INTERVAL,
     SHORTHANDS,
     UNSUPPORTED,
     Command,
@@ -114,7 +115,7 @@ class _Commands(Service):
         command = read_command(request)
         if command.number == REQUEST_MESSAGE or command.number in SHORTHANDS:
             return self._send(command, requested_message(command))
-        if command.number == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+        if command.number == SET_INTERVAL:
             return self._thin(command)
         return [command.ack(DENIED)]
 

@@ -141,12 +141,13 @@ class Vehicle:
             self._explain, exclusive=self.telemetry.settings.operator_control == "exclusive"
         )
         self._add_identity()
-        commands = CommandService(self._intervals, self.telemetry, self._explain)
+        commands = CommandService(self.telemetry, self._explain)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_STORAGE, self._parameters.store)
         commands.register(mavlink.MAV_CMD_PREFLIGHT_CALIBRATION, self._calibrator.start)
         commands.register(FIXED_MAG_CAL_YAW, self._calibrator.start_by_yaw)
         self.plan.register(commands)
         self._recording.register(commands)
+        self._intervals.register(commands)
         commands.register(REQUEST_OPERATOR_CONTROL, self._control.command, changes_state=False)
         self._route(commands)
 

@@ -16,7 +16,7 @@ A start that failed stays pending: the recorder retries by itself, and announces
 
 import math
 from collections.abc import Callable, Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -38,6 +38,8 @@ FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
 
 NO_PROGRESS: Final = 255
 REQUEST_MESSAGE: Final = mavlink.MAV_CMD_REQUEST_MESSAGE
+SET_INTERVAL: Final = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL
+GET_INTERVAL: Final = mavlink.MAV_CMD_GET_MESSAGE_INTERVAL
 RESPOND_TO_ALL: Final = 2
 """Last parameter of MAV_CMD_REQUEST_MESSAGE."""
 
@@ -184,36 +186,44 @@ class IntervalService(Service):
             answers += self._apply(request.client_id, message_id, DEFAULT if faster else wanted_us)
         return answers
 
-    def set_interval(
-        self, request: Request, message_id: int, requested_us: int
-    ) -> list[Answer] | None:
-        """Apply one client's requested interval, as in MAV_CMD_SET_MESSAGE_INTERVAL.
+    def register(self, commands: "CommandService") -> None:
+        """Register the commands that are carried out here."""
+        commands.register(SET_INTERVAL, self._set, changes_state=False)
+        commands.register(GET_INTERVAL, self._get, changes_state=False)
 
-        None if the message is never streamed, or the rate cannot be granted.
-        """
-        stream = self._telemetry.streams.get(message_id)
+    def _set(self, command: Command, _now_us: int) -> Outcome:
+        """Apply one client's requested interval."""
+        message_id, interval_us = whole(command.params[0]), command.params[1]
+        if not math.isfinite(interval_us):
+            return DENIED, []
+        if not self._telemetry.knows(message_id):
+            return UNSUPPORTED, []
+        stream, requested_us = self._telemetry.streams.get(message_id), round(interval_us)
         if stream is None:
-            return None
+            return DENIED, []
         if message_id == HEARTBEAT and requested_us != DEFAULT:
             # A vehicle without heartbeats disappears from ground stations.
             if not 0 < requested_us <= KEEPS_CLIENTS_US:
-                return None
+                return DENIED, []
             requested_us = DEFAULT
         if requested_us < 0:
             requested_us = NONE
         elif requested_us != DEFAULT:
             carried = message_id in CARRIED_MESSAGES
             requested_us = max(MIN_INTERVAL_US if carried else MIN_TIMED_INTERVAL_US, requested_us)
-        if _is_faster(requested_us, stream.interval_us) and not request.may_change:
-            return None
-        return self._apply(request.client_id, message_id, requested_us)
+        if _is_faster(requested_us, stream.interval_us) and not command.request.may_change:
+            return DENIED, []
+        return ACCEPTED, self._apply(command.request.client_id, message_id, requested_us)
 
-    def interval_us(self, client_id: int, message_id: int) -> int:
-        """Return a client's MESSAGE_INTERVAL: -1 if it gets none, 0 if it is never sent."""
-        stream = self._telemetry.streams.get(message_id)
-        if stream is None:
-            return DEFAULT
-        return self._requested.get((client_id, message_id), stream.interval_us)
+    def _get(self, command: Command, _now_us: int) -> Outcome:
+        """Report a client's interval: -1 if it gets none, 0 if the message is never sent."""
+        message_id, request = whole(command.params[0]), command.request
+        stream, interval_us = self._telemetry.streams.get(message_id), DEFAULT
+        if stream is not None:
+            key = (request.client_id, message_id)
+            interval_us = self._requested.get(key, stream.interval_us)
+        answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
+        return ACCEPTED, [request.reply(answer)]
 
     def remove_client(self, client_id: int) -> None:
         """Discard the rates of a client that has gone."""
@@ -275,8 +285,6 @@ class CommandService(Service):
 
     Parameters
     ----------
-    intervals : IntervalService
-        For the rates of single clients.
     telemetry : Telemetry
         Builds the messages that clients request.
     explain : callable
@@ -285,18 +293,10 @@ class CommandService(Service):
 
     types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
 
-    def __init__(
-        self,
-        intervals: IntervalService,
-        telemetry: Telemetry,
-        explain: Explain,
-    ) -> None:
-        self._intervals = intervals
+    def __init__(self, telemetry: Telemetry, explain: Explain) -> None:
         self._telemetry = telemetry
         self._explain = explain
         self._handlers: dict[int, Handler] = {
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
             **dict.fromkeys((REQUEST_MESSAGE, *SHORTHANDS), self._request_message),
             **dict.fromkeys(REFUSALS, self._decline),
         }
@@ -331,7 +331,9 @@ class CommandService(Service):
     def _request_message(self, command: Command, now_us: int) -> Outcome:
         message_id, request = requested_message(command), command.request
         if message_id == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
-            return self._report_interval(request, whole(command.params[1]))
+            # The second parameter is the message whose interval is requested.
+            shifted = replace(command, params=(*command.params[1:], 0.0))
+            return self._handlers[GET_INTERVAL](shifted, now_us)
         if not self._telemetry.knows(message_id):
             return UNSUPPORTED, []
         # The answer to an untrusted client must not load the links of others.
@@ -339,23 +341,6 @@ class CommandService(Service):
         client_id = None if to_all and request.may_change else request.client_id
         message = self._telemetry.build(message_id, now_us)
         return (NOT_NOW, []) if message is None else (ACCEPTED, [Reply(message, client_id)])
-
-    def _set_interval(self, command: Command, _now_us: int) -> Outcome:
-        message_id, interval_us = whole(command.params[0]), command.params[1]
-        if not math.isfinite(interval_us):
-            return DENIED, []
-        if not self._telemetry.knows(message_id):
-            return UNSUPPORTED, []
-        answers = self._intervals.set_interval(command.request, message_id, round(interval_us))
-        return (DENIED, []) if answers is None else (ACCEPTED, answers)
-
-    def _get_interval(self, command: Command, _now_us: int) -> Outcome:
-        return self._report_interval(command.request, whole(command.params[0]))
-
-    def _report_interval(self, request: Request, message_id: int) -> Outcome:
-        interval_us = self._intervals.interval_us(request.client_id, message_id)
-        answer = mavlink.MAVLink_message_interval_message(message_id & 0xFFFF, interval_us)
-        return ACCEPTED, [request.reply(answer)]
 
 
 RECORDER_TIMEOUT_US: Final = 10 * US_PER_S
