@@ -386,17 +386,14 @@ class OwnVehicles:
     def __init__(self) -> None:
         self._seen_us: dict[Origin, int] = {}
         self._frames: dict[Origin, dict[int, MavFrame]] = {}
-        self._waiting: dict[Origin, list[int]] = {}
-
-    @property
-    def has_waiting(self) -> bool:
-        """Whether a client waits for a greeting."""
-        return bool(self._waiting)
+        self.waiting: dict[Origin, list[int]] = {}
+        """The clients that wait for the greeting of each vehicle."""
 
     def register(self, frame: MavFrame, now_us: int) -> bool:
         """Register a frame of ours, maybe for greetings; return whether its vehicle is new."""
         origin, message_id = frame.origin, frame.message_id
-        is_new = not self.is_own(origin, now_us)
+        seen_us = self._seen_us.get(origin)
+        is_new = seen_us is None or now_us - seen_us > OWN_FRESH_US
         if not is_new and message_id not in GREETING:
             return False
         if is_new:
@@ -419,18 +416,18 @@ class OwnVehicles:
     def await_greeting(self, client_id: int) -> None:
         """Queue a new client for the greetings of every vehicle."""
         for origin in self._frames:
-            self._waiting.setdefault(origin, []).append(client_id)
+            self.waiting.setdefault(origin, []).append(client_id)
 
     def remove(self, client_id: int) -> None:
         """Do not greet a client that has gone."""
-        for origin, waiting in list(self._waiting.items()):
+        for origin, waiting in list(self.waiting.items()):
             if client_id in waiting:
                 waiting.remove(client_id)
             if not waiting:
-                del self._waiting[origin]
+                del self.waiting[origin]
 
     def greet(self, origin: Origin) -> tuple[list[int], list[MavFrame]]:
         """Return the clients that wait for a vehicle, and the frames to send them first."""
-        clients = self._waiting.pop(origin, [])
+        clients = self.waiting.pop(origin, [])
         known = self._frames.get(origin, {})
         return clients, [known[message_id] for message_id in GREETING if message_id in known]

@@ -377,12 +377,12 @@ class Daemon:
         if out.frames:
             self._send(out.frames)
         for record in out.records:
-            if isinstance(record, SettingsChanged):
+            if isinstance(record, FusedSample):
+                self._imu.add(record)
+            elif isinstance(record, SettingsChanged):
                 self._recorder.settings_changed(record.vehicle_id)
                 continue
             self._recorder.flight(record)
-            if isinstance(record, FusedSample):
-                self._imu.add(record)
         for order in out.orders:
             self._carry_out(order)
 

@@ -213,12 +213,13 @@ class Recorder:
 
     def flight(self, record: BaroRaw | GpsFix | FusedSample | NodeStatus) -> None:
         """Record a sample of the estimator, or the resulting state."""
-        if isinstance(record, GpsFix) and record.utc_us is not None:
-            self._civil.hear_gps(record.node.vehicle_id, record.utc_us, record.time_us)
-        vehicle_id = (
-            record.vehicle_id if isinstance(record, FusedSample) else record.node.vehicle_id
-        )
         part = self._part
+        if isinstance(record, FusedSample):
+            vehicle_id = record.vehicle_id
+        else:
+            vehicle_id = record.node.vehicle_id
+            if isinstance(record, GpsFix) and record.utc_us is not None:
+                self._civil.hear_gps(vehicle_id, record.utc_us, record.time_us)
         if part is not None and part.introduces(vehicle_id):
             for frame in self._introduction_of(vehicle_id):
                 self.frame(frame)

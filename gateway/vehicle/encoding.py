@@ -201,10 +201,9 @@ class PackedMessage(msgspec.Struct, frozen=True, gc=False):
 AUTOPILOT_COMPONENT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: clients look for a vehicle under no other component id."""
 
-_pack_head: Final = struct.Struct("<BBBBBBBHB").pack
-"""Start, length, two flag bytes, sequence, system, component, message id in three bytes."""
-KEY: Final = slice(5, 10)
-"""System, component and message in a frame."""
+_pack_head: Final = struct.Struct("<BBBBB5s").pack
+"""Start, length, two flag bytes, sequence, and the key: system, component and message."""
+_KEY: Final = struct.Struct("<BBHB")
 NO_TARGET: Final = (0, 0)
 _INTEGER_LIMITS: Final = {
     "int8_t": (-(2**7), 2**7 - 1),
@@ -225,6 +224,8 @@ class Encoder:
         """Start the sequence."""
         self.system_id = system_id
         self._origin = (system_id, AUTOPILOT_COMPONENT)
+        self._keys: dict[int, bytes] = {}
+        """System, component and message as in a frame, by message id."""
         self._sequence = 0
 
     def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
@@ -265,7 +266,7 @@ class Encoder:
         header, sequence = None, self._sequence
         self._sequence = sequence + 1 & 0xFF
         if not has_target:
-            key = frame[KEY]
+            key = self._keys[message_id]
             header = MavFrame(frame, key, message_id, self._origin, NO_TARGET, sequence, False)
         return Outgoing(frame, message_id, client_id, header)
 
@@ -275,22 +276,15 @@ class Encoder:
         """Put header and checksum around a payload; `force_mavlink1` is pymavlink's own."""
         del force_mavlink1
         body = payload.rstrip(b"\0") or payload[:1]
-        content = (
-            _pack_head(
-                START_V2,
-                len(body),
-                0,
-                0,
-                self._sequence,
-                self.system_id,
-                AUTOPILOT_COMPONENT,
-                message_id & 0xFFFF,
-                message_id >> 16,
-            )
-            + body
-        )
+        key = self._keys.get(message_id) or self._make_key(message_id)
+        content = _pack_head(START_V2, len(body), 0, 0, self._sequence, key) + body
         crc = mcrf4xx(content[1:] + crc_extra.to_bytes())
         return content + crc.to_bytes(2, "little")
+
+    def _make_key(self, message_id: int) -> bytes:
+        key = _KEY.pack(*self._origin, message_id & 0xFFFF, message_id >> 16)
+        self._keys[message_id] = key
+        return key
 
 
 def _has_target(message: Any) -> bool:

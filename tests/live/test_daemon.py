@@ -169,8 +169,8 @@ async def test_settings_are_reported_as_stored_once_the_file_is_whole(
     def fail(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def note(queued: tuple[MavFrame, int, int, int], _: int) -> None:
-        message = mavlink.MAVLink(None).decode(bytearray(queued[0].data))
+    def note(sent: MavFrame, *_: object) -> None:
+        message = mavlink.MAVLink(None).decode(bytearray(sent.data))
         if message.get_type() == "COMMAND_ACK":
             seen.append((message.result, file.read_text() if file.exists() else ""))
         elif message.get_type() == "STATUSTEXT" and message.text.startswith("Settings"):
@@ -178,7 +178,7 @@ async def test_settings_are_reported_as_stored_once_the_file_is_whole(
 
     if is_full:
         monkeypatch.setattr("gateway.config.write_new", fail)
-    monkeypatch.setattr(daemon._hub, "_send", note)
+    monkeypatch.setattr(daemon._hub, "_pass_on", note)
     bias = mavlink.MAVLink_param_set_message(1, 1, b"CAL_GYRO_BIAS_X", 0.01, 9)
     for message in (bias, STORE):
         daemon._on_frame(Incoming(5, frame(message), True))
