@@ -268,11 +268,11 @@ def _answers(device: str, baud: int) -> bool:
                 port.dtr = port.rts = level
             time.sleep(RESET_PULSE_S)
         port.reset_input_buffer()
-        heard = b""
+        received = b""
         for _ in range(SYNC_TRIES):
             port.write(GET_SYNC)
-            heard = (heard + port.read(64))[-64:]
-            if IN_SYNC in heard:
+            received = (received + port.read(64))[-64:]
+            if IN_SYNC in received:
                 return True
     return False
 

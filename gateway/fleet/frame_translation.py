@@ -154,7 +154,7 @@ class VehicleTraffic:
     frames: int = 0
     lost: int = 0
     """By the gaps in its sequence numbers."""
-    heard_us: int = 0
+    received_us: int = 0
     marks: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=RATE_MARKS))
     """Times of the last seconds, and the number of frames until then."""
 
@@ -271,7 +271,7 @@ class FrameTranslation:
         if not traffic.marks:
             traffic.marks.append((now_us, 0))
         traffic.frames += 1
-        traffic.heard_us = now_us
+        traffic.received_us = now_us
         if (before := self._sequences.get(origin)) is not None:
             if 0 < (before - sequence & SEQUENCE_MASK) <= MAX_OVERTAKEN:
                 traffic.lost = max(0, traffic.lost - 1)

@@ -80,18 +80,20 @@ class IdMap:
         self._give(vehicle, free)
         return free
 
-    def make_room(self, heard_us: Mapping[Vehicle, int], silent_since_us: int) -> "Handover | None":
+    def make_room(
+        self, received_us: Mapping[Vehicle, int], idle_since_us: int
+    ) -> "Handover | None":
         """Pass an id of a vehicle that is no longer received to one that waits for an id.
 
         The former vehicle is of the same site, or of a site that has more ids. A vehicle that is
         received keeps its id: ground stations would command another vehicle by it.
         """
         shares = self._shares()
-        silent = [each for each in self._ids if heard_us.get(each, 0) < silent_since_us]
-        silent.sort(key=lambda each: heard_us.get(each, 0))
+        idle = [each for each in self._ids if received_us.get(each, 0) < idle_since_us]
+        idle.sort(key=lambda each: received_us.get(each, 0))
         one_of_site = {each[0]: each for each in self.unmapped}
         for site in sorted(one_of_site, key=lambda each: shares[each]):
-            for former in silent:
+            for former in idle:
                 may_grow = shares[site] < self._per_site and shares[former[0]] > shares[site]
                 if former[0] == site or may_grow:
                     own_id = self._ids.pop(former)

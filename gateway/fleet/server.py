@@ -121,7 +121,7 @@ class SiteClient(Client):
                     "system_id": system_id,
                     "id": self.translation.id_of(system_id),
                     "rate_hz": traffic.rate_hz(now_us),
-                    "age_s": (now_us - traffic.heard_us) / US_PER_S,
+                    "age_s": (now_us - traffic.received_us) / US_PER_S,
                     "frames": traffic.frames,
                     "lost": traffic.lost,
                 }
@@ -283,13 +283,13 @@ class FleetServer:
     def _make_room(self, now_us: int) -> None:
         """Pass on the id of one abandoned vehicle, and remove abandoned sites."""
         if self._ids.unmapped:
-            heard_us = {
-                (name, system_id): traffic.heard_us
+            received_us = {
+                (name, system_id): traffic.received_us
                 for name, site in self._sites.items()
                 for system_id, traffic in site.translation.traffic.items()
             }
             # One at a time: it takes some milliseconds when many wait.
-            if done := self._ids.make_room(heard_us, now_us - ABANDONED_US):
+            if done := self._ids.make_room(received_us, now_us - ABANDONED_US):
                 text = "id %d of %s/%d, not received for an hour, is now of %s/%d"
                 log.warning(text, done.own_id, *done.former, *done.holder)
         if len(self._sites) >= MAX_SITES:

@@ -79,10 +79,10 @@ def test_site_gets_no_more_ids_than_its_limit() -> None:
     ids = IdMap(per_site=3)
     assert [ids.id_of("field", system) for system in range(1, 6)] == [1, 2, 3, None, None]
     assert ids.id_of("other", 1) == 4
-    heard_us = dict.fromkeys([vehicle for vehicle, _ in ids.items()], 0)
+    received_us = dict.fromkeys([vehicle for vehicle, _ in ids.items()], 0)
     for site in range(LAST_ID):
         ids.id_of(f"site-{site}", 1)
-    done = ids.make_room(heard_us, 1000)
+    done = ids.make_room(received_us, 1000)
     assert done is None or done.holder[0] != "field" or done.former[0] == "field"
     ids.set_by_hand("field", 4, 9)
     assert ids.known_id("field", 4) == 9, "the operator may exceed the limit"
@@ -92,27 +92,27 @@ def test_received_vehicle_keeps_its_id() -> None:
     ids = filled(8)
     assert ids.id_of("field", 7) is None
     before = ids.items()
-    heard_us = {vehicle: 1000 for vehicle, _ in before}
-    assert ids.make_room(heard_us, 1000) is None
+    received_us = {vehicle: 1000 for vehicle, _ in before}
+    assert ids.make_room(received_us, 1000) is None
     assert ids.items() == before
-    silent = min(vehicle for vehicle, _ in before)
-    heard_us[silent] = 999
-    done = ids.make_room(heard_us, 1000)
-    assert done == Handover(dict(before)[silent], silent, ("field", 7))
+    idle = min(vehicle for vehicle, _ in before)
+    received_us[idle] = 999
+    done = ids.make_room(received_us, 1000)
+    assert done == Handover(dict(before)[idle], idle, ("field", 7))
     assert ids.id_of("field", 7) == done.own_id
-    assert ids.id_of(*silent) is None, "it waits in its turn"
+    assert ids.id_of(*idle) is None, "it waits in its turn"
 
 
 def test_site_gets_no_id_of_a_smaller_site() -> None:
     ids = filled(8)
-    heard_us = {vehicle: 1000 for vehicle, _ in ids.items()}
-    (smallest, *_, largest) = sorted(heard_us, key=lambda each: ids._shares()[each[0]])
+    received_us = {vehicle: 1000 for vehicle, _ in ids.items()}
+    (smallest, *_, largest) = sorted(received_us, key=lambda each: ids._shares()[each[0]])
     assert largest[0] == "many-0"
-    heard_us[smallest] = 1
+    received_us[smallest] = 1
     ids.unmapped = {each for each in ids.unmapped if each[0] == "many-0"}
-    assert ids.make_room(heard_us, 1000) is None
-    heard_us[largest] = 2
-    done = ids.make_room(heard_us, 1000)
+    assert ids.make_room(received_us, 1000) is None
+    received_us[largest] = 2
+    done = ids.make_room(received_us, 1000)
     assert done is not None
     assert (done.former, done.holder[0]) == (largest, "many-0")
 
