@@ -33,6 +33,7 @@ from gateway.recordings.table import (
 )
 from gateway.records import FusedSample
 from tests.recordings.samples import make_baro, make_fix, make_flight, make_fused
+from tests.recordings.test_table import make_rows
 from tools.document_columns import PAGE, with_table
 
 
@@ -140,15 +141,9 @@ def test_lines_of_other_cells_are_left_to_python(text: bytes) -> None:
     assert read_lines(b"5,6\n" + text, 2) is None
 
 
-def some_rows(seed: int) -> list[TableRow]:
-    builder = RowBuilder()
-    records = make_flight(np.random.default_rng(seed), 60)
-    return [row for record in records for row in builder.add(record)] + builder.flush()
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_a_block_is_its_rows(seed: int) -> None:
-    rows = some_rows(seed)
+    rows = make_rows(seed, 60)
     lines = "".join(map(row_to_line, rows)).encode()
     block = block_of(rows)
     assert encode_block(block) == lines
@@ -159,7 +154,7 @@ def test_a_block_is_its_rows(seed: int) -> None:
 
 def test_one_bad_line_changes_no_other() -> None:
     """Then each line is read by itself: the numbers are the same."""
-    rows = some_rows(7)
+    rows = make_rows(7, 60)
     lines = [row_to_line(row).encode() for row in rows]
     mark = encode_line(TableMark(3, "here")).encode()
     head = encode_head(TableHeader()).encode()
@@ -184,7 +179,7 @@ def test_one_bad_line_changes_no_other() -> None:
     ],
 )
 def test_numbers_that_cannot_be_are_faults(changed: dict[str, str], reason: str) -> None:
-    row = next(row for row in some_rows(1) if row.gps and row.state)
+    row = next(row for row in make_rows(1, 60) if row.gps and row.state)
     cells = dict(zip(COLUMNS, row_to_line(row).rstrip("\n").split(","), strict=True))
     text = encode_head(TableHeader()) + ",".join((cells | changed).values()) + "\n"
     block = TableReader().feed_block(text.encode())
@@ -195,7 +190,7 @@ def test_numbers_that_cannot_be_are_faults(changed: dict[str, str], reason: str)
 
 
 def test_whole_numbers_that_another_program_wrote_as_floats_are_read() -> None:
-    (row,) = (row for row in some_rows(2)[:1])
+    (row,) = (row for row in make_rows(2, 60)[:1])
     text = row_to_line(row).replace(f"{row.time_us},", f"{row.time_us}.0,", 1)
     (again,) = TableReader().feed((encode_head(TableHeader(vehicle_id=3)) + text).encode())
     assert repr(again) == repr(row)
