@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from msgspec.structs import replace
 
 from gateway.analysis.flight import (
     Flight,
@@ -28,7 +27,7 @@ from gateway.geometry.geodesy import radii_m
 from gateway.panel.state.fields import FloatArray
 from gateway.panel.state.fleet import TimedFrames
 from gateway.recordings.formats.mavlink import AutopilotReader
-from gateway.recordings.fuse import FusionSettings
+from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
@@ -65,8 +64,8 @@ def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estima
     flight, zero_us = _flight_of(frames, settings)
     found = []
     for name in ESTIMATORS:
-        chosen = replace(settings, estimation=replace(settings.estimation, estimator=name))
-        found.append(_estimate(name, flight, fuse_track(flight, chosen), zero_us))
+        track = fuse_track(flight, with_estimator(settings, name))
+        found.append(_estimate(name, flight, track, zero_us))
     return found
 
 

@@ -8,6 +8,7 @@ import struct
 import threading
 import zlib
 from collections.abc import AsyncIterator, Iterable, Iterator
+from functools import cache
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import ClassVar
@@ -169,12 +170,17 @@ def changed(data: bytes, offset: int, value: int, size: int = 8) -> bytes:
     return data[:offset] + value.to_bytes(size, "little") + data[offset + size :]
 
 
+@cache
+def packed_zeros() -> bytes:
+    return gzip.compress(bytes(1 << 28), 1)
+
+
 def hostile_maps(folder: Path) -> dict[str, tuple[bytes, str]]:
     """Make files that are no usable maps, and what is said of each."""
     write_pmtiles(folder / "good", TileType.PNG)
     good = (folder / "good").read_bytes()
     write_pmtiles(folder / "vector", TileType.MVT)
-    bomb, text = gzip.compress(bytes(1 << 28)), "directory of it"
+    bomb, text = packed_zeros(), "directory of it"
     long_number = gzip.compress(b"\xff" * (1 << 18))
     return {
         "empty": (b"", "no PMTiles"),

@@ -326,7 +326,13 @@ class TestFollowing:
 
     @pytest.mark.parametrize(
         ("pattern", "word"),
-        [("(", "unclosed"), ("A" * 501, "500"), ("\\w{1000}", "no {}"), ("(?=A)", "look-around")],
+        [
+            ("(", "unclosed"),
+            ("A" * 301, "300"),
+            ("A{9}", "without {}"),
+            ("\\w", "without"),
+            ("(?=A)", "look-around"),
+        ],
     )
     async def test_invalid_filter_is_refused(self, world: World, pattern: str, word: str) -> None:
         async with websockets.connect(f"ws://{world.url}/v1/ws/mavlink?filter={pattern}") as stream:
@@ -335,7 +341,7 @@ class TestFollowing:
                 await stream.recv()
 
     def test_expression_that_python_would_try_for_ever_is_answered_at_once(self) -> None:
-        assert names_matching(r"(\w+)+-") == frozenset()
+        assert names_matching("(.+)+-") == frozenset()
         assert names_matching("^(ATTITUDE|HEARTBEAT)$") == {"ATTITUDE", "HEARTBEAT"}
 
     async def test_slow_subscriber_loses_its_oldest_messages_beyond_a_limit_in_bytes(self) -> None:
