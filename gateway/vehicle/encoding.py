@@ -30,21 +30,7 @@ FLOAT32_MAX: Final = 3.402_823_4e38
 
 
 def whole(value: float, low: int, high: int, unknown: int) -> int:
-    """Round to an integer field.
-
-    Parameters
-    ----------
-    value : float
-        In the field's unit; NaN is not known, an infinity is saturated.
-    low, high : int
-        Ends of the field, `unknown` excluded.
-    unknown : int
-        What the message definition specifies for an unknown value.
-
-    Returns
-    -------
-    int
-    """
+    """Round to an integer field from `low` to `high`; NaN is sent as `unknown`."""
     if math.isnan(value):
         return unknown
     if value <= low:
@@ -229,19 +215,10 @@ class Encoder:
         self._sequence = 0
 
     def encode(self, message: Any, client_id: int | None = None) -> Outgoing:
-        """Build the MAVLink 2 frame of one message.
+        """Build the MAVLink 2 frame of one message, for the one client that it answers, or all.
 
-        Parameters
-        ----------
-        message : PackedMessage or MAVLink_message
-            Any message of the dialect. A number beyond its field's range is saturated, so that no
-            measurement can stop the telemetry.
-        client_id : int, optional
-            The one client it answers.
-
-        Returns
-        -------
-        Outgoing
+        A number beyond its field's range is saturated, so that no measurement can stop the
+        telemetry.
         """
         if isinstance(message, PackedMessage):
             packer = message.packer

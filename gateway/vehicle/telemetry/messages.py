@@ -151,22 +151,8 @@ def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, upda
 
     HIGHRES_IMU rather than SCALED_IMU: its floats keep the sensors' resolution, it carries the
     barometer, and `fields_updated` marks the new values, where SCALED_IMU would have to send a
-    plausible zero for an absent magnetometer.
-
-    Parameters
-    ----------
-    sample : ImuSample
-        The sample to send.
-    mag_b_ut : tuple of 3 floats
-        Newest magnetic field in microtesla, NaN if there was none.
-    baro : BaroSample or None
-        Newest barometer sample.
-    updated : int
-        HIGHRES_IMU_UPDATED_FLAGS since the previous message.
-
-    Returns
-    -------
-    MAVLink_message
+    plausible zero for an absent magnetometer. `updated` has the flags of the values that are new
+    since the previous message; an unknown field is NaN.
     """
     x, y, z = mag_b_ut
     diff_pressure, imu_id = NAN, 0
