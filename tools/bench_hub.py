@@ -4,8 +4,8 @@ A source sends frames of foreign vehicles to the forwarder, which passes them to
 loopback. Three figures for each forwarder and N:
 
 * the lossless maximum: the source keeps at most a window of frames under way and the forwarder
-  sets the pace; the run lasts until every frame has come to every client, so that nothing is left
-  in any buffer, and what has not come within half a second is lost;
+  sets the pace; the run lasts until every client has received every frame, so that nothing is left
+  in any buffer, and a frame that is not received within half a second is lost;
 * the CPU time that the forwarder uses for each delivered message meanwhile;
 * latency and CPU share at a fixed rate, from the source's clock before the send to the kernel's
   stamp at the client's socket, datagram or stream, so that the clients' own wake-ups do not count.
@@ -62,13 +62,13 @@ COMMANDED_S = 3.0
 
 PLAIN = """
 import socket, sys
-place = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-place.bind(("127.0.0.1", int(sys.argv[1])))
+sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+sock.bind(("127.0.0.1", int(sys.argv[1])))
 clients = [("127.0.0.1", int(port)) for port in sys.argv[2:]]
 while True:
-    data, _ = place.recvfrom(65535)
+    data, _ = sock.recvfrom(65535)
     for client in clients:
-        place.sendto(data, client)
+        sock.sendto(data, client)
 """
 
 HUB = """
@@ -140,7 +140,7 @@ class Latency:
     cpu_percent: float
     lost: int
     gap_us: float
-    """The longest time in which a client heard nothing."""
+    """The longest time in which a client received nothing."""
 
 
 def python(code: str) -> Command:
@@ -190,7 +190,7 @@ def source_frames(systems: int = 1) -> list[bytes]:
 
 
 def heartbeat() -> bytes:
-    """Encode a heartbeat: some forwarders pass nothing on before they have heard one."""
+    """Encode a heartbeat: some forwarders pass nothing on before they have received one."""
     message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
     return bytes(message.pack(mavlink.MAVLink(None, SOURCE_SYSTEM, 1)))
 
@@ -227,14 +227,14 @@ class Bench:
     """A running forwarder with its source and its clients."""
 
     source_port = 0
-    """Whence frames are sent: the first free port, and from then on that one."""
+    """Port that frames are sent from: the first free one, and from then on that one."""
 
     def __init__(self, command: Command, clients: int, frames: list[bytes]) -> None:
         self._frames = frames
         self._length = len(frames[0])
         self._sinks = [udp_socket() for _ in range(clients)]
         self._poll = select.poll()
-        self._by_fd = {sink.fileno(): place for place, sink in enumerate(self._sinks)}
+        self._by_fd = {sink.fileno(): index for index, sink in enumerate(self._sinks)}
         for sink in self._sinks:
             sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
             self._poll.register(sink, select.POLLIN)
@@ -379,27 +379,27 @@ class Bench:
             pass
 
     def _drain(self, wait_ms: int) -> int:
-        """Take what has come; return how many frames that were."""
+        """Read all that was received; return the number of frames."""
         return sum(self._take(fd) for fd, _ in self._poll.poll(wait_ms))
 
     def _take(self, fd: int) -> int:
-        place = self._by_fd[fd]
-        count = self._read_stamps(place) if self._stamps else self._read(place)
-        self._counts[place] += count
+        index = self._by_fd[fd]
+        count = self._read_stamps(index) if self._stamps else self._read(index)
+        self._counts[index] += count
         return count
 
-    def _read(self, place: int) -> int:
+    def _read(self, index: int) -> int:
         # Other frames, such as heartbeats, are shorter than ours; several of ours may be in one.
-        receive, length, count = self._sinks[place].recv, self._length, 0
+        receive, length, count = self._sinks[index].recv, self._length, 0
         try:
             while True:
                 count += len(receive(2048)) // length
         except BlockingIOError:
             return count
 
-    def _read_stamps(self, place: int) -> int:
+    def _read_stamps(self, index: int) -> int:
         assert self._stamps is not None
-        sink, row, before = self._sinks[place], self._stamps[place], len(self._stamps[place])
+        sink, row, before = self._sinks[index], self._stamps[index], len(self._stamps[index])
         try:
             while True:
                 data, ancillary, _, _ = sink.recvmsg(2048, 64)
@@ -422,12 +422,12 @@ class WebBench(Bench):
         return [sys.executable, "-c", WEB_HUB, str(port), str(self._web_port)]
 
     def _wait_until_up(self) -> None:
-        """Put WebSockets in the place of the UDP sockets."""
-        for place, sink in enumerate(self._sinks):
+        """Replace the UDP sockets by WebSockets."""
+        for index, sink in enumerate(self._sinks):
             self._poll.unregister(sink)
             sink.close()
-            self._sinks[place] = self._open_web()
-        self._by_fd = {sink.fileno(): place for place, sink in enumerate(self._sinks)}
+            self._sinks[index] = self._open_web()
+        self._by_fd = {sink.fileno(): index for index, sink in enumerate(self._sinks)}
         self._rests = [b""] * len(self._sinks)
         for sink in self._sinks:
             sink.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -451,31 +451,31 @@ class WebBench(Bench):
         sink.setblocking(False)
         return sink
 
-    def _read(self, place: int) -> int:
-        return self._messages(place, self._received(place)[0])
+    def _read(self, index: int) -> int:
+        return self._messages(index, self._received(index)[0])
 
-    def _read_stamps(self, place: int) -> int:
+    def _read_stamps(self, index: int) -> int:
         assert self._stamps is not None
-        data, ancillary = self._received(place)
-        count = self._messages(place, data)
-        self._stamps[place] += [stamp_ns(ancillary)] * count if count else []
+        data, ancillary = self._received(index)
+        count = self._messages(index, data)
+        self._stamps[index] += [stamp_ns(ancillary)] * count if count else []
         return count
 
-    def _received(self, place: int) -> tuple[bytes, list[tuple[int, int, bytes]]]:
+    def _received(self, index: int) -> tuple[bytes, list[tuple[int, int, bytes]]]:
         try:
-            data, ancillary, _, _ = self._sinks[place].recvmsg(1 << 20, 64)
+            data, ancillary, _, _ = self._sinks[index].recvmsg(1 << 20, 64)
         except BlockingIOError:
             return b"", []
         return data, ancillary
 
-    def _messages(self, place: int, chunk: bytes) -> int:
+    def _messages(self, index: int, chunk: bytes) -> int:
         """Return how many messages of one frame of ours each are complete."""
-        data = self._rests[place] + chunk
+        data = self._rests[index] + chunk
         count, at = 0, 0
         while at + 2 <= len(data) and at + 2 + data[at + 1] <= len(data):
             count += data[at + 1] == self._length
             at += 2 + data[at + 1]
-        self._rests[place] = data[at:]
+        self._rests[index] = data[at:]
         return count
 
 
