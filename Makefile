@@ -22,13 +22,13 @@ kernels: .venv/.run
 	@.venv/bin/python -m tools.build_kernels
 
 # Tests that need the AVR tool chain or a browser skip, and say so, where it could not be installed.
-# Tests wait for a third of their time, so there are three workers for two cores. They start hundreds of
+# Tests wait for a third of their time, so there are four workers for two cores. They start hundreds of
 # processes, each of which would compile all sources again without bytecode files.
 test: export PYTHONDONTWRITEBYTECODE =
 test: .venv/.dev kernels
 	-@tools/apt_install.sh $(FIRMWARE_PACKAGES)
 	-@tools/apt_install.sh $(BROWSER_PACKAGES)
-	.venv/bin/pytest -q -n 3 --durations 20
+	.venv/bin/pytest -q -n 4 --durations 20
 
 # Before Python 3.12 tracing makes the tests take 2.7 times the processor time, from then on little more:
 # so it is apart from `make test`, and without the slow tests, most of which start other processes. A test

@@ -1,13 +1,14 @@
-"""The programs of tools/ can be imported: most run only now and then, and some use each other."""
+"""The programs of tools/ and of the bench can be imported: most run only now and then."""
 
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
+ROOT = Path(__file__).resolve().parent.parent
+PROGRAMS = [f"tools.{path.stem}" for path in sorted(ROOT.glob("tools/*.py"))]
 
 
-@pytest.mark.parametrize("name", sorted(path.stem for path in TOOLS.glob("*.py")))
+@pytest.mark.parametrize("name", [*PROGRAMS, "firmware.rig.measure"])
 def test_a_tool_can_be_imported(name: str) -> None:
-    import_module(f"tools.{name}")
+    import_module(name)

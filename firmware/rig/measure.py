@@ -19,7 +19,7 @@ from firmware.rig.bench import PS_PER_S, PS_PER_US
 from firmware.rig.boards import Board, Setup
 from firmware.rig.build import PROGRAMS, build, make
 from firmware.rig.tracker import IMU_CLOCK_PPM, Tracker
-from gateway.wire.framing import Frame, FrameDecoder
+from gateway.wire.framing import FrameDecoder
 from gateway.wire.payloads import (
     GpsFixPayload,
     ImuPayload,
@@ -127,7 +127,7 @@ def _read_line(run: Run, line: list[tuple[int, int]], sampled_ps: list[int]) -> 
     packets = fixes = 0
     for end_ps, byte in line:
         for event in decoder.feed(bytes([byte])) if byte == 0 else _keep(decoder, byte):
-            frame = decode_content(event.content) if isinstance(event, Frame) else None
+            frame = decode_content(event) if isinstance(event, bytes) else None
             if not isinstance(frame, RadioFrame):
                 continue
             packets += 1
@@ -145,7 +145,7 @@ def _read_line(run: Run, line: list[tuple[int, int]], sampled_ps: list[int]) -> 
     run.events.update(receiver=packets, gps_node=fixes)
 
 
-def _keep(decoder: FrameDecoder, byte: int) -> list[Frame]:
+def _keep(decoder: FrameDecoder, byte: int) -> list[bytes]:
     decoder.feed(bytes([byte]))
     return []
 
