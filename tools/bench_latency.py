@@ -52,6 +52,7 @@ WARM_UP_S = 3.0
 START_LIMIT_S = 120.0
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 GATEWAY = "mavgate"
+WITH_UVLOOP = "mavgate, uvloop"
 
 BASELINE = """
 import os, socket, sys
@@ -65,6 +66,9 @@ while data := os.read(line, 4096):
 CONFIG = """
 [vehicle.rates]
 attitude_quaternion_hz = 1000
+
+[hub]
+event_loop = "{event_loop}"
 """
 
 
@@ -162,7 +166,7 @@ class Line:
     """A pseudo-terminal with a program at its other end, and what the program answers by UDP."""
 
     def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
-        self._is_gateway = name == GATEWAY
+        self._is_gateway = name in (GATEWAY, WITH_UVLOOP)
         self._moments = moments
         self._waiting: dict[int, deque[float | None]] = {}
         """When what is not answered yet was sent; None for what does not count."""
@@ -272,16 +276,17 @@ def measure(
     }
 
 
-def programs(folder: Path, forwarders: list[str]) -> dict[str, list[str]]:
+def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
     """Give the command lines, with places for the line and the port, of all that is measured."""
-    (folder / "bench.toml").write_text(CONFIG)
-    gateway = f"-m gateway.cli run --plain --config {folder}/bench.toml --port {{line}}"
-    endpoint = "udp:127.0.0.1:{port}"
-    return {
-        "plain forwarder": [sys.executable, "-c", BASELINE, "{line}", "{port}"],
-        GATEWAY: [sys.executable, *gateway.split(), "--endpoint", endpoint],
-        **{command.split()[0]: shlex.split(command) for command in forwarders},
-    }
+    loops = {GATEWAY: "asyncio"} | ({WITH_UVLOOP: "uvloop"} if options.uvloop else {})
+    commands = {"plain forwarder": [sys.executable, "-c", BASELINE, "{line}", "{port}"]}
+    for name, event_loop in loops.items():
+        config = folder / f"{event_loop}.toml"
+        config.write_text(CONFIG.format(event_loop=event_loop))
+        gateway = f"-m gateway.cli run --plain --config {config} --port {{line}}"
+        endpoint = ["--endpoint", "udp:127.0.0.1:{port}"]
+        commands[name] = [sys.executable, *gateway.split(), *endpoint]
+    return commands | {command.split()[0]: shlex.split(command) for command in options.forwarder}
 
 
 def summed_up(rounds: list[dict[str, float]]) -> dict[str, float]:
@@ -302,12 +307,15 @@ def main() -> None:
         "--forwarder", action="append", default=[], metavar="COMMAND",
         help="compare another that sends one datagram a frame: a command with {line} and {port}",
     )  # fmt: skip
+    parser.add_argument(
+        "--uvloop", action="store_true", help="measure the gateway with hub.event_loop = uvloop too"
+    )
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     options = parser.parse_args()
     found: dict[tuple[int, str], list[dict[str, float]]] = {}
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        commands = programs(folder, options.forwarder)
+        commands = programs(folder, options)
         runs = list(itertools.product(range(options.rounds), RATES_HZ, commands))
         for _, rate_hz, name in track(runs, "measuring"):
             figures = measure(name, commands[name], rate_hz, options)

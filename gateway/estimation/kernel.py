@@ -94,7 +94,8 @@ class KernelEstimator:
         self._time_us = np.zeros(1, np.int64)
         self._row, self._fix = np.zeros(IMU_COLUMNS), np.zeros(GPS_COLUMNS)
         self._output = np.empty(NAV_COLUMNS)
-        self._row_view = self._row.data
+        # An item of an array is set five times slower.
+        self._time_view, self._row_view = self._time_us.data, self._row.data
         self._time_at, self._row_at = address_of(self._time_us), address_of(self._row)
         self._fix_at, self._output_at = address_of(self._fix), address_of(self._output)
         self._begin()
@@ -175,7 +176,7 @@ class KernelEstimator:
         NavState
             State at its time.
         """
-        self._time_us[0] = sample.time_us
+        self._time_view[0] = sample.time_us
         flags = sample.flags & _ROW_FLAGS
         _ROW.pack_into(
             self._row_view,

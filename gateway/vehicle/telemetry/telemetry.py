@@ -266,6 +266,8 @@ class Telemetry:
         soon_us, next_us = time_us + period_us, time_us + US_PER_S
         for stream, build in self._state_streams:
             due_us = stream.due_us
+            if due_us is None and stream.interval_us == OFF:
+                continue
             if due_us is None or due_us <= soon_us:
                 if stream.offer_paced(time_us, period_us):
                     message = build(time_us)
