@@ -32,6 +32,7 @@ WORDS: Final = {
     r"silence": "outage, gap, timeout",
 }
 """Words that are not used, and terms to use instead."""
+ANY_WORD: Final = re.compile(rf"\b(?:{'|'.join(WORDS)})\b", re.IGNORECASE)
 
 
 def files() -> list[Path]:
@@ -45,6 +46,8 @@ def files() -> list[Path]:
 
 def violations(text: str) -> list[str]:
     """Return each line that contains a word of the list, with the terms to use instead."""
+    if not ANY_WORD.search(text):
+        return []
     found = []
     for number, line in enumerate(text.splitlines(), 1):
         for pattern, instead in WORDS.items():

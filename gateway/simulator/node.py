@@ -18,9 +18,7 @@ from gateway.simulator.sensors import (
     ACCEL_RANGE,
     GYRO_RANGE,
     MAG_GAIN,
-    BaroSamples,
     DeviceClock,
-    ImuSamples,
     IntArray,
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -157,11 +155,17 @@ class ImuNode(Node):
 
     def _imu(self) -> Iterator[Sent]:
         for until_s in self._pieces(SAMPLES_AT_ONCE / self._rate_hz):
-            yield from imu_payloads(self._aircraft.imu.take(until_s))
+            imu = self._aircraft.imu.take(until_s)
+            columns = (imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw)
+            yield from pack_imu(
+                (*columns, imu.temperature_raw, imu.flags), (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN)
+            )
 
     def _baro(self) -> Iterator[Sent]:
         for until_s in self._pieces(SAMPLES_AT_ONCE / self._baro_rate_hz):
-            yield from baro_payloads(self._aircraft.baro.take(until_s))
+            baro = self._aircraft.baro.take(until_s)
+            columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+            yield from pack_baro(columns)
 
 
 class GpsNode(Node):
@@ -186,31 +190,14 @@ def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[
     return (imu, GpsNode(aircraft, settings.geoid_separation_m))
 
 
-def imu_payloads(imu: ImuSamples) -> Iterator[Sent]:
-    """Pack IMU samples."""
-    columns = (
-        imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw,
-        imu.temperature_raw, imu.flags,
-    )  # fmt: skip
-    return pack_imu(columns, (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN))
-
-
 def pack_imu(
     columns: Sequence[FloatArray | IntArray], ranges: tuple[int, int, int]
 ) -> Iterator[Sent]:
     """Pack IMU readings.
 
-    Parameters
-    ----------
-    columns : sequence of ndarray
-        True time of sampling in s and node time in us, each (N,); accelerometer, gyroscope and
-        magnetometer counts, each (N, 3); temperature counts and flags, each (N,).
-    ranges : tuple of 3 ints
-        Codes of the accelerometer's and gyroscope's ranges and the magnetometer's gain.
-
-    Yields
-    ------
-    Sent
+    Columns: true time of sampling in s and node time in us, each (N,); accelerometer, gyroscope and
+    magnetometer counts, each (N, 3); temperature counts and flags, each (N,). Ranges: the codes of
+    the accelerometer's and gyroscope's ranges and of the magnetometer's gain.
     """
     accel_range, gyro_range, mag_gain = ranges
     for time_s, node_us, accel, gyro, mag, temperature, flags in zip(
@@ -229,23 +216,8 @@ def pack_imu(
         yield Sent(time_s + IMU_READING_S, node_us, payload)
 
 
-def baro_payloads(baro: BaroSamples) -> Iterator[Sent]:
-    """Pack barometer samples."""
-    return pack_baro((baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc))
-
-
 def pack_baro(columns: Sequence[FloatArray | IntArray]) -> Iterator[Sent]:
-    """Pack barometer readings.
-
-    Parameters
-    ----------
-    columns : sequence of ndarray, each (N,)
-        True time of sampling in s, node time in us, pressure in Pa, temperature in deg C.
-
-    Yields
-    ------
-    Sent
-    """
+    """Pack readings: true time of sampling in s, node time in us, pressure in Pa, deg C."""
     for time_s, node_us, pressure_pa, degc in zip(*(c.tolist() for c in columns), strict=True):
         payload = BaroPayload(round(pressure_pa * 100.0), round(degc * 10.0))
         yield Sent(time_s + BARO_READING_S, node_us, payload)

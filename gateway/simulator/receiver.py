@@ -198,20 +198,8 @@ class SimulatedReceiver:
 def simulate(settings: SimulatorSettings, start_unix_us: int = START_UNIX_US) -> SimulatedReceiver:
     """Set up the receiver and all aircraft of the settings.
 
-    Parameters
-    ----------
-    settings : SimulatorSettings
-    start_unix_us : int
-        UTC at the start, which the GPS will report; limited to its range, 2000 to 2254.
-
-    Returns
-    -------
-    SimulatedReceiver
-
-    Raises
-    ------
-    ValueError
-        If the last aircraft's id is too large.
+    `start_unix_us` is the UTC that the GPS reports at the start, limited to 2000 to 2254.
+    Raises ValueError if the last aircraft's id is too large.
     """
     last_id = settings.vehicle_id + settings.vehicles - 1
     if last_id > LAST_VEHICLE_ID:
