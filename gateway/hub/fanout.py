@@ -35,9 +35,9 @@ from gateway.hub.send_queue import (
 from gateway.hub.transports.base import Client, Route
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import base_size
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
-from gateway.wire.mavlink_version1 import base_size
 
 MAX_KINDS: Final = 4096
 """Kinds of frame per client: a vehicle sends some fifty; forged headers must not fill memory."""

@@ -5,14 +5,20 @@ forwarded unchecked.
 """
 
 import struct
+from functools import cache
 from typing import Any, Final
 
+from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
 DROPPED: Final = {300: ("PROTOCOL_VERSION", 217), 397: ("COMPONENT_METADATA", 182)}
 """Name and checksum seed of messages that the dialects lack and ground stations ask for."""
 
 NO_TARGET: Final = -1
+MAX_ID_V1: Final = 255
+"""Messages with greater ids do not exist in MAVLink 1."""
+WIDEST: Final = 8
+"""Bytes of the widest type of a field."""
 
 
 def offset_of(message: Any, field: str) -> int:
@@ -49,3 +55,33 @@ MESSAGE_NAMES: Final[dict[int, str]] = {
 } | {message_id: name for message_id, (name, _) in DROPPED.items()}
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
+
+
+@cache
+def base_size(message_id: int) -> int | None:
+    """Return the size of a message without its extensions; None if MAVLink 1 lacks it.
+
+    Extension fields were added after the message was defined, so the checksum seed covers only the
+    fields before them, which shows where they begin.
+    """
+    message: Any = dialect.mavlink_map.get(message_id)
+    if message is None or message_id > MAX_ID_V1:
+        return None
+    types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+    seed = mcrf4xx(f"{message.msgname} ".encode())
+    size, found = 0, None
+    last = WIDEST
+    for name, code, length in zip(
+        message.ordered_fieldnames, message.native_format[1:], message.array_lengths, strict=True
+    ):
+        width = struct.calcsize(f"<{chr(code)}")
+        if width > last:
+            # The fields of the first definition are in descending order of their width.
+            break
+        last = width
+        seed = mcrf4xx(f"{types[name]} {name} ".encode(), seed)
+        seed = mcrf4xx(bytes((length,)), seed) if length else seed
+        size += width * max(1, length)
+        if (seed & 0xFF) ^ (seed >> 8) == message.crc_extra:
+            found = size
+    return found

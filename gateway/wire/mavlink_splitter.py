@@ -27,7 +27,7 @@ from gateway.records import PAYLOAD_V1 as PAYLOAD_V1
 from gateway.records import PAYLOAD_V2 as PAYLOAD_V2
 from gateway.records import START_V2 as START_V2
 from gateway.records import MavFrame as MavFrame
-from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS
+from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, base_size
 
 START_V1: Final = 0xFE
 SIGNED: Final = 0x01
@@ -229,6 +229,36 @@ def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
     data[SEQUENCE_V2 if data[0] == START_V2 else SEQUENCE_V1] = sequence
     data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[message_id]).to_bytes(2, "little")
     return MavFrame(bytes(data), frame.key, message_id, frame.origin, frame.target, sequence, False)
+
+
+def to_mavlink1(frame: bytes) -> bytes | None:
+    """Encode a frame as MAVLink 1, which has neither extension fields nor signatures [1]_.
+
+    Parameters
+    ----------
+    frame : bytes
+        A whole frame of either version.
+
+    Returns
+    -------
+    bytes or None
+        None if MAVLink 1 cannot carry the message, or its definition is not known.
+
+    References
+    ----------
+    .. [1] https://mavlink.io/en/guide/serialization.html
+    """
+    if frame[0] != START_V2:
+        return frame
+    message_id = message_id_of(frame)
+    size = base_size(message_id)
+    if size is None:
+        return None
+    length = min(frame[1], len(frame) - OVERHEAD_V2)
+    payload = frame[PAYLOAD_V2 : PAYLOAD_V2 + min(length, size)].ljust(size, b"\0")
+    content = bytes((size, frame[4], frame[5], frame[6], message_id)) + payload
+    crc = mcrf4xx(content + CRC_EXTRA[message_id])
+    return bytes((START_V1,)) + content + crc.to_bytes(2, "little")
 
 
 def _split(data: bytes, *, final: bool) -> tuple[list[Event], int]:

@@ -5,7 +5,8 @@ import pytest
 from pymavlink.dialects.v10 import all as v1
 from pymavlink.dialects.v20 import all as v2
 
-from gateway.wire.mavlink_version1 import base_size, to_mavlink1
+from gateway.wire.mavlink_messages import base_size
+from gateway.wire.mavlink_splitter import to_mavlink1
 
 
 def test_size_without_extensions_is_that_of_the_older_dialect() -> None:

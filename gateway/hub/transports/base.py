@@ -27,8 +27,8 @@ from gateway.wire.mavlink_splitter import (
     SplitFault,
     frame_of,
     is_whole_frame,
+    to_mavlink1,
 )
-from gateway.wire.mavlink_version1 import to_mavlink1
 
 log = logging.getLogger(__name__)
 
