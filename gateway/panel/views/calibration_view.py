@@ -118,9 +118,11 @@ class CalibrationView:
         if guide != self._drawn:
             self._drawn = guide
             self._build_guide(run, ready=ready)
-        if self._step is CalibrationStep.MOUNTING and self._mounted != self._orientation():
-            self._mounted = self._orientation()
-            self._choice.set_value(self._mounted)
+        if self._step is CalibrationStep.MOUNTING and self._mounted != (now := self._orientation()):
+            # A choice that is not used yet stays.
+            if self._choice.value == self._mounted:
+                self._choice.set_value(now)
+            self._mounted = now
         if run is not None:
             self._move(run)
 
