@@ -129,7 +129,9 @@ def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: 
     first = 3 * k
     from_last, from_held = change_of(v, s.imu_last, first), change_of(v, s.imu_held, first)
     same = from_last == 0.0
-    s.stuck_s[k] = s.stuck_s[k] + dt if same and not other_same else 0.0
+    # A gap between two equal samples is no time for which the sensor repeated them.
+    repeated_s = min(dt, gap_limit_s(s))
+    s.stuck_s[k] = s.stuck_s[k] + repeated_s if same and not other_same else 0.0
     # A change that is real is there in the next sample too.
     change = min(from_last, from_held)
     most = FASTEST[k][0] + FASTEST[k][1] * dt + TIMES_USUAL * s.imu_usual[k]
