@@ -46,7 +46,9 @@ def check_output(
 
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
-    there = next(place for place in (path, *path.parents) if place.exists() or place.is_symlink())
+    there = next(
+        folder for folder in (path, *path.parents) if folder.exists() or folder.is_symlink()
+    )
     if not there.is_dir():
         raise OSError(errno.ENOTDIR, "is no folder", str(there))
     if there == path and not overwrite and any(path.iterdir()):

@@ -54,7 +54,7 @@ class PipelineSettings:
     """Civil time at the gateway clock's zero, as far as known."""
     fused: FusedStates | None = None
     """The states of a recording, in place of an estimator."""
-    places: Mapping[int, StoredPlan] = field(default_factory=dict)
+    plans: Mapping[int, StoredPlan] = field(default_factory=dict)
     """Missions, marks and homes kept from an earlier run, by vehicle id."""
     stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
     """Signing timestamps kept from an earlier run, by vehicle id; see `SigningTimestamps`."""
@@ -127,7 +127,7 @@ class Pipeline:
             known.aircraft.get(vehicle_id, known.default),
             clock=self._signing_clock,
             stamps=self._stamps.setdefault(vehicle_id, SigningTimestamps()),
-            stored=known.places.get(vehicle_id),
+            stored=known.plans.get(vehicle_id),
             fused=known.fused,
         )
         self._set_key(aircraft)
@@ -229,7 +229,7 @@ class Pipeline:
             aircraft.perform(aircraft.vehicle.say(status, now_us), now_us, out)
         return out
 
-    def mark(self, place: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
+    def mark(self, location: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
         """Mark a location for one aircraft, or for all, or clear the mark.
 
         Raises
@@ -243,7 +243,7 @@ class Pipeline:
             raise ValueError(f"no such aircraft; heard so far: {heard}")
         out = Outputs()
         for aircraft in wanted:
-            aircraft.perform(aircraft.vehicle.put_mark(place, now_us), now_us, out)
+            aircraft.perform(aircraft.vehicle.put_mark(location, now_us), now_us, out)
         return out
 
     @property

@@ -19,7 +19,7 @@ from gateway.live.control_socket import ControlServer, socket_path
 from gateway.live.player_edge import PlayerEdge
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
-from gateway.recordings.moment import Moment, place_in
+from gateway.recordings.moment import Moment, time_us_of
 from gateway.recordings.opening import PlayedFlight
 from gateway.recordings.play import Player
 from gateway.recordings.reading import NOTHING_WITHIN
@@ -55,14 +55,14 @@ def prepare(flights: Sequence[PlayedFlight], plan: PlayPlan) -> None:
     tracks = [track for flight in flights for track in flight.tracks]
     first_us = begin_us = min(track.first_us for track in tracks)
     if plan.begin is not None:
-        begin_us = max(place_in(plan.begin, first_us), first_us)
+        begin_us = max(time_us_of(plan.begin, first_us), first_us)
         while not all(track.prepare(begin_us) for track in tracks):
             pass
         if begin_us > (end_us := max(track.last_us for track in tracks)):
             raise FlightError(
                 f"it ends after {(end_us - first_us) / US_PER_S:.1f} s, before --from"
             )
-    if plan.end is not None and place_in(plan.end, first_us) < begin_us:
+    if plan.end is not None and time_us_of(plan.end, first_us) < begin_us:
         raise FlightError(NOTHING_WITHIN)
 
 
@@ -134,8 +134,8 @@ class PlayerDaemon:
             tracks,
             self._now_us(),
             speed=plan.speed,
-            begin_us=None if plan.begin is None else place_in(plan.begin, first_us),
-            end_us=None if plan.end is None else place_in(plan.end, first_us),
+            begin_us=None if plan.begin is None else time_us_of(plan.begin, first_us),
+            end_us=None if plan.end is None else time_us_of(plan.end, first_us),
             max_gap_us=None if plan.max_gap_s is None else round(plan.max_gap_s * US_PER_S),
             loop=plan.loop,
         )

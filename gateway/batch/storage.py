@@ -38,24 +38,24 @@ _USER: Final = re.compile(r"(?<=://)[^/@]*@")
 
 
 class StorageError(WorkError):
-    """A place that cannot be reached; the text says which and why."""
+    """A location that cannot be reached; the text says which and why."""
 
 
 class BatchItem(msgspec.Struct, frozen=True):
     """One recording to work on: its parts, in order."""
 
-    places: tuple[str, ...]
+    locations: tuple[str, ...]
     """Local paths or URLs of its parts."""
 
     @property
-    def place(self) -> str:
+    def location(self) -> str:
         """Path or URL of its first part, without a user's name and password."""
-        return without_user(self.places[0])
+        return without_user(self.locations[0])
 
     @property
     def is_fetched(self) -> bool:
         """Whether a part of it has to be fetched from elsewhere."""
-        return any(map(is_url, self.places))
+        return any(map(is_url, self.locations))
 
 
 def is_url(name: str) -> bool:
@@ -78,10 +78,10 @@ def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem
 
     Raises StorageError if there is nothing of a name, or its storage cannot be reached.
     """
-    places = list(dict.fromkeys(place for name in names for place in _places(name)))
+    locations = list(dict.fromkeys(location for name in names for location in _locations(name)))
     if each_file:
-        return [BatchItem((_plain(place),)) for place in places]
-    by_path = {Path(place): place for place in places}
+        return [BatchItem((_plain(location),)) for location in locations]
+    by_path = {Path(location): location for location in locations}
     with_table = {_series(path) for path in by_path if _ending(path) == ".csv"}
     wanted = [p for p in by_path if _ending(p) == ".csv" or _series(p) not in with_table]
     return [
@@ -97,7 +97,7 @@ def stamp_of_item(item: BatchItem) -> str:
     nothing is fetched for it; raises OSError and StorageError.
     """
     if item.is_fetched:
-        stamps = [_stamp_of(place) for place in item.places]
+        stamps = [_stamp_of(location) for location in item.locations]
         if all(stamps):
             return sha256("\n".join(stamps).encode()).hexdigest()
     with local_files(item) as paths:
@@ -114,24 +114,26 @@ def digest_of_files(paths: Sequence[Path]) -> str:
 def local_files(item: BatchItem) -> Iterator[list[Path]]:
     """Have the files of a recording on this machine's disk."""
     if not item.is_fetched:
-        yield [Path(place) for place in item.places]
+        yield [Path(location) for location in item.locations]
         return
     with TemporaryDirectory(prefix="mavgate-") as folder:
-        yield [_fetched(place, Path(folder, str(k))) for k, place in enumerate(item.places)]
+        yield [
+            _fetched(location, Path(folder, str(k))) for k, location in enumerate(item.locations)
+        ]
 
 
-def _fetched(place: str, folder: Path) -> Path:
-    if not is_url(place):
-        return Path(place)
+def _fetched(location: str, folder: Path) -> Path:
+    if not is_url(location):
+        return Path(location)
     folder.mkdir()
-    path = folder / place.rsplit("/", 1)[-1]
-    storage, remote = _storage(place)
-    with _storage_errors(place), storage.open(remote, "rb") as source, path.open("wb") as target:
+    path = folder / location.rsplit("/", 1)[-1]
+    storage, remote = _storage(location)
+    with _storage_errors(location), storage.open(remote, "rb") as source, path.open("wb") as target:
         shutil.copyfileobj(source, target, CHUNK)
     return path
 
 
-def _places(name: str) -> list[str]:
+def _locations(name: str) -> list[str]:
     if not is_url(name):
         path = Path(name)
         return [str(found) for found in recordings_below(path)] if path.is_dir() else [name]
@@ -146,35 +148,35 @@ def _places(name: str) -> list[str]:
     # A host that is in the URL is not in the path.
     plain = name.rstrip("/")
     begin = plain.removesuffix(remote) if plain.endswith(remote) else None
-    places = [
-        storage.unstrip_protocol(place) if begin is None else begin + place
-        for place in sorted(found)
-        if _ending(Path(place)) in REMOTE_ENDINGS
+    locations = [
+        storage.unstrip_protocol(location) if begin is None else begin + location
+        for location in sorted(found)
+        if _ending(Path(location)) in REMOTE_ENDINGS
     ]
-    if not places:
+    if not locations:
         endings = ", ".join(REMOTE_ENDINGS)
         raise StorageError(f"{without_user(name)}: no recording is there ({endings})")
-    return places
+    return locations
 
 
-def _plain(place: str) -> str:
+def _plain(location: str) -> str:
     """Return a path as absolute, and the URL of a local file as its path."""
-    if not is_url(place):
-        return str(Path(place).absolute())
-    storage, remote = _storage(place)
+    if not is_url(location):
+        return str(Path(location).absolute())
+    storage, remote = _storage(location)
     protocols = {storage.protocol} if isinstance(storage.protocol, str) else {*storage.protocol}
-    return remote if HERE in protocols else place
+    return remote if HERE in protocols else location
 
 
-def _stamp_of(place: str) -> str:
-    """Return a file's place, size and change as its storage reports them, or nothing."""
-    if not is_url(place):
+def _stamp_of(location: str) -> str:
+    """Return a file's location, size and change as its storage reports them, or nothing."""
+    if not is_url(location):
         return ""
-    storage, remote = _storage(place)
-    with _storage_errors(place):
+    storage, remote = _storage(location)
+    with _storage_errors(location):
         facts = storage.info(remote)
     stamps = [str(facts[name]) for name in STAMPS if facts.get(name)]
-    return "\t".join([without_user(place), str(facts.get("size")), *stamps]) if stamps else ""
+    return "\t".join([without_user(location), str(facts.get("size")), *stamps]) if stamps else ""
 
 
 def _storage(url: str) -> tuple[Any, str]:

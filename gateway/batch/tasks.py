@@ -223,7 +223,7 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
             raise
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
-            for place, file in zip(item.places, files, strict=True):
+            for place, file in zip(item.locations, files, strict=True):
                 text = text.replace(str(file), without_user(place))
             return msgspec.structs.replace(result, error=as_text(text)), {}
     done = msgspec.structs.replace(
@@ -254,7 +254,7 @@ def without_secrets(options: ReadOptions) -> ReadOptions:
 
 def name_of(item: BatchItem) -> str:
     """Return the name of a recording in the folder of the results."""
-    name = as_text(recording_name(Path(item.place)))
+    name = as_text(recording_name(Path(item.location)))
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
     return name
@@ -389,7 +389,7 @@ def run_season(
         key = _key(task, stamp)
         kept = folder.find(key) if folder is not None else None
         if kept is not None:
-            found[number] = msgspec.structs.replace(kept, place=as_text(item.place))
+            found[number] = msgspec.structs.replace(kept, place=as_text(item.location))
         else:
             todo.append((item, stamp, key, names[number]))
             numbers.append(number)
@@ -407,7 +407,7 @@ def run_season(
                 folder.keep(result, files)
         found[numbers[place]] = result
         done += 1
-        report(item.place, done, len(items))
+        report(item.location, done, len(items))
     return [result for result in found if result is not None]
 
 
@@ -437,7 +437,7 @@ def _key(task: FlightTask, stamp: str) -> str:
 
 
 def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightResult:
-    place = as_text(item.place)
+    place = as_text(item.location)
     return FlightResult(place=place, digest=stamp, key=key, task=task.name, version=__version__)
 
 

@@ -1,4 +1,4 @@
-"""The WGS 84 ellipsoid near one place: metres north and east against degrees.
+"""The WGS 84 ellipsoid near one position: metres north and east against degrees.
 
 `pymap3d` does the exact conversions in tools and analysis; the two radii here are for the
 per-sample kernels, which only ever step a few metres from a known latitude.

@@ -1,4 +1,4 @@
-"""The Earth's magnetic field at a place: the World Magnetic Model through `pygeomag`."""
+"""The Earth's magnetic field at a position: the World Magnetic Model through `pygeomag`."""
 
 import math
 from functools import cache
@@ -14,7 +14,7 @@ _US_PER_YEAR = 365.2425 * 86_400e6
 
 
 class MagneticField(NamedTuple):
-    """The field of the Earth at one place."""
+    """The field of the Earth at one position."""
 
     declination_rad: float
     """Magnetic north against true north, positive east."""

@@ -23,7 +23,7 @@ from gateway.config import (
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, client_verbs, mark_verbs
-from gateway.live.kept_files import PlaceFiles, StampFile, begin_worker
+from gateway.live.kept_files import PlanFiles, StampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
 from gateway.live.pty_port import PtyPort
@@ -100,7 +100,7 @@ class Daemon:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
         self._settings = settings
         self._read = read
-        self._places = PlaceFiles(aircraft_folder(settings), self._announce_places)
+        self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._stamps = StampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
         self._pipeline.disconnect(serial.port)
@@ -135,13 +135,11 @@ class Daemon:
         self._lag = LoopLag()
 
     def _make_pipeline(self, aircraft: Mapping[int, AircraftSettings]) -> Pipeline:
-        places, stamps = self._places.load(), self._stamps.load()
-        self._broken_places = dict(self._places.broken)
+        plans, stamps = self._plans.load(), self._stamps.load()
+        self._broken_plans = dict(self._plans.broken)
         at_zero_us = unix_time_us() - self.now_us()
         default = self._settings.default_aircraft
-        return Pipeline(
-            PipelineSettings(default, aircraft, at_zero_us, places=places, stamps=stamps)
-        )
+        return Pipeline(PipelineSettings(default, aircraft, at_zero_us, plans=plans, stamps=stamps))
 
     def _make_control(self) -> ControlServer:
         self._imu = ImuTap(
@@ -221,7 +219,7 @@ class Daemon:
         self._control.close()
         self._files.shutdown()
         self._recorder.close()
-        self._places.close()
+        self._plans.close()
         self._stamps.close(self._pipeline.newest_stamps())
         self._metrics.close()
         self._hub.close()
@@ -237,7 +235,7 @@ class Daemon:
             sent=tuple(sorted(self._sent.items())),
             hub=self._hub.counters(),
             listeners=(*self._hub.listeners(), *self._metrics.listeners()),
-            places_not_kept=self._places.failures,
+            places_not_kept=self._plans.failures,
             refused=self._pipeline.refused,
             forged=self._pipeline.forged,
             simulated=self._receiver is not None,
@@ -276,8 +274,8 @@ class Daemon:
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
 
-    def _mark(self, place: Location | None, vehicle_id: int | None) -> None:
-        self._perform(self._pipeline.mark(place, vehicle_id, self.now_us()))
+    def _mark(self, location: Location | None, vehicle_id: int | None) -> None:
+        self._perform(self._pipeline.mark(location, vehicle_id, self.now_us()))
 
     def _announce(self, is_trouble: bool, text: str) -> None:
         status = StatusText(WARNING if is_trouble else INFO, text)
@@ -345,9 +343,9 @@ class Daemon:
         now_us = self.now_us()
         self._watch_loop(now_us)
         self._perform(self._pipeline.poll(now_us))
-        for vehicle_id in self._broken_places.keys() & self._pipeline.aircraft.keys():
+        for vehicle_id in self._broken_plans.keys() & self._pipeline.aircraft.keys():
             # After its first heartbeat, before which ground stations ignore its messages.
-            self._announce_places(vehicle_id, self._broken_places.pop(vehicle_id))
+            self._announce_plans(vehicle_id, self._broken_plans.pop(vehicle_id))
         self._recorder.set_in_flight(self._pipeline.in_flight)
         trouble, recording = self._recorder.trouble, self._recorder.recording
         self._perform(self._pipeline.on_recorder(trouble, now_us, recording=recording))
@@ -393,7 +391,7 @@ class Daemon:
             case SaveSettings():
                 self._save(order)
             case SavePlan():
-                self._places.save(order.vehicle_id, order.plan)
+                self._plans.save(order.vehicle_id, order.plan)
             case RecordingRequest():
                 (self._recorder.record if order.start else self._recorder.stop)()
 
@@ -425,7 +423,7 @@ class Daemon:
             log.info("settings of aircraft %d saved to %s", vehicle_id, saving.result())
         self._perform_for(aircraft, aircraft.vehicle.on_saved(request, text, now_us, stored=stored))
 
-    def _announce_places(self, vehicle_id: int, trouble: str | None) -> None:
+    def _announce_plans(self, vehicle_id: int, trouble: str | None) -> None:
         status = StatusText(INFO, "Mission, mark and home are kept again")
         if trouble is not None:
             status = StatusText(WARNING, f"Mission, mark and home not kept: {trouble}")

@@ -50,20 +50,20 @@ RETRY_S: Final = 10.0
 """Soon for a person who has repaired a file or made room, and no load for a failing disk."""
 
 
-class PlaceFiles:
+class PlanFiles:
     """The files of all aircraft."""
 
     def __init__(self, folder: Path, report: Callable[[int, str | None], None]) -> None:
         self.failures = 0
         """Changes that could not be written at once since the start."""
         self.broken: dict[int, str] = {}
-        """Why the places of an aircraft could not be loaded, by vehicle id."""
+        """Why the plan of an aircraft could not be loaded, by vehicle id."""
         self._folder = folder
         self._report = report
         self._pending: dict[int, StoredPlan] = {}
         self._failed: dict[int, StoredPlan] = {}
-        """Places whose last write failed."""
-        self._worker = begin_worker("places")
+        """Plans whose last write failed."""
+        self._worker = begin_worker("plans")
         self._task: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
 
@@ -88,9 +88,9 @@ class PlaceFiles:
                 )
         return found
 
-    def save(self, vehicle_id: int, places: StoredPlan) -> None:
-        """Store the places of an aircraft; returns at once, only the newest are written."""
-        self._pending[vehicle_id] = places
+    def save(self, vehicle_id: int, plan: StoredPlan) -> None:
+        """Store the plan of an aircraft; returns at once, only the newest is written."""
+        self._pending[vehicle_id] = plan
         self._start()
 
     async def settle(self) -> None:
@@ -105,9 +105,9 @@ class PlaceFiles:
         if self._task is not None:
             self._task.cancel()
         self._worker.shutdown(wait=True)
-        for vehicle_id, places in self._pending.items():
+        for vehicle_id, plan in self._pending.items():
             with contextlib.suppress(OSError):
-                self._write(vehicle_id, places)
+                self._write(vehicle_id, plan)
 
     def _start(self) -> None:
         if self._task is None or self._task.done():
@@ -121,39 +121,39 @@ class PlaceFiles:
         loop = asyncio.get_running_loop()
         tried: dict[int, StoredPlan] = {}
         while left := [item for item in self._pending.items() if tried.get(item[0]) is not item[1]]:
-            vehicle_id, places = left[0]
-            tried[vehicle_id] = places
+            vehicle_id, plan = left[0]
+            tried[vehicle_id] = plan
             try:
-                await loop.run_in_executor(self._worker, self._write, vehicle_id, places)
+                await loop.run_in_executor(self._worker, self._write, vehicle_id, plan)
             except OSError as error:
-                self._note_failure(vehicle_id, places, reason_of(error))
+                self._note_failure(vehicle_id, plan, reason_of(error))
             else:
-                self._note_success(vehicle_id, places)
+                self._note_success(vehicle_id, plan)
         if self._pending:
             self._retry = loop.call_later(RETRY_S, self._start)
 
-    def _note_failure(self, vehicle_id: int, places: StoredPlan, reason: str) -> None:
-        if self._failed.get(vehicle_id) is places:
+    def _note_failure(self, vehicle_id: int, plan: StoredPlan, reason: str) -> None:
+        if self._failed.get(vehicle_id) is plan:
             return
-        self._failed[vehicle_id] = places
+        self._failed[vehicle_id] = plan
         self.failures += 1
-        log.warning("places of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
+        log.warning("plan of aircraft %d cannot be kept: %s; trying again", vehicle_id, reason)
         self._report(vehicle_id, reason)
 
-    def _note_success(self, vehicle_id: int, places: StoredPlan) -> None:
+    def _note_success(self, vehicle_id: int, plan: StoredPlan) -> None:
         # It stays until it is written, so that a shutdown in between loses nothing.
-        if self._pending[vehicle_id] is places:
+        if self._pending[vehicle_id] is plan:
             del self._pending[vehicle_id]
         if self._failed.pop(vehicle_id, None):
-            log.info("places of aircraft %d are kept again", vehicle_id)
+            log.info("plan of aircraft %d is kept again", vehicle_id)
             self._report(vehicle_id, None)
 
-    def _write(self, vehicle_id: int, places: StoredPlan) -> None:
+    def _write(self, vehicle_id: int, plan: StoredPlan) -> None:
         file = self._folder / f"{vehicle_id}.places.json"
         if vehicle_id in self.broken and file.exists():
             raise OSError(None, _broken(file))
         self._folder.mkdir(parents=True, exist_ok=True)
-        write_new(file, [encode_plan(places).encode()], overwrite=True)
+        write_new(file, [encode_plan(plan).encode()], overwrite=True)
 
 
 def _broken(file: Path) -> str:
@@ -194,7 +194,7 @@ class StampFile:
             return {}
 
     def save(self, stamps: Kept) -> None:
-        """Store these; returns at once, only the newest are written."""
+        """Store these; returns at once, only the newest is written."""
         is_busy, self._waiting = self._waiting is not None, stamps
         if not is_busy:
             self._worker.submit(self._write)

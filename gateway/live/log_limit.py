@@ -36,9 +36,9 @@ def summary_line(snapshot: "Snapshot") -> str:
     ]
     for vehicle_id, state in snapshot.states:
         roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
-        place = f"{figure_of(state.lat_deg, '.6f')} {figure_of(state.lon_deg, '.6f')}"
+        position = f"{figure_of(state.lat_deg, '.6f')} {figure_of(state.lon_deg, '.6f')}"
         parts.append(
-            f"aircraft {vehicle_id} at {place} {figure_of(state.alt_amsl_m, '.1f')} m, "
+            f"aircraft {vehicle_id} at {position} {figure_of(state.alt_amsl_m, '.1f')} m, "
             f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
         )
     count = len(snapshot.clients)

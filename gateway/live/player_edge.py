@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gateway.live.control_socket import Verbs
-from gateway.recordings.moment import parse_moment, place_in
+from gateway.recordings.moment import parse_moment, time_us_of
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player, PlayState, check_speed
 from gateway.units import US_PER_S
 
@@ -105,7 +105,7 @@ class PlayerEdge:
         """Move to a moment, as soon as it is ready; see `parse_moment`, also for its error."""
         player, moment = self._player, parse_moment(to)
         here_us = player.position_us if self._wanted_us is None else self._wanted_us
-        self._wanted_us = place_in(moment, here_us if moment.relative else player.begin_us)
+        self._wanted_us = time_us_of(moment, here_us if moment.relative else player.begin_us)
         return self._turned()
 
     def status(self) -> PlayerStatus:

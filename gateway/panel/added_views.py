@@ -30,7 +30,7 @@ class View:
 ADDED_VIEWS: Final[dict[str, View]] = {}
 
 
-def add_view(title: str, icon: str, place: str) -> View:
+def add_view(title: str, icon: str, location: str) -> View:
     """Add a view to every page that is opened from now on, below the page's own.
 
     Parameters
@@ -39,7 +39,7 @@ def add_view(title: str, icon: str, place: str) -> View:
         A short word for the rail.
     icon : str
         Name of a Material icon.
-    place : str
+    location : str
         Module and function, `package.module:build`, that create the view's NiceGUI elements. It is
         imported when a page first shows it, and called with a
         `gateway.panel.view_context.ViewContext`.
@@ -53,12 +53,12 @@ def add_view(title: str, icon: str, place: str) -> View:
     ValueError
         If it was added before.
     """
-    if place in ADDED_VIEWS:
-        raise ValueError(f"view {place!r} is added twice")
-    view = ADDED_VIEWS[place] = View(place, title, icon, partial(_build, place))
+    if location in ADDED_VIEWS:
+        raise ValueError(f"view {location!r} is added twice")
+    view = ADDED_VIEWS[location] = View(location, title, icon, partial(_build, location))
     return view
 
 
-def _build(place: str, context: ViewContext) -> None:
-    module, _, function = place.partition(":")
+def _build(location: str, context: ViewContext) -> None:
+    module, _, function = location.partition(":")
     getattr(import_module(module), function)(context)

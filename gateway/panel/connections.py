@@ -2,8 +2,8 @@
 
 Any client can open connections and send nothing. A connection counts as *anonymous* until a request
 on it has passed access control. Anonymous connections are limited per address and in total, beyond
-which the oldest one is closed, so places remain for users; and each must send a complete request
-header in time, of a limited size.
+which the oldest one is closed, so connections remain for users; and each must send a complete
+request header in time, of a limited size.
 """
 
 import asyncio

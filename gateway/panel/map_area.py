@@ -44,9 +44,11 @@ def length_m(text: str) -> float:
     return float(match[1]) * SPANS[(match[2] or "m").lower()]
 
 
-def box_around(places: Iterator[tuple[float, float]] | list[tuple[float, float]], m: float) -> Box:
-    """Return the box that contains some places with a margin in metres."""
-    known = [(lat, lon) for lat, lon in places if math.isfinite(lat) and math.isfinite(lon)]
+def box_around(
+    positions: Iterator[tuple[float, float]] | list[tuple[float, float]], m: float
+) -> Box:
+    """Return the box that contains some positions with a margin in metres."""
+    known = [(lat, lon) for lat, lon in positions if math.isfinite(lat) and math.isfinite(lon)]
     if not known:
         raise MapAreaError("there is no position")
     lats, lons = zip(*known, strict=True)

@@ -353,13 +353,13 @@ def _open_mbtiles(path: Path) -> Callable[[int, int, int], bytes | None]:
     """Open an MBTiles file: SQLite, whose rows count from the south."""
     if not path.is_file():
         raise FileNotFoundError("there is no such file")
-    place = f"{path.resolve().as_uri()}?mode=ro"
-    with closing(sqlite3.connect(place, uri=True)) as database:
+    uri = f"{path.resolve().as_uri()}?mode=ro"
+    with closing(sqlite3.connect(uri, uri=True)) as database:
         database.execute("select tile_data from tiles limit 1")
 
     def get(z: int, x: int, y: int) -> bytes | None:
         ask = "select tile_data from tiles where zoom_level=? and tile_column=? and tile_row=?"
-        with closing(sqlite3.connect(place, uri=True)) as database:
+        with closing(sqlite3.connect(uri, uri=True)) as database:
             row = database.execute(ask, (z, x, (1 << z) - 1 - y)).fetchone()
         return None if row is None else bytes(row[0])
 

@@ -267,11 +267,11 @@ def _bound(settings: PanelSettings, *, or_any: bool) -> socket.socket:
         sock.bind((settings.address, settings.port))
     except OSError as error:
         sock.close()
-        place = f"{settings.address}:{settings.port}"
+        address = f"{settings.address}:{settings.port}"
         if or_any and error.errno == errno.EADDRINUSE:
-            log.warning("%s is in use; the panel takes another port", place)
+            log.warning("%s is in use; the panel takes another port", address)
             return _bound(msgspec.structs.replace(settings, port=0), or_any=False)
-        raise PanelError(f"panel on {place}: {error.strerror}; --port takes another") from error
+        raise PanelError(f"panel on {address}: {error.strerror}; --port takes another") from error
     return sock
 
 

@@ -272,27 +272,27 @@ def _thumbnails(features: dict[str, Any]) -> dict[str, str]:
     """Draw the first track of each recording, north up."""
     found: dict[str, str] = {}
     for feature in features["features"]:
-        places = _line_of(feature["geometry"])
-        if len(places) > 1:
-            found.setdefault(feature["properties"]["name"], _corners(places))
+        corners = _line_of(feature["geometry"])
+        if len(corners) > 1:
+            found.setdefault(feature["properties"]["name"], _corners(corners))
     return found
 
 
 def _line_of(geometry: dict[str, Any] | None) -> list[list[float]]:
-    """Return the places of a line; a line that crosses the 180th meridian has several parts."""
+    """Return the corners of a line; a line that crosses the 180th meridian has several parts."""
     if geometry is None:
         return []
     if geometry["type"] == "MultiLineString":
-        return [place for part in geometry["coordinates"] for place in part]
+        return [corner for part in geometry["coordinates"] for corner in part]
     return list(geometry["coordinates"]) if geometry["type"] == "LineString" else []
 
 
-def _corners(places: list[list[float]]) -> str:
+def _corners(corners: list[list[float]]) -> str:
     width, height = THUMBNAIL
-    places = places[:: max(1, len(places) // MAX_CORNERS)]
-    shrink = math.cos(math.radians(places[0][1]))
-    east = [(place[0] - places[0][0] + 540.0) % 360.0 - 180.0 for place in places]
-    points = [(x * shrink, -place[1]) for x, place in zip(east, places, strict=True)]
+    corners = corners[:: max(1, len(corners) // MAX_CORNERS)]
+    shrink = math.cos(math.radians(corners[0][1]))
+    east = [(corner[0] - corners[0][0] + 540.0) % 360.0 - 180.0 for corner in corners]
+    points = [(x * shrink, -corner[1]) for x, corner in zip(east, corners, strict=True)]
     left, top = (min(values) for values in zip(*points, strict=True))
     right, bottom = (max(values) for values in zip(*points, strict=True))
     scale = min((width - 4) / max(right - left, 1e-9), (height - 4) / max(bottom - top, 1e-9))
@@ -388,13 +388,13 @@ class RecordingJobs:
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
         token = secrets.token_urlsafe(16)
-        place = self._folder / token
-        place.mkdir()
+        work = self._folder / token
+        work.mkdir()
         try:
-            target = await _make(folder, place, name, kind)
+            target = await _make(folder, work, name, kind)
         except BaseException:
             # Half a file of a large recording may take gigabytes.
-            shutil.rmtree(place, ignore_errors=True)
+            shutil.rmtree(work, ignore_errors=True)
             raise
         self._made[token] = (target, time.monotonic())
         return f"{EXPORTS}{token}"
@@ -412,13 +412,13 @@ class RecordingJobs:
             log.info("the recordings in %s are not indexed: %s", folder, error)
 
 
-async def _make(folder: Path, place: Path, name: str, kind: str) -> Path:
+async def _make(folder: Path, work: Path, name: str, kind: str) -> Path:
     """Export a recording into an empty folder, and return the only file in it."""
     _, command, suffix = FORMATS[kind]
-    target = place / f"{name}{suffix}"
-    output = place / name if kind == "report" else target
+    target = work / f"{name}{suffix}"
+    output = work / name if kind == "report" else target
     # Settings with the folder of the recordings, which commands take names from.
-    config = place / "settings.toml"
+    config = work / "settings.toml"
     config.write_text(f"[recording]\nfolder = {json.dumps(str(folder), ensure_ascii=False)}\n")
     arguments = ["--config", str(config), "-o", str(output), "--", name]
     await _run([*own_command(command), *arguments])

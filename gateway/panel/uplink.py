@@ -126,8 +126,8 @@ ATTEMPTS: Final = 3
 MAX_SENDERS: Final = 64
 """Programs that send through the panel under their own ids."""
 
-LOCAL_PLACE: Final = "udp-listen:127.0.0.1:0"
-LOCAL_URL: Final = f"{LOCAL_PLACE}?name=panel"
+LOCAL_ADDRESS: Final = "udp-listen:127.0.0.1:0"
+LOCAL_URL: Final = f"{LOCAL_ADDRESS}?name=panel"
 PLAYBACK_URL: Final = "udp-listen:127.0.0.1:0?name=playback&trusted=yes"
 """Where the panel's player sends its frames."""
 
@@ -320,7 +320,7 @@ class Uplink:
         for _ in range(2):
             status = await self._control.ask("status")
             for listener in status["listeners"]:
-                if listener["endpoint"].partition("?")[0] == LOCAL_PLACE:
+                if listener["endpoint"].partition("?")[0] == LOCAL_ADDRESS:
                     return int(listener["port"])
             await self._control.ask("clients.add", url=LOCAL_URL)
         return 0

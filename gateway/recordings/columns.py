@@ -339,7 +339,7 @@ BoolArray = NDArray[np.bool_]
 
 IS_WHOLE: Final = np.array([name in WHOLE_COLUMNS for name in COLUMNS])
 _WHOLE: Final = np.flatnonzero(IS_WHOLE)
-_AT: Final = {name: place for place, name in enumerate(COLUMNS)}
+_AT: Final = {name: index for index, name in enumerate(COLUMNS)}
 _NEEDED: Final = [
     (0, [0]),
     (RAW.start, [_AT["node_id"], _AT["node_time_us"]]),
@@ -403,13 +403,13 @@ def read_lines(text: bytes, width: int) -> FloatArray | None:
     return cells.reshape(-1, width)
 
 
-def read_cells(line: bytes, width: int, places: Sequence[int] | None) -> list[float]:
+def read_cells(line: bytes, width: int, indices: Sequence[int] | None) -> list[float]:
     """Read one line as Python reads numbers."""
     texts = line.decode().split(",")
     if len(texts) != width:
         raise ValueError(f"{counted(len(texts), 'cell')} where there should be {width}")
-    if places is not None:
-        texts = [texts[place] if place >= 0 else "" for place in places]
+    if indices is not None:
+        texts = [texts[index] if index >= 0 else "" for index in indices]
     return [float(text) if text else np.nan for text in texts]
 
 

@@ -17,7 +17,7 @@ from gateway.recordings.formats.maps import (
     tracks_of_frames,
     tracks_of_table,
 )
-from gateway.recordings.moment import place_in
+from gateway.recordings.moment import time_us_of
 from gateway.recordings.reading import (
     NOTHING_WITHIN,
     Limits,
@@ -207,9 +207,9 @@ def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecor
     is_empty = limits != (None, None)
     for record in records:
         first_us = record.time_us if first_us is None else first_us
-        if end is not None and record.time_us > place_in(end, first_us):
+        if end is not None and record.time_us > time_us_of(end, first_us):
             break
-        if begin is None or record.time_us >= place_in(begin, first_us):
+        if begin is None or record.time_us >= time_us_of(begin, first_us):
             yield record
             is_empty = False
     if is_empty:

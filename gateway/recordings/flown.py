@@ -62,9 +62,9 @@ def _cells(samples: Samples) -> FloatArray:
         if isinstance(record, BaroSample):
             cells[row, BARO] = record.alt_pressure_m
         elif record.fix_ok:
-            place = (record.lat_dege7 * DEG_PER_DEGE7, record.lon_dege7 * DEG_PER_DEGE7)
+            position = (record.lat_dege7 * DEG_PER_DEGE7, record.lon_dege7 * DEG_PER_DEGE7)
             # A receiver sends a whole velocity or none; speed and course are of a level one.
             north_mps, east_mps, down_mps = record.vel_n_mps
             velocity = (north_mps, east_mps, 0.0 if math.isnan(down_mps) else down_mps)
-            cells[row, GPS:] = (record.time_us / US_PER_S, *place, record.alt_amsl_m, *velocity)
+            cells[row, GPS:] = (record.time_us / US_PER_S, *position, record.alt_amsl_m, *velocity)
     return cells

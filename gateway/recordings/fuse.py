@@ -278,12 +278,12 @@ class Fusion:
         comments: list[tuple[int, TableComment]] = []
         begin = 0
         for row, comment in block.comments:
-            place = location_of[row]
+            end = location_of[row]
             if isinstance(comment, TableHeader | FusionState):
-                fused.append(self._fused(cells[begin:place]))
-                begin = place
+                fused.append(self._fused(cells[begin:end]))
+                begin = end
             if self._goes_on(comment):
-                comments.append((place, comment))
+                comments.append((end, comment))
         fused.append(self._fused(cells[begin:]))
         return TableBlock(np.concatenate(fused), tuple(comments))
 

@@ -50,7 +50,7 @@ def civil_time(unix_us: float) -> datetime | None:
         return None
 
 
-def place_in(moment: Moment, first_us: int) -> int:
+def time_us_of(moment: Moment, first_us: int) -> int:
     """Convert a moment to a recording's own time, given that of its start."""
     if moment.time_us is not None:
         return moment.time_us

@@ -248,8 +248,8 @@ def lay_out(
         together = flight.first_us <= end_us and begin_us <= flight.last_us
         shift_us = 0 if together else begin_us - flight.first_us
         system_ids: dict[int, int] = {}
-        for place, system_id in enumerate(flight.vehicles):
-            wanted = wanted_ids[number] + place if number < len(wanted_ids) else system_id
+        for index, system_id in enumerate(flight.vehicles):
+            wanted = wanted_ids[number] + index if number < len(wanted_ids) else system_id
             while wanted in used or wanted >= FIRST_GROUND_STATION:
                 wanted = wanted % (FIRST_GROUND_STATION - 1) + 1
             used.add(wanted)

@@ -42,7 +42,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
-from gateway.recordings.moment import Moment, place_in
+from gateway.recordings.moment import Moment, time_us_of
 from gateway.recordings.table import (
     BLOCK_ROWS,
     HEAD_LINES,
@@ -370,7 +370,7 @@ LATE_US: Final = 1_000_000
 def joined_tables(tables: list[RecordedTable]) -> RecordedTable:
     """Put tables of one aircraft behind one another on the clock of the first.
 
-    Parts of one recording share a clock; other recordings are put in their place by civil time.
+    Parts of one recording share a clock; other recordings are ordered by civil time.
     Where two overlap, the later one is taken from the end of the earlier one on.
 
     Raises FlightError if they are of several aircraft; while the rows are read, if one begins
@@ -472,9 +472,9 @@ def trimmed(table: RecordedTable, limits: Limits) -> RecordedTable:
                 first_us = int(times_us[0])
             start, stop, was_begun = 0, len(block), begun
             if end is not None and first_us is not None:
-                stop = _first(times_us > place_in(end, first_us))
+                stop = _first(times_us > time_us_of(end, first_us))
             if not begun and begin is not None and first_us is not None:
-                start = _first(times_us[:stop] >= place_in(begin, first_us))
+                start = _first(times_us[:stop] >= time_us_of(begin, first_us))
                 begun = start < stop
             # What was changed before the begin still holds, but a state from there does not.
             comments = tuple(

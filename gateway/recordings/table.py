@@ -197,7 +197,7 @@ class TableReader:
         self._rest = b""
         self._skipped = 0
         self._width = 0
-        self._places: list[int] | None = None
+        self._indices: list[int] | None = None
 
     @property
     def vehicle_id(self) -> int:
@@ -235,7 +235,7 @@ class TableReader:
                 self.lines += len(cells)
                 return TableBlock(cells)
         rows: list[bytes] = []
-        places: list[int] = []
+        lines: list[int] = []
         comments: list[tuple[int, TableComment]] = []
         for line in text.split(b"\n")[:-1]:
             self.lines += 1
@@ -244,15 +244,15 @@ class TableReader:
                 comments.append((self.lines, TableFault(self.lines, size, "the line is too long")))
             elif self._width and line.rstrip(b"\r") and not line.startswith(b"#"):
                 rows.append(line)
-                places.append(self.lines)
+                lines.append(self.lines)
             elif (comment := self._take_other(line)) is not None:
                 comments.append((self.lines, comment))
-        return self._joined(rows, np.array(places, np.int64), comments)
+        return self._joined(rows, np.array(lines, np.int64), comments)
 
     def _joined(
         self, rows: list[bytes], lines: IntArray, comments: list[tuple[int, TableComment]]
     ) -> TableBlock:
-        """Read rows, and put the other lines in their places by the numbers of lines."""
+        """Read rows, and put the other lines between them by the numbers of lines."""
         if not rows:
             return TableBlock(NO_ROWS, tuple((0, comment) for _, comment in comments))
         text = b"\n".join([*rows, b""])
@@ -272,10 +272,10 @@ class TableReader:
 
     def _read(self, text: bytes) -> FloatArray | None:
         cells = read_lines(text, self._width)
-        if cells is None or self._places is None:
+        if cells is None or self._indices is None:
             return cells
         # The last column is none of the file's.
-        return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._places]
+        return np.column_stack([cells, np.full(len(cells), np.nan)])[:, self._indices]
 
     def _read_singly(self, rows: list[bytes]) -> tuple[FloatArray, dict[int, str]]:
         """Read rows of which some are none: those are reported, and stay empty."""
@@ -283,7 +283,7 @@ class TableReader:
         faults: dict[int, str] = {}
         for row, line in enumerate(rows):
             try:
-                cells[row] = read_cells(line.rstrip(b"\r"), self._width, self._places)
+                cells[row] = read_cells(line.rstrip(b"\r"), self._width, self._indices)
             except ValueError as error:
                 faults[row] = str(error)
         return cells, faults
@@ -316,4 +316,4 @@ class TableReader:
             raise ValueError("no line of column names with time_us before the first row")
         self._width = len(names)
         if tuple(names) != COLUMNS:
-            self._places = [names.index(name) if name in names else -1 for name in COLUMNS]
+            self._indices = [names.index(name) if name in names else -1 for name in COLUMNS]

@@ -170,8 +170,8 @@ class Batch:
         end = int(self.starts[-1]) + TIME_SIZE + int(self.sizes[-1])
         shifted = np.frombuffer(self.data, np.uint8)[begin:end].copy()
         times = np.maximum(self.time_us + shift_us, 0).astype(">u8")
-        places = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
-        shifted[places] = times.view(np.uint8).reshape(-1, TIME_SIZE)
+        indices = (self.starts - begin)[:, None] + np.arange(TIME_SIZE)
+        shifted[indices] = times.view(np.uint8).reshape(-1, TIME_SIZE)
         return shifted.tobytes()
 
     def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:

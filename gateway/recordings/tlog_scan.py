@@ -152,8 +152,8 @@ def scan(
     found = np.zeros(4, np.int64)
     arrays = (extra, records, damage, found)
     flags = final * _FINAL | strict * _STRICT | in_step * _IN_STEP
-    places = [address_of(array) for array in (data, *arrays)]
-    scan_at(len(data), records.shape[1], flags, *places)
+    addresses = [address_of(array) for array in (data, *arrays)]
+    scan_at(len(data), records.shape[1], flags, *addresses)
     at, count, damaged, in_step_now = found.tolist()
     return (at, count, damaged, bool(in_step_now))
 

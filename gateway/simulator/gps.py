@@ -94,9 +94,9 @@ class GpsSampler:
         self._trajectory = trajectory
         self._start_unix_us = gps_start(start_unix_us)
         self._epoch = -(-self._start_unix_us // EPOCH_US)
-        place, noise, speed, speed_noise, sky, self._latency = rng.spawn(6)
+        position, noise, speed, speed_noise, sky, self._latency = rng.spawn(6)
         interval_s = 1.0 / GPS_RATE_HZ
-        self._position_wander = Wander(place, 1.0, WANDER_S, interval_s)
+        self._position_wander = Wander(position, 1.0, WANDER_S, interval_s)
         self._position_noise = White(noise, 1.0)
         self._velocity_wander = Wander(speed, 1.0, VELOCITY_WANDER_S, interval_s)
         self._velocity_noise = White(speed_noise, 1.0)

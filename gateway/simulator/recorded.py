@@ -144,7 +144,7 @@ class RecordedFlight:
             raise ValueError(f"time_s goes back at {at_s} s")
         begin_s = time_s[0]
         fixes = _complete(stack(*GPS_COLUMNS))
-        # A fix from before the first sample has no place on the nodes' clocks.
+        # A fix from before the first sample has no time on the nodes' clocks.
         fixes &= columns.get("gps_time_s", blank) >= begin_s
         return RecordedFlight(
             time_s=time_s - begin_s,

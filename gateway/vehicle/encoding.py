@@ -147,7 +147,7 @@ class MessagePacker:
 
     def __init__(self, kind: Any) -> None:
         lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
-        places = [(name, n) for name in kind.fieldnames for n in range(lengths[name] or 1)]
+        elements = [(name, n) for name in kind.fieldnames for n in range(lengths[name] or 1)]
         wire = [(name, n) for name in kind.ordered_fieldnames for n in range(lengths[name] or 1)]
         types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
         self.message_id: int = kind.id
@@ -155,8 +155,8 @@ class MessagePacker:
         self.crc_extra: int = kind.crc_extra
         self.has_target = _has_target(kind)
         self.pack = kind.unpacker.pack
-        self.wire_order = itemgetter(*(places.index(place) for place in wire))
-        self.types = [types[name] for name, _ in places]
+        self.wire_order = itemgetter(*(elements.index(element) for element in wire))
+        self.types = [types[name] for name, _ in elements]
 
     def __call__(self, *values: float) -> "PackedMessage":
         """Make a message of its values in the order of the definition, arrays spread out."""

@@ -37,7 +37,7 @@ OVERHEAD_V2: Final = 12
 SEQUENCE_V1: Final = 2
 SEQUENCE_V2: Final = 4
 KEY_V2: Final = slice(5, 10)
-"""Place of `MavFrame.key` in a frame of version 2."""
+"""Offset of `MavFrame.key` in a frame of version 2."""
 SIGNATURE_SIZE: Final = 13
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""

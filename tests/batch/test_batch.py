@@ -231,7 +231,7 @@ def test_tables_stand_for_their_recordings_tlogs(tmp_path: Path) -> None:
     for name in ("a_01.tlog", "a_01_v1.csv", "a_02_v1.csv", "b_01.tlog"):
         (tmp_path / name).write_text("x")
     found = items_of([str(tmp_path)])
-    names = [[Path(place).name for place in item.places] for item in found]
+    names = [[Path(place).name for place in item.locations] for item in found]
     assert names == [["a_01_v1.csv", "a_02_v1.csv"], ["b_01.tlog"]]
     assert len(items_of([str(tmp_path)], each_file=True)) == 4
 
@@ -284,7 +284,7 @@ def memory(season: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize(("pattern", "first"), [("", 0), ("/*.csv", 0), (f"/{FLIGHTS[1]}", 1)])
 def test_url_names_a_folder_a_pattern_or_a_file(memory: str, pattern: str, first: int) -> None:
-    found = [item.place for item in items_of([memory + pattern])]
+    found = [item.location for item in items_of([memory + pattern])]
     assert found == [f"{memory}/{name}" for name in FLIGHTS[first:2]]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.live import kept_files
-from gateway.live.kept_files import STAMPS_NAME, PlaceFiles, StampFile
+from gateway.live.kept_files import STAMPS_NAME, PlanFiles, StampFile
 from gateway.vehicle.plan import Location, StoredPlan
 
 pytestmark = pytest.mark.io
@@ -24,14 +24,14 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.reports: list[tuple[int, str | None]] = []
-        self.files = PlaceFiles(folder, lambda *report: self.reports.append(report))
+        self.files = PlanFiles(folder, lambda *report: self.reports.append(report))
 
     async def save(self, vehicle_id: int, places: StoredPlan) -> None:
         self.files.save(vehicle_id, places)
         await self.files.settle()
 
     def read(self) -> dict[int, StoredPlan]:
-        return PlaceFiles(self.folder, lambda *_: None).load()
+        return PlanFiles(self.folder, lambda *_: None).load()
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import pytest
 
-from gateway.recordings.moment import Moment, parse_moment, place_in
+from gateway.recordings.moment import Moment, parse_moment, time_us_of
 
 DAY_US = 86_400_000_000
 
@@ -33,5 +33,5 @@ def test_invalid_moment_is_refused(text: str) -> None:
 
 
 def test_place_in_a_recording() -> None:
-    assert place_in(parse_moment("1:20"), 1_000) == 80_001_000
-    assert place_in(parse_moment("1970-01-02"), 1_000) == DAY_US
+    assert time_us_of(parse_moment("1:20"), 1_000) == 80_001_000
+    assert time_us_of(parse_moment("1970-01-02"), 1_000) == DAY_US

@@ -144,7 +144,7 @@ def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
     return figure
 
 
-SAME_PLACE_DEG: Final = 0.5
+SAME_POSITION_DEG: Final = 0.5
 """Flights further apart do not fit on one map."""
 NAMES: Final = ("A", "B")
 AB_COLOURS: Final = (style.BLUE, style.RED)
@@ -199,7 +199,7 @@ def _on_one_map(a: Case, b: Case) -> bool:
         return False
     north_deg = abs(a.frame.lat_deg - b.frame.lat_deg)
     east_deg = abs(wrap_180(a.frame.lon_deg - b.frame.lon_deg))
-    return max(north_deg, east_deg) < SAME_PLACE_DEG
+    return max(north_deg, east_deg) < SAME_POSITION_DEG
 
 
 def _draw_difference(a: Case, b: Case, width_in: float) -> Figure:

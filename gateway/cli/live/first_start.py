@@ -284,7 +284,7 @@ def _observe(
 def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
     """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
     bench = Workbench(settings)
-    # The flight's dropouts have no place on a workbench.
+    # The flight's dropouts do not occur on a workbench.
     settings = replace(settings, gps_outages_s=())
     aircraft = SimulatedAircraft(settings, start_unix_us=unix_time_us(), motion=bench)
     receiver = SimulatedReceiver(settings, nodes_of(aircraft, settings))

@@ -78,9 +78,9 @@ def index(
 ) -> None:
     """Bring the catalogue of a folder up to date; the word `index` may be left out."""
     settings = read_settings(config)
-    place = (folder or folder_of(settings)).expanduser()
-    if not place.is_dir():
-        refuse(f"{place}: is no folder")
+    root = (folder or folder_of(settings)).expanduser()
+    if not root.is_dir():
+        refuse(f"{root}: is no folder")
     options = read_options(settings, columns)
     with progress_bar() as progress:
         task = progress.add_task("reading", total=None)
@@ -88,9 +88,9 @@ def index(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total, refresh=True)
 
-        report = index_folder(place, options, LocalProcesses(jobs), show)
+        report = index_folder(root, options, LocalProcesses(jobs), show)
     console_of().print(
-        f"{place}: {counted(report.read, 'file')} read ({report.broken} of them broken), "
+        f"{root}: {counted(report.read, 'file')} read ({report.broken} of them broken), "
         f"{report.unchanged} unchanged, {report.gone} gone"
     )
 
@@ -105,11 +105,11 @@ def list_flights(
     config: ConfigOption = None,
 ) -> None:
     """List the flights of the catalogue, or those for which a condition holds."""
-    place = _place(folder, config)
+    root = _folder(folder, config)
     if geojson or json:
-        print_json(geojson_of(place, where) if geojson else find_flights(place, where))
+        print_json(geojson_of(root, where) if geojson else find_flights(root, where))
     else:
-        _show_table(find_flights(place, where))
+        _show_table(find_flights(root, where))
 
 
 @group.command()
@@ -122,16 +122,16 @@ def show(
     config: ConfigOption = None,
 ) -> None:
     """Show all that the catalogue knows of one recording; `last` is the newest."""
-    place = _place(folder, config)
+    root = _folder(folder, config)
     with suppress(RecordingError):
-        name = find_recording(place, name).name
+        name = find_recording(root, name).name
     quoted = name.replace("'", "''")
     where = f"name = '{quoted}' or path = '{quoted}'"
-    rows = find_flights(place, where)
+    rows = find_flights(root, where)
     if not rows:
-        refuse(f"{name}: is not in the catalogue of {place}; `mavgate catalogue list` shows it")
+        refuse(f"{name}: is not in the catalogue of {root}; `mavgate catalogue list` shows it")
     if geojson or json:
-        print_json(geojson_of(place, where) if geojson else rows)
+        print_json(geojson_of(root, where) if geojson else rows)
         return
     for number, row in enumerate(rows):
         print(end="\n" if number else "")
@@ -143,7 +143,7 @@ def show(
         console_of().print(grid)
 
 
-def _place(folder: Path | None, config: Path | None) -> Path:
+def _folder(folder: Path | None, config: Path | None) -> Path:
     return (folder or folder_of(read_settings(config))).expanduser()
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from gateway.recordings.reading import ReadOptions
 
 SHOWN: Final = 8
-"""Gaps and damaged places that are listed one by one."""
+"""Gaps and damaged ranges that are listed one by one."""
 
 EARLIEST_US: Final = 366 * 86_400 * US_PER_S
 """Times before, in µs since 1970, are those since a start, as in other programs' logs."""

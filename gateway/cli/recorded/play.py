@@ -251,7 +251,7 @@ async def _watch(daemon: PlayerDaemon) -> None:
                 description=status.state,
                 completed=status.position_s,
                 total=max(status.duration_s, 1e-3),
-                at=_place(status),
+                at=_position(status),
             )
             if console.is_terminal:
                 live.refresh()
@@ -260,7 +260,7 @@ async def _watch(daemon: PlayerDaemon) -> None:
                     await daemon.ended.wait()
             except TimeoutError:
                 continue
-    console.print(f"ended: {_place(daemon.edge.status())}")
+    console.print(f"ended: {_position(daemon.edge.status())}")
 
 
 def _speed(text: str) -> float:
@@ -272,12 +272,12 @@ def _speed(text: str) -> float:
         raise FlightError(f"speed {text!r}: write 0.1 to 100, or {FASTEST}") from error
 
 
-def _place(status: PlayerStatus) -> str:
+def _position(status: PlayerStatus) -> str:
     speed = FASTEST if status.speed is None else f"{status.speed:g}x"
     sent = counted(status.sent, "frame")
     return f"{status.position_s:.1f} of {status.duration_s:.1f} s, {speed}, {sent}"
 
 
 def _show(status: dict[str, Any]) -> None:
-    place = PlayerStatus(**{**status, "files": tuple(status["files"])})
-    console_of().print(f"{place.state}: {_place(place)}")
+    current = PlayerStatus(**{**status, "files": tuple(status["files"])})
+    console_of().print(f"{current.state}: {_position(current)}")

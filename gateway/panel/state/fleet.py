@@ -305,7 +305,7 @@ class VehicleState:
         """Return the present state."""
         get = self.newest.get
         q_nb, rates = self._attitude()
-        place, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
+        position, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
         fix, beat = get("GPS_RAW_INT"), get("HEARTBEAT")
         mark, distance_m, bearing_deg = self._mark()
         return Instant(
@@ -317,15 +317,15 @@ class VehicleState:
             silent_s=self.silent_s(now_us),
             q_nb=q_nb,
             rate_b_radps=rates,
-            lat_deg=place.lat / DEGE7 if place else NAN,
-            lon_deg=place.lon / DEGE7 if place else NAN,
-            alt_amsl_m=place.alt / MM if place else (hud.alt if hud else NAN),
-            alt_home_m=place.relative_alt / MM if place else NAN,
-            vel_n_mps=(place.vx / CM, place.vy / CM, place.vz / CM) if place else UNKNOWN_VEC3,
+            lat_deg=position.lat / DEGE7 if position else NAN,
+            lon_deg=position.lon / DEGE7 if position else NAN,
+            alt_amsl_m=position.alt / MM if position else (hud.alt if hud else NAN),
+            alt_home_m=position.relative_alt / MM if position else NAN,
+            vel_n_mps=_vel_n_mps(position),
             groundspeed_mps=hud.groundspeed if hud else NAN,
             airspeed_mps=_airspeed_mps(hud),
             climb_mps=hud.climb if hud else NAN,
-            heading_deg=_heading_deg(place, hud),
+            heading_deg=_heading_deg(position, hud),
             pos_std_m=self._pos_std_m(),
             fix_type=fix.fix_type if fix else 0,
             satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else 0,
@@ -364,19 +364,19 @@ class VehicleState:
 
     def _mark(self) -> tuple[Spot | None, float, float]:
         """Return the mark, and the distance and bearing reported by the aircraft."""
-        way, place = (
+        way, position = (
             self.newest.get("NAV_CONTROLLER_OUTPUT"),
             self.newest.get("GLOBAL_POSITION_INT"),
         )
-        if way is None or place is None or not way.wp_dist:
+        if way is None or position is None or not way.wp_dist:
             return self.exact_mark, NAN, NAN
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
         if self.exact_mark is not None:
             return self.exact_mark, distance_m, bearing_deg
-        if not is_on_earth(place.lat / DEGE7, place.lon / DEGE7):
+        if not is_on_earth(position.lat / DEGE7, position.lon / DEGE7):
             return None, distance_m, bearing_deg
         lat_deg, lon_deg = vincenty.vreckon(
-            place.lat / DEGE7, place.lon / DEGE7, distance_m, bearing_deg
+            position.lat / DEGE7, position.lon / DEGE7, distance_m, bearing_deg
         )
         lon_deg = wrap_180(float(lon_deg))
         return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
@@ -417,9 +417,15 @@ def _airspeed_mps(hud: Any) -> float:
     return NAN if hud is None or hud.airspeed == hud.groundspeed else float(hud.airspeed)
 
 
-def _heading_deg(place: Any, hud: Any) -> float:
-    if place is not None and place.hdg != 65535:
-        return float(place.hdg / CM)
+def _vel_n_mps(position: Any) -> tuple[float, float, float]:
+    if position is None:
+        return UNKNOWN_VEC3
+    return position.vx / CM, position.vy / CM, position.vz / CM
+
+
+def _heading_deg(position: Any, hud: Any) -> float:
+    if position is not None and position.hdg != 65535:
+        return float(position.hdg / CM)
     return float(hud.heading % 360) if hud is not None else NAN
 
 

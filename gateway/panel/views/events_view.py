@@ -26,7 +26,7 @@ ICONS: Final = {"bad": "error", "warn": "warning", "info": "info", "soft": "bug_
 def build_banner(context: ViewContext) -> None:
     """Build the banners of alerts; shown above every view."""
     shown: list[Alert] = []
-    place = ui.element("div").props('role=alert aria-live="assertive"')
+    area = ui.element("div").props('role=alert aria-live="assertive"')
 
     def refresh() -> None:
         nonlocal shown
@@ -40,8 +40,8 @@ def build_banner(context: ViewContext) -> None:
         if alerts == shown:
             return
         shown = alerts
-        place.clear()
-        with place:
+        area.clear()
+        with area:
             for alert in alerts:
                 _build_alert(alert)
 

@@ -35,7 +35,7 @@ from gateway.recordings.index import delete_recording, list_recordings
 
 REFRESH_S: Final = 1.0
 IDLE: Final = "idle"
-PLACE_S: Final = 0.25
+POSITION_S: Final = 0.25
 MUCH_LOST: Final = 0.05
 """A share of lost samples that a pilot should see."""
 FACTS: Final = ("Duration", "Distance", "Height", "Loss")
@@ -76,7 +76,7 @@ class RecordingsView:
                     buttons=self._buttons(),
                 )
         context.every(REFRESH_S, self.refresh)
-        context.every(PLACE_S, self._show_place)
+        context.every(POSITION_S, self._show_position)
 
     def _buttons(self) -> list[RowButton]:
         buttons = [RowButton("play_arrow", "Open", self._open)]
@@ -134,7 +134,7 @@ class RecordingsView:
             }
         )
 
-    def _show_place(self) -> None:
+    def _show_position(self) -> None:
         playback, status = self._playback, self._playback.status
         self._player.set_visibility(status is not None)
         if status is None:
@@ -199,7 +199,7 @@ class RecordingsView:
             self._context.check_may_change()
             if (answer := act(*args, **params)) is not None:
                 await answer
-            self._show_place()
+            self._show_position()
 
     async def _on_seek(self, event: GenericEventArguments) -> None:
         await self._play(self._playback.order, "seek", to=f"{float(event.args):.2f}")

@@ -111,7 +111,7 @@ class ArdupilotReader:
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
         """The newest fix, which waits for its accuracies."""
-        self._place: tuple[int, float, float, float] | None = None
+        self._fused_position: tuple[int, float, float, float] | None = None
         self._motion: tuple[int, Vec3] | None = None
         self._handlers: dict[str, Callable[[Message, int], list[Imported]]] = {
             "IMU": self._imu, "MAG": self._magnetometer, "BARO": self._baro,
@@ -246,7 +246,7 @@ class ArdupilotReader:
         return self._flush_fix()
 
     def _position(self, m: Message, time_us: int) -> list[Imported]:
-        self._place = (time_us, m.Lat, m.Lng, m.Alt)
+        self._fused_position = (time_us, m.Lat, m.Lng, m.Alt)
         return []
 
     def _kalman(self, m: Message, time_us: int) -> list[Imported]:
@@ -255,14 +255,17 @@ class ArdupilotReader:
 
     def _attitude(self, m: Message, time_us: int) -> list[Imported]:
         """Take the autopilot's own solution, for comparison."""
-        place: tuple[float, float, float] | None = None
+        position: tuple[float, float, float] | None = None
         vel = UNKNOWN_VEC3
-        if self._place is not None and time_us - self._place[0] <= VELOCITY_AGE_US:
-            place = self._place[1:]
+        if (
+            self._fused_position is not None
+            and time_us - self._fused_position[0] <= VELOCITY_AGE_US
+        ):
+            position = self._fused_position[1:]
         if self._motion is not None and time_us - self._motion[0] <= VELOCITY_AGE_US:
             _, vel = self._motion
         angles_rad = (math.radians(degrees) for degrees in (m.Roll, m.Pitch, m.Yaw))
-        return [autopilot_state(time_us, from_euler(*angles_rad), place, vel)]
+        return [autopilot_state(time_us, from_euler(*angles_rad), position, vel)]
 
 
 MAGIC: Final = b"\xa3\x95"

@@ -41,8 +41,8 @@ class TrackPoint:
     """Roll, pitch and yaw, where they are known."""
 
 
-class PlaceKind(StrEnum):
-    """Kind of a single place on the map."""
+class MarkerKind(StrEnum):
+    """Kind of a marker on the map."""
 
     HOME = "home"
     MARK = "mark"
@@ -50,10 +50,10 @@ class PlaceKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class MapPlace:
+class MapMarker:
     """Home, a mark, or where the vehicle was when something happened."""
 
-    kind: PlaceKind
+    kind: MarkerKind
     name: str
     at: TrackPoint
 
@@ -64,7 +64,7 @@ class VehicleTrack:
 
     name: str
     points: list[TrackPoint] = field(default_factory=list)
-    places: list[MapPlace] = field(default_factory=list)
+    markers: list[MapMarker] = field(default_factory=list)
 
 
 FIRST_US: Final = 0
@@ -73,7 +73,7 @@ LAST_US: Final = 253_402_300_799 * US_PER_S
 
 
 def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
-    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and places."""
+    """Write a flight as KML 2.2: a folder per vehicle, with its track, attitude and markers."""
     yield (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         '<kml xmlns="http://www.opengis.net/kml/2.2" '
@@ -88,7 +88,7 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     for number, vehicle in enumerate(vehicles):
         yield f"<Folder><name>{_escaped(vehicle.name)}</name>\n"
         yield from _kml_track(vehicle, f"#track{number % len(COLOURS)}")
-        yield from map(_kml_place, vehicle.places)
+        yield from map(_kml_marker, vehicle.markers)
         yield "</Folder>\n"
     yield "</Document></kml>\n"
 
@@ -106,12 +106,12 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
     yield "</gx:Track></Placemark>\n"
 
 
-def _kml_place(place: MapPlace) -> str:
+def _kml_marker(marker: MapMarker) -> str:
     return (
-        f"<Placemark><name>{_escaped(place.name)}</name><description>{place.kind}</description>"
-        f"<TimeStamp><when>{iso_time(place.at.time_us)}</when></TimeStamp>"
+        f"<Placemark><name>{_escaped(marker.name)}</name><description>{marker.kind}</description>"
+        f"<TimeStamp><when>{iso_time(marker.at.time_us)}</when></TimeStamp>"
         "<Point><altitudeMode>absolute</altitudeMode>"
-        f"<coordinates>{_kml_coordinates(place.at, ',')}</coordinates></Point></Placemark>\n"
+        f"<coordinates>{_kml_coordinates(marker.at, ',')}</coordinates></Point></Placemark>\n"
     )
 
 
@@ -130,7 +130,7 @@ def _kml_angles(point: TrackPoint) -> str:
 def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     """Write a flight as GPX 1.1; see `to_kml`.
 
-    Places are waypoints. GPX has no attitude: it is in the extensions of each point, in a separate
+    Markers are waypoints. GPX has no attitude: it is in the extensions of each point, in a separate
     namespace, which other programs ignore.
     """
     vehicles = list(vehicles)
@@ -142,14 +142,14 @@ def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     )
     for vehicle in vehicles:
         yield from (
-            f"<wpt {_gpx_place(place.at)}{_gpx_time(place.at)}<name>{_escaped(place.name)}</name>"
-            f"<desc>{_escaped(vehicle.name)}</desc><type>{place.kind}</type></wpt>\n"
-            for place in vehicle.places
+            f"<wpt {_gpx_position(marker.at)}{_gpx_time(marker.at)}"
+            f"<name>{_escaped(marker.name)}</name><desc>{_escaped(vehicle.name)}</desc><type>{marker.kind}</type></wpt>\n"
+            for marker in vehicle.markers
         )
     for vehicle in vehicles:
         yield f"<trk><name>{_escaped(vehicle.name)}</name><trkseg>\n"
         yield from (
-            f"<trkpt {_gpx_place(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
+            f"<trkpt {_gpx_position(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
             for p in vehicle.points
         )
         yield "</trkseg></trk>\n"
@@ -161,7 +161,7 @@ def _escaped(text: str) -> str:
     return saxutils.escape(_NOT_IN_XML.sub("\N{REPLACEMENT CHARACTER}", text))
 
 
-def _gpx_place(point: TrackPoint) -> str:
+def _gpx_position(point: TrackPoint) -> str:
     return f'lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}"><ele>{point.alt_amsl_m:.2f}</ele>'
 
 
@@ -214,10 +214,10 @@ def _features(vehicle: VehicleTrack) -> Iterator[dict[str, Any]]:
         coord_times = times[0]
     properties: dict[str, Any] = {"name": vehicle.name, "kind": "track", "time": times[0][0]}
     yield _feature(kind, coordinates, properties | {"coordTimes": coord_times})
-    for place in vehicle.places:
-        time = iso_time(place.at.time_us)
-        properties = {"name": place.name, "kind": str(place.kind), "vehicle": vehicle.name}
-        yield _feature("Point", _position(place.at), properties | {"time": time})
+    for marker in vehicle.markers:
+        time = iso_time(marker.at.time_us)
+        properties = {"name": marker.name, "kind": str(marker.kind), "vehicle": vehicle.name}
+        yield _feature("Point", _position(marker.at), properties | {"time": time})
 
 
 def _parts(points: list[TrackPoint]) -> list[list[TrackPoint]]:
@@ -254,8 +254,8 @@ def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[st
 
 
 def _position(point: TrackPoint) -> list[float]:
-    place = [round(point.lon_deg, 7), round(point.lat_deg, 7)]
-    return [*place, round(point.alt_amsl_m, 2)] if math.isfinite(point.alt_amsl_m) else place
+    position = [round(point.lon_deg, 7), round(point.lat_deg, 7)]
+    return [*position, round(point.alt_amsl_m, 2)] if math.isfinite(point.alt_amsl_m) else position
 
 
 ATTITUDE_ID: Final = 30
@@ -270,10 +270,10 @@ _READ: Final = frozenset(
 INFO: Final = 6
 """MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
-"""The gateway's STATUSTEXT for a marked place."""
+"""The gateway's STATUSTEXT for a marked position."""
 INTERVAL_US: Final = US_PER_S // 5
 """A map shows no more than five points a second."""
-MAX_PLACES: Final = 10_000
+MAX_MARKERS: Final = 10_000
 """Of one vehicle; a flood of texts must not fill the memory."""
 
 
@@ -298,9 +298,9 @@ class _Drawn:
         self.early.clear()
 
     def add_event(self, time_us: int, text: str) -> None:
-        """Place an event at the vehicle's position."""
+        """Put an event at the vehicle's position."""
         if not self.track.points:
-            if len(self.early) < MAX_PLACES:
+            if len(self.early) < MAX_MARKERS:
                 self.early.append((time_us, text))
             return
         here = self.track.points[-1]
@@ -308,15 +308,15 @@ class _Drawn:
         if marked := _MARKED.fullmatch(text):
             lat_deg, lon_deg = map(float, marked.groups())
             at = TrackPoint(time_us, lat_deg, lon_deg, here.alt_amsl_m)
-            self.put(PlaceKind.MARK, text, at)
+            self.put(MarkerKind.MARK, text, at)
         else:
             is_mark = text.startswith(REMARK)
-            kind = PlaceKind.MARK if is_mark else PlaceKind.EVENT
+            kind = MarkerKind.MARK if is_mark else MarkerKind.EVENT
             self.put(kind, text.removeprefix(REMARK), at)
 
-    def put(self, kind: PlaceKind, name: str, at: TrackPoint) -> None:
-        if len(self.track.places) < MAX_PLACES:
-            self.track.places.append(MapPlace(kind, name, at))
+    def put(self, kind: MarkerKind, name: str, at: TrackPoint) -> None:
+        if len(self.track.markers) < MAX_MARKERS:
+            self.track.markers.append(MapMarker(kind, name, at))
 
 
 def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:
@@ -350,7 +350,7 @@ def _take(one: _Drawn, record: TlogRecord) -> None:
         lat, lon = m["latitude"], m["longitude"]
         if (lat or lon) and one.home != (lat, lon):
             one.home = (lat, lon)
-            one.put(PlaceKind.HOME, "Home", _point(time_us, lat, lon, m["altitude"], None))
+            one.put(MarkerKind.HOME, "Home", _point(time_us, lat, lon, m["altitude"], None))
     elif m["severity"] <= INFO:
         _take_text(one, m, time_us)
 
@@ -358,10 +358,10 @@ def _take(one: _Drawn, record: TlogRecord) -> None:
 def _take_text(one: _Drawn, m: Mapping[str, Any], time_us: int) -> None:
     text, number = m["text"].split(b"\0", 1)[0].decode("ascii", "replace"), m["id"]
     if number and m["chunk_seq"]:
-        places = one.track.places
-        if number == one.text_id and places and places[-1].kind is PlaceKind.EVENT:
-            last = places.pop()
-            places.append(replace(last, name=last.name + text))
+        markers = one.track.markers
+        if number == one.text_id and markers and markers[-1].kind is MarkerKind.EVENT:
+            last = markers.pop()
+            markers.append(replace(last, name=last.name + text))
         return
     one.text_id = number
     one.add_event(time_us, text)
@@ -378,18 +378,21 @@ def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[Ve
         elif isinstance(row, FusionState) and row.home is not None and not has_home:
             lat_deg, lon_deg, alt_m, since_us = row.home
             at = TrackPoint(zero_us + since_us, lat_deg, lon_deg, alt_m)
-            one.put(PlaceKind.HOME, "Home", at)
+            one.put(MarkerKind.HOME, "Home", at)
             has_home = True
         elif isinstance(row, TableRow):
             if not has_home and row.gps is not None:
                 limits = aircraft.vehicle
                 has_home = is_good_enough(row.gps, limits.home_accuracy_m, limits.home_satellites)
                 if has_home:
-                    place = location_of(row.gps)
+                    position = location_of(row.gps)
                     at = TrackPoint(
-                        zero_us + row.gps.time_us, place.lat_deg, place.lon_deg, place.alt_amsl_m
+                        zero_us + row.gps.time_us,
+                        position.lat_deg,
+                        position.lon_deg,
+                        position.alt_amsl_m,
                     )
-                    one.put(PlaceKind.HOME, "Home", at)
+                    one.put(MarkerKind.HOME, "Home", at)
             if (point := _point_of(row, zero_us)) is not None:
                 one.add(point)
     return [one.track] if one.track.points else []
@@ -399,8 +402,8 @@ def _point_of(row: TableRow, zero_us: int) -> TrackPoint | None:
     state, fix = row.state, row.gps
     if state is not None and NavFlags.POSITION_VALID in state.flags:
         attitude_deg = _angles(state.q_nb) if NavFlags.ATTITUDE_VALID in state.flags else None
-        place = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        return TrackPoint(zero_us + row.time_us, *place, attitude_deg)
+        position = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
+        return TrackPoint(zero_us + row.time_us, *position, attitude_deg)
     if state is None and fix is not None and fix.fix_ok:
         lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
         return TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
@@ -410,8 +413,8 @@ def _point_of(row: TableRow, zero_us: int) -> TrackPoint | None:
 def _point(
     time_us: int, lat: int, lon: int, alt: int, attitude: tuple[float, float, float] | None
 ) -> TrackPoint:
-    place = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
-    return TrackPoint(time_us, *place, attitude)
+    position = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
+    return TrackPoint(time_us, *position, attitude)
 
 
 def _angles(q_nb: Quat) -> tuple[float, float, float] | None:

@@ -39,10 +39,10 @@ def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
     data = np.frombuffer(batch.data, np.uint8)
     starts = batch.starts[wanted] + TIME_SIZE
     begins = starts + np.where(data[starts] == START_V2, HEAD_V2, HEAD_V1)
-    places = np.arange(layout.itemsize)
-    is_there = places < data[starts + LENGTH_AT][:, None]
+    offsets = np.arange(layout.itemsize)
+    is_there = offsets < data[starts + LENGTH_AT][:, None]
     payloads = np.zeros((len(wanted), layout.itemsize), np.uint8)
-    payloads[is_there] = data[(begins[:, None] + places)[is_there]]
+    payloads[is_there] = data[(begins[:, None] + offsets)[is_there]]
     found: NDArray[np.void] = payloads.view(layout)[:, 0]
     return found
 
@@ -61,7 +61,7 @@ GPS_NODE: Final = 1
 Fields = NDArray[np.void]
 
 _ATTITUDE_FLAGS: Final = int(NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID)
-_PLACE_FLAGS: Final = int(
+_POSITION_FLAGS: Final = int(
     NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
 )
 
@@ -93,8 +93,10 @@ def baro_cells(values: Fields, time_us: IntArray) -> FloatArray:
     return np.column_stack([time_us, node, time_us, pressure_pa, temperature_degc])
 
 
-def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntArray) -> FloatArray:
-    """Return the cells of GPS_RAW_INT; `place_at` is the newest of `places`, -1 for none."""
+def gps_cells(
+    values: Fields, time_us: IntArray, positions: Fields, position_at: IntArray
+) -> FloatArray:
+    """Return the cells of GPS_RAW_INT; `position_at` is the newest of `positions`, -1 for none."""
     reported = np.minimum(values["fix_type"], FIX_3D)
     fix_type = np.select(
         [reported == FIX_2D, reported == FIX_3D],
@@ -105,7 +107,7 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     satellites = values["satellites_visible"]
     utc_us = values["time_usec"]
     is_civil = (utc_us > FIRST_CIVIL_US) & (utc_us <= LARGEST_WHOLE)
-    down_mps = _of_place(places, np.where(reported == FIX_3D, place_at, -1), "vz", CENTI)
+    down_mps = _of_position(positions, np.where(reported == FIX_3D, position_at, -1), "vz", CENTI)
     speed_mps = np.where(has_fix, _known(values["vel"], CENTI), np.nan)
     north_mps, east_mps = level_velocity(speed_mps, _known(values["cog"], CENTI))
     return np.column_stack(
@@ -132,20 +134,22 @@ def gps_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntAr
     )
 
 
-def nav_cells(values: Fields, time_us: IntArray, places: Fields, place_at: IntArray) -> FloatArray:
-    """Return the cells of `NAV_COLUMNS` of ATTITUDE; the places are as for `gps_cells`."""
+def nav_cells(
+    values: Fields, time_us: IntArray, positions: Fields, position_at: IntArray
+) -> FloatArray:
+    """Return the cells of `NAV_COLUMNS` of ATTITUDE; the positions are as for `gps_cells`."""
     angles = [values[name].astype(np.float64) for name in ("roll", "pitch", "yaw")]
     rates = [values[name] for name in ("rollspeed", "pitchspeed", "yawspeed")]
-    flags = np.where(place_at >= 0, _ATTITUDE_FLAGS | _PLACE_FLAGS, _ATTITUDE_FLAGS)
+    flags = np.where(position_at >= 0, _ATTITUDE_FLAGS | _POSITION_FLAGS, _ATTITUDE_FLAGS)
     return np.column_stack(
         [
             time_us,
             from_euler_array(np.column_stack(angles)),
             *rates,
-            _of_place(places, place_at, "lat", DEG_PER_DEGE7),
-            _of_place(places, place_at, "lon", DEG_PER_DEGE7),
-            _of_place(places, place_at, "alt", MILLI),
-            *(_of_place(places, place_at, name, CENTI) for name in ("vx", "vy", "vz")),
+            _of_position(positions, position_at, "lat", DEG_PER_DEGE7),
+            _of_position(positions, position_at, "lon", DEG_PER_DEGE7),
+            _of_position(positions, position_at, "alt", MILLI),
+            *(_of_position(positions, position_at, name, CENTI) for name in ("vx", "vy", "vz")),
             np.full((len(values), 9), np.nan),
             flags,
         ]
@@ -168,11 +172,11 @@ def _unless_zero(values: NDArray[np.int32], scale: float) -> FloatArray:
     return np.where(values == 0, NAN, values * scale)
 
 
-def _of_place(places: Fields, place_at: IntArray, name: str, scale: float) -> FloatArray:
-    """Return a field of the place that was known at each time; NaN where none was."""
-    found = np.full(len(place_at), np.nan)
-    known = place_at >= 0
-    found[known] = places[name][place_at[known]] * scale
+def _of_position(positions: Fields, position_at: IntArray, name: str, scale: float) -> FloatArray:
+    """Return a field of the position that was known at each time; NaN where none was."""
+    found = np.full(len(position_at), np.nan)
+    known = position_at >= 0
+    found[known] = positions[name][position_at[known]] * scale
     return found
 
 
@@ -181,16 +185,16 @@ VELOCITY_AGE_US: Final = US_PER_S // 2
 
 
 def autopilot_state(
-    time_us: int, q_nb: Quat, place: tuple[float, float, float] | None, vel_n_mps: Vec3
+    time_us: int, q_nb: Quat, position: tuple[float, float, float] | None, vel_n_mps: Vec3
 ) -> NavState:
     """Make a state of an autopilot's own solution, without standard deviations."""
     flags = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-    if place is not None:
+    if position is not None:
         flags |= NavFlags.POSITION_VALID | NavFlags.ALTITUDE_VALID
     if math.isfinite(sum(vel_n_mps)):
         flags |= NavFlags.VELOCITY_VALID
     unknown = UNKNOWN_VEC3
-    lat_deg, lon_deg, alt_m = place or unknown
+    lat_deg, lon_deg, alt_m = position or unknown
     return NavState(
         time_us, q_nb, unknown, lat_deg, lon_deg, alt_m, vel_n_mps, unknown, unknown, unknown, flags
     )
@@ -206,7 +210,7 @@ IMU_RANK: Final = {
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
 }
 _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
-_PLACE: Final = layout_of(mavlink.mavlink_map[POSITION])
+_POSITION_LAYOUT: Final = layout_of(mavlink.mavlink_map[POSITION])
 
 _OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
 """Kinds of messages that may have another clock than the IMU's."""
@@ -230,8 +234,8 @@ class AutopilotReader:
         """Of each of `_OWN_CLOCKS`, and of the IMU under `_IMU`, on the rows' clock."""
         self._sampled_us = 0
         """When the newest IMU sample was recorded, or else the first message."""
-        self._places = np.empty(0, _PLACE)
-        self._places_us = np.empty(0, np.int64)
+        self._positions = np.empty(0, _POSITION_LAYOUT)
+        self._positions_us = np.empty(0, np.int64)
         """The newest GLOBAL_POSITION_INT, if any, and when it was recorded."""
         self._state = np.full((1, NAV.stop - NAV.start), np.nan)
         """The newest estimate of the autopilot; NaN once a sample has it."""
@@ -247,9 +251,9 @@ class AutopilotReader:
             for one in np.unique(message_ids)
         }
         time_us = self._times(message_ids, recorded_us, fields)
-        places = self._places_at(message_ids, recorded_us, fields)
-        states = self._states_at(message_ids, time_us, places, fields)
-        return self._rows(message_ids, time_us, places, states, fields)
+        positions = self._positions_at(message_ids, recorded_us, fields)
+        states = self._states_at(message_ids, time_us, positions, fields)
+        return self._rows(message_ids, time_us, positions, states, fields)
 
     def flush(self) -> FloatArray:
         """Return the row that still waits for a sample, if any, without one."""
@@ -315,26 +319,28 @@ class AutopilotReader:
             self._sampled_us = recorded_us
         return newest_us[stream]
 
-    def _places_at(
+    def _positions_at(
         self, message_ids: IntArray, recorded_us: IntArray, fields: dict[int, NDArray[np.void]]
     ) -> tuple[NDArray[np.void], IntArray]:
         """Return all GLOBAL_POSITION_INT, and which was known at each message; -1 for none."""
-        is_place = message_ids == POSITION
-        known = len(self._places)
-        places = np.concatenate([self._places, fields.get(POSITION, np.empty(0, _PLACE))])
-        places_us = np.concatenate([self._places_us, recorded_us[is_place]])
-        at = np.cumsum(is_place) - 1 + known
-        if len(places):
-            is_old = np.abs(recorded_us - places_us[at]) > VELOCITY_AGE_US
+        is_position = message_ids == POSITION
+        known = len(self._positions)
+        positions = np.concatenate(
+            [self._positions, fields.get(POSITION, np.empty(0, _POSITION_LAYOUT))]
+        )
+        positions_us = np.concatenate([self._positions_us, recorded_us[is_position]])
+        at = np.cumsum(is_position) - 1 + known
+        if len(positions):
+            is_old = np.abs(recorded_us - positions_us[at]) > VELOCITY_AGE_US
             at = np.where(is_old, -1, at)
-        self._places, self._places_us = places[-1:], places_us[-1:]
-        return places, at
+        self._positions, self._positions_us = positions[-1:], positions_us[-1:]
+        return positions, at
 
     def _states_at(
         self,
         message_ids: IntArray,
         time_us: IntArray,
-        places: tuple[NDArray[np.void], IntArray],
+        positions: tuple[NDArray[np.void], IntArray],
         fields: dict[int, NDArray[np.void]],
     ) -> FloatArray:
         """Return the estimate of the autopilot at each sample; NaN where there is none."""
@@ -348,7 +354,9 @@ class AutopilotReader:
         states = np.full((len(at), NAV.stop - NAV.start), np.nan)
         if values is not None:
             values = values[at[at > before] - 1]
-            states[at > before] = nav_cells(values, time_us[chosen], places[0], places[1][chosen])
+            states[at > before] = nav_cells(
+                values, time_us[chosen], positions[0], positions[1][chosen]
+            )
         if not at[0]:
             states[0] = self._state[0]
         self._state = states[-1:]
@@ -358,7 +366,7 @@ class AutopilotReader:
         self,
         message_ids: IntArray,
         time_us: IntArray,
-        places: tuple[NDArray[np.void], IntArray],
+        positions: tuple[NDArray[np.void], IntArray],
         states: FloatArray,
         fields: dict[int, NDArray[np.void]],
     ) -> FloatArray:
@@ -379,7 +387,7 @@ class AutopilotReader:
             if message_id == PRESSURE:
                 rows[row, BARO] = baro_cells(values, now_us)
             elif message_id == FIX:
-                rows[row, GPS] = gps_cells(values, now_us, places[0], places[1][here])
+                rows[row, GPS] = gps_cells(values, now_us, positions[0], positions[1][here])
             elif message_id in IMU_RANK:
                 rows[row, _HEAD], rows[row, SI] = imu_cells(message_id, values, now_us)
         rows[row_of[kinds == _IMU], NAV] = states

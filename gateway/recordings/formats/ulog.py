@@ -207,16 +207,16 @@ class Px4Log:
 
     def _states(self) -> Iterator[NavState]:
         """Yield the autopilot's own solution, for comparison."""
-        places = _Newest(self._rows("vehicle_global_position"))
+        positions = _Newest(self._rows("vehicle_global_position"))
         motions = _Newest(self._rows("vehicle_local_position", "vehicle_global_position"))
         for row in self._rows("vehicle_attitude"):
-            place, motion = places.at(row["timestamp"]), motions.at(row["timestamp"])
+            position, motion = positions.at(row["timestamp"]), motions.at(row["timestamp"])
             north, east, down = (motion.get(k, motion.get(old, NAN)) for k, old in _VELOCITY)
             yield autopilot_state(
                 self._time(row),
                 (row["q[0]"], row["q[1]"], row["q[2]"], row["q[3]"]),
-                (place["lat"], place.get("lon", NAN), place.get("alt", NAN))
-                if "lat" in place
+                (position["lat"], position.get("lon", NAN), position.get("alt", NAN))
+                if "lat" in position
                 else None,
                 (north, east, down),
             )

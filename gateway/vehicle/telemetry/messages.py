@@ -113,8 +113,8 @@ def has_position(state: NavState) -> bool:
 def global_position_int(state: NavState, reference_alt_m: float) -> Any:
     """Encode the fused position; for states that have one.
 
-    Latitude, longitude and heights have no "unknown" in this message, and 0, 0 is a place; so
-    nothing is sent before the first position, and the estimate always from then on:
+    Latitude, longitude and heights have no "unknown" in this message, and 0, 0 is a valid position;
+    so nothing is sent before the first position, and the estimate always from then on:
     ESTIMATOR_STATUS reports its quality. Velocities have no "unknown" either and are zero in the
     rare state that has a position but no velocity.
     """
@@ -220,8 +220,8 @@ def _squared(values: Vec3) -> Vec3:
 def _covariance(*variances: float) -> list[float]:
     """Lay out the upper right triangle, row by row, of a 6x6 matrix with this diagonal."""
     found = [0.0] * 21
-    for place, variance in zip((0, 6, 11, 15, 18, 20), variances, strict=True):
-        found[place] = variance
+    for index, variance in zip((0, 6, 11, 15, 18, 20), variances, strict=True):
+        found[index] = variance
     return found
 
 
@@ -323,7 +323,7 @@ def gps_raw_int(fix: GpsFix, located: GpsFix | None = None) -> Any:
     """Encode a fix.
 
     While the receiver has no position, the last one is repeated with fix type NO_FIX, as autopilots
-    do: 0, 0 is a place.
+    do: 0, 0 is a valid position.
 
     The receiver reports only the position's DOP, whose square is the sum of those of HDOP and
     VDOP; it is divided by the accuracies, which are proportional to them. An extension field that

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.recordings.formats.maps import (
-    MapPlace,
-    PlaceKind,
+    MapMarker,
+    MarkerKind,
     TrackPoint,
     VehicleTrack,
     to_geojson,
@@ -38,9 +38,9 @@ POINTS = [
 ATTITUDE = TrackPoint(POINTS[-1].time_us + 10**6, 47.2, -8.5, 431.0, (-10.0, 5.0, -90.0))
 VEHICLES = [
     VehicleTrack("wood & <field>", [*POINTS, ATTITUDE], [
-        MapPlace(PlaceKind.HOME, "Home", POINTS[0]),
-        MapPlace(PlaceKind.MARK, "over <the> gate", POINTS[2]),
-        MapPlace(PlaceKind.EVENT, "GPS fix lost", POINTS[3]),
+        MapMarker(MarkerKind.HOME, "Home", POINTS[0]),
+        MapMarker(MarkerKind.MARK, "over <the> gate", POINTS[2]),
+        MapMarker(MarkerKind.EVENT, "GPS fix lost", POINTS[3]),
     ]),
     VehicleTrack("system 7", POINTS[:2]),
 ]  # fmt: skip
@@ -106,7 +106,7 @@ def test_no_points_is_still_a_file() -> None:
 @pytest.mark.parametrize("write", [to_kml, to_gpx])
 def test_texts_that_xml_cannot_hold_leave_it_readable(write: Callable[..., Iterator[str]]) -> None:
     odd = "".join(map(chr, range(0x20))) + "\x7f\ud800\udcff\ufffe\uffff]]>\N{HELICOPTER}"
-    vehicles = [VehicleTrack(odd, POINTS, [MapPlace(PlaceKind.MARK, odd, POINTS[0])])]
+    vehicles = [VehicleTrack(odd, POINTS, [MapMarker(MarkerKind.MARK, odd, POINTS[0])])]
     text = "".join(write(odd, vehicles))
     names = [e.text or "" for e in ET.fromstring(text.encode()).iter() if e.tag.endswith("name")]
     assert len(names) >= 3
@@ -205,8 +205,8 @@ def records() -> list[TlogRecord]:
     ]
 
 
-def places(track: VehicleTrack) -> list[tuple[PlaceKind, str]]:
-    return [(place.kind, place.name) for place in track.places]
+def markers(track: VehicleTrack) -> list[tuple[MarkerKind, str]]:
+    return [(marker.kind, marker.name) for marker in track.markers]
 
 
 def test_tracks_are_those_of_the_vehicles_only() -> None:
@@ -227,14 +227,14 @@ def test_points_have_the_attitude_of_their_time() -> None:
 
 def test_home_marks_and_events() -> None:
     one, _ = tracks_of_frames(records(), None)
-    assert places(one) == [
-        (PlaceKind.HOME, "Home"),
-        (PlaceKind.EVENT, "Attitude valid"),
-        (PlaceKind.MARK, "over the gate"),
-        (PlaceKind.MARK, "Marked 47.500000, 8.600000"),
-        (PlaceKind.EVENT, "A" * 50 + "B"),
+    assert markers(one) == [
+        (MarkerKind.HOME, "Home"),
+        (MarkerKind.EVENT, "Attitude valid"),
+        (MarkerKind.MARK, "over the gate"),
+        (MarkerKind.MARK, "Marked 47.500000, 8.600000"),
+        (MarkerKind.EVENT, "A" * 50 + "B"),
     ]
-    by_name = {place.name: place.at for place in one.places}
+    by_name = {marker.name: marker.at for marker in one.markers}
     assert by_name["Marked 47.500000, 8.600000"].lat_deg == 47.5
     assert by_name["over the gate"].lat_deg == pytest.approx(47.0000001)
     assert by_name["Home"].alt_amsl_m == pytest.approx(400.0)
@@ -251,7 +251,7 @@ def test_tracks_of_a_table_have_home_and_marks(rng: np.random.Generator) -> None
     ]
     mark = TableMark(rows[-1].time_us, "over the gate")
     (track,) = tracks_of_table(RecordedTable(header, iter([block_of([*rows, mark])])), settings)
-    assert places(track) == [(PlaceKind.HOME, "Home"), (PlaceKind.MARK, "over the gate")]
+    assert markers(track) == [(MarkerKind.HOME, "Home"), (MarkerKind.MARK, "over the gate")]
     assert len(track.points) > 10
     known = [row.state for row in rows if row.state and NavFlags.ATTITUDE_VALID in row.state.flags]
     assert any(point.attitude_deg is not None for point in track.points) == bool(known)
