@@ -9,15 +9,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.aircraft import AircraftSettings, Outputs
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
-from gateway.records import (
-    BaroRaw,
-    FusedSample,
-    GpsFix,
-    GpsFixType,
-    ImuFlags,
-    Incoming,
-    NodeId,
-)
+from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, Incoming, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.plan import Location
 from gateway.vehicle.requests import EPOCH_2015_US, key_from_passphrase

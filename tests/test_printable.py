@@ -10,13 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.support.terminal import console_of
-from gateway.printable import (
-    LONGEST,
-    PrintableFormatter,
-    printable,
-    printable_json,
-    receiver_state,
-)
+from gateway.printable import LONGEST, PrintableFormatter, printable, printable_json, receiver_state
 
 RIGHT_TO_LEFT = "\u202e"
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}

@@ -12,14 +12,7 @@ from hypothesis import strategies as st
 
 from gateway.aircraft import Aircraft, AircraftSettings, Outputs
 from gateway.config import GatewaySettings
-from gateway.records import (
-    BaroRaw,
-    GpsFix,
-    ImuFlags,
-    ImuRaw,
-    NodeId,
-    RawRecord,
-)
+from gateway.records import BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeId, RawRecord
 from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of

@@ -23,15 +23,7 @@ from gateway.estimation.kernel import SampleLog
 from gateway.estimation.paper import PaperEstimator, PaperSettings
 from gateway.estimation.reference import EarthField, ReferenceSettings
 from gateway.geometry.geodesy import radii_m
-from gateway.records import (
-    BaroRaw,
-    GpsFix,
-    GpsFixType,
-    ImuFlags,
-    ImuRaw,
-    ImuSample,
-    NodeId,
-)
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, ImuSample, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings

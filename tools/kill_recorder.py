@@ -34,15 +34,7 @@ from gateway.live.session import RecordingSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.recordings.tlog import Batch, TlogScanner
-from gateway.records import (
-    FusedSample,
-    ImuFlags,
-    ImuRaw,
-    ImuSample,
-    NavFlags,
-    NavState,
-    NodeId,
-)
+from gateway.records import FusedSample, ImuFlags, ImuRaw, ImuSample, NavFlags, NavState, NodeId
 
 RATE_HZ = 200
 """Fused samples a second; each goes with two frames."""

@@ -25,12 +25,7 @@ from rich.progress import track
 from rich.table import Table
 from scipy.spatial.transform import Rotation
 
-from gateway.estimation.columns import (
-    NAV_ATTITUDE_STD,
-    NAV_LAT,
-    NAV_LON,
-    NAV_POS_STD,
-)
+from gateway.estimation.columns import NAV_ATTITUDE_STD, NAV_LAT, NAV_LON, NAV_POS_STD
 from gateway.estimation.kernel import KernelEstimator
 from gateway.estimation.select import EstimationSettings, make_estimator
 from gateway.estimation.smoother import smooth

@@ -19,13 +19,7 @@ from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
 from gateway.hub.settings import HubSettings
-from gateway.hub.stats import (
-    ClientAlerts,
-    ClientStats,
-    HubCounters,
-    ListenerStats,
-    LogRateLimiter,
-)
+from gateway.hub.stats import ClientAlerts, ClientStats, HubCounters, ListenerStats, LogRateLimiter
 from gateway.hub.transports.base import (
     READ_BYTES,
     UNTRUSTED_READ_BURST,

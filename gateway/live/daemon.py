@@ -36,13 +36,7 @@ from gateway.printable import reason_of
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
-from gateway.records import (
-    RECORDED_ONLY,
-    ClientInterval,
-    FusedSample,
-    Incoming,
-    Outgoing,
-)
+from gateway.records import RECORDED_ONLY, ClientInterval, FusedSample, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.status import Snapshot, status_of

@@ -26,13 +26,7 @@ from gateway.live.session import part_stem
 from gateway.output import sync_folder
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.index import check_free, free_name, list_recordings, move_recording
-from gateway.recordings.table import (
-    HEADER_PREFIX,
-    TableHeader,
-    TableMark,
-    encode_head,
-    encode_line,
-)
+from gateway.recordings.table import HEADER_PREFIX, TableHeader, TableMark, encode_head, encode_line
 from gateway.recordings.tlog import Stamper, TlogScanner, encode_record
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NodeStatus
 

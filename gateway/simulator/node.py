@@ -14,13 +14,7 @@ import numpy as np
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import GPS_NODE, IMU_NODE, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
-from gateway.simulator.sensors import (
-    ACCEL_RANGE,
-    GYRO_RANGE,
-    MAG_GAIN,
-    DeviceClock,
-    IntArray,
-)
+from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, DeviceClock, IntArray
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FloatArray
 from gateway.wire.payloads import (

@@ -27,13 +27,7 @@ from numpy.typing import NDArray
 from gateway.geometry.geomagnetism import magnetic_field
 from gateway.records import ImuFlags, Vec3
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import (
-    CRUISE_MPS,
-    FloatArray,
-    SensorMotion,
-    Truth,
-    rotate_inverse,
-)
+from gateway.simulator.trajectory import CRUISE_MPS, FloatArray, SensorMotion, Truth, rotate_inverse
 from gateway.units import STANDARD_GRAVITY_MPS2
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 

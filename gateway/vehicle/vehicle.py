@@ -57,10 +57,7 @@ from gateway.vehicle.services.commands import (
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
 from gateway.vehicle.services.parameter_service import PACKED_PATH, ParameterService
-from gateway.vehicle.services.parameters import (
-    Metadata,
-    ParameterTable,
-)
+from gateway.vehicle.services.parameters import Metadata, ParameterTable
 from gateway.vehicle.services.plan_service import PlanService
 from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health

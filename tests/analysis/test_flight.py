@@ -27,14 +27,7 @@ from gateway.geometry.geodesy import displacement_m
 from gateway.recordings.columns import TableRow
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.table import block_of
-from gateway.records import (
-    BaroRaw,
-    GpsFix,
-    ImuCalibrated,
-    ImuFlags,
-    ImuRaw,
-    NodeId,
-)
+from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -19,16 +19,7 @@ from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.kit.ground_station import decode, kinds
-from tests.kit.records import (
-    BARO,
-    FIX,
-    NO_FIX,
-    SAMPLE,
-    STATE,
-    link,
-    report,
-    status,
-)
+from tests.kit.records import BARO, FIX, NO_FIX, SAMPLE, STATE, link, report, status
 
 FLOATS = [math.nan, math.inf, -math.inf, 0.0, -0.0, 1e-300, 1e300, -1e300, 3.5e38, -7.0, 90.0]
 INTEGERS = [0, 1, 255, 256, 65_535, 65_536, 2**31, 2**32, -1, -(2**31) - 1, 2**40]

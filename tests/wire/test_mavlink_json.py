@@ -8,13 +8,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.wire.mavlink_json import (
-    CLASSES,
-    BadMessageError,
-    from_json,
-    template,
-    to_json,
-)
+from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template, to_json
 
 LIMITS = {"int8_t": 7, "int16_t": 15, "int32_t": 31, "int64_t": 53}
 UNSIGNED = {"uint8_t": 8, "uint16_t": 16, "uint32_t": 32, "uint64_t": 53}

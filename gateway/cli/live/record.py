@@ -16,13 +16,7 @@ from gateway.cli.support.options import (
     read_options,
     read_settings,
 )
-from gateway.cli.support.terminal import (
-    UNKNOWN,
-    JsonOption,
-    console_of,
-    print_json,
-    table_of,
-)
+from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_json, table_of
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,

@@ -6,16 +6,7 @@ from msgspec.structs import replace
 from gateway.records import ImuFlags, NavFlags, NodeId
 from gateway.vehicle.telemetry import health as bits
 from gateway.vehicle.telemetry.health import AHRS, GEOFENCE, GPS, LOGGING, MAG, PREARM, Health
-from tests.kit.records import (
-    GPS_NODE,
-    IMU_NODE,
-    NO_FIX,
-    SAMPLE,
-    STATE,
-    link,
-    report,
-    status,
-)
+from tests.kit.records import GPS_NODE, IMU_NODE, NO_FIX, SAMPLE, STATE, link, report, status
 
 INERTIAL = bits.GYRO | bits.ACCEL
 ALL = INERTIAL | MAG | bits.PRESSURE | GPS | AHRS
