@@ -28,12 +28,12 @@ def test_a_waiting_client_gets_heartbeat_and_home_of_each_vehicle() -> None:
     for frame in frames:
         vehicles.register(frame, 0)
     vehicles.await_greeting(7)
-    assert vehicles.has_waiting
+    assert vehicles.waiting
     assert vehicles.greet((1, 1)) == ([7], [frames[1], frames[0]])
     assert vehicles.greet((1, 1))[0] == []
-    assert vehicles.has_waiting
+    assert vehicles.waiting
     assert vehicles.greet((2, 1)) == ([7], [frames[2]])
-    assert not vehicles.has_waiting
+    assert not vehicles.waiting
 
 
 def test_a_removed_client_is_not_greeted() -> None:
@@ -45,7 +45,7 @@ def test_a_removed_client_is_not_greeted() -> None:
     assert vehicles.greet((1, 1))[0] == [8]
     vehicles.await_greeting(7)
     vehicles.remove(7)
-    assert not vehicles.has_waiting
+    assert not vehicles.waiting
 
 
 def test_a_system_that_returns_greets_without_its_old_home() -> None:
@@ -61,4 +61,4 @@ def test_a_system_that_returns_greets_without_its_old_home() -> None:
 def test_without_a_vehicle_no_client_waits() -> None:
     vehicles = OwnVehicles()
     vehicles.await_greeting(7)
-    assert not vehicles.has_waiting
+    assert not vehicles.waiting
