@@ -158,6 +158,8 @@ def test_orientation_of_the_board_is_chosen_and_stored(desk: Desk) -> None:
     picture = view.locator(".mounting-picture")
     desk.page.wait_for_function("document.querySelector('.mounting-picture')?.naturalWidth > 0")
     expect(picture).to_be_visible()
+    # The step is built again once the parameters are loaded.
+    expect(view.get_by_role("button", name="Use it")).to_be_enabled()
     choice = view.get_by_label("Orientation of the board")
     expect(choice).to_have_value("face up, arrow to the nose")
     for way in ("tail", "nose"):

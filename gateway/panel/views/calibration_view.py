@@ -80,7 +80,6 @@ class CalibrationView:
         self._step = CalibrationStep.GYRO
         self._drawn: object = None
         self._drawn_steps: object = None
-        self._mounted = ""
         self._choice: ui.select
         self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
         with ui.element("div").classes("calibration"):
@@ -118,11 +117,6 @@ class CalibrationView:
         if guide != self._drawn:
             self._drawn = guide
             self._build_guide(run, ready=ready)
-        if self._step is CalibrationStep.MOUNTING and self._mounted != (now := self._orientation()):
-            # A choice that is not used yet stays.
-            if self._choice.value == self._mounted:
-                self._choice.set_value(now)
-            self._mounted = now
         if run is not None:
             self._move(run)
 
@@ -181,8 +175,8 @@ class CalibrationView:
             picture = ui.element("img").classes("mounting-picture")
         picture.props["src"] = "/web/mounting.svg"
         picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
-        self._mounted = self._orientation()
-        self._choice = ui.select([*ORIENTATIONS, MEASURED], value=self._mounted)
+        # From here on the choice is the operator's: a refresh must not change it before it is used.
+        self._choice = ui.select([*ORIENTATIONS, MEASURED], value=self._orientation())
         self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
         with ui.element("div").classes("buttons"):
             may = self._may_calibrate and ready
