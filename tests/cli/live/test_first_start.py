@@ -37,7 +37,6 @@ def fast_port(frames: Iterator[TimedFrame]) -> PtyPort:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(calibrate, "GatewayClock", FastClock)
     monkeypatch.setattr(first_start, "PtyPort", fast_port)
-    monkeypatch.setattr(first_start, "LOOK_S", 2.5 / SPEED)
     monkeypatch.setattr(first_start, "GPS_WAIT_S", 0.5)
 
 
