@@ -342,6 +342,8 @@ START_V2: Final = 0xFD
 PAYLOAD_V1: Final = 6
 PAYLOAD_V2: Final = 10
 """Where the payload of a MAVLink frame begins."""
+EVERYBODY: Final = (0, 0)
+"""Target of a message without one."""
 HEARTBEAT_TYPE_OFFSET: Final = 4
 _TYPE_GCS: Final = bytes((6,))
 """MAV_TYPE_GCS."""

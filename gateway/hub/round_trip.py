@@ -12,9 +12,10 @@ from typing import Final
 from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.routing_table import Origin
+from gateway.records import EVERYBODY
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import EVERYBODY, MavFrame, frame_of
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
 PROBE_COMPONENT: Final = dialect.MAV_COMP_ID_USER75
 """Of the ids for private use the last one: mavros and Cockpit are 240, the UDP bridge."""

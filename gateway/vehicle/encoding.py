@@ -19,7 +19,7 @@ from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.records import START_V2, MavFrame, Outgoing
+from gateway.records import EVERYBODY, START_V2, MavFrame, Outgoing
 
 INT16_MAX: Final = 2**15 - 1
 INT32_MAX: Final = 2**31 - 1
@@ -190,7 +190,6 @@ AUTOPILOT_COMPONENT: Final = 1
 _pack_head: Final = struct.Struct("<BBBBB5s").pack
 """Start, length, two flag bytes, sequence, and the key: system, component and message."""
 _KEY: Final = struct.Struct("<BBHB")
-NO_TARGET: Final = (0, 0)
 _INTEGER_LIMITS: Final = {
     "int8_t": (-(2**7), 2**7 - 1),
     "int16_t": (-(2**15), 2**15 - 1),
@@ -244,7 +243,7 @@ class Encoder:
         self._sequence = sequence + 1 & 0xFF
         if not has_target:
             key = self._keys[message_id]
-            header = MavFrame(frame, key, message_id, self._origin, NO_TARGET, sequence, False)
+            header = MavFrame(frame, key, message_id, self._origin, EVERYBODY, sequence, False)
         return Outgoing(frame, message_id, client_id, header)
 
     def _frame(

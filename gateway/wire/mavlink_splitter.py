@@ -23,6 +23,7 @@ from typing import Final
 
 from fastcrc.crc16 import mcrf4xx
 
+from gateway.records import EVERYBODY
 from gateway.records import PAYLOAD_V1 as PAYLOAD_V1
 from gateway.records import PAYLOAD_V2 as PAYLOAD_V2
 from gateway.records import START_V2 as START_V2
@@ -41,9 +42,6 @@ KEY_V2: Final = slice(5, 10)
 SIGNATURE_SIZE: Final = 13
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
-
-EVERYBODY: Final = (0, 0)
-"""Target of a message without one."""
 
 _HEAD_V2: Final = struct.Struct("<BBBBBBBHB").unpack_from
 """Start, length, two bytes of flags, sequence, system, component, message id in three bytes."""
