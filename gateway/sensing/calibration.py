@@ -1,5 +1,6 @@
 """A node's calibration: counts in sensor axes to SI in body FRD."""
 
+import math
 import operator
 from collections.abc import Callable
 from functools import cache, reduce
@@ -161,6 +162,12 @@ def gyro_scale(range_dps: int) -> float:
     return per_count_dps * RAD_PER_DEG
 
 
+@cache
+def mag_scale(lsb_per_gauss: int) -> float:
+    """Return uT per count of the magnetometer; NaN if its gain is unknown."""
+    return UT_PER_GAUSS / lsb_per_gauss if lsb_per_gauss > 0 else math.nan
+
+
 def accel_from_counts(raw: Int3, range_g: int) -> Vec3:
     """Scale accelerometer counts to m/s2 in sensor axes."""
     scale = accel_scale(range_g)
@@ -177,7 +184,7 @@ def mag_from_counts(raw: Int3, lsb_per_gauss: int) -> Vec3 | None:
     """Scale magnetometer counts to uT in sensor axes; None on an overflow, or if all are zero."""
     if lsb_per_gauss <= 0 or MAG_OVERFLOW in raw or not any(raw):
         return None
-    scale = UT_PER_GAUSS / lsb_per_gauss
+    scale = mag_scale(lsb_per_gauss)
     return (raw[0] * scale, raw[1] * scale, raw[2] * scale)
 
 
@@ -190,24 +197,23 @@ def temperature_from_counts(raw: Number) -> Number:
 
 
 def vectors_from_counts(
-    scaled: Callable[[Int3, int], Vec3 | None], counts: FloatArray, ranges: FloatArray
+    scale_of: Callable[[int], float], counts: FloatArray, ranges: FloatArray
 ) -> FloatArray:
     """Scale an array of counts, shape (n, 3), each vector by its own range."""
-    found = np.full(counts.shape, np.nan)
+    scaled = np.empty(counts.shape)
     for one in np.unique(ranges).tolist():
-        unit = scaled((1, 1, 1), int(one))
-        if unit is not None:
-            found[ranges == one] = counts[ranges == one] * unit[0]
-    if scaled is mag_from_counts:
-        found[(counts == MAG_OVERFLOW).any(axis=1) | ~counts.any(axis=1)] = np.nan
-    return found
+        scaled[ranges == one] = counts[ranges == one] * scale_of(int(one))
+    return scaled
 
 
 def new_field_ut(counts: FloatArray, flags: IntArray) -> FloatArray:
-    """Scale the magnetometer's counts of many payloads to uT in sensor axes."""
-    state = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT)
-    field = vectors_from_counts(mag_from_counts, counts[:, 6:9], counts[:, 12])
-    return np.where((state == int(ImuFlags.MAG_NEW))[:, np.newaxis], field, np.nan)
+    """Scale the magnetometer's counts of many payloads to uT in sensor axes; NaN unless new."""
+    state, raw = flags & int(ImuFlags.MAG_NEW | ImuFlags.MAG_ABSENT), counts[:, 6:9]
+    is_new = state == int(ImuFlags.MAG_NEW)
+    is_valid = raw.any(axis=1) & (raw != MAG_OVERFLOW).all(axis=1)
+    field = vectors_from_counts(mag_scale, raw, counts[:, 12])
+    field[~(is_new & is_valid)] = np.nan
+    return field
 
 
 class Correction:

@@ -20,9 +20,7 @@ from gateway.sensing.calibration import (
     IDENTITY3,
     Correction,
     NodeCalibration,
-    accel_from_counts,
     accel_scale,
-    gyro_from_counts,
     gyro_scale,
     mag_from_counts,
     new_field_ut,
@@ -144,8 +142,8 @@ class SensorChain:
         flags : ndarray of int, shape (n,)
             Those given, and what the calibration adds.
         """
-        accel = vectors_from_counts(accel_from_counts, counts[:, 0:3], counts[:, 10])
-        gyro = vectors_from_counts(gyro_from_counts, counts[:, 3:6], counts[:, 11])
+        accel = vectors_from_counts(accel_scale, counts[:, 0:3], counts[:, 10])
+        gyro = vectors_from_counts(gyro_scale, counts[:, 3:6], counts[:, 11])
         blank = (counts[:, 0:3] == BLANK).all(axis=1)
         accel[blank] = gyro[blank] = np.nan
         return (
