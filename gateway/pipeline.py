@@ -248,7 +248,7 @@ class Pipeline:
 
     @property
     def in_flight(self) -> bool:
-        """Whether an aircraft flies."""
+        """Whether an aircraft is in flight."""
         return any(aircraft.vehicle.in_flight for aircraft in self.aircraft.values())
 
     @property

@@ -26,7 +26,7 @@ Origin = tuple[int, int]
 """System and component id."""
 
 MAX_ORIGINS: Final = 256
-"""Remembered per client: every system there can be, or fewer with several components each."""
+"""Per client: every system there can be, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
 """A path on which a system was received this recently is preferred to silent ones."""
 MEMORY_US: Final = 30 * US_PER_S
@@ -246,7 +246,7 @@ class FrameMemory(Generic[Note]):
         return self._recent.get(frame) or self._older.get(frame)
 
     def put(self, frame: Hashable, note: Note) -> None:
-        """Remember a frame."""
+        """Register a frame with its note."""
         self._recent[frame] = note
 
 
@@ -377,7 +377,7 @@ OWN_FRESH_US: Final = 5 * US_PER_S
 
 
 class OwnVehicles:
-    """Remember the newest greeting frames of our vehicles and the clients that wait for them.
+    """The newest greeting frames of our vehicles, and the clients that wait for them.
 
     A new client is greeted just before the next frame of a vehicle, with the sequence numbers
     before it, so that its stream begins without a gap.

@@ -63,6 +63,10 @@ IMPORTANCE: Final[dict[int, float]] = {
 }
 """Others have 1: position and health come first, then motion."""
 FLOOR_HZ: Final = 0.5
+LEAST_FLOOR_SHARE: Final = 0.1
+"""Part of this rate that is sent even where answers use all of the bandwidth."""
+LEAST_FLOW: Final = 1e-3
+"""Bytes a second below which a kind of frame counts as ended."""
 SMOOTHING: Final = 0.3
 """Weight of the newest second."""
 FULL_PERCENT: Final = 20
@@ -116,22 +120,21 @@ class Bandwidth:
             rate += SMOOTHING * (frames / elapsed_s - rate)
             flow += SMOOTHING * (size / elapsed_s - flow)
             self._offered[key] = message_id, rate, flow
-        self._offered = {key: each for key, each in self._offered.items() if each[2] > 1e-3}
+        self._offered = {key: each for key, each in self._offered.items() if each[2] > LEAST_FLOW}
         self._answered += SMOOTHING * (answered / elapsed_s - self._answered)
         self._intervals_us = self._thinned()
 
     def _thinned(self) -> dict[Key, int]:
         fixed = sum(flow for i, _, flow in self._offered.values() if i in NEVER_THINNED)
-        room = max(0.0, self.bytes_per_s * self.share - fixed - self._answered)
+        free = max(0.0, self.bytes_per_s * self.share - fixed - self._answered)
         kinds = {key: each for key, each in self._offered.items() if each[0] not in NEVER_THINNED}
         least = {key: min(1.0, FLOOR_HZ / rate) for key, (_, rate, _) in kinds.items() if rate}
         floors = sum(least[key] * kinds[key][2] for key in least)
-        if floors > room:
-            # Half a heartbeat's worth even where the answers take it all.
-            squeeze = max(room / floors, 0.1)
+        if floors > free:
+            squeeze = max(free / floors, LEAST_FLOOR_SHARE)
             parts = {key: part * squeeze for key, part in least.items()}
         else:
-            parts = _parts(kinds, least, room)
+            parts = _parts(kinds, least, free)
         return {
             key: round(US_PER_S / (part * kinds[key][1]))
             for key, part in parts.items()
@@ -140,9 +143,9 @@ class Bandwidth:
 
 
 def _parts(
-    kinds: Mapping[Key, tuple[int, float, float]], least: Mapping[Key, float], room: float
+    kinds: Mapping[Key, tuple[int, float, float]], least: Mapping[Key, float], free: float
 ) -> dict[Key, float]:
-    """Return which share of each kind is sent so that together they fill the room."""
+    """Return the share of each kind to send, so that together they use `free` bytes a second."""
 
     def at(factor: float) -> dict[Key, float]:
         return {
@@ -151,12 +154,12 @@ def _parts(
         }
 
     low, high = 0.0, 1.0
-    if sum(kinds[key][2] for key in least) <= room:
+    if sum(kinds[key][2] for key in least) <= free:
         return at(high)
     for _ in range(STEPS):
         middle = (low + high) / 2
         used = sum(part * kinds[key][2] for key, part in at(middle).items())
-        low, high = (middle, high) if used <= room else (low, middle)
+        low, high = (middle, high) if used <= free else (low, middle)
     return at(low)
 
 
@@ -336,8 +339,8 @@ class SendQueue:
 class Packer:
     """Gather frames into datagrams of at most `max_bytes`; a single longer frame goes alone.
 
-    `send` is called with the frames of a datagram when it is full, and when `flush` is called:
-    `flush_soon` is asked for that with the first frame of each datagram.
+    `send` is called with the frames of a datagram when it is full, and when `flush` is called.
+    `flush_soon` gets `flush` with the first frame of each datagram, to call it later.
     """
 
     def __init__(

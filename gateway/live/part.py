@@ -235,7 +235,7 @@ class PartFiles:
         return DiskState(max(self._sizes.values(), default=0), free_bytes_near(self._folder))
 
     def sync_job(self) -> Callable[[], None]:
-        """Return what waits until all that was written is on the physical disk.
+        """Return a function that waits until all written data is on the physical disk.
 
         It raises OSError if the disk fails. Other threads may write meanwhile, but not close.
         """
@@ -360,10 +360,9 @@ class Restamper:
 
     def _steps(self, path: Path, shift_us: int) -> Iterator[None]:
         temporary = path.with_name(path.name + NEW)
-        disk = os.statvfs(path.parent)
-        if disk.f_bavail * disk.f_frsize < path.stat().st_size + self._free_floor:
+        if free_bytes_near(path.parent) < path.stat().st_size + self._free_floor:
             raise OSError(errno.ENOSPC, "the disk is too full for a copy")
-        shifted = _shifted_tlog if path.suffix == ".tlog" else _shifted_table
+        shifted = _shifted_tlog if path.suffix == TLOG else _shifted_table
         try:
             with path.open("rb") as file, temporary.open("wb") as copy:
                 for data in shifted(file, shift_us):
@@ -382,7 +381,7 @@ class Restamper:
 def clear_copies(folder: Path) -> None:
     """Remove the copies that a power cut has left behind."""
     with contextlib.suppress(OSError):
-        for ending in (".tlog", ".csv"):
+        for ending in (TLOG, ".csv"):
             for path in folder.glob(f"*{ending}{NEW}"):
                 path.unlink()
 

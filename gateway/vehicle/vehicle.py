@@ -185,7 +185,7 @@ class Vehicle:
 
     @property
     def in_flight(self) -> bool:
-        """Whether the aircraft flies."""
+        """Whether the aircraft is in flight."""
         return self.telemetry.motion.landed_state == IN_AIR
 
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:

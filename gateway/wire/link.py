@@ -36,7 +36,7 @@ LATE_WINDOW: Final = 64
 """Payloads further back than any retry queue belong to another run of the node."""
 ALL_SEEN: Final = (1 << LATE_WINDOW) - 1
 SLOWED: Final = 64
-"""Divisor of the elapsed time: by so little may samples follow each other sooner."""
+"""Divisor of the elapsed time: the most by which a sample's interval may be shortened."""
 MOST_AHEAD_US: Final = 50_000
 """A correction of the clock's estimate beyond this is applied at once."""
 RATE_SPAN_US: Final = US_PER_S
@@ -336,17 +336,17 @@ def _gps_fix(header: payloads.Header, fix: payloads.GpsFixPayload, node: _Node) 
         alt_amsl_m=alt_amsl_m,
         vel_n_mps=(north * M_PER_CM, east * M_PER_CM, down * M_PER_CM),
         alt_ellipsoid_m=alt_amsl_m + separation_m,
-        h_acc_m=_unless_held(quality.h_acc_cm, M_PER_CM),
-        v_acc_m=_unless_held(quality.v_acc_cm, M_PER_CM),
-        speed_acc_mps=_unless_held(quality.speed_acc_cmps, M_PER_CM),
-        course_acc_deg=_unless_held(quality.course_acc_cdeg, 1e-2),
-        pdop=_unless_held(quality.pdop_centi, 1e-2),
+        h_acc_m=_unless_saturated(quality.h_acc_cm, M_PER_CM),
+        v_acc_m=_unless_saturated(quality.v_acc_cm, M_PER_CM),
+        speed_acc_mps=_unless_saturated(quality.speed_acc_cmps, M_PER_CM),
+        course_acc_deg=_unless_saturated(quality.course_acc_cdeg, 1e-2),
+        pdop=_unless_saturated(quality.pdop_centi, 1e-2),
         utc_us=utc_us,
     )
 
 
-def _unless_held(value: float, scale: float) -> float:
-    """Scale a 16-bit value; one that is saturated means no more than "bad"."""
+def _unless_saturated(value: float, scale: float) -> float:
+    """Scale a 16-bit value; NaN for a saturated one, which only means "bad"."""
     return NAN if value == UINT16_MAX else value * scale
 
 

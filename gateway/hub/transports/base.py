@@ -253,7 +253,7 @@ class Client:
         self.since_us = self.context.now_us()
 
     def become(self, state: str, error: Exception | None = None) -> None:
-        """Set the state, and remember its reason."""
+        """Set the state and its reason."""
         self.state = state
         self.reason = "" if error is None else reason_of(error)
 
@@ -431,9 +431,9 @@ Peer = TypeVar("Peer", bound=Client)
 SILENT_AFTER_US: Final = 3 * US_PER_S
 """Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
 SHARE: Final = 4
-"""One host is left a quarter of the clients when others want them,"""
+"""Divisor: one host keeps a quarter of a full port's clients when others connect."""
 FEW: Final = 4
-"""and at least these: a ground station, a script and a display."""
+"""Clients that one host keeps in any case, such as a ground station, a script and a display."""
 
 
 def client_to_remove(

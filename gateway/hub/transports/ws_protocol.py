@@ -136,9 +136,10 @@ def caller_context(settings: HubSettings) -> ssl.SSLContext:
 def valid_until_s(certificate: Path, key: Path) -> float:
     """Return when a certificate ends, in s since 1970.
 
-    It is shown to a client that trusts it, whoever signed it: Python reads no other. Raises OSError
-    if the PEM files, which may be the same, cannot be read or are invalid;
-    ssl.SSLCertVerificationError if the certificate is not valid now.
+    Python reads only certificates that were verified: so a client in memory, to which this one is
+    its own authority, connects to a server that presents it. Raises OSError if the PEM files, which
+    may be the same, cannot be read or are invalid; ssl.SSLCertVerificationError if the certificate
+    is not valid now.
     """
     trusting = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     trusting.check_hostname = False

@@ -51,7 +51,7 @@ log = logging.getLogger(__name__)
 
 LOCAL: Final = ("tcp/127.", "tcp/[::1]", "tcp/localhost:", "unixsock-stream/")
 MAX_DUPLICATE_SESSIONS: Final = 16
-"""Other sessions with this site's name that are remembered; more are forged."""
+"""Other sessions with this site's name that are registered; more are forged."""
 
 
 class _Topic(NamedTuple):
