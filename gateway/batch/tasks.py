@@ -223,8 +223,8 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
             raise
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
-            for place, file in zip(item.locations, files, strict=True):
-                text = text.replace(str(file), without_user(place))
+            for location, file in zip(item.locations, files, strict=True):
+                text = text.replace(str(file), without_user(location))
             return msgspec.structs.replace(result, error=as_text(text)), {}
     done = msgspec.structs.replace(
         result,
@@ -394,8 +394,8 @@ def run_season(
             todo.append((item, stamp, key, names[number]))
             numbers.append(number)
     done = len(items) - len(todo)
-    for place, outcome in executor.run(partial(work_on, task), todo):
-        item, stamp, key, _ = todo[place]
+    for index, outcome in executor.run(partial(work_on, task), todo):
+        item, stamp, key, _ = todo[index]
         if isinstance(outcome, WorkFailed):
             result = _failed(task, item, stamp, key, outcome)
         else:
@@ -405,7 +405,7 @@ def run_season(
                 result = _failed(task, item, stamp, key, reason)
             elif folder is not None:
                 folder.keep(result, files)
-        found[numbers[place]] = result
+        found[numbers[index]] = result
         done += 1
         report(item.location, done, len(items))
     return [result for result in found if result is not None]
@@ -437,8 +437,9 @@ def _key(task: FlightTask, stamp: str) -> str:
 
 
 def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightResult:
-    place = as_text(item.location)
-    return FlightResult(place=place, digest=stamp, key=key, task=task.name, version=__version__)
+    return FlightResult(
+        place=as_text(item.location), digest=stamp, key=key, task=task.name, version=__version__
+    )
 
 
 def _failed(

@@ -273,12 +273,12 @@ class Fusion:
         cells = block.cells
         held = np.any([has_group(cells, group) for group in (BARO, GPS, RAW, SI)], axis=0)
         cells = cells[held]
-        location_of = np.concatenate([[0], np.cumsum(held)]).tolist()
+        held_before = np.concatenate([[0], np.cumsum(held)]).tolist()
         fused: list[FloatArray] = []
         comments: list[tuple[int, TableComment]] = []
         begin = 0
         for row, comment in block.comments:
-            end = location_of[row]
+            end = held_before[row]
             if isinstance(comment, TableHeader | FusionState):
                 fused.append(self._fused(cells[begin:end]))
                 begin = end

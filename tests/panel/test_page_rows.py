@@ -149,7 +149,8 @@ def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
     show(page, "map")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     view = page.locator("section[data-view='map']")
-    expect(view.locator("[data-role='place']")).to_have_text(re.compile(r"-7\.7\d{5}, 110\.3\d{5}"))
+    position = view.locator("[data-role='position']")
+    expect(position).to_have_text(re.compile(r"-7\.7\d{5}, 110\.3\d{5}"))
     copy = view.get_by_text("Copy", exact=True)
     copy.evaluate(LISTEN_TO_WORDS)
     copy.click()
@@ -164,7 +165,7 @@ def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
     expect(view.locator(".pin.home")).to_be_visible()
     canvas = view.locator(".map-canvas")
     canvas.click(position={"x": 300, "y": 250})
-    page.get_by_text("Mark this place").click()
+    page.get_by_text("Mark this position").click()
     expect(view.locator("[data-role='way']")).to_have_text(
         re.compile(r"mark \d+(\.\d+)? (m|km), \d{1,3}°")
     )

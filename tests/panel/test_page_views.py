@@ -89,14 +89,14 @@ class Desk:
     @property
     def home(self) -> tuple[float, float]:
         """As the gateway has it."""
-        return self.chosen_places["home"]
+        return self.home_and_mark["home"]
 
     @property
-    def chosen_places(self) -> dict[str, tuple[float, float]]:
-        """Home and mark, if there is one, as the gateway has them."""
+    def home_and_mark(self) -> dict[str, tuple[float, float]]:
+        """Those that are set, as the gateway has them."""
         aircraft = self.status["aircraft"][0]
-        known = {name: place for name in ("home", "mark") if (place := aircraft[name])}
-        return {name: (place["lat_deg"], place["lon_deg"]) for name, place in known.items()}
+        known = {name: spot for name in ("home", "mark") if (spot := aircraft[name])}
+        return {name: (spot["lat_deg"], spot["lon_deg"]) for name, spot in known.items()}
 
     def let_pass(self, duration_s: float) -> None:
         """Wait until the aircraft has flown on for so long, and the view has been refreshed."""
@@ -422,7 +422,7 @@ def write_certificate(certificate: Path, key: Path) -> None:
 
 
 def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page) -> None:
-    page, before = viewers_page, desk.chosen_places
+    page, before = viewers_page, desk.home_and_mark
     assert page.url.startswith("https://")
     page.get_by_label("Password").fill("wrong")
     page.get_by_text("Open the panel").click()
@@ -438,7 +438,7 @@ def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page
     show(page, "map")
     expect(page.get_by_label("Upload a PMTiles file")).to_have_count(0)
     page.locator("section[data-view='map'] .map-canvas").click(position={"x": 300, "y": 300})
-    expect(page.get_by_text("Mark this place")).to_have_count(0)
+    expect(page.get_by_text("Mark this position")).to_have_count(0)
     show(page, "link")
     expect(page.locator("section[data-view='link'] [data-role='receiver']")).to_be_visible()
     expect(page.get_by_label("Serial port")).to_have_count(0)
@@ -449,7 +449,7 @@ def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page
             path,
         )
         assert status == 403
-    assert desk.chosen_places == before
+    assert desk.home_and_mark == before
 
 
 def test_page_finds_a_gateway_that_was_killed_and_started_again(

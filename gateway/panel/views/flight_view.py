@@ -32,7 +32,7 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
         context.every(STYLES_S, self.refresh)
         self._props["may_mark"] = full and context.may_change
         if full and context.may_change:
-            self.on("place", partial(_ask, context))
+            self.on("position", partial(_ask, context))
             with self:
                 upload = UploadButton(
                     context, MAPS, ".pmtiles", label="Add map…", title="Upload a PMTiles file"
@@ -69,7 +69,7 @@ def _ask(context: ViewContext, event: GenericEventArguments) -> None:
 
             return closing(dialog, run)
 
-        mark = ui.button("Mark this place", on_click=then(partial(_mark, context, spot)))
+        mark = ui.button("Mark this position", on_click=then(partial(_mark, context, spot)))
         mark.props("no-caps")
         home = ui.button("Set home here", on_click=then(partial(_set_home, context, spot)))
         home.props("no-caps outline")

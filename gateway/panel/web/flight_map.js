@@ -105,10 +105,10 @@ const TownNames = CanvasLayer.extend({
     pen.fillStyle = mavgate.colour("soft");
     const view = map.getBounds().pad(0.05);
     const taken = [];
-    for (const [name, place] of this.towns) {
+    for (const [name, position] of this.towns) {
       if (taken.length >= MAX_TOWNS) break;
-      if (!view.contains(place)) continue;
-      const { x, y } = map.latLngToContainerPoint(place);
+      if (!view.contains(position)) continue;
+      const { x, y } = map.latLngToContainerPoint(position);
       const box = [x - 4, y - 9, x + 12 + pen.measureText(name).width, y + 9];
       if (taken.some(([left, top, right, low]) => left < box[2] && box[0] < right && top < box[3] && box[1] < low)) continue;
       taken.push(box);
@@ -125,14 +125,14 @@ const TownNames = CanvasLayer.extend({
 let base_map = null;
 function load_base_map(url) {
   base_map ??= fetch(url).then((answer) => answer.json()).then(({ unit_deg, coasts, borders, towns }) => {
-    const place = (x, y) => [y * unit_deg, x * unit_deg];
+    const position = (x, y) => [y * unit_deg, x * unit_deg];
     const line = (steps) => {
       let [x, y] = steps;
-      const points = [place(x, y)];
-      for (let n = 2; n < steps.length; n += 2) points.push(place((x += steps[n]), (y += steps[n + 1])));
+      const points = [position(x, y)];
+      for (let n = 2; n < steps.length; n += 2) points.push(position((x += steps[n]), (y += steps[n + 1])));
       return points;
     };
-    return { coasts: coasts.map(line), borders: borders.map(line), towns: towns.map(([name, x, y]) => [name, place(x, y)]) };
+    return { coasts: coasts.map(line), borders: borders.map(line), towns: towns.map(([name, x, y]) => [name, position(x, y)]) };
   });
   return base_map;
 }
@@ -152,14 +152,14 @@ export default {
         <slot></slot>
       </div>
       <div class="map-offline" v-if="offline" role="status">no map tiles (offline)</div>
-      <div class="map-place" v-if="place">
-        <span class="figure" data-role="place">{{ place }}</span>
+      <div class="map-position" v-if="position">
+        <span class="figure" data-role="position">{{ position }}</span>
         <button @click="copy" title="Copy latitude and longitude">{{ copied ? "Copied" : "Copy" }}</button>
       </div>
       <form class="map-entry" v-if="full" @submit.prevent="locate">
         <input v-model="entry" placeholder="latitude, longitude" aria-label="Coordinates to show" :aria-invalid="entry !== '' && !entered">
         <button type="submit" :disabled="!entered" title="Show these coordinates">Show</button>
-        <button type="button" v-if="may_mark" :disabled="!entered" @click="$emit('place', entered)" title="Mark these coordinates or set home there">Mark …</button>
+        <button type="button" v-if="may_mark" :disabled="!entered" @click="$emit('position', entered)" title="Mark these coordinates or set home there">Mark …</button>
       </form>
       <div class="map-legend" v-if="full">
         <span class="key track">fused</span><span class="key fix">GPS</span>
@@ -177,7 +177,7 @@ export default {
       return numbers.length === 2 && Math.abs(lat_deg) <= 90 && Math.abs(lon_deg) <= 180 ? { lat_deg, lon_deg } : null;
     },
   },
-  data: () => ({ follow: true, style: 0, place: "", copied: false, way: "", circle: "", played: [], offline: false, entry: "" }),
+  data: () => ({ follow: true, style: 0, position: "", copied: false, way: "", circle: "", played: [], offline: false, entry: "" }),
 
   mounted() {
     const map = (this.map = L.map(this.$refs.map, {
@@ -195,7 +195,7 @@ export default {
     this.bearing = L.polyline([], { weight: 2, dashArray: "6 6" });
     this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false, keyboard: false });
     this.accuracy = L.circle([0, 0], { radius: 1, weight: 1, fillOpacity: 0.12, interactive: false });
-    map.on("click", (event) => this.full && this.$emit("place", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
+    map.on("click", (event) => this.full && this.$emit("position", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
     map.on("dragstart", () => (this.follow = false));
     this.$watch("style", () => this.set_style());
     // A map that was added is shown where there was none.
@@ -309,8 +309,8 @@ export default {
       for (; one.points < track.points.length; one.points++) one.track.addLatLng(flat(track.points[one.points]));
       for (; one.dots < track.fixes.length; one.dots++) this.dot(one, flat(track.fixes[one.dots]));
     },
-    dot(one, place) {
-      L.circleMarker(place, { pane: "fixes", radius: 1.8, weight: 1, fill: false, color: mavgate.colour("fix"), interactive: false, renderer: this.dots }).addTo(one.fixes);
+    dot(one, position) {
+      L.circleMarker(position, { pane: "fixes", radius: 1.8, weight: 1, fill: false, color: mavgate.colour("fix"), interactive: false, renderer: this.dots }).addTo(one.fixes);
       const dots = one.fixes.getLayers();
       if (dots.length > MAX_DOTS + 500) for (const old of dots.slice(0, 500)) one.fixes.removeLayer(old);
     },
@@ -358,7 +358,7 @@ export default {
         const bearing = reported ? state.mark_bearing_deg : mavgate.bearing_deg(here, at(state.mark));
         this.way = `mark ${mavgate.show("distance", distance, 2).join(" ")}, ${Math.round(bearing) % 360}°`;
       }
-      this.place = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;
+      this.position = `${state.lat_deg.toFixed(6)}, ${state.lon_deg.toFixed(6)}`;
       if (!this.placed) {
         this.placed = true;
         this.map.setView(here, 17, { animate: false });
@@ -393,10 +393,10 @@ export default {
     },
     async copy() {
       try {
-        await navigator.clipboard.writeText(this.place);
+        await navigator.clipboard.writeText(this.position);
       } catch {
         // Without TLS a browser gives no clipboard but by way of a selection.
-        const box = Object.assign(document.createElement("textarea"), { value: this.place });
+        const box = Object.assign(document.createElement("textarea"), { value: this.position });
         document.body.append(box);
         box.select();
         document.execCommand("copy");

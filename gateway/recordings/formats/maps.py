@@ -143,7 +143,8 @@ def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
     for vehicle in vehicles:
         yield from (
             f"<wpt {_gpx_position(marker.at)}{_gpx_time(marker.at)}"
-            f"<name>{_escaped(marker.name)}</name><desc>{_escaped(vehicle.name)}</desc><type>{marker.kind}</type></wpt>\n"
+            f"<name>{_escaped(marker.name)}</name><desc>{_escaped(vehicle.name)}</desc>"
+            f"<type>{marker.kind}</type></wpt>\n"
             for marker in vehicle.markers
         )
     for vehicle in vehicles:

@@ -177,7 +177,7 @@ class _Vehicle:
     has_attitude: bool = False
     has_quaternion: bool = False
     """It sends its attitude as a quaternion too: the angles are then left out."""
-    place: Any = None
+    position: Any = None
     """The newest GLOBAL_POSITION_INT."""
     accuracy_m: tuple[float, float] | None = None
     """Standard deviations along each level axis, and of the height, by the estimator."""
@@ -228,26 +228,27 @@ class FoxgloveView:
         w, x, y, z = multiply(multiply(_ENU_OF_NED, q_nb), _FRD_OF_FLU)
         turned = {"x": x, "y": y, "z": z, "w": w}
         at = {"timestamp": _time(time_us)}
-        place = self._place(vehicle)
+        on_map_m = self._on_map_m(vehicle)
         shown = [
             Shown(
                 TF_TOPIC,
                 "foxglove.FrameTransform",
                 at
                 | {"parent_frame_id": MAP, "child_frame_id": vehicle.frame}
-                | {"translation": place, "rotation": turned},
+                | {"translation": on_map_m, "rotation": turned},
             )
         ]
-        if vehicle.place is not None:
-            pose = {"position": place, "orientation": turned}
+        if vehicle.position is not None:
+            pose = {"position": on_map_m, "orientation": turned}
             content = at | {"frame_id": MAP, "pose": pose}
             shown.append(Shown(f"/{vehicle.frame}/pose", "foxglove.PoseInFrame", content))
         return [*shown, self._state(vehicle)]
 
-    def _place(self, vehicle: _Vehicle) -> dict[str, float]:
-        if vehicle.place is None or self.origin is None:
+    def _on_map_m(self, vehicle: _Vehicle) -> dict[str, float]:
+        """Return the position in the frame `map`; its origin before the first position."""
+        if vehicle.position is None or self.origin is None:
             return {"x": 0.0, "y": 0.0, "z": 0.0}
-        lat_deg, lon_deg, alt_m = _degrees(vehicle.place)
+        lat_deg, lon_deg, alt_m = _degrees(vehicle.position)
         north, east = displacement_m(*self.origin[:2], lat_deg, lon_deg, self.origin[2])
         return {"x": east, "y": north, "z": alt_m - self.origin[2]}
 
@@ -256,20 +257,20 @@ class FoxgloveView:
         content: dict[str, float | None] = dict.fromkeys(SCHEMAS["mavgate.State"]["properties"])
         if vehicle.has_attitude:
             content |= {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": yaw % 360.0}
-        place = vehicle.place
-        if place is not None:
+        position = vehicle.position
+        if position is not None:
             content |= {
-                "alt_amsl_m": place.alt * M_PER_MM,
-                "height_m": place.relative_alt * M_PER_MM,
-                "speed_mps": math.hypot(place.vx, place.vy) * M_PER_CM,
-                "climb_mps": -place.vz * M_PER_CM,
+                "alt_amsl_m": position.alt * M_PER_MM,
+                "height_m": position.relative_alt * M_PER_MM,
+                "speed_mps": math.hypot(position.vx, position.vy) * M_PER_CM,
+                "climb_mps": -position.vz * M_PER_CM,
             }
         return Shown(f"/{vehicle.frame}/state", "mavgate.State", content)
 
     def _position(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
         if not m.lat and not m.lon:
             return []
-        vehicle.place = m
+        vehicle.position = m
         if self.origin is None:
             self.origin = _degrees(m)
         known = COVARIANCE_DIAGONAL if vehicle.accuracy_m else COVARIANCE_APPROXIMATED
@@ -319,11 +320,11 @@ def _degrees(m: Any) -> tuple[float, float, float]:
 def _fix(
     frame: str,
     time_us: int,
-    place: tuple[float, float, float],
+    position: tuple[float, float, float],
     accuracy_m: tuple[float, float] | None,
     covariance_type: int,
 ) -> dict[str, Any]:
-    lat_deg, lon_deg, alt_m = place
+    lat_deg, lon_deg, alt_m = position
     covariance = [0.0] * 9
     if accuracy_m is not None:
         level_m, height_m = accuracy_m
