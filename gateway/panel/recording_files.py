@@ -33,6 +33,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 
 from gateway.batch.catalogue import CATALOGUE_NAME, CatalogueError, Row, find_flights, geojson_of
+from gateway.geometry.angle import wrap_180
 from gateway.live.terminal import own_command
 from gateway.panel.access import RECORDINGS, ROLE, Role
 from gateway.recordings.columns import TableRow
@@ -272,27 +273,28 @@ def _thumbnails(features: dict[str, Any]) -> dict[str, str]:
     """Draw the first track of each recording, north up."""
     found: dict[str, str] = {}
     for feature in features["features"]:
-        corners = _line_of(feature["geometry"])
-        if len(corners) > 1:
-            found.setdefault(feature["properties"]["name"], _corners(corners))
+        positions = _line_of(feature["geometry"])
+        if len(positions) > 1:
+            found.setdefault(feature["properties"]["name"], _corners(positions))
     return found
 
 
 def _line_of(geometry: dict[str, Any] | None) -> list[list[float]]:
-    """Return the corners of a line; a line that crosses the 180th meridian has several parts."""
+    """Return the positions of a line; a line that crosses the 180th meridian has several parts."""
     if geometry is None:
         return []
     if geometry["type"] == "MultiLineString":
-        return [corner for part in geometry["coordinates"] for corner in part]
+        return [position for part in geometry["coordinates"] for position in part]
     return list(geometry["coordinates"]) if geometry["type"] == "LineString" else []
 
 
-def _corners(corners: list[list[float]]) -> str:
+def _corners(positions: list[list[float]]) -> str:
+    """Return the corners of a drawing of a line; its positions are longitude and latitude, deg."""
     width, height = THUMBNAIL
-    corners = corners[:: max(1, len(corners) // MAX_CORNERS)]
-    shrink = math.cos(math.radians(corners[0][1]))
-    east = [(corner[0] - corners[0][0] + 540.0) % 360.0 - 180.0 for corner in corners]
-    points = [(x * shrink, -corner[1]) for x, corner in zip(east, corners, strict=True)]
+    positions = positions[:: max(1, len(positions) // MAX_CORNERS)]
+    first_lon, first_lat, *_ = positions[0]
+    shrink = math.cos(math.radians(first_lat))
+    points = [(wrap_180(lon - first_lon) * shrink, -lat) for lon, lat, *_ in positions]
     left, top = (min(values) for values in zip(*points, strict=True))
     right, bottom = (max(values) for values in zip(*points, strict=True))
     scale = min((width - 4) / max(right - left, 1e-9), (height - 4) / max(bottom - top, 1e-9))

@@ -24,6 +24,7 @@ from gateway.live.control_socket import ControlError, find_socket, request
 from gateway.panel.state.fleet import FleetState, Spot, command_long
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
+from gateway.vehicle.plan import DEGE7
 from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
 
 log = logging.getLogger(__name__)
@@ -211,8 +212,8 @@ class Uplink:
             mavlink.MAV_FRAME_GLOBAL,
             number,
             *(0, 0, 0.0, 0.0, 0.0, 0.0),
-            round(spot.lat_deg * 1e7),
-            round(spot.lon_deg * 1e7),
+            round(spot.lat_deg * DEGE7),
+            round(spot.lon_deg * DEGE7),
             spot.alt_amsl_m,
         )
         await self._until_acknowledged(system_id, number, message)

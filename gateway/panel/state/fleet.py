@@ -16,7 +16,7 @@ from gateway.geometry.quaternion import from_euler
 from gateway.recordings.answers import FIRST_GROUND_STATION
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import is_on_earth
+from gateway.vehicle.plan import DEGE7, is_on_earth
 
 
 def command_long(system_id: int, number: int, *params: float) -> Any:
@@ -136,7 +136,6 @@ class StatusTexts:
         self._open = (number, chunk + 1) if continues else None
 
 
-DEGE7: Final = 1e7
 MM: Final = 1e3
 CM: Final = 1e2
 UNKNOWN_MV: Final = 65535
@@ -364,10 +363,8 @@ class VehicleState:
 
     def _mark(self) -> tuple[Spot | None, float, float]:
         """Return the mark, and the distance and bearing reported by the aircraft."""
-        way, position = (
-            self.newest.get("NAV_CONTROLLER_OUTPUT"),
-            self.newest.get("GLOBAL_POSITION_INT"),
-        )
+        get = self.newest.get
+        way, position = get("NAV_CONTROLLER_OUTPUT"), get("GLOBAL_POSITION_INT")
         if way is None or position is None or not way.wp_dist:
             return self.exact_mark, NAN, NAN
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)

@@ -7,6 +7,7 @@ from typing import Any, Final
 from nicegui import ui
 from nicegui.element import Element
 
+from gateway.geometry.angle import wrap_180
 from gateway.panel.state.calibration import (
     CELLS,
     ORIENTATIONS,
@@ -175,7 +176,7 @@ class CalibrationView:
             picture = ui.element("img").classes("mounting-picture")
         picture.props["src"] = "/web/mounting.svg"
         picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
-        # From here on the choice is the operator's: a refresh must not change it before it is used.
+        # Set here alone: a refresh must not change a choice that is not used yet.
         self._choice = ui.select([*ORIENTATIONS, MEASURED], value=self._orientation())
         self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
         with ui.element("div").classes("buttons"):
@@ -186,16 +187,15 @@ class CalibrationView:
 
     def _orientation(self) -> str:
         """Return which of the orientations the parameters have."""
-        entries = (
-            {} if self._context.dialogue is None else self._context.dialogue.parameters.entries
-        )
+        dialogue = self._context.dialogue
+        entries = {} if dialogue is None else dialogue.parameters.entries
         now = [entries[name].value for name in MNT_NAMES if name in entries]
         near = (
             name
             for name, angles in ORIENTATIONS.items()
             if len(now) == len(angles)
             and all(
-                abs((have - want + 180.0) % 360.0 - 180.0) < ANGLE_DEG
+                abs(wrap_180(have - want)) < ANGLE_DEG
                 for have, want in zip(now, angles, strict=True)
             )
         )
