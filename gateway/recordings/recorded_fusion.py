@@ -284,9 +284,9 @@ class RecordedFusion:
             self._correct = smoothed_states(*self._smoothed)
         elif options.position == "interpolated":
             latency_s = self.aircraft.estimation.reference.gps_latency_s
-            cells = [block.cells for block in _blocks_of(files, options)]
-            fixes = np.concatenate([each[has_group(each, GPS), GPS] for each in cells])
-            self._correct = interpolated_positions(fixes, latency_s)
+            cells = (block.cells for block in _blocks_of(files, options))
+            fixes = [some[has_group(some, GPS), GPS] for some in cells]
+            self._correct = interpolated_positions(np.concatenate(fixes), latency_s)
         self._refused: list[str] = []
 
     def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
