@@ -110,8 +110,8 @@ def _texts(vehicle: VehicleState, now_us: int) -> list[Alert]:
         for pattern, keys in _ENDS:
             if match := pattern.match(text.text):
                 is_known = True
-                ended = re.compile(keys.format(re.escape(match[1])))
-                standing = {k: v for k, v in standing.items() if not ended.fullmatch(k)}
+                ended = keys.format(re.escape(match[1]))
+                standing = {k: v for k, v in standing.items() if not re.fullmatch(ended, k)}
         grave = text.severity <= mavlink.MAV_SEVERITY_CRITICAL
         if grave and not is_known and now_us - text.time_us < SHOUT_US:
             key = f"text {text.number}"
