@@ -177,7 +177,7 @@ class PmTiles:
 
 
 def file_reader(path: Path) -> GetBytes:
-    """Return what reads ranges of bytes of a file; raises OSError or ValueError at damage."""
+    """Return a function that reads ranges of bytes of a file; it raises OSError or ValueError."""
 
     def get_bytes(offset: int, length: int) -> bytes:
         # Not mapped into memory: a file that becomes shorter would end the process.
