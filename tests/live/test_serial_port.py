@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import select
 import tty
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 import serial
 
+from gateway.live import serial_port
 from gateway.live.control_socket import ControlServer
 from gateway.live.control_verbs import SerialVerbs
 from gateway.live.serial_port import (
@@ -336,12 +338,20 @@ async def test_no_receiver_among_several_adapters_is_reported_with_each_answer(
 ) -> None:
     monkeypatch.setattr("gateway.live.serial_port.ASK_S", 0.2)
     silent, noisy, held = (adapters.plug() for _ in range(3))
-    with serial.Serial(held, timeout=0, exclusive=True):
-        search = asyncio.create_task(find_receiver(SerialSettings(port="auto")))
-        await asyncio.sleep(0.05)
-        os.write(adapters.masters[noisy], NOISE)
-        with pytest.raises(PortNotFoundError) as raised:
-            await search
+    open_port = serial_port.open_port
+
+    def open_and_send(device: str, baud: int, ports: list[Port]) -> serial.Serial:
+        port = open_port(device, baud, ports)
+        if device == noisy:
+            # Not before: opening discards what was received.
+            os.write(adapters.masters[noisy], NOISE)
+            assert select.select([port], [], [], 60.0)[0]
+        return port
+
+    monkeypatch.setattr(serial_port, "open_port", open_and_send)
+    in_use = serial.Serial(held, timeout=0, exclusive=True)
+    with in_use, pytest.raises(PortNotFoundError) as raised:
+        await find_receiver(SerialSettings(port="auto"))
     for text in (
         f"{silent}: sends nothing",
         f"{noisy}: sends no frames at 500000 baud",

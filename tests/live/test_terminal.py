@@ -27,6 +27,7 @@ from gateway.live.terminal import (
 
 pytestmark = pytest.mark.io
 
+LIMIT_S = 60
 
 CHILD = """
 import asyncio
@@ -82,6 +83,12 @@ async def test_the_end_of_the_terminal_stays_ignored_where_it_is(is_ignored: boo
 
 
 @pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the end wait for output as long as a busy machine needs."""
+    monkeypatch.setattr(terminal_module, "LAST_WORDS_S", LIMIT_S)
+
+
+@pytest.fixture
 def pipe() -> Iterator[tuple[TextIO, TextIO]]:
     reader, writer = os.pipe()
     with (
@@ -91,6 +98,7 @@ def pipe() -> Iterator[tuple[TextIO, TextIO]]:
         yield out, into
 
 
+@pytest.mark.usefixtures("patient")
 def test_written_texts_arrive_in_order(pipe: tuple[TextIO, TextIO]) -> None:
     out, into = pipe
     stream = DetachedStream(into)
@@ -121,6 +129,7 @@ def test_unread_pipe_does_not_block_the_writer(pipe: tuple[TextIO, TextIO], bloc
     stream._thread.join()
 
 
+@pytest.mark.usefixtures("patient")
 def test_a_reader_that_has_gone_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -153,7 +162,6 @@ def test_log_and_prints_are_detached_and_attached_again(
     assert [out.readline(), out.readline()] == ["heard\n", "too\n"]
 
 
-LIMIT_S = 60
 LOCAL_FLAGS = 3
 
 

@@ -1,6 +1,7 @@
 """`mavgate setup`: the guidance on the simulated receiver, and when something is missing."""
 
 import os
+import select
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -103,6 +104,8 @@ def test_port_that_is_no_receiver_is_named_with_what_to_do(
     def start(port: SerialPort) -> None:
         before(port)
         os.write(master, sent)
+        if sent:
+            assert select.select([port._port], [], [], 60.0)[0], "there before the look begins"
 
     monkeypatch.setattr(SerialPort, "start", start)
     done = setup("--port", path)
