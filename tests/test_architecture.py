@@ -121,7 +121,7 @@ def names_of(paths: Iterable[Path]) -> list[str]:
     return [str(path.relative_to(ROOT)) for path in paths]
 
 
-def test_imports_follow_the_flow() -> None:
+def test_imports_are_those_that_may_import_allows() -> None:
     wrong: dict[str, set[str]] = {}
     for path in SOURCES:
         package = package_of(path)
@@ -155,7 +155,7 @@ def test_pure_packages_do_no_io() -> None:
     assert wrong == {}
 
 
-def test_no_module_wide_state_from_mavutil() -> None:
+def test_mavutil_is_not_imported() -> None:
     users = [path for path in SOURCES if "pymavlink.mavutil" in imported_modules(path)]
     assert names_of(users) == []
 
@@ -166,7 +166,7 @@ def lines_of(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (body[-1].end_lineno or 0) - body[0].lineno + 1 if body else 0
 
 
-def test_short_functions() -> None:
+def test_functions_have_at_most_40_lines() -> None:
     long = {
         f"{path.relative_to(ROOT)}: {node.name}": lines_of(node)
         for path in SOURCES
@@ -177,7 +177,7 @@ def test_short_functions() -> None:
     assert long == {}
 
 
-def test_no_stage_knows_an_edge() -> None:
+def test_stages_import_no_edge() -> None:
     """Only the root, the command line and the settings file (for the edges' keys) do."""
     knowing = {
         package_of(path)
@@ -200,7 +200,7 @@ def test_no_two_public_classes_share_a_name() -> None:
     assert [name for name, count in names.items() if count > 1] == []
 
 
-def test_imports_go_in_no_circle() -> None:
+def test_imports_form_no_cycle() -> None:
     """Imports for type checkers alone count too: they are knowledge all the same."""
     modules = {
         ".".join(path.relative_to(ROOT.parent).with_suffix("").parts): path for path in SOURCES
@@ -211,7 +211,7 @@ def test_imports_go_in_no_circle() -> None:
     TopologicalSorter(graph).prepare()
 
 
-def test_nothing_that_git_ignores_is_in_the_repository() -> None:
+def test_repository_contains_no_ignored_file() -> None:
     """A checkout would put it in the place of what is there, such as a virtual environment."""
     ask = ["git", "ls-files", "--cached", "--ignored", "--exclude-standard"]
     try:

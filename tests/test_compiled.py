@@ -59,7 +59,7 @@ def use(function: EntryPoint[[int, int, float]], offset: float = 0.25) -> list[f
     return numbers.tolist()
 
 
-def test_machine_code_gives_the_results_of_python(
+def test_machine_code_gives_results_of_python(
     scaling: EntryPoint[[int, int, float]], tmp_path: Path
 ) -> None:
     build_library(path := tmp_path / "kernels.so", [scaling])
@@ -69,7 +69,7 @@ def test_machine_code_gives_the_results_of_python(
     assert [*tmp_path.iterdir()] == [path]
 
 
-def test_an_experiment_compiles_patched_constants_until_its_end(
+def test_experiment_compiles_patched_constants_until_its_end(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     flight = entry_point_of_quaternions()
@@ -93,14 +93,14 @@ def from_euler(point: EntryPoint[[int, int, int]]) -> list[float]:
     return found.tolist()
 
 
-def test_a_kernel_may_not_allocate(tmp_path: Path) -> None:
+def test_kernel_that_allocates_is_rejected(tmp_path: Path) -> None:
     point = EntryPoint(allocate)
     ENTRY_POINTS.remove(point)
     with pytest.raises(TypeError, match="allocates"):
         build_library(tmp_path / "kernels.so", [point])
 
 
-def test_the_installed_library_is_current_and_complete() -> None:
+def test_installed_library_is_current_and_complete() -> None:
     assert is_current()
     load_entry_points()
 
@@ -130,7 +130,7 @@ def test_only_a_change_of_code_makes_a_library_stale(
     assert changed_source(stamp) == (None if current else "kernel.py")
 
 
-def test_a_library_names_what_it_was_compiled_from(
+def test_library_contains_stamp_of_its_sources(
     scaling: EntryPoint[[int, int, float]], tmp_path: Path
 ) -> None:
     build_library(path := tmp_path / "kernels.so", [scaling], stamp='gateway/units.py 1 2\n"\\\0x')
@@ -139,7 +139,7 @@ def test_a_library_names_what_it_was_compiled_from(
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no library"])
-def test_without_a_library_the_error_names_the_command_that_builds_it(
+def test_error_for_missing_library_names_build_command(
     tmp_path: Path, content: bytes | None
 ) -> None:
     path = tmp_path / "kernels.so"
@@ -168,7 +168,7 @@ def test_no_compiler_is_needed_at_run_time() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-def test_all_entry_points_are_built_of_what_a_wheel_is_built_with() -> None:
+def test_entry_points_import_only_build_requirements() -> None:
     code = (
         f"import json, sys, {', '.join(KERNEL_MODULES)};"
         "print(json.dumps({n: getattr(m, '__file__', None) for n, m in sys.modules.items()}))"

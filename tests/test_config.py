@@ -37,7 +37,7 @@ def all_fields(kind: type[Settings], prefix: str = "") -> list[tuple[str, Field]
 FIELDS = all_fields(GatewaySettings)
 
 
-def test_documented_file_is_the_defaults(tmp_path: Path) -> None:
+def test_documented_file_contains_defaults(tmp_path: Path) -> None:
     """config/gateway.toml shows every setting; `mavgate check-config` writes it."""
     assert (ROOT / "config" / "gateway.toml").read_text() == render(GatewaySettings())
     assert load(ROOT / "config" / "gateway.toml") == GatewaySettings()
@@ -70,7 +70,7 @@ def errors_in(folder: Path, text: str) -> list[str]:
     return [line.removeprefix(f"{folder / 'gateway.toml'}: ") for line in lines]
 
 
-def test_empty_file_is_the_defaults(tmp_path: Path) -> None:
+def test_empty_file_gives_defaults(tmp_path: Path) -> None:
     assert load_text(tmp_path, "") == GatewaySettings()
 
 
@@ -108,7 +108,7 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
         (r'aircraft_folder = "/tmp/\u0000"', r"aircraft_folder = '/tmp/\x00': no path"),
     ],
 )
-def test_refusals_name_file_key_value_and_what_is_allowed(
+def test_error_names_file_key_value_and_allowed_values(
     text: str, message: str, tmp_path: Path
 ) -> None:
     assert message in "\n".join(errors_in(tmp_path, text))
@@ -151,7 +151,7 @@ def settings(tmp_path: Path) -> GatewaySettings:
     return GatewaySettings(aircraft_folder=str(tmp_path / "aircraft"))
 
 
-def test_aircraft_files_lie_over_the_common_settings(settings: GatewaySettings) -> None:
+def test_aircraft_file_overrides_common_settings(settings: GatewaySettings) -> None:
     estimation = msgspec.convert({"paper": {"accel_cutoff_hz": 7.0}}, EstimationSettings)
     settings = msgspec.structs.replace(settings, estimation=estimation)
     folder = Path(settings.aircraft_folder)
@@ -169,11 +169,11 @@ def test_aircraft_files_lie_over_the_common_settings(settings: GatewaySettings) 
     assert (paper.accel_cutoff_hz, paper.accel_filter) == (7.0, "chebyshev")
 
 
-def test_no_folder_is_no_aircraft(settings: GatewaySettings) -> None:
+def test_missing_aircraft_folder_gives_no_aircraft(settings: GatewaySettings) -> None:
     assert load_aircraft(settings) == {}
 
 
-def test_a_wrong_aircraft_file_is_refused(settings: GatewaySettings) -> None:
+def test_invalid_aircraft_files_are_reported(settings: GatewaySettings) -> None:
     Path(settings.aircraft_folder).mkdir()
     (Path(settings.aircraft_folder) / "1.toml").write_text("[calibration]\nbias = 3\n")
     (Path(settings.aircraft_folder) / "2.toml").write_text("[calibration\n")
@@ -184,7 +184,7 @@ def test_a_wrong_aircraft_file_is_refused(settings: GatewaySettings) -> None:
     assert "2.toml: is not valid TOML" in second
 
 
-def test_only_what_differs_is_saved_and_comments_stay(settings: GatewaySettings) -> None:
+def test_only_changed_settings_are_saved_and_comments_kept(settings: GatewaySettings) -> None:
     file = aircraft_file(settings, 2)
     file.parent.mkdir()
     file.write_text("# my plane\n[sensing]\naccel_cutoff_hz = 4.0 # slow\n")
@@ -200,7 +200,7 @@ def test_only_what_differs_is_saved_and_comments_stay(settings: GatewaySettings)
     assert "mounting" not in text
 
 
-def test_a_setting_put_back_leaves_the_file(settings: GatewaySettings) -> None:
+def test_setting_restored_to_default_is_removed_from_file(settings: GatewaySettings) -> None:
     default = settings.default_aircraft
     estimation = msgspec.convert({"paper": {"accel_cutoff_hz": 4.0}}, EstimationSettings)
     slow = msgspec.structs.replace(default, estimation=estimation)
@@ -211,7 +211,7 @@ def test_a_setting_put_back_leaves_the_file(settings: GatewaySettings) -> None:
 
 
 @pytest.mark.io
-def test_a_file_that_may_hold_a_passphrase_is_for_its_owner_alone(
+def test_aircraft_file_is_readable_by_owner_only(
     settings: GatewaySettings,
 ) -> None:
     secret = VehicleSettings(signing_passphrase="correct horse")
@@ -225,7 +225,7 @@ def test_a_file_that_may_hold_a_passphrase_is_for_its_owner_alone(
 
 
 @pytest.mark.io
-def test_what_would_not_be_read_again_is_not_saved(settings: GatewaySettings) -> None:
+def test_invalid_settings_are_not_saved(settings: GatewaySettings) -> None:
     flat = NodeCalibration(gyro_bias_radps=(0.0, 99.0, 0.0))
     aircraft = msgspec.structs.replace(settings.default_aircraft, calibration=flat)
     with pytest.raises(OSError, match="would not be read again"):
@@ -234,7 +234,7 @@ def test_what_would_not_be_read_again_is_not_saved(settings: GatewaySettings) ->
 
 
 @pytest.mark.io
-def test_a_file_that_is_broken_while_it_runs_is_left_alone(settings: GatewaySettings) -> None:
+def test_damaged_aircraft_file_is_not_overwritten(settings: GatewaySettings) -> None:
     file = aircraft_file(settings, 3)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_bytes(b"[vehicle\xff")
@@ -243,7 +243,7 @@ def test_a_file_that_is_broken_while_it_runs_is_left_alone(settings: GatewaySett
     assert file.read_bytes() == b"[vehicle\xff"
 
 
-def test_an_endpoint_is_added_to_the_file_for_good(tmp_path: Path) -> None:
+def test_endpoint_is_added_to_file_with_comments_kept(tmp_path: Path) -> None:
     file = tmp_path / "new" / "gateway.toml"
     save_endpoint(file, "tcp-listen:127.0.0.1:5760")
     assert load(file).hub.endpoints == (

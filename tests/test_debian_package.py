@@ -81,7 +81,7 @@ def test_installed_and_purged(package: Path, tmp_path: Path) -> None:
     assert not (root / "usr/lib/mavgate").exists()
 
 
-def test_the_program_starts_from_its_own_packages(unpacked: Path) -> None:
+def test_program_starts_from_its_own_packages(unpacked: Path) -> None:
     program = unpacked / "usr/bin/mavgate"
     where = f"import runpy, sys; sys.argv[:] = [{str(program)!r}, '--version'];"
     where += f"runpy.run_path({str(program)!r}, run_name='__main__')"
@@ -110,7 +110,7 @@ runpy.run_path({program!r}, run_name="__main__")
     assert done.stdout.splitlines()[1].startswith(str(unpacked))
 
 
-def test_the_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None:
+def test_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None:
     settings = load(unpacked / "etc/mavgate/gateway.toml")
     unit = (unpacked / UNIT).read_text()
     assert "StateDirectory=mavgate" in unit
@@ -119,7 +119,7 @@ def test_the_services_settings_are_right_and_writable_for_it(unpacked: Path) -> 
         assert folder.is_relative_to("/var/lib/mavgate")
 
 
-def test_the_unit_starts_what_the_package_brings(unpacked: Path) -> None:
+def test_unit_starts_what_the_package_brings(unpacked: Path) -> None:
     lines = (unpacked / UNIT).read_text().splitlines()
     [start] = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
     program = unpacked / start.split()[0].lstrip("/")

@@ -94,7 +94,7 @@ def fly_with(settings: AircraftSettings, seconds: float) -> list[bytes]:
     return frames
 
 
-def test_a_message_is_sent_at_its_rate(install: Install) -> None:
+def test_added_message_is_sent_at_its_rate(install: Install) -> None:
     install("load_factor", example("A message"))
     assert load_extensions() == ("load_factor",)
     wanted = mavlink.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
@@ -105,7 +105,7 @@ def test_a_message_is_sent_at_its_rate(install: Install) -> None:
     assert message.value == pytest.approx(1.0, abs=0.1)
 
 
-async def test_an_endpoint_kind_sends_and_receives(install: Install, tmp_path: Path) -> None:
+async def test_added_endpoint_kind_sends_and_receives(install: Install, tmp_path: Path) -> None:
     install("unix_endpoint", example("An endpoint kind"))
     load_extensions()
     station = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -130,7 +130,7 @@ async def test_an_endpoint_kind_sends_and_receives(install: Install, tmp_path: P
     station.close()
 
 
-def test_an_estimator_is_chosen_by_name(install: Install) -> None:
+def test_added_estimator_is_chosen_by_name(install: Install) -> None:
     install("gyro_only", example("An estimator"))
     load_extensions()
     settings = AircraftSettings(estimation=EstimationSettings(estimator="gyro_only"))
@@ -140,7 +140,7 @@ def test_an_estimator_is_chosen_by_name(install: Install) -> None:
     assert (first.q1, first.q2, first.q3, first.q4) == (1.0, 0.0, 0.0, 0.0)
 
 
-def test_a_format_is_written_and_read(install: Install, tmp_path: Path) -> None:
+def test_added_format_is_written_and_read(install: Install, tmp_path: Path) -> None:
     install("json_lines", example("A recording format"))
     load_extensions()
     settings = AircraftSettings()
@@ -159,7 +159,7 @@ def test_a_format_is_written_and_read(install: Install, tmp_path: Path) -> None:
     assert b"".join(WRITERS[".jsonl"](again)) == written.read_bytes()
 
 
-def test_a_view_is_built_on_the_page(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_added_view_is_built_on_page(install: Install, monkeypatch: pytest.MonkeyPatch) -> None:
     install("my_tracker", example("A view of the panel"))
     load_extensions()
     nicegui, context = MagicMock(), MagicMock()
@@ -173,12 +173,12 @@ def test_a_view_is_built_on_the_page(install: Install, monkeypatch: pytest.Monke
         add_view("Radio", "radio", "my_tracker:build")
 
 
-def test_an_unknown_estimator_is_refused_by_name() -> None:
+def test_unknown_estimator_is_rejected_by_name() -> None:
     with pytest.raises(ValueError, match="'gyro_only', which is none of eskf, paper"):
         EstimationSettings(estimator="gyro_only")
 
 
-def test_the_stages_run_from_python(install: Install) -> None:
+def test_stages_run_from_python(install: Install) -> None:
     library = install("library", example("The stages from Python"))
     records = fly(SimulatorSettings(), duration_s=2.0).records()
     found = list(library.run(records))
@@ -202,7 +202,7 @@ def extend():
         (TAKEN, "already"),
     ],
 )
-def test_a_broken_extension_is_named(
+def test_error_of_broken_extension_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, reason: str
 ) -> None:
     (tmp_path / "broken_one.py").write_text(source)

@@ -14,7 +14,7 @@ from gateway.output import PRIVATE, check_folder, check_output, write_new, writt
 pytestmark = pytest.mark.io
 
 
-def test_a_new_file_has_the_rights_of_the_user(tmp_path: Path) -> None:
+def test_new_file_has_permissions_of_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         assert write_new(tmp_path / "a", [b"12", b"3"]) == 3
@@ -25,7 +25,7 @@ def test_a_new_file_has_the_rights_of_the_user(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a"]
 
 
-def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
+def test_existing_file_is_replaced_only_with_overwrite(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"old")
     with pytest.raises(FileExistsError):
         write_new(tmp_path / "a", [b"new"])
@@ -35,7 +35,7 @@ def test_nothing_is_replaced_unasked(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rights", [None, PRIVATE])
-def test_what_was_private_stays_so(tmp_path: Path, rights: int | None) -> None:
+def test_private_file_stays_private_when_replaced(tmp_path: Path, rights: int | None) -> None:
     file = tmp_path / "1.toml"
     file.write_bytes(b"old")
     file.chmod(0o600 if rights is None else 0o644)
@@ -44,7 +44,7 @@ def test_what_was_private_stays_so(tmp_path: Path, rights: int | None) -> None:
 
 
 @pytest.mark.parametrize("kind", ["link", "broken link", "fifo", "folder", "device"])
-def test_only_regular_files_are_ever_replaced(tmp_path: Path, kind: str) -> None:
+def test_only_regular_files_are_replaced(tmp_path: Path, kind: str) -> None:
     path = Path("/dev/null") if kind == "device" else tmp_path / "out"
     (tmp_path / "other").write_bytes(b"kept")
     if kind.endswith("link"):
@@ -62,7 +62,7 @@ def test_only_regular_files_are_ever_replaced(tmp_path: Path, kind: str) -> None
 
 
 @pytest.mark.parametrize("way", ["same", "hard link", "dots", "link"])
-def test_an_input_is_never_the_output(tmp_path: Path, way: str) -> None:
+def test_output_that_is_an_input_is_rejected(tmp_path: Path, way: str) -> None:
     flight = tmp_path / "flight.csv"
     flight.write_bytes(b"precious")
     out = {"same": flight, "dots": tmp_path / "." / "flight.csv"}.get(way, tmp_path / "out")
@@ -76,7 +76,7 @@ def test_an_input_is_never_the_output(tmp_path: Path, way: str) -> None:
 
 
 @pytest.mark.parametrize("old", [None, b"old"])
-def test_what_breaks_off_leaves_what_was_there(tmp_path: Path, old: bytes | None) -> None:
+def test_interrupted_write_leaves_previous_content(tmp_path: Path, old: bytes | None) -> None:
     def broken() -> Iterator[bytes]:
         yield b"half"
         raise KeyboardInterrupt
@@ -93,7 +93,7 @@ def no_links(*_: object) -> None:
 
 
 @pytest.mark.parametrize("on_fat", [False, True])
-def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(
+def test_file_created_during_write_is_not_overwritten(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_fat: bool
 ) -> None:
     def slow() -> Iterator[bytes]:
@@ -109,7 +109,7 @@ def test_a_file_of_that_name_that_comes_meanwhile_is_not_lost(
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_a_file_is_there_whole_or_not_at_all(tmp_path: Path, overwrite: bool) -> None:
+def test_file_appears_only_when_complete(tmp_path: Path, overwrite: bool) -> None:
     """A gateway that is killed while it writes a mission must not find it empty afterwards."""
 
     def looking() -> Iterator[bytes]:
@@ -138,7 +138,7 @@ def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
             check_folder(below, overwrite=True)
 
 
-def test_an_output_is_checked_before_the_work(tmp_path: Path) -> None:
+def test_output_check_creates_no_file(tmp_path: Path) -> None:
     check_output(tmp_path / "a")
     assert not (tmp_path / "a").exists()
 
@@ -155,7 +155,7 @@ def test_error_of_a_full_disk_names_the_requested_file(
 
 
 @pytest.mark.parametrize("is_there", [False, True])
-def test_files_that_belong_together_get_their_names_together(
+def test_files_of_a_folder_are_replaced_together_or_not_at_all(
     tmp_path: Path, is_there: bool
 ) -> None:
     folder = tmp_path / "report"
@@ -184,7 +184,7 @@ def test_files_that_belong_together_get_their_names_together(
     }
 
 
-def test_a_folder_that_takes_no_file_is_named(
+def test_error_of_unwritable_folder_names_requested_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_suffix: object, prefix: str, folder: Path) -> str:
@@ -197,7 +197,7 @@ def test_a_folder_that_takes_no_file_is_named(
     assert not (tmp_path / "new").exists()
 
 
-def test_what_cannot_be_read_keeps_its_own_name(tmp_path: Path) -> None:
+def test_read_error_names_the_input(tmp_path: Path) -> None:
     def pieces() -> Iterator[bytes]:
         yield b"1"
         raise OSError(errno.EIO, "is broken", "input.csv")
@@ -208,7 +208,7 @@ def test_what_cannot_be_read_keeps_its_own_name(tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_long_name_in_any_script_can_be_written(tmp_path: Path) -> None:
+def test_long_non_ascii_name_is_written(tmp_path: Path) -> None:
     name = "飛" * 83 + ".csv"
     write_new(tmp_path / name, [b"1"])
     assert [path.name for path in tmp_path.iterdir()] == [name]

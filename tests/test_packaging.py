@@ -51,12 +51,12 @@ def test_each_dependency_is_locked() -> None:
         assert {canonicalize_name(Requirement(one).name) for one in wanted} <= locked, lock
 
 
-def test_the_list_of_licences_is_current() -> None:
+def test_list_of_licences_is_current() -> None:
     """`python -m tools.third_party` writes it again."""
     assert third_party.PAGE.read_text() == third_party.page()
 
 
-def test_the_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -> None:
+def test_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -> None:
     names = third_party.locked_in(ROOT / "requirements.lock")
     packages = [third_party.distribution(name) for name in names]
     text = third_party.copyright_of(packages)
@@ -67,7 +67,7 @@ def test_the_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -
 
 @pytest.mark.io
 @pytest.mark.slow
-def test_a_wheel_contains_the_kernels_for_its_platform(tmp_path: Path) -> None:
+def test_wheel_contains_the_kernels_for_its_platform(tmp_path: Path) -> None:
     source = tmp_path / "source"
     skipped = shutil.ignore_patterns(".*", "build", "dist", "__pycache__", "tests", "firmware")
     shutil.copytree(ROOT, source, ignore=skipped)

@@ -72,7 +72,7 @@ def named(out: Outputs, name: str) -> list[mavlink.MAVLink_message]:
     return [message for message in decode(out) if message.get_type() == name]
 
 
-def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
+def test_one_imu_frame_gives_attitude_at_once(pipeline: Pipeline) -> None:
     actions = pipeline.feed(Tracker().frame(0, LEVEL), 5_000)
     (message,) = named(actions, "ATTITUDE_QUATERNION")
     assert message.get_srcSystem() == 1
@@ -81,7 +81,7 @@ def test_one_imu_frame_becomes_attitude_at_once(pipeline: Pipeline) -> None:
     assert (attitude.roll, attitude.pitch) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
-def test_a_single_frame_makes_no_aircraft(pipeline: Pipeline) -> None:
+def test_aircraft_needs_two_frames_with_agreeing_clocks(pipeline: Pipeline) -> None:
     """Noise may pass the check of a frame; two of it that agree do not come."""
     ghost, true = Tracker(7), Tracker()
     assert pipeline.feed(ghost._frame(0, LEVEL, 0), 5_000) == Outputs()
@@ -111,7 +111,7 @@ def test_aircraft_is_removed_after_a_timeout_and_returns_unchanged(pipeline: Pip
     assert pipeline.aircraft[1] is aircraft
 
 
-def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:
+def test_first_message_of_aircraft_is_its_heartbeat(pipeline: Pipeline) -> None:
     kinds = [m.get_type() for m in decode(pipeline.feed(Tracker().frame(0, LEVEL), 5_000))]
     assert kinds[0] == "HEARTBEAT"
     assert kinds.count("HEARTBEAT") == 1
@@ -120,7 +120,7 @@ def test_the_first_frame_of_an_aircraft_is_its_heartbeat(pipeline: Pipeline) -> 
     assert "HEARTBEAT" not in [m.get_type() for m in later]
 
 
-def test_records_come_out_in_the_order_of_their_fusion(pipeline: Pipeline) -> None:
+def test_records_are_returned_in_order_of_fusion(pipeline: Pipeline) -> None:
     tracker = Tracker()
     records = pipeline.feed(tracker.frame(0, LEVEL), 0).records
     baro_frame = tracker.frame(5_000, payloads.BaroPayload(10_000_000, 250))
@@ -152,7 +152,7 @@ def test_two_aircraft_are_two_systems_with_their_own_calibration(pipeline: Pipel
     assert attitudes[2] == pytest.approx((-0.5236, 0.0), abs=2e-3)
 
 
-def test_heartbeats_keep_coming_while_the_receiver_is_away(pipeline: Pipeline) -> None:
+def test_heartbeats_continue_while_receiver_is_disconnected(pipeline: Pipeline) -> None:
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     pipeline.disconnect("/dev/ttyUSB0")
     beats = [
@@ -175,7 +175,7 @@ def test_loss_of_the_receiver_is_reported(pipeline: Pipeline) -> None:
     assert not pipeline.report.connected
 
 
-def test_a_mark_shows_distance_and_bearing(pipeline: Pipeline) -> None:
+def test_mark_gives_distance_and_bearing(pipeline: Pipeline) -> None:
     tracker = Tracker()
     pipeline.feed(tracker.frame(0, QUALITY, 1) + tracker.frame(0, FIX, 1), 0)
     pipeline.feed(tracker.frame(0, LEVEL), 0)
@@ -187,15 +187,13 @@ def test_a_mark_shows_distance_and_bearing(pipeline: Pipeline) -> None:
 
 
 @pytest.mark.parametrize(("lat_deg", "vehicle_id"), [(91.0, 1), (0.0, 7)])
-def test_marks_that_cannot_be_are_refused(
-    pipeline: Pipeline, lat_deg: float, vehicle_id: int
-) -> None:
+def test_invalid_marks_are_rejected(pipeline: Pipeline, lat_deg: float, vehicle_id: int) -> None:
     pipeline.feed(Tracker().frame(0, LEVEL), 0)
     with pytest.raises(ValueError, match=r"earth|heard so far: 1|nowhere|91"):
         pipeline.mark(Location(lat_deg, 0.0, 0.0), vehicle_id, 0)
 
 
-def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> None:
+def test_nothing_is_sent_before_an_aircraft_is_heard(pipeline: Pipeline) -> None:
     assert pipeline.poll(0) == Outputs()
     assert pipeline.next_due_us() == 1_000_000
     pipeline.feed(b"\x05garbage\x00" * 100, 0)
@@ -204,7 +202,7 @@ def test_nothing_is_said_of_aircraft_that_nobody_heard(pipeline: Pipeline) -> No
     assert dict(pipeline.report.faults)
 
 
-def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None:
+def test_signatures_of_all_messages_pass_strict_check() -> None:
     vehicle = VehicleSettings(signing_passphrase="correct horse")
     pipeline = Pipeline(PipelineSettings(AircraftSettings(vehicle=vehicle), {}, UNIX_US))
     receiver, tracker, kinds = mavlink.MAVLink(None), Tracker(), set()
@@ -230,7 +228,7 @@ def test_every_kind_of_message_is_signed_as_a_strict_receiver_wants_it() -> None
     assert kinds > {0, 22, 30, 31, 77, 300, 397, 435}
 
 
-def test_requests_that_are_not_carried_out_are_counted(pipeline: Pipeline) -> None:
+def test_rejected_requests_are_counted_by_reason(pipeline: Pipeline) -> None:
     for vehicle_id in (1, 2):
         pipeline.feed(Tracker(vehicle_id).frame(0, LEVEL), 0)
     pipeline.sign_by("correct horse", {}, 0)

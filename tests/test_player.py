@@ -105,7 +105,7 @@ def make_daemon(
 
 
 @pytest.mark.parametrize("with_commands", [False, True])
-async def test_what_stations_said_is_played_only_to_who_asks(
+async def test_commands_of_stations_are_played_only_on_request(
     tmp_path: Path, opened: ExitStack, station: Station, with_commands: bool
 ) -> None:
     daemon = make_daemon(tmp_path, opened, settings_of(station.url), with_commands=with_commands)
@@ -129,7 +129,7 @@ async def test_what_stations_said_is_played_only_to_who_asks(
         "tcp:drone.example:5760",
     ],
 )
-def test_commands_leave_this_machine_only_after_a_yes(
+def test_commands_to_other_machines_need_confirmation(
     tmp_path: Path, opened: ExitStack, url: str
 ) -> None:
     settings = settings_of("udp:127.0.0.1:14550", "tcp:[::1]:5760", url)
@@ -140,7 +140,7 @@ def test_commands_leave_this_machine_only_after_a_yes(
     make_daemon(tmp_path, opened, settings)
 
 
-async def test_every_parameter_arrives_and_none_looks_lost(
+async def test_all_parameters_arrive_with_consecutive_sequence_numbers(
     tmp_path: Path, opened: ExitStack, station: Station
 ) -> None:
     daemon = make_daemon(tmp_path, opened, settings_of(station.url))
@@ -161,7 +161,7 @@ async def test_every_parameter_arrives_and_none_looks_lost(
     assert [f[4] for f in station.frames[:PARAMETERS]] == list(range(2, 2 + PARAMETERS))
 
 
-async def test_an_answer_does_not_overtake_the_batch_before_it(
+async def test_answer_is_sent_after_the_batch_before_it(
     tmp_path: Path, opened: ExitStack, station: Station
 ) -> None:
     daemon = make_daemon(tmp_path, opened, settings_of(station.url), paused=True)

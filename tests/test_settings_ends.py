@@ -137,13 +137,13 @@ def all_known(found: list[Any]) -> bool:
     return bool(found) and all(math.isfinite(m.roll + m.pitch) for m in found)
 
 
-def test_every_number_has_two_ends() -> None:
+def test_every_number_has_lower_and_upper_bound() -> None:
     everything = [*numbers(GatewaySettings), *numbers(AircraftSettings)]
     assert [path for path, field in everything if None in field.bounds] == []
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_no_setting_takes_what_is_no_number(value: float) -> None:
+def test_settings_reject_nan_and_infinity(value: float) -> None:
     for path, field in [*numbers(GatewaySettings), *numbers(AircraftSettings)]:
         plain = msgspec.to_builtins(field.default)
         if isinstance(plain, list | tuple):
@@ -157,7 +157,7 @@ def test_no_setting_takes_what_is_no_number(value: float) -> None:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> None:
+def test_each_bound_of_each_number_gives_finite_attitudes(name: str) -> None:
     plain = with_estimator(name)
     for path, field in FUSION:
         if not concerns(path, name):
@@ -174,7 +174,7 @@ def test_an_aircraft_flies_on_through_every_end_of_every_number(name: str) -> No
 # Without shrinking, which takes minutes; the failing draws are reported all the same.
 @settings(deadline=None, derandomize=True, max_examples=40, phases=[Phase.generate])
 @given(st.data())
-def test_any_ends_together_give_attitudes(data: st.DataObject) -> None:
+def test_combined_bounds_give_attitudes(data: st.DataObject) -> None:
     wanted = with_estimator(data.draw(st.sampled_from(ESTIMATORS)))
     for path, field in FUSION:
         if data.draw(st.booleans()):
@@ -184,7 +184,7 @@ def test_any_ends_together_give_attitudes(data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("before", ESTIMATORS)
 @pytest.mark.parametrize("after", ESTIMATORS)
-def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after: str) -> None:
+def test_estimator_can_be_changed_in_flight(before: str, after: str) -> None:
     aircraft = Aircraft(1, with_estimator(before))
     fly(aircraft)
     wanted = with_estimator(after).estimation
@@ -194,7 +194,7 @@ def test_a_ground_station_may_choose_any_estimator_in_flight(before: str, after:
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
+def test_changed_gps_latency_keeps_attitude(name: str) -> None:
     aircraft = Aircraft(1, with_estimator(name))
     before = fly(aircraft)[-1]
     wanted = replaced(with_estimator(name), "estimation.reference.gps_latency_s", 0.3).estimation
@@ -203,7 +203,7 @@ def test_a_retuned_estimator_goes_on_where_it_was(name: str) -> None:
     assert (after.roll, after.pitch) == pytest.approx((before.roll, before.pitch), abs=0.2)
 
 
-def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
+def test_failed_settings_change_leaves_settings_unchanged(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     aircraft = Aircraft(1, AircraftSettings())
@@ -230,12 +230,12 @@ def test_a_stage_that_cannot_be_built_leaves_the_settings_that_hold(
         ("gyro_bias_radps", (0.0, 0.0, -1e300), ">= -10"),
     ],
 )
-def test_a_calibration_that_cannot_be_is_refused(key: str, value: Any, words: str) -> None:
+def test_invalid_calibration_is_rejected(key: str, value: Any, words: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=words):
         msgspec.convert({key: value}, NodeCalibration)
 
 
-def test_a_measured_error_beyond_any_sensor_changes_nothing() -> None:
+def test_calibration_beyond_bounds_is_refused_and_not_used() -> None:
     aircraft = Aircraft(1, AircraftSettings())
     fly(aircraft)
     correction = msgspec.structs.replace(IN_BODY_AXES, mag_hard_iron_ut=(5000.0, 0.0, 0.0))

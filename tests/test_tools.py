@@ -10,5 +10,5 @@ PROGRAMS = [f"tools.{path.stem}" for path in sorted(ROOT.glob("tools/*.py"))]
 
 
 @pytest.mark.parametrize("name", [*PROGRAMS, "firmware.rig.measure"])
-def test_a_tool_can_be_imported(name: str) -> None:
+def test_tool_can_be_imported(name: str) -> None:
     import_module(name)

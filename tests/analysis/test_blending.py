@@ -39,7 +39,7 @@ def line(valid_s: list[float]) -> Fixes:
     return Fixes(valid_us + 100_000, valid_us, 45.0 + s, lon, 10.0 * s, np.outer(s, [1, 2, 3]))
 
 
-def test_interpolation_is_linear_between_the_times_of_validity() -> None:
+def test_interpolation_is_linear_between_times_of_validity() -> None:
     time_us = np.array([500_000, 1_500_000])
     track = interpolate(line([0.0, 1.0, 2.0]), time_us)
     assert track.lat_deg == pytest.approx([45.5, 46.5])
@@ -48,23 +48,23 @@ def test_interpolation_is_linear_between_the_times_of_validity() -> None:
     assert track.vel_n_mps[1] == pytest.approx([1.5, 3.0, 4.5])
 
 
-def test_nothing_is_known_outside_and_across_long_gaps() -> None:
+def test_interpolation_is_nan_outside_fixes_and_across_long_gaps() -> None:
     time_us = np.array([-1, 500_000, 3_000_000, 5_500_000, 6_000_001])
     track = interpolate(line([0.0, 1.0, 5.0, 6.0]), time_us)
     assert np.isfinite(track.lat_deg).tolist() == [False, True, False, True, False]
 
 
-def test_one_fix_is_no_line() -> None:
+def test_single_fix_is_not_interpolated() -> None:
     assert np.isnan(interpolate(line([1.0]), np.array([1_000_000])).lat_deg).all()
 
 
-def test_a_track_over_the_date_line_is_compared_with_the_fixes_there() -> None:
+def test_track_across_date_line_is_compared_with_fixes_near_it() -> None:
     fixes = line([0.0, 0.5, 0.8, 1.2, 2.0])
     track = interpolate(fixes, np.array([0, 700_000, 1_100_000, 2_000_000]))
     assert np.abs(error_at_fixes_m(track, fixes)).max() < 1e-6
 
 
-def test_thinning_keeps_one_fix_a_second() -> None:
+def test_thinning_keeps_one_fix_per_second() -> None:
     flight = short_flight()
     keep = thin(flight, 1.0)
     kept, dropped = flight.with_fixes(keep), flight.with_fixes(~keep)
@@ -84,7 +84,7 @@ def test_every_nth_usable_fix_is_withheld() -> None:
     assert len(fixes_of(kept)) == total - total // 4
 
 
-def test_the_truth_is_near_the_fixes_at_their_time_of_validity() -> None:
+def test_truth_agrees_with_fixes_at_their_time_of_validity() -> None:
     flight = short_flight()
     assert flight.reference is not None
     error = error_at_fixes_m(flight.reference.track, fixes_of(flight))
@@ -94,19 +94,19 @@ def test_the_truth_is_near_the_fixes_at_their_time_of_validity() -> None:
     assert np.nanmean(np.hypot(*worse.T)) > np.nanmean(np.hypot(*error.T))
 
 
-def test_the_papers_table_grows_both_ways() -> None:
+def test_errors_of_published_table_grow_with_both_weights() -> None:
     assert grows(PAPER_TABLE, "north_m")
     assert grows(PAPER_TABLE, "east_m")
 
 
-def test_a_table_that_falls_somewhere_does_not_grow() -> None:
+def test_table_with_one_decrease_does_not_grow() -> None:
     table = PAPER_TABLE.copy()
     table.loc[4, "east_m"] = 1.0
     assert grows(table, "north_m")
     assert not grows(table, "east_m")
 
 
-def test_the_table_has_the_papers_shape() -> None:
+def test_errors_of_simulated_flight_grow_with_both_weights() -> None:
     case = short_case()
     table = blend_table(case.flight, case.fusion, 1.0)
     assert isinstance(table, pd.DataFrame)
@@ -124,7 +124,7 @@ def test_interpolated_gps_scores_zero_against_itself() -> None:
     assert 0.0 < found["held_m"] < 2.0
 
 
-def test_truth_scores_zero_against_the_reference() -> None:
+def test_truth_scores_zero_against_itself() -> None:
     flight = short_flight()
     assert flight.reference is not None
     judge = make_judge(flight, np.ones(len(flight.fixes), np.bool_))
@@ -133,14 +133,14 @@ def test_truth_scores_zero_against_the_reference() -> None:
     assert np.isnan(found["held_m"])
 
 
-def test_weights_choose_the_papers_estimator() -> None:
+def test_weights_select_paper_estimator() -> None:
     changed = with_weights(FusionSettings(), 0.3, 0.7).estimation
     assert (changed.estimator, changed.paper.alpha_accel, changed.paper.beta_velocity) == (
         "paper", 0.3, 0.7,
     )  # fmt: skip
 
 
-def test_no_table_where_no_fix_judges() -> None:
+def test_flight_without_scored_samples_has_no_weight_table() -> None:
     case = short_case()
     blind = replace(case.flight, scored=np.zeros(len(case.flight.time_us), dtype=bool))
     assert weights(replace(case, flight=blind)) is None
@@ -152,7 +152,7 @@ IN_FLIGHT = slice(15_000, 21_000)
 
 @pytest.mark.io
 @pytest.mark.slow
-def test_table_of_a_real_flight_has_the_papers_shape(data_dir: Path) -> None:
+def test_errors_of_real_flight_grow_with_both_weights(data_dir: Path) -> None:
     text = b"".join(read_chunks(data_dir / "arduplane_testlog2.csv.gz")).decode()
     lines = text.splitlines()
     columns = msgspec.toml.decode(TRACKER_LOG.read_bytes(), type=ColumnMap)

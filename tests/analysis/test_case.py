@@ -38,7 +38,7 @@ def test_error_at_withheld_fixes_differs_between_estimators() -> None:
     assert all(0.05 < error_m < 2.0 for error_m in errors_m)
 
 
-def test_settings_that_differ_are_listed() -> None:
+def test_changed_settings_are_listed_with_both_values() -> None:
     a = short_case().fusion
     paper = msgspec.structs.replace(a.estimation.paper, accel_cutoff_hz=5.0)
     estimation = msgspec.structs.replace(a.estimation, estimator="paper", paper=paper)
@@ -50,7 +50,7 @@ def test_settings_that_differ_are_listed() -> None:
     ]
 
 
-def test_two_settings_are_compared_over_time() -> None:
+def test_comparison_of_two_settings_shows_difference_over_time() -> None:
     a = short_case()
     section = comparison(a, make_case(short_flight(), with_estimator(a.fusion, "paper")))
     assert [p.name for p in section.pictures] == ["comparison_difference", "comparison_map"]
@@ -60,7 +60,7 @@ def test_two_settings_are_compared_over_time() -> None:
     assert section.tables[1].frame["setting"].tolist() == ["estimation.estimator"]
 
 
-def test_two_flights_are_compared_by_their_profiles() -> None:
+def test_comparison_of_two_flights_shows_profiles() -> None:
     other = simulated_flight(SimulatorSettings(imu_rate_hz=50, seed=5), duration_s=40.0)
     section = comparison(short_case(), make_case(other))
     assert [p.name for p in section.pictures] == ["comparison_profiles", "comparison_map"]
@@ -71,7 +71,7 @@ def test_two_flights_are_compared_by_their_profiles() -> None:
 RATE_HZ = 50
 
 
-def test_the_simulated_flight() -> None:
+def test_pilot_figures_agree_with_simulated_truth() -> None:
     case = short_case()
     assert case.frame is not None
     figures = pilot_figures(case.flight, case.track, case.frame)
@@ -106,7 +106,7 @@ def made(north_m: np.ndarray, height_m: np.ndarray, speed_mps: np.ndarray) -> tu
     return flight, track, frame
 
 
-def test_distance_is_flown_in_the_air_and_not_jumped() -> None:
+def test_distance_excludes_ground_and_position_jumps() -> None:
     seconds = short_flight().time_s
     up = (seconds > 10.0) & (seconds < 30.0)
     north = np.where(seconds > 10.0, np.minimum(seconds - 10.0, 20.0) * 5.0, 0.0)
@@ -118,14 +118,14 @@ def test_distance_is_flown_in_the_air_and_not_jumped() -> None:
     assert figures.farthest_m == pytest.approx(1100.0, abs=1.0)
 
 
-def test_a_hop_of_a_second_is_no_flight() -> None:
+def test_hop_of_one_second_is_not_airborne() -> None:
     seconds = short_flight().time_s
     up = (seconds > 10.0) & (seconds < 11.0)
     flight, track, frame = made(0.0 * seconds, np.where(up, 9.0, 0.0), np.where(up, 9.0, 0.0))
     assert pilot_figures(flight, track, frame).airborne_s == 0.0
 
 
-def test_gap_in_the_samples_is_a_loss_of_the_link() -> None:
+def test_gap_in_samples_is_counted_as_link_loss() -> None:
     flight = short_flight()
     late = flight.time_us + np.where(flight.time_s > 20.0, 4_000_000, 0)
     case = short_case()
@@ -135,7 +135,7 @@ def test_gap_in_the_samples_is_a_loss_of_the_link() -> None:
     assert end - begin == pytest.approx(4.0 + 1.0 / RATE_HZ, abs=0.05)
 
 
-def test_unknown_figures_are_nan() -> None:
+def test_figures_of_unknown_track_are_nan() -> None:
     flight = short_flight()
     count = len(flight.time_us)
     unknown = np.full(count, np.nan)

@@ -35,7 +35,7 @@ from tests.analysis.flights import DURATION_S, short_case, short_flight, with_im
 from tools.simulated_flight import SimulatedFlight, fly
 
 
-def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:
+def test_simulated_flight_is_calibrated_and_has_exact_truth() -> None:
     flight = short_flight()
     assert flight.rate_hz == pytest.approx(50.0, rel=0.01)
     assert flight.duration_s == pytest.approx(DURATION_S, abs=0.1)
@@ -47,7 +47,7 @@ def test_the_simulated_flight_is_calibrated_and_has_its_truth() -> None:
     assert np.linalg.norm(flight.imu.gyro_b_radps[:200].mean(axis=0)) < math.radians(0.3)
 
 
-def test_the_magnetometer_is_there_before_and_after_calibration() -> None:
+def test_calibration_reduces_spread_of_field_strength() -> None:
     flight = short_flight()
     assert flight.mag_uncalibrated_b_ut is not None
     before = np.linalg.norm(flight.mag_uncalibrated_b_ut, axis=1)
@@ -55,31 +55,31 @@ def test_the_magnetometer_is_there_before_and_after_calibration() -> None:
     assert np.nanstd(after) < 0.2 * np.nanstd(before)
 
 
-def test_only_usable_fixes_are_laid_out() -> None:
+def test_fixes_are_usable_ones_with_latency_subtracted() -> None:
     flight = short_flight()
     fixes = fixes_of(flight)
     assert 0 < len(fixes) < len(flight.fixes)
     assert (fixes.arrival_us - fixes.valid_us == round(flight.latency_s * 1e6)).all()
 
 
-def test_the_start_up_does_not_count() -> None:
+def test_scoring_starts_5_s_after_first_fix() -> None:
     flight = short_flight()
     first_us = fixes_of(flight).arrival_us[0]
     assert flight.time_us[np.argmax(flight.scored)] == pytest.approx(first_us + 5e6, abs=3e4)
 
 
-def test_the_local_frame_measures_metres() -> None:
+def test_local_frame_agrees_with_displacement_across_date_line() -> None:
     frame = LocalFrame(-7.0, 179.9999, 100.0)
     pos_m = frame.local_m(np.array([-6.999]), np.array([-179.9999]))
     expected = displacement_m(-7.0, 179.9999, -6.999, -179.9999, 100.0)
     assert pos_m[0] == pytest.approx(expected)
 
 
-def test_a_flight_without_fixes_has_no_frame() -> None:
+def test_flight_without_fixes_has_no_local_frame() -> None:
     assert local_frame(short_flight().with_fixes([False] * len(short_flight().fixes))) is None
 
 
-def test_too_few_samples_are_no_flight() -> None:
+def test_single_imu_sample_is_rejected() -> None:
     zero = (0.0, 0.0, 0.0)
     row = TableRow(0, imu=ImuCalibrated(0, NodeId(1, 0), zero, zero, None, 20.0, ImuFlags(0)))
     with pytest.raises(ValueError, match="1 IMU samples are no flight"):
@@ -92,7 +92,7 @@ SIMULATED: SimulatedFlight = fly(
 
 
 def rows(*, raw: bool) -> Iterator[TableRow]:
-    """What the recorder would have written, with states."""
+    """Rows as the recorder writes them, with states."""
     fusion = short_case().fusion
     chain = SensorChain(ideal_calibration(SIMULATED.errors))
     estimator = make_estimator(fusion.estimation)
@@ -117,7 +117,7 @@ def rows(*, raw: bool) -> Iterator[TableRow]:
 
 
 @pytest.mark.parametrize("raw", [True, False])
-def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
+def test_recorded_rows_give_samples_and_states_of_simulated_flight(raw: bool) -> None:
     flight = flight_of_blocks(
         [block_of(rows(raw=raw))],
         ideal_calibration(SIMULATED.errors),
@@ -138,7 +138,7 @@ def test_a_recording_becomes_the_same_flight(raw: bool) -> None:
     assert flight.recorded.lat_deg[-1] == pytest.approx(again.lat_deg[-1], abs=1e-9)
 
 
-def test_the_simulated_flight_comes_over_the_radio() -> None:
+def test_simulated_flight_has_radio_loss_and_jitter() -> None:
     flight = short_flight()
     assert flight.node_time_us is not None
     lost = np.rint(np.diff(flight.node_time_us) / 20_000) - 1
@@ -147,7 +147,7 @@ def test_the_simulated_flight_comes_over_the_radio() -> None:
     assert 0.0 < jitter_us.std() < 2_000.0
 
 
-def test_a_recording_without_reference_still_has_its_report() -> None:
+def test_report_without_reference_compares_recorded_states() -> None:
     flight = flight_of_blocks(
         [block_of(rows(raw=False))],
         NodeCalibration(),
@@ -164,7 +164,7 @@ def test_a_recording_without_reference_still_has_its_report() -> None:
     assert "recorded in flight" in compared.tables[0].frame["estimator"].tolist()
 
 
-def test_other_states_can_be_the_reference() -> None:
+def test_states_of_another_recording_serve_as_reference() -> None:
     plain = replace(short_flight(), reference=None)
     judged = judged_by(plain, [block_of(rows(raw=False))], "ref.csv")
     assert judged.reference is not None
@@ -174,12 +174,12 @@ def test_other_states_can_be_the_reference() -> None:
     assert 20.0 < known.sum() / 50.0 < 30.0
 
 
-def test_a_reference_without_states_is_refused() -> None:
+def test_reference_without_states_is_rejected() -> None:
     with pytest.raises(ValueError, match=r"ref\.csv: holds no states"):
         judged_by(short_flight(), [block_of([TableRow(0)])], "ref.csv")
 
 
-def test_the_nearest_row_is_taken_if_it_is_near() -> None:
+def test_nearest_row_is_used_within_time_limit() -> None:
     time_us = np.array([0, 100_000, 400_000])
     values = np.array([1.0, 2.0, 3.0])
     track = FlightTrack(
@@ -190,7 +190,7 @@ def test_the_nearest_row_is_taken_if_it_is_near() -> None:
     assert found.vel_n_mps[3].tolist() == [3.0, 3.0, 3.0]
 
 
-def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> None:
+def test_report_without_gps_compass_and_reference_has_three_sections() -> None:
     flight = short_flight()
     bare = replace(flight.with_fixes([False] * len(flight.fixes)), reference=None)
     bare = with_imu(bare, mag_b_ut=np.full_like(flight.imu.mag_b_ut, np.nan))
@@ -199,21 +199,21 @@ def test_a_flight_without_gps_compass_and_reference_still_has_its_report() -> No
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
-def test_the_fused_track_is_near_the_truth(name: str) -> None:
+def test_fused_track_is_within_4_m_rms_of_truth(name: str) -> None:
     flight = short_flight()
     assert flight.reference is not None
     error = position_error_m(short_case().tracks[name], flight.reference.track)[flight.scored]
     assert rms(np.hypot(error[:, 0], error[:, 1])) < 4.0
 
 
-def test_values_without_a_validity_flag_are_unknown() -> None:
+def test_position_before_first_valid_fix_is_nan() -> None:
     track: FlightTrack = short_case().tracks["paper"]
     unknown = short_flight().time_us < next(f.time_us for f in short_flight().fixes if f.fix_ok)
     assert np.isnan(track.lat_deg[unknown]).all()
     assert np.isfinite(track.lat_deg[~unknown]).all()
 
 
-def test_another_cutoff_gives_another_track() -> None:
+def test_changed_cutoff_changes_fused_attitude() -> None:
     flight, fusion = short_flight(), with_estimator(short_case().fusion, "paper")
     paper = msgspec.structs.replace(fusion.estimation.paper, accel_cutoff_hz=2.0)
     estimation = msgspec.structs.replace(fusion.estimation, paper=paper)

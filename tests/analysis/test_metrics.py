@@ -22,7 +22,7 @@ def quats(rotation: Rotation) -> np.ndarray:
     return np.atleast_2d(rotation.as_quat(scalar_first=True))
 
 
-def test_unknown_values_are_left_out_of_means() -> None:
+def test_nan_is_left_out_of_means() -> None:
     values = np.array([3.0, np.nan, -4.0])
     assert rms(values) == pytest.approx(np.sqrt(12.5))
     assert mean_abs(values) == 3.5
@@ -46,12 +46,12 @@ def test_rotation_error_splits_into_heading_and_inclination(seed: int) -> None:
     assert total_error_rad(both) == pytest.approx((lean * turn).magnitude())
 
 
-def test_the_quaternions_sign_does_not_matter() -> None:
+def test_rotation_error_ignores_sign_of_quaternion() -> None:
     q = quats(Rotation.from_euler("ZYX", [1.0, 0.2, -0.4]))
     assert total_error_rad(rotation_error(-q, q)) == pytest.approx([0.0])
 
 
-def test_euler_angles_equal_scipys(rng: np.random.Generator) -> None:
+def test_euler_angles_equal_those_of_scipy(rng: np.random.Generator) -> None:
     rotation = Rotation.random(50, rng=rng)
     expected = rotation.as_euler("ZYX")[:, ::-1]
     assert euler_rad(quats(rotation)) == pytest.approx(expected)

@@ -1,4 +1,4 @@
-"""Forked processes: what they leave alone."""
+"""Forked processes: garbage of the parent, and the end of the parent."""
 
 import gc
 import os
@@ -18,7 +18,7 @@ COLLECTED: list[str] = []
 
 
 class Session:
-    """Its destructor needs threads that a forked process does not have."""
+    """Object in a cycle; a real destructor may need threads that a forked process lacks."""
 
     def __init__(self) -> None:
         self.itself = self
@@ -34,7 +34,7 @@ def collect(_: int) -> list[str]:
 
 @pytest.fixture
 def _left_over() -> Iterator[None]:
-    """Leave garbage to the collector, which does not come before the test is over."""
+    """Leave garbage that the parent does not collect before the test ends."""
     gc.collect()
     gc.disable()
     COLLECTED.clear()
@@ -46,13 +46,13 @@ def _left_over() -> Iterator[None]:
 
 @pytest.mark.io
 @pytest.mark.usefixtures("_left_over")
-def test_a_worker_collects_nothing_that_its_parent_left() -> None:
+def test_worker_does_not_collect_garbage_of_its_parent() -> None:
     assert dict(LocalProcesses(1).run(collect, [0])) == {0: []}
 
 
 @pytest.mark.io
 @pytest.mark.usefixtures("_left_over")
-def test_a_copy_collects_nothing_that_its_parent_left() -> None:
+def test_forked_process_does_not_collect_garbage_of_its_parent() -> None:
     with forked(collect, 2) as run:
         assert dict(run([0, 1])) == {0: [], 1: []}
 
@@ -73,8 +73,8 @@ time.sleep(3600.0)
 
 @pytest.mark.io
 @pytest.mark.parametrize("doing", ["sender.send(bytes(100_000))", "time.sleep(0.1)"])
-def test_copies_end_with_a_parent_that_is_killed(doing: str) -> None:
-    """Whatever they are doing: a compiler sends nothing for half a minute."""
+def test_copies_end_when_their_parent_is_killed(doing: str) -> None:
+    """Copies that send, and those that do not: a compiler sends nothing for half a minute."""
     program = PARENT.format(doing=doing)
     with subprocess.Popen(
         [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True

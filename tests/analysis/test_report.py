@@ -35,7 +35,7 @@ def test_lost_and_late_samples_are_measured() -> None:
     assert row["jitter of gateway time, ms RMS"] == pytest.approx(1.0)
 
 
-def test_the_excerpt_is_where_the_acceleration_changes() -> None:
+def test_excerpt_is_where_acceleration_changes_most() -> None:
     flight = short_flight()
     count = round(EXCERPT_S * flight.rate_hz)
     accel = np.zeros_like(flight.imu.accel_b_mps2)
@@ -51,11 +51,11 @@ def drawn() -> str:
         return style.to_svg(figure)
 
 
-def test_the_same_figure_is_the_same_file() -> None:
+def test_equal_figures_give_identical_svg() -> None:
     assert drawn() == drawn()
 
 
-def test_texts_keep_their_digits_while_paths_lose_theirs() -> None:
+def test_svg_paths_are_rounded_and_texts_are_not() -> None:
     svg = drawn()
     assert re.search(r">110\.37\d+<", svg)
     paths = svg.split('d="M')[1:]
@@ -63,7 +63,7 @@ def test_texts_keep_their_digits_while_paths_lose_theirs() -> None:
     assert all("." not in p or len(p.split(".")[1].split()[0]) <= 2 for p in paths)
 
 
-def test_page_colours_by_css_and_file_does_not() -> None:
+def test_svg_has_css_colours_on_page_and_fixed_ones_in_file() -> None:
     svg = drawn()
     assert style.BLUE in style.stand_alone(svg)
     assert "#ffffff" in style.stand_alone(svg)
@@ -73,7 +73,7 @@ def test_page_colours_by_css_and_file_does_not() -> None:
     assert 'width="' not in style.for_page(svg).split(">")[0]
 
 
-def test_a_narrow_page_puts_panels_below_each_other() -> None:
+def test_narrow_figure_stacks_its_panels() -> None:
     with style.styled():
         wide, _ = style.panels(style.WIDE_IN, 1, 2.0, columns=3)
         narrow, axes = style.panels(style.NARROW_IN, 1, 2.0, columns=3)
@@ -82,7 +82,7 @@ def test_a_narrow_page_puts_panels_below_each_other() -> None:
     assert len(axes) == 3
 
 
-def test_a_long_line_keeps_its_extremes(rng: np.random.Generator) -> None:
+def test_envelope_of_long_line_keeps_extremes_and_gaps(rng: np.random.Generator) -> None:
     x, y = np.arange(50_000.0), rng.normal(size=50_000)
     y[100:900] = np.nan
     y[1234], y[40_001] = 99.0, -99.0
@@ -93,12 +93,12 @@ def test_a_long_line_keeps_its_extremes(rng: np.random.Generator) -> None:
     assert np.isnan(thin_y).any()
 
 
-def test_a_short_line_stays_as_it_is() -> None:
+def test_short_line_is_not_thinned() -> None:
     x = np.arange(10.0)
     assert style.envelope(x, x)[0] is x
 
 
-def test_a_square_holds_all_points() -> None:
+def test_square_axes_contain_all_points() -> None:
     with style.styled():
         _, (axes,) = style.panels(style.WIDE_IN, 1, 3.0)
         style.fit_square(axes, np.array([0.0, 10.0]), np.array([5.0, 7.0]))
@@ -152,7 +152,7 @@ class Tags(HTMLParser):
         self.seen.append((tag, dict(attrs)))
 
 
-def test_the_page_is_well_formed_and_needs_no_network(folder: Path) -> None:
+def test_page_is_well_formed_without_scripts_or_remote_assets(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
     tags = Tags()
     tags.feed(text)
@@ -166,7 +166,7 @@ def test_the_page_is_well_formed_and_needs_no_network(folder: Path) -> None:
     assert "<script" not in text
 
 
-def test_the_pages_theme_colours_the_figures(folder: Path) -> None:
+def test_figures_take_colours_from_page_theme(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
     figures = "".join(re.findall(r"<svg.*?</svg>", text, flags=re.DOTALL))
     assert not [colour for colour in CSS_NAMES if colour in figures]
@@ -174,7 +174,7 @@ def test_the_pages_theme_colours_the_figures(folder: Path) -> None:
         assert len(re.findall(rf"--{name}: #", text)) == 2
 
 
-def test_every_figure_can_be_drawn_for_a_phone(report: Report, page: Report) -> None:
+def test_every_figure_is_drawn_at_phone_width(report: Report, page: Report) -> None:
     names = {picture.name for section in report.sections for picture in section.pictures}
     assert {"fig07_yaw", "fig08_quaternion", "fig09_acceleration_x", "table1_heat_map"} <= names
     for section in report.sections:
@@ -184,7 +184,7 @@ def test_every_figure_can_be_drawn_for_a_phone(report: Report, page: Report) -> 
                     picture.draw(style.NARROW_IN).draw_without_rendering()
 
 
-def test_every_figure_and_table_is_a_file_too(page: Report, folder: Path) -> None:
+def test_every_figure_and_table_is_written_to_a_file(page: Report, folder: Path) -> None:
     names = {picture.name for section in page.sections for picture in section.pictures}
     tables = {table.name for section in page.sections for table in section.tables}
     assert {path.stem for path in folder.glob("*.svg")} == names
@@ -193,14 +193,14 @@ def test_every_figure_and_table_is_a_file_too(page: Report, folder: Path) -> Non
     assert len(pd.read_csv(folder / "table1.csv")) == 9
 
 
-def test_every_link_has_its_section(folder: Path) -> None:
+def test_every_navigation_link_has_its_section(folder: Path) -> None:
     text = (folder / "index.html").read_text(encoding="utf-8")
     links = re.findall(r'<li><a href="#([^"]+)">', text)
     assert links
     assert set(links) == set(re.findall(r'<section id="([^"]+)">', text))
 
 
-def test_numbers_are_shown_short_and_unknown_ones_as_a_dash() -> None:
+def test_numbers_are_rounded_and_nan_is_a_dash() -> None:
     table = ReportTable(
         "t", pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]}), "", digits=1
     )
@@ -215,7 +215,9 @@ def test_prose_is_escaped() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed")
 @pytest.mark.parametrize(("width", "height"), [(1100, 900), (390, 800)])
-def test_a_browser_shows_the_page(folder: Path, tmp_path: Path, width: int, height: int) -> None:
+def test_browser_renders_page_at_desktop_and_phone_width(
+    folder: Path, tmp_path: Path, width: int, height: int
+) -> None:
     picture = tmp_path / "page.png"
     subprocess.run(
         [

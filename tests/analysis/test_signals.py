@@ -29,7 +29,7 @@ def test_butterworth_is_3_db_down_at_the_cutoff_and_flat_below(rate_hz: float) -
     assert (table["time a sample, ns"] > 0.0).all()
 
 
-def test_phase_and_delay_belong_together() -> None:
+def test_group_delay_is_negative_slope_of_phase() -> None:
     found = response("butterworth", SETTINGS, 1000.0)
     slope = -np.gradient(np.radians(found.phase_deg), 2.0 * np.pi * found.frequency_hz)
     middle = slice(20, -20)
@@ -37,7 +37,7 @@ def test_phase_and_delay_belong_together() -> None:
     assert found.gain_db[0] == pytest.approx(0.0, abs=1e-6)
 
 
-def test_the_filter_is_the_gateways_own(rng: np.random.Generator) -> None:
+def test_low_pass_equals_scipy_butterworth(rng: np.random.Generator) -> None:
     x = rng.normal(size=(300, 3))
     b, a = signal.butter(2, 10.0, fs=100.0)
     expected = signal.lfilter(b, a, x - x[0], axis=0) + x[0]
@@ -59,7 +59,7 @@ def test_spectrum_of_a_sine_peaks_at_its_frequency() -> None:
     assert frequency[density[:, 0].argmax()] == pytest.approx(12.5)
 
 
-def test_averaging_white_noise_falls_by_the_root(rng: np.random.Generator) -> None:
+def test_allan_deviation_of_white_noise_falls_with_root_of_time(rng: np.random.Generator) -> None:
     tau, deviation = allan_deviation(rng.normal(0.0, 1.0, (40_000, 3)), RATE_HZ)
     assert deviation[0] == pytest.approx([1.0] * 3, rel=0.03)
     near_1_s = int(np.argmin(np.abs(tau - 1.0)))
@@ -67,26 +67,26 @@ def test_averaging_white_noise_falls_by_the_root(rng: np.random.Generator) -> No
     assert deviation[near_1_s] == pytest.approx([expected] * 3, rel=0.15)
 
 
-def test_a_ramp_rises_with_the_averaging_time() -> None:
+def test_allan_deviation_of_rate_ramp_rises_with_averaging_time() -> None:
     """A rate ramp of slope s gives s * tau / sqrt(2)."""
     x = np.outer(np.arange(4000) / RATE_HZ * 0.5, [1, 1, 1])
     tau, deviation = allan_deviation(x, RATE_HZ)
     assert deviation[:, 0] == pytest.approx(0.5 * tau / np.sqrt(2.0))
 
 
-def test_too_short_a_log_has_no_deviation() -> None:
+def test_log_of_three_samples_has_no_allan_deviation() -> None:
     tau, deviation = allan_deviation(np.zeros((3, 3)), RATE_HZ)
     assert (len(tau), deviation.shape) == (0, (0, 3))
 
 
-def test_the_rest_before_take_off_is_found() -> None:
+def test_longest_rest_is_before_take_off() -> None:
     flight = short_flight()
     rest = longest_rest(flight.imu.accel_b_mps2, flight.imu.gyro_b_radps, flight.rate_hz)
     assert flight.time_s[rest.start] < 1.0
     assert 9.0 < flight.time_s[rest.stop - 1] < 15.0
 
 
-def test_a_flight_without_rest_has_none(rng: np.random.Generator) -> None:
+def test_longest_rest_of_moving_sensors_is_empty(rng: np.random.Generator) -> None:
     moving = rng.normal(0.0, 1.0, (500, 3))
     rest = longest_rest(moving, moving, RATE_HZ)
     assert rest.stop == rest.start

@@ -38,11 +38,11 @@ LATENCY = "estimation.reference.gps_latency_s"
         ("reference.declination_deg", "estimation.reference.declination_deg"),
     ],
 )
-def test_a_setting_is_found_by_its_name(name: str, key: str) -> None:
+def test_setting_is_found_by_short_name_or_end_of_path(name: str, key: str) -> None:
     assert full_key(name) == key
 
 
-def test_an_unknown_setting_is_reported() -> None:
+def test_unknown_setting_is_reported() -> None:
     with pytest.raises(SweepError, match="no setting ends in 'gama'"):
         full_key("gama")
 
@@ -56,46 +56,46 @@ def test_an_unknown_setting_is_reported() -> None:
         ("0.25", (0.25,)),
     ],
 )
-def test_values_are_read(text: str, values: tuple[float, ...]) -> None:
+def test_axis_is_parsed_from_range_or_list(text: str, values: tuple[float, ...]) -> None:
     assert parse_axis("alpha", text).values == values
 
 
-def test_names_are_values_too() -> None:
+def test_axis_accepts_names_as_values() -> None:
     axis = parse_axis("accel_filter", "butterworth, chebyshev")
     assert axis == Axis("estimation.paper.accel_filter", ("butterworth", "chebyshev"))
 
 
 @pytest.mark.parametrize("text", ["0:2:3", "a:b:c", "-0.1", "chebyshev"])
-def test_values_that_are_not_allowed_are_reported(text: str) -> None:
+def test_invalid_axis_values_are_reported(text: str) -> None:
     with pytest.raises(SweepError, match="alpha"):
         parse_axis("alpha", text)
 
 
-def test_a_value_lands_where_it_belongs() -> None:
+def test_value_changes_only_its_setting() -> None:
     changed = with_value(FusionSettings(), ALPHA, 0.7)
     assert changed.estimation.paper.alpha_accel == 0.7
     assert changed.estimation.paper.beta_velocity == 0.1
     assert changed.estimation.eskf == FusionSettings().estimation.eskf
 
 
-def test_a_grid_is_every_point() -> None:
+def test_grid_contains_every_combination() -> None:
     axes = [Axis("a", (1, 2)), Axis("b", (3, 4, 5))]
     assert grid(axes) == [(1, 3), (1, 4), (1, 5), (2, 3), (2, 4), (2, 5)]
 
 
-def test_a_grid_too_large_is_refused() -> None:
+def test_too_large_grid_is_rejected() -> None:
     with pytest.raises(SweepError, match="1000000 points"):
         grid([Axis("a", tuple(range(1000))), Axis("b", tuple(range(1000)))])
 
 
-def test_varying_an_estimators_setting_chooses_it() -> None:
+def test_varied_setting_selects_its_estimator() -> None:
     contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
     settings = with_values(contest.fusion, contest.keys, (0.3, 0.4))
     assert settings.estimation.estimator == "paper"
     assert settings.estimation.paper.alpha_accel == 0.3
 
 
-def test_two_estimators_at_once_are_refused() -> None:
+def test_settings_of_two_estimators_are_rejected() -> None:
     keys = [ALPHA, "estimation.eskf.x"]
     with pytest.raises(SweepError, match="several estimators"):
         make_contest(short_flight(), short_case().fusion, keys)
@@ -111,7 +111,7 @@ def test_withheld_fixes_are_not_fused(interval_s: float, share: float) -> None:
     assert len(fused) / len(fixes_of(flight)) == pytest.approx(share, abs=0.03)
 
 
-def test_several_processes_give_the_same_as_one() -> None:
+def test_several_processes_give_results_of_one() -> None:
     contest = make_contest(short_flight(), short_case().fusion, [ALPHA, BETA])
     points = grid([Axis(ALPHA, (0.1, 0.9)), Axis(BETA, (0.1, 0.9))])
     with pool(contest, 2) as run:
@@ -122,8 +122,8 @@ def test_several_processes_give_the_same_as_one() -> None:
     assert one[0]["held_m"] < one[3]["held_m"]
 
 
-def test_withheld_fixes_find_the_latency() -> None:
-    """Interpolated GPS would choose no compensation at all: it copies the late fixes."""
+def test_withheld_fixes_identify_latency_and_interpolated_do_not() -> None:
+    """Interpolated GPS favours no latency compensation, because it copies the late fixes."""
     # With the turns that begin after 40 s.
     flight, fusion = short_flight(60.0), short_case().fusion
     contest = make_contest(flight, fusion, [LATENCY])
@@ -136,7 +136,7 @@ def test_withheld_fixes_find_the_latency() -> None:
     assert copied.iloc[0][LATENCY] <= table.iloc[0][LATENCY]
 
 
-def test_trials_are_sorted_and_unknown_columns_left_out() -> None:
+def test_trials_are_sorted_without_columns_of_nan() -> None:
     scores = [((k,), {"held_m": m, "reference_m": math.nan}) for k, m in enumerate((3.0, 1.0, 2.0))]
     table = tabulate(["k"], scores, "held")
     assert table["k"].tolist() == [1, 2, 0]
@@ -145,7 +145,7 @@ def test_trials_are_sorted_and_unknown_columns_left_out() -> None:
         tabulate(["k"], scores, "reference")
 
 
-def test_the_optimiser_finds_the_bottom_of_a_bowl() -> None:
+def test_optimiser_finds_minimum_of_paraboloid() -> None:
     def bowl(points: list[Values]) -> list[float]:
         return [
             math.nan if p[0] > 0.95 else (float(p[0]) - 0.3) ** 2 + (float(p[1]) - 0.7) ** 2
@@ -159,12 +159,12 @@ def test_the_optimiser_finds_the_bottom_of_a_bowl() -> None:
 
 
 @pytest.mark.parametrize("values", [(0.5,), ("butterworth", "chebyshev"), (0.5, 0.5)])
-def test_the_optimiser_needs_a_range(values: Values) -> None:
+def test_optimiser_requires_range(values: Values) -> None:
     with pytest.raises(SweepError, match="needs a range"):
         optimise([Axis("a", values)], lambda points: [0.0] * len(points), 1)
 
 
-def test_an_attitude_is_judged_by_the_reference() -> None:
+def test_attitude_is_scored_against_reference() -> None:
     contest = make_contest(short_flight(), short_case().fusion, ["estimation.paper.alpha_gyro"])
     close, far = run_trial(contest, (0.995,)), run_trial(contest, (0.1,))
     assert close["attitude_deg"] < far["attitude_deg"]

@@ -48,7 +48,7 @@ def fused(season: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     return out, *run("fuse", season, "-o", out, "--jobs", 2)
 
 
-def test_one_broken_file_stops_nothing_and_is_reported(fused: tuple[Path, int, str]) -> None:
+def test_broken_file_is_reported_and_others_are_fused(fused: tuple[Path, int, str]) -> None:
     out, code, text = fused
     assert code == 1
     assert "broken.csv" in text
@@ -63,7 +63,7 @@ def test_one_broken_file_stops_nothing_and_is_reported(fused: tuple[Path, int, s
     assert "broken.csv" in page
 
 
-def test_batch_fuses_as_the_command(
+def test_batch_gives_output_of_fuse_command(
     season: Path, fused: tuple[Path, int, str], tmp_path: Path
 ) -> None:
     single = tmp_path / "alone.csv"
@@ -84,7 +84,7 @@ def test_finished_recordings_are_not_done_again(season: Path, fused: tuple[Path,
     assert [json.loads(path.read_bytes())["files"] for path in changed] == [["fused/beta.csv"]]
 
 
-def test_other_settings_are_other_work(season: Path, tmp_path: Path) -> None:
+def test_changed_settings_repeat_the_work(season: Path, tmp_path: Path) -> None:
     items = items_of([str(season / FLIGHTS[0])])
     seen: list[str] = []
 
@@ -102,7 +102,7 @@ def test_other_settings_are_other_work(season: Path, tmp_path: Path) -> None:
     assert sorted(seen) == ["str", "str", "str", "tuple", "tuple"]
 
 
-def test_a_version_is_compared_with_another(
+def test_results_of_two_versions_are_compared(
     fused: tuple[Path, int, str], season: Path, tmp_path: Path
 ) -> None:
     out, _, _ = fused
@@ -125,7 +125,7 @@ def test_a_version_is_compared_with_another(
     assert missing[0] == 2
 
 
-def test_nothing_half_written_looks_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_partial_result_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = ResultFolder(tmp_path)
     result = FlightResult(
         place="a", digest="d", key="k", task="report", version="1", files=("reports/a/index.html",)
@@ -174,7 +174,7 @@ def test_two_batches_do_not_write_into_one_folder(season: Path, tmp_path: Path) 
     assert not staged.exists()
 
 
-def test_results_of_one_tick_of_the_clock_stand_by_name(tmp_path: Path) -> None:
+def test_results_with_equal_times_are_sorted_by_name(tmp_path: Path) -> None:
     folder = ResultFolder(tmp_path)
     for key in ("b", "z", "a", "m", "c", "y"):
         result = FlightResult(place=key, digest="d", key=key, task="info", version="1")
@@ -193,7 +193,7 @@ def test_info_describes_every_file(season: Path, tmp_path: Path) -> None:
     assert durations == pytest.approx([40.0] * 4, abs=0.2)
 
 
-def test_names_that_are_not_utf8_stop_nothing(season: Path, tmp_path: Path) -> None:
+def test_files_with_non_utf8_names_are_processed(season: Path, tmp_path: Path) -> None:
     there = tmp_path / "there"
     there.mkdir()
     shutil.copy(season / FLIGHTS[0], there / os.fsdecode(b"fl\xfcg_01_v1.csv"))
@@ -202,11 +202,11 @@ def test_names_that_are_not_utf8_stop_nothing(season: Path, tmp_path: Path) -> N
         code, text = run("info", there, "-o", tmp_path / "out", "--jobs", 1)
         assert code == 1
         assert "1 of 2 recordings failed" in text
-    places = {Path(result.place).name for result in read_results(tmp_path / "out")}
-    assert places == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
+    names = {Path(result.place).name for result in read_results(tmp_path / "out")}
+    assert names == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
 
 
-def test_a_report_is_put_in_place_as_a_whole(
+def test_report_folder_contains_page_and_figures(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One section stands for all of them, which take ten seconds to draw."""
@@ -219,7 +219,7 @@ def test_a_report_is_put_in_place_as_a_whole(
     assert {file.name for file in folder.iterdir()} == names
 
 
-def test_two_recordings_of_one_name_are_kept_apart(season: Path, tmp_path: Path) -> None:
+def test_two_recordings_with_equal_names_are_kept_apart(season: Path, tmp_path: Path) -> None:
     for folder, name in (("x", FLIGHTS[0]), ("y", FLIGHTS[1])):
         (tmp_path / folder).mkdir()
         shutil.copy(season / name, tmp_path / folder / "log_01_v1.csv")
@@ -227,7 +227,7 @@ def test_two_recordings_of_one_name_are_kept_apart(season: Path, tmp_path: Path)
     assert len(list((tmp_path / "out" / "fused").glob("log-*.csv"))) == 2
 
 
-def test_tables_stand_for_their_recordings_tlogs(tmp_path: Path) -> None:
+def test_tables_are_preferred_to_tlog_of_same_recording(tmp_path: Path) -> None:
     for name in ("a_01.tlog", "a_01_v1.csv", "a_02_v1.csv", "b_01.tlog"):
         (tmp_path / name).write_text("x")
     found = items_of([str(tmp_path)])
@@ -259,7 +259,7 @@ def _raise(marker: Path) -> str:
     ("work", "text"),
     [(_die_once, "once"), (_die_always, "its process died"), (_raise, "IndexError: no such thing")],
 )
-def test_a_process_that_dies_is_made_up_for(
+def test_death_of_process_affects_only_its_own_work(
     work: Callable[[Path], str], text: str, tmp_path: Path
 ) -> None:
     items = [tmp_path / name for name in ("a", "b", "bad", "c", "d", "e")]
@@ -297,7 +297,7 @@ def test_url_gives_the_results_of_the_local_file(
     assert (tmp_path / "fused" / "beta.csv").read_bytes() == alone
 
 
-def test_a_local_url_is_read_too(season: Path, tmp_path: Path) -> None:
+def test_file_url_is_read(season: Path, tmp_path: Path) -> None:
     code, text = run("info", f"file://{season}", "-o", tmp_path)
     assert code == 1
     assert all(name in text for name in FLIGHTS)
@@ -358,7 +358,7 @@ def test_remote_files_are_fetched_once_unless_changed(season: Path, tmp_path: Pa
     assert fetched() == [FLIGHTS[1]]
 
 
-def test_a_broken_file_elsewhere_is_reported_by_its_url(memory: str, tmp_path: Path) -> None:
+def test_broken_remote_file_is_reported_by_its_url(memory: str, tmp_path: Path) -> None:
     fsspec.filesystem("memory").pipe_file("/flights/broken.csv", b"x,y\n1,2\n")
     code, text = run("info", f"{memory}/broken.csv", "-o", tmp_path)
     assert code == 1
@@ -399,7 +399,7 @@ def test_missing_extra_is_named(
     assert "mavgate[batch]" in text
 
 
-def test_no_passphrase_leaves_the_machine() -> None:
+def test_signing_passphrase_is_not_sent_to_workers() -> None:
     import msgspec
 
     vehicle = msgspec.structs.replace(AircraftSettings().vehicle, signing_passphrase="secret word")

@@ -83,16 +83,16 @@ def write_tlog(path: Path) -> Path:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with all kinds of files, indexed."""
-    place = tmp_path_factory.mktemp("season")
-    write_flight(place / "one_01_v1.csv", vehicle=1, day=0)
-    write_flight(place / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
-    write_tlog(place / "far.tlog")
-    (place / "empty.csv").write_text("")
-    (place / "noise.tlog").write_bytes(bytes(np.random.default_rng(1).integers(0, 255, 5000)))
-    (place / "readme.txt").write_text("no recording")
-    (place / ".hidden.csv").write_text("time_us,x\n")
-    index_folder(place, OPTIONS, InThisProcess())
-    return place
+    folder = tmp_path_factory.mktemp("season")
+    write_flight(folder / "one_01_v1.csv", vehicle=1, day=0)
+    write_flight(folder / "deeper" / "two_01_v2.csv", vehicle=2, day=3, lost=10)
+    write_tlog(folder / "far.tlog")
+    (folder / "empty.csv").write_text("")
+    (folder / "noise.tlog").write_bytes(bytes(np.random.default_rng(1).integers(0, 255, 5000)))
+    (folder / "readme.txt").write_text("no recording")
+    (folder / ".hidden.csv").write_text("time_us,x\n")
+    index_folder(folder, OPTIONS, InThisProcess())
+    return folder
 
 
 def row_of(folder: Path, path: str) -> dict:
@@ -137,7 +137,7 @@ def test_tlog_has_one_row_for_each_vehicle(folder: Path) -> None:
     assert second["distance"] is None
 
 
-def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(tmp_path: Path) -> None:
+def test_clock_jump_of_years_is_not_counted_as_duration(tmp_path: Path) -> None:
     scanner = TlogScanner()
     batch = scanner.feed(write_tlog(tmp_path / "a.tlog").read_bytes(), final=True)
     leap_us = 30 * 31_556_952_000_000
@@ -154,7 +154,7 @@ def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(tmp_path: Path) ->
     assert facts.gps_lost == pytest.approx(11.0, abs=1.5)
 
 
-def test_files_that_go_while_they_are_looked_for_stop_nothing(
+def test_file_deleted_during_indexing_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = [write_tlog(tmp_path / name) for name in ("a.tlog", "b.tlog")]
@@ -168,7 +168,7 @@ def test_files_that_go_while_they_are_looked_for_stop_nothing(
 
 
 @pytest.mark.parametrize("name", ["a.tlog.gz", "packed.tlog"])
-def test_a_packed_file_is_known_by_its_first_bytes(tmp_path: Path, name: str) -> None:
+def test_compressed_file_is_recognised_by_its_first_bytes(tmp_path: Path, name: str) -> None:
     plain = write_tlog(tmp_path / "a.tlog").read_bytes()
     (tmp_path / name).write_bytes(gzip.compress(plain))
     found = read_file(tmp_path, OPTIONS, (name, ""))
@@ -184,7 +184,7 @@ def test_broken_file_has_a_row_with_the_reason(folder: Path) -> None:
     assert "is no recording" in broken["noise.tlog"]
 
 
-def test_a_name_that_is_not_utf8_and_a_time_beyond_all(tmp_path: Path, folder: Path) -> None:
+def test_file_with_non_utf8_name_and_extreme_mtime_is_indexed(tmp_path: Path, folder: Path) -> None:
     odd = tmp_path / os.fsdecode(b"fl\xfcg_01_v1.csv")
     odd.write_bytes((folder / "one_01_v1.csv").read_bytes())
     os.utime(odd, (13_000_000_000, 13_000_000_000))
@@ -209,7 +209,7 @@ def test_only_changed_files_are_read_again(tmp_path: Path) -> None:
     assert index_folder(tmp_path, OPTIONS, executor).unchanged == 2
 
 
-def test_an_interruption_loses_nothing(tmp_path: Path) -> None:
+def test_interrupted_indexing_keeps_files_already_read(tmp_path: Path) -> None:
     for number in range(5):
         (tmp_path / f"{number}.csv").write_text("x")
 
@@ -225,7 +225,7 @@ def test_an_interruption_loses_nothing(tmp_path: Path) -> None:
     assert index_folder(tmp_path, OPTIONS, InThisProcess()).read == 2
 
 
-def test_a_half_written_table_is_read_as_far_as_it_goes(tmp_path: Path, folder: Path) -> None:
+def test_truncated_table_is_read_up_to_its_end(tmp_path: Path, folder: Path) -> None:
     whole = (folder / "one_01_v1.csv").read_bytes()
     (tmp_path / "cut.csv").write_bytes(whole[: len(whole) // 2])
     found = read_file(tmp_path, OPTIONS, ("cut.csv", ""))
@@ -255,7 +255,7 @@ def test_a_half_written_table_is_read_as_far_as_it_goes(tmp_path: Path, folder: 
          "too long|not authorized|prohibited"),
     ],
 )  # fmt: skip
-def test_a_condition_can_only_read(folder: Path, where: str, message: str) -> None:
+def test_query_condition_cannot_write(folder: Path, where: str, message: str) -> None:
     if not message:
         assert len(find_flights(folder, where)) == 4
         return
@@ -272,7 +272,7 @@ def test_file_that_is_no_catalogue_is_reported(tmp_path: Path) -> None:
         Catalogue(tmp_path)
 
 
-def test_catalogue_of_another_version_is_made_again(tmp_path: Path) -> None:
+def test_catalogue_of_another_version_is_rebuilt(tmp_path: Path) -> None:
     catalogue = Catalogue(tmp_path)
     catalogue.put([CataloguedFile("a", "a", None, 1, 1, "d", flights=((FlightFacts(), []),))])
     catalogue._db.execute("PRAGMA user_version = 99")
@@ -312,7 +312,7 @@ def catalogued(number: int) -> CataloguedFile:
     return CataloguedFile(f"{number}.csv", f"{number}", None, 1, 2, "d" * 500)
 
 
-def test_a_catalogue_that_another_indexing_made_meanwhile_is_kept(
+def test_catalogue_of_concurrent_indexing_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = Catalogue(tmp_path)
@@ -336,33 +336,38 @@ def test_damaged_catalogue_is_reported(tmp_path: Path) -> None:
         index_folder(tmp_path, OPTIONS, LocalProcesses(1))
 
 
-def test_the_tracks_are_geojson(folder: Path) -> None:
+def test_tracks_are_returned_as_geojson(folder: Path) -> None:
     found = geojson_of(folder, "kind = 'tlog'")
     (flight,) = found["features"]
     (line,) = flight["geometry"]["coordinates"]
     assert line[0][:2] == pytest.approx([8.0, 47.0])
-    # Of a square's two sides the corner is all that is needed, and the step up costs one place.
+    # Two sides of a square need one corner, and the climb at the start one more position.
     assert 3 <= len(line) <= 5
     assert flight["properties"]["vehicle"] == 1
 
 
-def test_a_track_across_180_degrees_is_cut() -> None:
+def test_track_across_date_line_is_split() -> None:
     line = feature([(0.0, 179.9, 0.0), (0.0, -179.9, 0.0)], {})["geometry"]["coordinates"]
-    assert [[place[0] for place in part] for part in line] == [[179.9, 179.9], [-179.9, -179.9]]
+    assert [[position[0] for position in part] for part in line] == [
+        [179.9, 179.9],
+        [-179.9, -179.9],
+    ]
 
 
-def test_a_track_is_shown_within_the_tolerance(rng: np.random.Generator) -> None:
+def test_simplified_track_is_within_tolerance(rng: np.random.Generator) -> None:
     turn = np.linspace(0.0, 20.0, 3000)
-    places = [(1e-3 * a * np.cos(a), 1e-3 * a * np.sin(a), 10.0) for a in turn]
-    kept = simplified(places)
-    assert kept[0] == places[0]
-    assert kept[-1] == places[-1]
+    positions = [(1e-3 * a * np.cos(a), 1e-3 * a * np.sin(a), 10.0) for a in turn]
+    kept = simplified(positions)
+    assert kept[0] == positions[0]
+    assert kept[-1] == positions[-1]
     assert 20 < len(kept) < 400
-    lost = np.interp(turn, [turn[places.index(place)] for place in kept], [p[0] for p in kept])
-    assert np.abs(lost - np.array(places)[:, 0]).max() * 111_000.0 < 15.0
+    lost = np.interp(
+        turn, [turn[positions.index(position)] for position in kept], [p[0] for p in kept]
+    )
+    assert np.abs(lost - np.array(positions)[:, 0]).max() * 111_000.0 < 15.0
 
 
-def test_a_slow_receiver_is_no_outage() -> None:
+def test_slow_fix_rate_is_not_an_outage() -> None:
     tally = FlightTally()
     for second in (0, 5, 10, 15, 30, 35):
         tally.add_gps(second * US_PER_S, fixed=True)
@@ -376,7 +381,7 @@ def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:
     assert lost_share(np.array([1])) is None
 
 
-def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> None:
+def test_commands_index_list_and_show(tmp_path: Path, folder: Path) -> None:
     (tmp_path / "one_01_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "one_02_v1.csv").write_bytes((folder / "one_01_v1.csv").read_bytes())
     (tmp_path / "other").mkdir()
@@ -400,12 +405,12 @@ def test_the_command_indexes_lists_and_shows(tmp_path: Path, folder: Path) -> No
     assert invoke("catalogue", "show", "nobody", "-d", tmp_path).exit_code == 2
 
 
-def test_every_column_has_a_place_in_the_book() -> None:
+def test_every_column_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "batch.md").read_text()
     assert [name for name in COLUMNS if f"`{name}`" not in text] == []
 
 
-def test_processes_give_the_results_of_one(folder: Path, tmp_path: Path) -> None:
+def test_several_processes_give_results_of_one(folder: Path, tmp_path: Path) -> None:
     for name in ("one_01_v1.csv", "far.tlog"):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     index_folder(tmp_path, OPTIONS, LocalProcesses(2))

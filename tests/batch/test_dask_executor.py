@@ -31,7 +31,7 @@ def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
 
 
 def _kill_one_worker(marker: Path) -> int:
-    """Die the first time, as a machine does."""
+    """Kill the worker process at the first attempt, as a failing machine would."""
     if marker.name == "deadly" and not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
@@ -58,7 +58,7 @@ def test_cluster_gives_the_results_of_this_machine(
         assert len(here) >= 2
 
 
-def test_a_worker_that_is_killed_is_made_up_for(address: str, tmp_path: Path) -> None:
+def test_work_of_killed_worker_is_repeated(address: str, tmp_path: Path) -> None:
     cluster = DaskCluster(address)
     try:
         names = ["a", "bb", "deadly", "ccc", *(f"more {k}" for k in range(20))]
@@ -69,7 +69,7 @@ def test_a_worker_that_is_killed_is_made_up_for(address: str, tmp_path: Path) ->
     assert found == {k: len(name) for k, name in enumerate(names)}
 
 
-def test_work_that_fails_fails_alone(address: str, tmp_path: Path) -> None:
+def test_failed_work_is_returned_with_reason(address: str, tmp_path: Path) -> None:
     cluster = DaskCluster(address)
     try:
         ((_, outcome),) = cluster.run(_fail, [tmp_path / "x"])
@@ -86,7 +86,7 @@ def test_missing_scheduler_is_reported(
         DaskCluster("tcp://127.0.0.1:9")
 
 
-def test_workers_of_another_version_are_refused(
+def test_workers_of_another_version_are_rejected(
     address: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("gateway.batch.executors.__version__", "0.0.1")

@@ -37,7 +37,7 @@ def test_flights_are_judged_by_the_choice_of_other_folds() -> None:
     assert np.mean(judged) > -0.05
 
 
-def test_a_true_lead_is_distinguished_from_chance(rng: np.random.Generator) -> None:
+def test_true_lead_is_distinguished_from_chance(rng: np.random.Generator) -> None:
     errors = np.exp(rng.normal(0.0, 0.1, (40, 5)))
     errors[:, 3] *= 0.8
     found = choose(errors, np.exp(rng.normal(0.0, 0.1, 40)), GROUPS)
@@ -52,7 +52,7 @@ def test_a_true_lead_is_distinguished_from_chance(rng: np.random.Generator) -> N
     assert "more than chance" in lead.text
 
 
-def test_flights_that_know_nothing_are_left_out() -> None:
+def test_flights_without_scores_are_left_out() -> None:
     errors = np.array([[1.0, 2.0], [np.nan, 1.0], [1.0, 3.0]])
     found = choose(errors, np.array([2.0, 2.0, np.nan]), ["a", "b", "c"])
     assert found.winner == 0
@@ -93,7 +93,7 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
     ]
 
 
-def test_worse_flights_are_listed_the_worst_first() -> None:
+def test_degraded_flights_are_listed_worst_first() -> None:
     then = [flight("a", 1, eskf=1.0), flight("b", 1, eskf=1.0), flight("c", 1, eskf=1.0)]
     now = [flight("a", 1, eskf=1.04), flight("b", 1, eskf=2.0), flight("c", 1, eskf=3.0)]
     found = versus([*now, flight("new", 1, eskf=9.0)], then)
@@ -102,7 +102,7 @@ def test_worse_flights_are_listed_the_worst_first() -> None:
 
 
 @pytest.mark.io
-def test_one_set_is_found_for_a_season(season: Path, tmp_path: Path) -> None:
+def test_sweep_of_season_finds_one_set_of_settings(season: Path, tmp_path: Path) -> None:
     words = ["batch", "sweep", str(season), "-o", str(tmp_path), "--vary", "beta=0.1,0.5,0.9"]
     done = invoke(*words, "--jobs", "2")
     assert done.exit_code == 1, done.output
@@ -120,7 +120,7 @@ def test_one_set_is_found_for_a_season(season: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.io
-def test_sweep_takes_many_flights(season: Path, tmp_path: Path) -> None:
+def test_sweep_accepts_several_flights(season: Path, tmp_path: Path) -> None:
     flights = [str(season / name) for name in ("alpha_01_v1.csv", "gamma_01_v2.csv")]
     best = tmp_path / "best.toml"
     words = ["sweep", *flights, "--beta", "0.1,0.9", "-o", str(best), "--jobs", "2"]

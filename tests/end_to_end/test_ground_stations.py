@@ -101,7 +101,7 @@ def stations(gateway: Gateway) -> Iterator[Callable[..., Station]]:
         station.close()
 
 
-def test_qgroundcontrols_start_up(stations: Callable[..., Station]) -> None:
+def test_qgroundcontrol_start_up_is_answered(stations: Callable[..., Station]) -> None:
     for kind in (socket.SOCK_DGRAM, socket.SOCK_STREAM):
         for version in (1, 2):
             qgroundcontrol(stations(kind, version))

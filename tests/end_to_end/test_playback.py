@@ -94,7 +94,7 @@ def play(tmp_path: Path) -> Iterator[Callable[..., Playing]]:
         playing.process.communicate()
 
 
-def test_a_client_gets_every_frame_byte_for_byte(
+def test_client_gets_every_frame_unchanged(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -106,7 +106,7 @@ def test_a_client_gets_every_frame_byte_for_byte(
     assert playing.process.wait(START_LIMIT_S) == 0
 
 
-def test_an_attached_player_ends_when_its_parent_is_gone(
+def test_attached_player_ends_when_its_parent_ends(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -119,7 +119,7 @@ def test_an_attached_player_ends_when_its_parent_is_gone(
     assert playing.process.wait(START_LIMIT_S) == 0
 
 
-def test_a_paused_player_is_steered_by_its_socket(
+def test_paused_player_obeys_its_control_socket(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -134,7 +134,7 @@ def test_a_paused_player_is_steered_by_its_socket(
     assert seen["HEARTBEAT"].get_srcSystem() == 3
 
 
-def test_two_recordings_fly_as_two_vehicles(
+def test_two_recordings_are_played_as_two_vehicles(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -145,7 +145,7 @@ def test_two_recordings_fly_as_two_vehicles(
         systems |= {message.get_srcSystem() for message in client.receive()}
 
 
-def test_a_recorded_vehicle_answers_a_ground_station(
+def test_recorded_vehicle_answers_a_ground_station(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -219,7 +219,7 @@ async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., 
     assert home.longitude_deg == pytest.approx(LON_DEG, abs=0.01)
 
 
-async def test_what_mavproxy_recorded_is_seen_by_mavproxy_and_mavsdk(
+async def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
     start_gateway: Callable[..., Gateway],
     start_mavproxy: Callable[[int], MavProxy],
     play: Callable[..., Playing],

@@ -135,7 +135,7 @@ async def test_recorded_replayed_and_recorded_again_is_equal_message_for_message
     assert frames_in(tmp_path / "second") == frames
 
 
-async def test_the_table_alone_gives_the_recorded_states_to_the_last_bit(
+async def test_table_alone_gives_recorded_states_bit_for_bit(
     recorded: tuple[Path, list[bytes], list[NavState], Flight],
 ) -> None:
     folder, _, states, flight = recorded

@@ -92,7 +92,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-async def test_a_broken_file_is_reported_when_the_aircraft_appears(
+async def test_broken_file_is_reported_when_the_aircraft_appears(
     folder: Path, connect: Callable[..., Client]
 ) -> None:
     file = folder / "aircraft" / "1.places.json"

@@ -72,7 +72,7 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Systemd
     systemd.close()
 
 
-def test_a_reload_changes_clients_and_leaves_no_gap(
+def test_reload_changes_clients_and_leaves_no_gap(
     start_gateway: Callable[..., Gateway],
     connect: Callable[..., Client],
     systemd: Systemd,
@@ -118,7 +118,7 @@ def test_a_reload_changes_clients_and_leaves_no_gap(
     assert systemd.notified() == b"STOPPING=1"
 
 
-def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
+def test_terminal_that_goes_ends_all_processes_of_the_demo(
     start_gateway: Callable[..., Gateway], tmp_path: Path
 ) -> None:
     master, terminal = os.openpty()
@@ -142,7 +142,7 @@ def test_a_terminal_that_goes_ends_all_processes_of_the_demo(
     wait_for(is_gone)
 
 
-def test_a_reload_changes_the_signing(
+def test_reload_changes_the_signing(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
     gateway = start_gateway("demo")
@@ -164,7 +164,7 @@ def test_a_reload_changes_the_signing(
     until_signed(False)
 
 
-def test_a_recording_is_accepted_only_when_it_runs(
+def test_recording_is_accepted_only_when_it_runs(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
     in_the_way = tmp_path / "flights"

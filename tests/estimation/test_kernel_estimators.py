@@ -32,7 +32,7 @@ Items = list[ImuSample | BaroSample | GpsFix]
 
 REFERENCE = ReferenceSettings(gps_latency_s=0.2)
 MAG = (21.0, 1.3, 43.0)
-"""About the field at the tests' place."""
+"""About the field at the position of the tests, uT."""
 
 
 @pytest.fixture
@@ -121,7 +121,7 @@ def test_log_and_samples_give_the_same_bits(estimator: KernelEstimator) -> None:
     np.testing.assert_array_equal(offline, live)
 
 
-def test_a_record_is_read_and_written_at_its_address(estimator: KernelEstimator) -> None:
+def test_record_is_read_and_written_at_its_address(estimator: KernelEstimator) -> None:
     feed(estimator, events(1.0, 6))
     state: Any = estimator._state
     record = record_at(address_of(state), state.dtype)
@@ -131,10 +131,10 @@ def test_a_record_is_read_and_written_at_its_address(estimator: KernelEstimator)
     assert (state.time_s, state.q_nb[2]) == (7.5, 0.25)
 
 
-def test_python_gives_what_machine_code_does(
+def test_python_agrees_with_machine_code(
     estimator: KernelEstimator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Python rounds powers differently."""
+    """Powers are rounded differently, so the last bits may differ."""
     items = events(8.0, 5)
     machine = as_rows(feed(estimator, items))
     for name in ("begin_state", "imu_steps", "baro_step", "gps_step"):
@@ -159,14 +159,14 @@ def test_split_run_equals_one_run(either: Estimator, seed: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(whole[:, NAV_QUAT:4], axis=1), 1.0, atol=1e-12)
 
 
-def test_rest_is_found_and_reported(estimator: KernelEstimator) -> None:
+def test_rest_is_detected_and_reported(estimator: KernelEstimator) -> None:
     state = feed(estimator, still(0, 4.0))[-1]
     assert NavFlags.AT_REST | NavFlags.ATTITUDE_VALID | NavFlags.USING_MAG in state.flags
     assert NavFlags.HEADING_VALID not in state.flags
     assert math.isnan(state.lat_deg)
 
 
-def test_a_fix_gives_place_and_true_north(estimator: KernelEstimator) -> None:
+def test_fix_gives_position_and_true_north(estimator: KernelEstimator) -> None:
     items = [*still(0, 2.0), fix(2_000_000), *still(2_000_000, 1.0)]
     state = feed(estimator, items)[-1]
     valid = NavFlags.POSITION_VALID | NavFlags.HEADING_VALID | NavFlags.USING_GPS
@@ -178,13 +178,13 @@ def test_a_fix_gives_place_and_true_north(estimator: KernelEstimator) -> None:
     assert heading_deg == pytest.approx(3.5 - math.degrees(math.atan2(1.3, 21.0)), abs=1.5)
 
 
-class TestNonsense:
+class TestInvalidData:
     def finite(self, states: list[NavState]) -> bool:
         rows = as_rows(states)
         return bool(np.isfinite(rows[:, :4]).all() and np.isfinite(rows[1:, NAV_LAT]).all())
 
     @pytest.mark.parametrize("bad", [math.nan, math.inf, 1e30, 1e300, -500.0])
-    def test_a_bad_number_is_left_out_and_reported(self, either: Estimator, bad: float) -> None:
+    def test_invalid_samples_are_left_out_and_reported(self, either: Estimator, bad: float) -> None:
         feed(either, [*still(0, 3.0), fix(3_000_000)])
         change = {"accel_b_mps2": (bad, 0.0, bad), "gyro_b_radps": (bad, bad, 0.0)}
         broken = [replace(s, **change, mag_b_ut=(bad,) * 3) for s in still(3_000_000, 0.5)]
@@ -196,19 +196,19 @@ class TestNonsense:
         assert after.q_nb[0] > 0.99
         assert math.hypot(*after.vel_n_mps) < 1.0
 
-    def test_bad_before_the_start(self, either: Estimator) -> None:
+    def test_invalid_first_sample_gives_no_attitude(self, either: Estimator) -> None:
         state = either.update_imu(imu(0, (math.nan, 0.0, 0.0)))
         assert NavFlags.ATTITUDE_VALID not in state.flags
         assert NavFlags.SENSOR_FAULT in state.flags
         assert state.q_nb == (1.0, 0.0, 0.0, 0.0)
 
-    def test_a_late_sample_changes_nothing(self, either: Estimator) -> None:
+    def test_late_sample_does_not_change_attitude(self, either: Estimator) -> None:
         before = feed(either, [*still(0, 3.0), fix(3_000_000), *still(3_000_000, 0.1)])[-1]
         late = either.update_imu(imu(1_000_000, gyro=(9.0, 9.0, 9.0)))
         np.testing.assert_allclose(late.q_nb, before.q_nb, rtol=0.0, atol=1e-15)
 
     @pytest.mark.parametrize("repeats", [False, True])
-    def test_samples_that_are_lost_on_their_way_are_no_fault_of_a_sensor(
+    def test_lost_samples_are_not_reported_as_sensor_fault(
         self, estimator: KernelEstimator, repeats: bool
     ) -> None:
         items = still(0, 3.0)
@@ -222,7 +222,9 @@ class TestNonsense:
             assert not [each for each in states if NavFlags.SENSOR_FAULT in each.flags]
 
     @pytest.mark.parametrize("jump_us", [5_000_000, -60_000_000])
-    def test_a_jump_in_time_is_survived(self, either: Estimator, jump_us: int) -> None:
+    def test_time_jump_leaves_states_finite_and_gps_in_use(
+        self, either: Estimator, jump_us: int
+    ) -> None:
         start = 100_000_000
         feed(either, [*still(start, 3.0), fix(start + 3_000_000), *still(start + 3_000_000, 1.0)])
         later = start + 4_000_000 + jump_us
@@ -232,7 +234,9 @@ class TestNonsense:
         assert states[-1].q_nb[0] > 0.99
         assert NavFlags.USING_GPS | NavFlags.POSITION_VALID in states[100].flags
 
-    def test_a_stuck_gyroscope_is_found(self, estimator: KernelEstimator) -> None:
+    def test_stuck_gyroscope_is_reported_until_it_recovers(
+        self, estimator: KernelEstimator
+    ) -> None:
         feed(estimator, still(0, 3.0))
         stuck = [replace(s, gyro_b_radps=(0.3, 0.0, 0.0)) for s in still(3_000_000, 6.0)]
         states = feed(estimator, stuck)
@@ -241,9 +245,7 @@ class TestNonsense:
         assert NavFlags.SENSOR_FAULT not in recovered[-1].flags
         assert recovered[-1].q_nb[0] > 0.99
 
-    def test_a_glitch_of_hundreds_of_metres_is_rejected_and_reported(
-        self, estimator: KernelEstimator
-    ) -> None:
+    def test_gps_glitch_of_300_m_is_rejected_and_reported(self, estimator: KernelEstimator) -> None:
         items: Items = []
         for sample in still(0, 12.0):
             t = sample.time_us
@@ -256,9 +258,7 @@ class TestNonsense:
         assert NavFlags.GPS_REJECTED in states[900].flags
         assert NavFlags.GPS_REJECTED not in states[-1].flags
 
-    def test_lasting_jump_of_the_fixes_is_accepted_in_the_end(
-        self, estimator: KernelEstimator
-    ) -> None:
+    def test_lasting_jump_of_fixes_is_finally_accepted(self, estimator: KernelEstimator) -> None:
         items: Items = []
         for sample in still(0, 60.0):
             t = sample.time_us
@@ -270,7 +270,7 @@ class TestNonsense:
         assert NavFlags.GPS_REJECTED not in state.flags
 
 
-def test_outage_is_reported_and_a_reset_discards_the_fixes(either: Estimator) -> None:
+def test_outage_is_reported_and_reset_discards_fixes(either: Estimator) -> None:
     feed(either, [*still(0, 3.0), fix(3_000_000)])
     states = feed(either, still(3_000_000, 5.0))
     assert NavFlags.USING_GPS in states[50].flags

@@ -1,4 +1,4 @@
-"""Nonsense from sensors: whatever comes, the states stay finite and within reason."""
+"""Invalid data of sensors: the states stay finite and within physical limits."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -152,15 +152,15 @@ NONSENSE: tuple[Nonsense, ...] = (
 
 
 @pytest.mark.parametrize("how", NONSENSE, ids=lambda how: how.__name__)
-def test_of_one_kind(flight: Flight, how: Nonsense) -> None:
+def test_one_kind_of_invalid_data_leaves_states_finite(flight: Flight, how: Nonsense) -> None:
     log = part(flight, 0.0, 60.0)
     how(log, np.random.default_rng(1))
     check_sane(flight, log)
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_of_several_kinds(flight: Flight, seed: int) -> None:
-    """From the ground or in the air."""
+def test_several_kinds_of_invalid_data_leave_states_finite(flight: Flight, seed: int) -> None:
+    """The parts begin on the ground or in flight."""
     rng = np.random.default_rng(seed)
     log = part(flight, rng.uniform(0.0, 150.0), 40.0)
     for k in rng.permutation(len(NONSENSE))[: rng.integers(1, 5)]:
@@ -169,7 +169,7 @@ def test_of_several_kinds(flight: Flight, seed: int) -> None:
 
 
 @pytest.mark.parametrize("how", ["x", "y", "swapped"])
-def test_a_compass_that_is_mounted_wrongly_is_done_without(flight: Flight, how: str) -> None:
+def test_wrongly_mounted_compass_is_reported_and_not_used(flight: Flight, how: str) -> None:
     log = part(flight, -1.0, 300.0)
     if how == "swapped":
         log.imu[:, MAG : MAG + 2] = log.imu[:, [MAG + 1, MAG]]
@@ -188,8 +188,8 @@ def test_a_compass_that_is_mounted_wrongly_is_done_without(flight: Flight, how: 
 
 @pytest.mark.parametrize("leap_s", [100, 86_400])
 @pytest.mark.parametrize("since_s", [4.0, 60.0], ids=["at rest", "in flight"])
-def test_jump_of_the_clock_is_an_outage(flight: Flight, leap_s: int, since_s: float) -> None:
-    """Its end may find the aircraft anywhere, but the filter sane."""
+def test_clock_jump_is_handled_as_outage(flight: Flight, leap_s: int, since_s: float) -> None:
+    """The aircraft may be in any state after the jump; the filter converges again."""
     log = part(flight, -1.0, 300.0)
     for times_us in (log.imu_time_us, log.baro_time_us, log.gps_time_us):
         times_us[times_us > since_s * 1e6] += leap_s * 1_000_000
@@ -200,8 +200,8 @@ def test_jump_of_the_clock_is_an_outage(flight: Flight, leap_s: int, since_s: fl
     assert np.nanmax(np.abs(out[:, NAV_VEL : NAV_VEL + 3])) < 100.0
 
 
-def test_blows_beyond_the_range_of_the_accelerometer_are_got_over(flight: Flight) -> None:
-    """Some 40 ms long each, in either direction of each axis: what it reads is not what it was."""
+def test_shocks_beyond_accelerometer_range_leave_small_errors(flight: Flight) -> None:
+    """Each lasts 40 ms and saturates all axes in either direction."""
     log, rng = part(flight, -1.0, 300.0), np.random.default_rng(11)
     for begin in np.flatnonzero(rng.random(len(log.imu)) < 0.003):
         blow = slice(begin, begin + 4)
@@ -216,16 +216,16 @@ def test_blows_beyond_the_range_of_the_accelerometer_are_got_over(flight: Flight
     assert max(scores["heading"], scores["inclination"]) < 3.0
 
 
-def test_impossible_jump_of_the_fixes_yields_no_velocity(flight: Flight) -> None:
-    """All later fixes are there, so they are accepted in the end."""
+def test_impossible_jump_of_fixes_gives_no_velocity(flight: Flight) -> None:
+    """All later fixes are at the second position, so they are finally accepted."""
     log = part(flight, 30.0, 60.0)
     log.gps[:, GPS_VEL : GPS_VEL + 3] = np.nan
     log.gps[len(log.gps) // 2 :, GPS_LAT : GPS_LON + 1] = 0.0
     check_sane(flight, log)
 
 
-def test_zeros_that_the_fixes_refute_are_no_velocity(flight: Flight) -> None:
-    """As of a receiver that measures none, or a log that holds none."""
+def test_zero_velocity_contradicted_by_positions_is_not_used(flight: Flight) -> None:
+    """As from a receiver that measures no velocity, or a log without one."""
     log = part(flight, 0.0, 120.0)
     log.gps[:, GPS_VEL : GPS_VEL + 3] = 0.0
     out, late = run(flight, log), log.imu_time_us > 60_000_000
@@ -234,7 +234,7 @@ def test_zeros_that_the_fixes_refute_are_no_velocity(flight: Flight) -> None:
     assert max(scores["heading"], scores["inclination"]) < 3.5
 
 
-def test_zeros_at_rest_are_accepted(rng: np.random.Generator) -> None:
+def test_zero_velocity_is_accepted_at_rest_and_rejected_in_motion(rng: np.random.Generator) -> None:
     s = new_record(State)
     clear_times(s)
     zero, refuted = (0.0, 0.0, 0.0), []
@@ -262,8 +262,8 @@ def test_repeated_fix_is_used_once(flight: Flight, has_velocity: bool) -> None:
     np.testing.assert_array_equal(out, run(flight, once))
 
 
-def test_a_receiver_that_is_stuck_in_flight_is_none(flight: Flight) -> None:
-    """Its last fix, repeated, changes the position no more than an outage."""
+def test_fix_repeated_in_flight_is_handled_as_outage(flight: Flight) -> None:
+    """The last fix, repeated, has the same effect as no fix."""
     log = part(flight, 30.0, 60.0)
     stuck = (log.gps_time_us > 60e6) & (log.gps_time_us < 66e6)
     none = replace(log, gps_time_us=log.gps_time_us[~stuck], gps=log.gps[~stuck])
@@ -273,7 +273,7 @@ def test_a_receiver_that_is_stuck_in_flight_is_none(flight: Flight) -> None:
 
 @pytest.mark.parametrize("speed_mps", [0.0, np.nan])
 def test_repeated_fixes_at_rest_are_accepted(speed_mps: float) -> None:
-    """Some hold their place while they stand."""
+    """Some receivers hold their position at rest."""
     log = at_rest(20.0, speed_mps)
     out = make_estimator(EstimationSettings()).run(log)
     assert (out[-1000:, NAV_FLAGS].astype(int) & NavFlags.POSITION_VALID != 0).all()

@@ -32,7 +32,7 @@ def metres(state: NavState) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(("roll", "pitch"), [(0.0, 0.0), (0.5, -0.3), (-1.2, 0.9), (3.0, 0.2)])
-def test_starts_at_the_accelerometers_tilt(roll: float, pitch: float) -> None:
+def test_first_attitude_is_tilt_of_accelerometer(roll: float, pitch: float) -> None:
     state = run(make(), [imu(0, tilted(roll, pitch))])
     assert to_euler(state.q_nb)[:2] == pytest.approx((roll, pitch))
     assert NavFlags.ATTITUDE_VALID in state.flags
@@ -41,18 +41,20 @@ def test_starts_at_the_accelerometers_tilt(roll: float, pitch: float) -> None:
 
 
 class TestGainEnds:
-    def test_gyro_gain_one_is_the_gyroscope_alone(self) -> None:
+    def test_gyro_gain_one_uses_gyroscope_alone(self) -> None:
         samples = [imu(t, tilted(0.3, 0.1), (0.2, 0.0, 0.0)) for t in times(1.01)]
         state = run(make(alpha_gyro=1.0), [imu(0), *samples[1:]])
         assert to_euler(state.q_nb) == pytest.approx((0.2, 0.0, 0.0), abs=1e-9)
 
-    def test_gyro_gain_zero_is_the_accelerometer_alone(self) -> None:
+    def test_gyro_gain_zero_uses_accelerometer_alone(self) -> None:
         samples = [imu(t, tilted(0.3, 0.1), (0.2, 0.0, 0.0)) for t in times(1.01)]
         state = run(make(alpha_gyro=0.0), [imu(0), *samples[1:]])
         assert to_euler(state.q_nb)[:2] == pytest.approx((0.3, 0.1), abs=1e-9)
 
     @pytest.mark.parametrize(("gain", "north_m"), [(0.0, 7.0), (1.0, 0.0)])
-    def test_position_gain(self, gain: float, north_m: float) -> None:
+    def test_position_gain_selects_fix_or_integrated_position(
+        self, gain: float, north_m: float
+    ) -> None:
         estimator = make(alpha_accel=0.0, beta_velocity=gain)
         run(estimator, [imu(t) for t in times(0.5)])
         estimator.update_gps(fix(500_000))
@@ -60,7 +62,9 @@ class TestGainEnds:
         assert metres(run(estimator, [imu(510_000)]))[0] == pytest.approx(north_m, abs=0.02)
 
     @pytest.mark.parametrize(("gain", "north_mps"), [(0.0, 4.0), (1.0, 0.0)])
-    def test_velocity_gain(self, gain: float, north_mps: float) -> None:
+    def test_velocity_gain_selects_gps_or_integrated_velocity(
+        self, gain: float, north_mps: float
+    ) -> None:
         estimator = make(alpha_accel=gain)
         run(estimator, [imu(t) for t in times(0.5)])
         estimator.update_gps(fix(500_000))
@@ -69,7 +73,7 @@ class TestGainEnds:
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 179.0, -179.0, -45.0])
-def test_compass_under_tilt_with_declination(yaw_deg: float) -> None:
+def test_tilted_compass_gives_true_heading_with_declination(yaw_deg: float) -> None:
     yaw, declination = math.radians(yaw_deg), math.radians(5.0)
     q = from_euler(0.4, -0.2, yaw)
     north = (20.0 * math.cos(declination), 20.0 * math.sin(declination), 40.0)
@@ -81,14 +85,14 @@ def test_compass_under_tilt_with_declination(yaw_deg: float) -> None:
     assert NavFlags.HEADING_VALID in state.flags
 
 
-def test_dead_reckons_between_fixes_with_gravity_removed() -> None:
+def test_dead_reckoning_between_fixes_removes_gravity() -> None:
     estimator = make()
     q = from_euler(0.0, 0.0, math.pi / 2.0)
     north = (25.0, 0.0, 40.0)
     still = [imu(t, mag=rotate_inverse(q, north)) for t in times(1.0)]
     run(estimator, still)
     estimator.update_gps(fix(1_000_000))
-    # Nose east: one second of forward acceleration is an eastward way.
+    # The nose points east: one second of forward acceleration gives a displacement east.
     moving = [imu(1_000_000 + t, (1.0, 0.0, -G), mag=None) for t in times(1.0)]
     state = run(make_gyro_only(estimator), moving)
     # The low-pass delays the acceleration by some 20 ms.
@@ -97,13 +101,13 @@ def test_dead_reckons_between_fixes_with_gravity_removed() -> None:
 
 
 def make_gyro_only(estimator: PaperEstimator) -> PaperEstimator:
-    """Move a state into an estimator whose accelerometer does not pull the attitude."""
+    """Move a state into an estimator whose attitude ignores the accelerometer."""
     other = make(alpha_gyro=1.0)
     other.restore(estimator.snapshot())
     return other
 
 
-def test_latency_moves_the_fix_forward() -> None:
+def test_latency_moves_fix_forward_by_its_velocity() -> None:
     estimator = make(ReferenceSettings(gps_latency_s=0.5, declination="fixed"), beta_velocity=0.0)
     run(estimator, [imu(0)])
     estimator.update_gps(fix(0, vel=(10.0, -20.0, 2.0)))
@@ -112,7 +116,7 @@ def test_latency_moves_the_fix_forward() -> None:
     assert state.alt_amsl_m == pytest.approx(499.0)
 
 
-def test_velocity_is_that_of_the_track_if_the_receiver_sends_none() -> None:
+def test_missing_gps_velocity_is_derived_from_two_positions() -> None:
     estimator = make(alpha_accel=0.0)
     run(estimator, [imu(0)])
     unknown = (math.nan, math.nan, math.nan)
@@ -122,7 +126,7 @@ def test_velocity_is_that_of_the_track_if_the_receiver_sends_none() -> None:
     assert state.vel_n_mps == pytest.approx((3.0, 4.0, -1.0), abs=0.03)
 
 
-def test_blending_at_every_sample_pulls_back_to_the_held_fix() -> None:
+def test_blending_at_every_sample_holds_position_at_fix() -> None:
     ends = {}
     for blend in ("at_fix", "every_sample"):
         estimator = make(alpha_gyro=1.0, blend=blend)
@@ -136,7 +140,7 @@ def test_blending_at_every_sample_pulls_back_to_the_held_fix() -> None:
 def noisy_rest(
     rng: np.random.Generator, bias: Vec3, begin_us: int, long_s: float
 ) -> list[ImuSample]:
-    """Stand still; the gyroscope is off."""
+    """Samples at rest, with noise and a gyroscope bias."""
     return [
         imu(
             begin_us + t,
@@ -151,7 +155,7 @@ BIAS = (math.radians(3.0), math.radians(-2.0), math.radians(1.0))
 
 
 class TestGyroscopeBias:
-    def test_is_what_the_gyroscope_shows_at_rest(self, rng: np.random.Generator) -> None:
+    def test_bias_is_mean_rate_at_rest(self, rng: np.random.Generator) -> None:
         estimator = make()
         run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
         estimator.update_gps(fix(20_000_000, vel=(20.0, 0.0, 0.0)))
@@ -160,7 +164,7 @@ class TestGyroscopeBias:
         assert state.rate_b_radps == pytest.approx((0.0, 0.0, 0.0), abs=math.radians(0.05))
         assert to_euler(state.q_nb)[:2] == pytest.approx((0.0, 0.0), abs=math.radians(1.0))
 
-    def test_is_not_learned_in_motion(self, rng: np.random.Generator) -> None:
+    def test_bias_is_not_estimated_in_motion(self, rng: np.random.Generator) -> None:
         estimator, rate = make(), BIAS
         run(estimator, noisy_rest(rng, (0.0, 0.0, 0.0), 0, 5.0))
         for second in range(5, 15):
@@ -168,7 +172,7 @@ class TestGyroscopeBias:
             state = run(estimator, noisy_rest(rng, rate, second * 1_000_000, 1.0))
         assert state.rate_b_radps == pytest.approx(rate, abs=math.radians(0.5))
 
-    def test_follows_from_rest_to_rest(self, rng: np.random.Generator) -> None:
+    def test_bias_follows_change_between_rests(self, rng: np.random.Generator) -> None:
         estimator = make()
         run(estimator, noisy_rest(rng, BIAS, 0, 20.0))
         run(estimator, [imu(20_000_000 + t, gyro=(1.0, 0.0, 0.0)) for t in times(1.0)])
@@ -177,8 +181,8 @@ class TestGyroscopeBias:
         assert NavFlags.ATTITUDE_VALID in state.flags
 
 
-def test_a_long_turn_does_not_level_the_horizon() -> None:
-    """Two minutes of circling at 20 m/s, always the same way: the accelerometer says level."""
+def test_two_minutes_of_circling_keep_attitude_errors_small() -> None:
+    """In a coordinated turn at 20 m/s the specific force is that of level flight."""
     bank, speed_mps = math.radians(30.0), 20.0
     turn_radps = G * math.tan(bank) / speed_mps
     estimator, worst = make(), 0.0
@@ -198,7 +202,7 @@ def test_a_long_turn_does_not_level_the_horizon() -> None:
     assert math.degrees(worst) < 6.5, math.degrees(worst)
 
 
-def test_a_field_of_zeros_is_no_heading() -> None:
+def test_zero_field_does_not_change_heading() -> None:
     estimator = make()
     east = run(estimator, [imu(t, mag=(0.0, -20.0, 40.0)) for t in times(0.5)])
     state = run(estimator, [imu(500_000, mag=(0.0, 0.0, 0.0))])
@@ -206,7 +210,7 @@ def test_a_field_of_zeros_is_no_heading() -> None:
 
 
 @pytest.mark.parametrize("jump_us", [5_000_000, -5_000_000])
-def test_a_jump_in_time_is_not_integrated(jump_us: int) -> None:
+def test_time_jump_is_not_integrated(jump_us: int) -> None:
     estimator = make(alpha_gyro=1.0)
     run(estimator, [imu(10_000_000 + t) for t in times(0.5)])
     state = run(estimator, [imu(10_500_000 + jump_us, gyro=(1.0, 0.0, 0.0))])

@@ -140,13 +140,13 @@ def test_estimator_is_not_changed_by_smoothing(flight: Flight) -> None:
 
 @pytest.mark.slow
 def test_position_that_is_not_estimated_stays_that_of_the_fixes(flight: Flight) -> None:
-    """On the ground without a compass no heading is known: what comes later moves nothing there."""
+    """Without a heading, on the ground without a compass, later fixes correct no position."""
     blind = no_mag(flight).flight
     live, smoothed = run_eskf(blind), run_smoothed(blind)
     before = np.isfinite(live[:, NAV_LAT]) & np.isnan(live[:, NAV_POS_STD])
     assert before.sum() > 500
-    place = slice(NAV_LAT, NAV_LAT + 3)
-    np.testing.assert_allclose(smoothed[before, place], live[before, place], rtol=1e-8)
+    position = slice(NAV_LAT, NAV_LAT + 3)
+    np.testing.assert_allclose(smoothed[before, position], live[before, position], rtol=1e-8)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_real_fixed_wing(data_dir) -> None:
 
 @pytest.mark.slow
 def test_real_car(data_dir) -> None:
-    """Long parked without a heading; then GPS velocities that lag behind the places by 0.12 s."""
+    """Long parked without a heading; then GPS velocities 0.12 s behind the positions."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
     live, smoothed = (
         rms(position_errors_m(flight, run(flight))) for run in (run_eskf, run_smoothed)

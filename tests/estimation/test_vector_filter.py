@@ -18,25 +18,25 @@ def gain(c: Coefficients, frequency_hz: float, rate_hz: float) -> float:
 
 @pytest.mark.parametrize("rate_hz", [60.0, 200.0, 1000.0])
 class TestGain:
-    def test_butterworth(self, rate_hz: float) -> None:
+    def test_butterworth_has_half_power_at_cutoff(self, rate_hz: float) -> None:
         c = design_lowpass("butterworth", 10.0, rate_hz)
         assert gain(c, 0.0, rate_hz) == pytest.approx(1.0)
         assert gain(c, 10.0, rate_hz) == pytest.approx(0.5**0.5)
 
-    def test_chebyshev(self, rate_hz: float) -> None:
+    def test_chebyshev_has_unit_gain_at_0_hz_and_ripple_end_at_cutoff(self, rate_hz: float) -> None:
         c = design_lowpass("chebyshev", 10.0, rate_hz, 1.0)
         assert gain(c, 0.0, rate_hz) == pytest.approx(1.0)
         # The ripple's end lies where the design began before its scaling: at the gain of 0 Hz.
         assert gain(c, 10.0, rate_hz) == pytest.approx(1.0)
         assert gain(c, 7.0, rate_hz) > 1.05
 
-    def test_highpass(self, rate_hz: float) -> None:
+    def test_highpass_has_half_power_at_cutoff(self, rate_hz: float) -> None:
         c = design_highpass(0.5, rate_hz)
         assert gain(c, 0.0, rate_hz) == pytest.approx(0.0, abs=1e-12)
         assert gain(c, 0.5, rate_hz) == pytest.approx(0.5**0.5)
 
 
-def test_cutoff_beyond_half_the_rate_is_a_wire() -> None:
+def test_cutoff_beyond_half_the_sample_rate_passes_all() -> None:
     assert design_lowpass("butterworth", 10.0, 20.0) == PASS_THROUGH
     assert design_highpass(0.0, 20.0) == PASS_THROUGH
 
@@ -59,7 +59,7 @@ def test_array_and_samples_and_pieces_give_the_same_bits(kind: str) -> None:
     np.testing.assert_array_equal(np.vstack([first, other.run(x[123:])]), whole)
 
 
-def test_agrees_with_scipy() -> None:
+def test_lowpass_output_equals_scipy() -> None:
     x = np.random.default_rng(4).normal(size=(300, 3)) + 5.0
     b, a = signal.butter(2, 10.0, fs=100.0)
     zi = signal.lfilter_zi(b, a)[:, None] * x[0]
@@ -83,7 +83,7 @@ def test_highpass_removes_a_constant_at_once() -> None:
     assert f.step((1.5, 0.5, 0.5))[0] == pytest.approx(1.0, abs=0.01)
 
 
-def test_empty_array() -> None:
+def test_empty_array_leaves_filter_unstarted() -> None:
     f = VectorFilter(lambda rate: design_highpass(0.01, rate), 100.0)
     assert f.run(np.empty((0, 3))).shape == (0, 3)
     assert f.state is None

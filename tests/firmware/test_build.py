@@ -15,7 +15,7 @@ SIZES = re.compile(r"^(\w+) +flash +(\d+) bytes .*static RAM +(\d+) bytes", re.M
 FLASH, RAM = 32768, 2048
 
 
-def test_every_program_leaves_room_in_flash_and_ram(programs: Path) -> None:
+def test_every_program_fits_flash_and_ram(programs: Path) -> None:
     said = make("all")
     found = {name: (int(flash), int(ram)) for name, flash, ram in SIZES.findall(said)}
     assert set(found) == {"imu_node", "gps_node", "receiver"}

@@ -211,7 +211,7 @@ def test_demo_flies_on_every_combination_of_chips(programs: Path, name: str) -> 
         assert "IMU node 0: MPU6050, HMC5883L, BMP180" in flown.texts
 
 
-def test_the_demos_line_gives_whole_frames_in_order_of_time(programs: Path) -> None:
+def test_demo_line_gives_whole_frames_in_time_order(programs: Path) -> None:
     line = frames(SimulatorSettings(), START_UNIX_US)
     first = [next(line) for _ in range(60)]
     assert all(frame.data.endswith(b"\0") and frame.data.count(b"\0") == 1 for frame in first)

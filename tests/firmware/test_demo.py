@@ -20,7 +20,7 @@ def gateway(programs: Path, tmp_path: Path) -> Iterator[Gateway]:
         started.process.wait(START_LIMIT_S)
 
 
-def test_a_ground_station_sees_the_vehicle(gateway: Gateway) -> None:
+def test_ground_station_sees_the_vehicle(gateway: Gateway) -> None:
     client = Client(gateway.port)
     try:
         seen = client.until(lambda seen: {"ATTITUDE_QUATERNION", "GPS_RAW_INT"} <= set(seen))

@@ -23,7 +23,7 @@ OVERFLOWS_16_MHZ = 1 << 17
 @pytest.mark.parametrize(
     ("cause", "through_bootloader"), [(BROWN_OUT, False), (WATCHDOG, False), (WATCHDOG, True)]
 )
-def test_a_reset_in_flight_costs_little_and_is_reported(
+def test_reset_in_flight_costs_little_and_is_reported(
     bench: MakeBench, cause: int, through_bootloader: bool
 ) -> None:
     rig = bench()
@@ -42,7 +42,7 @@ def test_a_reset_in_flight_costs_little_and_is_reported(
 
 
 @pytest.mark.parametrize("which", ["imu", "gps", "receiver"])
-def test_a_program_that_hangs_is_restarted_by_its_watchdog(bench: MakeBench, which: str) -> None:
+def test_program_that_hangs_is_restarted_by_its_watchdog(bench: MakeBench, which: str) -> None:
     rig = bench()
     boards = {"imu": rig.imu_node(), "gps": rig.gps_node(), "receiver": rig.receiver}
     rig.run(1.0)
@@ -91,7 +91,7 @@ def pass_forty_minutes(rig: Bench, board: Board) -> None:
         rig.run(1.5)  # the reports that fell due meanwhile
 
 
-def test_a_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBench) -> None:
+def test_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node()
     rig.run(0.6)
@@ -101,7 +101,7 @@ def test_a_receiver_that_loses_its_radio_late_sets_it_up_at_once(bench: MakeBenc
     assert len(rig.payloads(ImuPayload, since_s=rig.now_s - 0.4)) == pytest.approx(40, abs=3)
 
 
-def test_a_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
+def test_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     node.compass.absent = True
@@ -113,7 +113,7 @@ def test_a_magnetometer_that_comes_late_is_read(bench: MakeBench) -> None:
     assert len(new) > 10
 
 
-def test_the_gateways_link_sees_every_sample_and_a_restart(bench: MakeBench) -> None:
+def test_gateways_link_sees_every_sample_and_a_restart(bench: MakeBench) -> None:
     rig = bench(loss=0.1)
     node = rig.imu_node(clock_ppm=40.0)
     rig.run(2.2)

@@ -22,7 +22,7 @@ def always(solution: Solution) -> World:
     return World(solution=lambda _time_s: solution)
 
 
-def test_a_receiver_fresh_from_the_factory_is_configured(bench: MakeBench) -> None:
+def test_receiver_fresh_from_the_factory_is_configured(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S)
@@ -91,7 +91,7 @@ def test_no_fix_is_reported_and_sent_on(bench: MakeBench) -> None:
     assert rig.last(NodeStatusPayload).sensors_failed == 0
 
 
-def test_a_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> None:
+def test_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S + 0.5)
@@ -133,7 +133,7 @@ def test_garbage_on_the_line_costs_no_more_than_the_message_it_hits(bench: MakeB
 @pytest.mark.parametrize(
     "left", [b"\xb5", ubx(0x01, 0x07, bytes(92))[:60]], ids=["one byte", "a head"]
 )
-def test_a_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left: bytes) -> None:
+def test_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left: bytes) -> None:
     rig = bench()
     node = rig.gps_node()
     rig.run(CONFIGURED_S)

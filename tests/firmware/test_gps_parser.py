@@ -253,12 +253,12 @@ class TestNmea:
             b"$GPGGA,,,,,,0,00,25.5,,,,,,*7A\r\n$GPRMC,,V,,,,,,,,,,N*53\r\n",
         ],
     )
-    def test_a_receiver_without_a_fix_reports_none(self, parse: Parse, sentences: bytes) -> None:
+    def test_receiver_without_a_fix_reports_none(self, parse: Parse, sentences: bytes) -> None:
         ((fix, quality),) = parse(sentences)
         assert (fix.fix_type, fix.fix_ok, fix.satellites) == (GpsFixType.NONE, False, 0)
         assert quality.utc is None
 
-    def test_a_flipped_bit_never_gives_a_wrong_fix(self, parse: Parse) -> None:
+    def test_flipped_bit_never_gives_a_wrong_fix(self, parse: Parse) -> None:
         epoch = Epoch(np.random.default_rng(2))
         good = epoch.gga() + epoch.rmc()
         ((expected, quality),) = parse(good)

@@ -10,5 +10,5 @@ from firmware.rig.build import make
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 
-def test_the_host_tests_pass(build: Callable[..., Path]) -> None:
+def test_host_tests_pass(build: Callable[..., Path]) -> None:
     assert " 0 failed checks" in make("host-test")

@@ -86,7 +86,7 @@ def test_node_time_is_the_moment_of_the_sample(bench: MakeBench) -> None:
     assert max(late_us) - min(late_us) < 20
 
 
-def test_butterworth_takes_a_vibration_and_leaves_the_manoeuvre(bench: MakeBench) -> None:
+def test_butterworth_attenuates_vibration_and_passes_manoeuvre(bench: MakeBench) -> None:
     def moment(time_s: float) -> Moment:
         slow = 3.0 * math.sin(2 * math.pi * 1.0 * time_s)
         return Moment(accel_mps2=(slow + 8.0 * math.sin(2 * math.pi * 90.0 * time_s), 0.0, 9.80665))
@@ -99,7 +99,7 @@ def test_butterworth_takes_a_vibration_and_leaves_the_manoeuvre(bench: MakeBench
     assert min(x) == pytest.approx(-3.0 / 9.80665 * 4096, rel=0.06)
 
 
-def test_raw_mode_sends_means_and_says_so(bench: MakeBench, build: Callable[..., Path]) -> None:
+def test_raw_mode_sends_means_and_reports_it(bench: MakeBench, build: Callable[..., Path]) -> None:
     settings = "-DIMU_RAW=1 -DRADIO_KBPS=250 -DVEHICLE_ID=3 -DBARO_OVERSAMPLING=0"
     folder = build(settings, programs=("imu_node", "receiver"))
     rig = bench(build=folder, world=still(gyro_radps=(math.radians(100), 0.0, 0.0)))
@@ -112,7 +112,7 @@ def test_raw_mode_sends_means_and_says_so(bench: MakeBench, build: Callable[...,
     assert {frame.pipe for _, frame in rig.frames} == {4}
 
 
-def test_the_8_mhz_build_keeps_time_and_rate(bench: MakeBench, build: Callable[..., Path]) -> None:
+def test_8_mhz_build_keeps_time_and_rate(bench: MakeBench, build: Callable[..., Path]) -> None:
     rig = bench(build=build("", 8_000_000), frequency_hz=8_000_000)
     rig.imu_node()
     rig.run(2.5)
@@ -132,14 +132,14 @@ def test_clipping_is_reported(bench: MakeBench) -> None:
     )
 
 
-def test_a_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
+def test_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
     rig = bench(world=still(mag_ut=(20.0, 500.0, 40.0)))
     rig.imu_node()
     rig.run(START_S + 0.1)
     assert rig.last(ImuPayload).mag == (218, -4096, 436)
 
 
-def test_a_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> None:
+def test_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node().imu.self_test_works = False
     rig.run(START_S + 0.3)
@@ -154,7 +154,7 @@ def test_a_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> 
         ("barometer", ImuFlags.BARO_ABSENT, BARO),
     ],
 )
-def test_an_absent_sensor_is_reported_and_found_when_it_comes(
+def test_absent_sensor_is_reported_and_found_when_it_comes(
     bench: MakeBench, absent: str, flag: ImuFlags, bits: int
 ) -> None:
     rig = bench()
@@ -187,7 +187,7 @@ def test_without_the_imu_barometer_and_status_still_come(bench: MakeBench) -> No
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
 
 
-def test_an_imu_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
+def test_imu_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(1.0)
@@ -197,7 +197,7 @@ def test_an_imu_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
 
 
-def test_a_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -> None:
+def test_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -> None:
     rig = bench(world=World(moment=lambda time_s: Moment(mag_ut=(22.0 + 10.0 * time_s, 1.5, 42.0))))
     node = rig.imu_node()
     rig.run(0.8)
@@ -232,7 +232,7 @@ def test_imu_without_its_interrupt_is_polled_and_reported(bench: MakeBench) -> N
     assert rig.last(NodeStatusPayload).sensors_failed == 0
 
 
-def test_a_self_test_that_breaks_off_leaves_no_range_behind(bench: MakeBench) -> None:
+def test_interrupted_self_test_restores_ranges(bench: MakeBench) -> None:
     rig = bench(world=still(gyro_radps=(1.0, 0.0, 0.0)))
     chip = rig.imu_node(noise=False).imu
     read = chip.read_register
@@ -247,7 +247,7 @@ def test_a_self_test_that_breaks_off_leaves_no_range_behind(bench: MakeBench) ->
     assert rig.last(ImuPayload).gyro == (round(math.degrees(1.0) * 32.8), 0, 0)
 
 
-def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
+def test_refused_bytes_are_counted_and_skipped(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(0.8)
@@ -261,7 +261,7 @@ def test_refused_bytes_are_counted_and_passed_over(bench: MakeBench) -> None:
 
 
 @pytest.mark.parametrize("clocks", [1, 8])
-def test_a_hung_slave_is_clocked_free(bench: MakeBench, clocks: int) -> None:
+def test_hung_slave_is_clocked_free(bench: MakeBench, clocks: int) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(0.8)
@@ -273,7 +273,7 @@ def test_a_hung_slave_is_clocked_free(bench: MakeBench, clocks: int) -> None:
     assert len(rig.payloads(ImuPayload, since_s=0.8)) > 120
 
 
-def test_a_bus_held_for_good_stops_the_samples_but_not_the_node(bench: MakeBench) -> None:
+def test_bus_held_for_good_stops_the_samples_but_not_the_node(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(0.8)

@@ -56,7 +56,7 @@ def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> Non
     assert 0.002 < np.median(late_s) < 0.005
 
 
-def test_the_receiver_counts_what_went_by(bench: MakeBench) -> None:
+def test_receiver_counts_what_went_by(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node()
     rig.run(1.2)
@@ -116,7 +116,7 @@ def test_noise_on_the_channel_is_reported_and_own_packets_are_not(bench: MakeBen
 
 
 @pytest.mark.parametrize("side", ["receiver", "node"])
-def test_a_radio_that_lost_its_supply_is_set_up_again(bench: MakeBench, side: str) -> None:
+def test_radio_that_lost_its_supply_is_set_up_again(bench: MakeBench, side: str) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(RUNNING_S)
@@ -126,7 +126,7 @@ def test_a_radio_that_lost_its_supply_is_set_up_again(bench: MakeBench, side: st
     assert rig.receiver.mcu.resets == node.mcu.resets == 0
 
 
-def test_a_node_without_its_radio_waits_for_it(bench: MakeBench) -> None:
+def test_node_without_its_radio_waits_for_it(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     node.radio.absent = True
@@ -138,7 +138,7 @@ def test_a_node_without_its_radio_waits_for_it(bench: MakeBench) -> None:
     assert len(rig.payloads(ImuPayload)) > 20
 
 
-def test_a_receiver_without_its_radio_still_reports(bench: MakeBench) -> None:
+def test_receiver_without_its_radio_still_reports(bench: MakeBench) -> None:
     rig = bench()
     rig.receiver.radio.absent = True
     rig.run(2.2)
@@ -159,7 +159,7 @@ def test_only_the_right_address_and_channel_are_heard(
     assert not rig.frames
 
 
-def test_the_models_air_times_follow_the_specification() -> None:
+def test_models_air_times_follow_the_specification() -> None:
     full = Packet(76, 1000, b"12345", bytes(32), 0, is_ack=False)
     assert full.duration_ps == 329 * PS_PER_US
     assert Packet(76, 250, b"12345", b"", 0, is_ack=True).duration_ps == 73 * 4 * PS_PER_US
@@ -189,7 +189,7 @@ def test_packets_that_overlap_destroy_each_other() -> None:
     assert air.collisions == 2
 
 
-def test_the_same_seed_gives_the_same_bytes(bench: MakeBench, programs: Path) -> None:
+def test_same_seed_gives_the_same_bytes(bench: MakeBench, programs: Path) -> None:
     def bytes_of(seed: int) -> list[tuple[int, int]]:
         rig = Bench(Setup(seed=seed, loss=0.2, build=programs))
         rig.imu_node()

@@ -14,7 +14,7 @@ from gateway.geometry.geomagnetism import magnetic_field, year_of
     ],
     ids=["Melbourne", "Munich", "equator"],
 )
-def test_field_known_at_a_place(
+def test_field_equals_published_values(
     lat_deg: float, lon_deg: float, declination_deg: float, dip_deg: float, strength_ut: float
 ) -> None:
     field = magnetic_field(lat_deg, lon_deg, 0.0, 2025.0)

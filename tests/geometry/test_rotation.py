@@ -9,7 +9,7 @@ from gateway.records import Vec3
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_it_is_the_quaternions_rotation_and_comes_back(seed: int) -> None:
+def test_matrix_equals_quaternion_rotation_in_both_directions(seed: int) -> None:
     roll, pitch, yaw = np.random.default_rng(seed).uniform((-180, -90, -180), (180, 90, 180))
     matrix = matrix_from_euler_deg((roll, pitch, yaw))
     q = from_euler(*np.radians((roll, pitch, yaw)))
@@ -25,7 +25,7 @@ def test_quarters_of_a_turn_are_exact() -> None:
 
 
 @pytest.mark.parametrize("angles", [(30.0, 90.0, 45.0), (-170.0, -90.0, 20.0), (0.0, 90.0, 0.0)])
-def test_a_vertical_pitch_gives_angles_of_the_same_rotation(angles: Vec3) -> None:
+def test_vertical_pitch_gives_angles_of_the_same_rotation(angles: Vec3) -> None:
     matrix = matrix_from_euler_deg(angles)
     again = euler_deg_from_matrix(matrix)
     assert again[0] == 0.0

@@ -27,13 +27,13 @@ def columns(samples: object) -> dict[str, np.ndarray]:
 
 
 class TestSamples:
-    def test_come_at_their_rates(self, flight: SimulatedFlight) -> None:
+    def test_samples_come_at_their_rates(self, flight: SimulatedFlight) -> None:
         assert len(flight.imu.time_s) == pytest.approx(21_800, abs=4)
         assert flight.imu.mag_new.mean() == pytest.approx(0.75, abs=0.001)
         assert len(flight.baro.time_s) == pytest.approx(5450, abs=2)
         assert len(flight.gps.time_s) == 1090
 
-    def test_inertial_samples_follow_the_truth(self, flight: SimulatedFlight) -> None:
+    def test_inertial_samples_follow_truth(self, flight: SimulatedFlight) -> None:
         errors, imu = flight.errors, flight.imu
         face_up = np.array([1.0, -1.0, -1.0])
         accel_s = imu.accel_b_mps2 * face_up - errors.accel_bias_mps2
@@ -43,7 +43,7 @@ class TestSamples:
         off = imu.gyro_b_radps - errors.gyro_bias_radps * face_up - imu.truth.rate_b_radps
         assert np.abs(off.mean(axis=0)).max() < 0.005
 
-    def test_magnetometer_follows_the_truth(self, flight: SimulatedFlight) -> None:
+    def test_magnetometer_follows_truth(self, flight: SimulatedFlight) -> None:
         errors, imu = flight.errors, flight.imu
         face_up = np.array([1.0, -1.0, -1.0])
         off_s = imu.mag_b_ut * face_up - errors.mag_hard_iron_ut
@@ -57,7 +57,7 @@ class TestSamples:
         assert (age_s >= 0.0).all()
         assert age_s.max() < 1.0 / 75.0 + 1e-5
 
-    def test_fixes_are_late_and_near(self, flight: SimulatedFlight) -> None:
+    def test_fixes_have_latency_and_small_errors(self, flight: SimulatedFlight) -> None:
         gps = flight.gps
         latency_s = gps.time_s - gps.valid_time_s
         assert 0.13 <= latency_s.min() < latency_s.max() <= 0.19
@@ -71,7 +71,9 @@ class TestSamples:
         assert (gps.unix_us % 200_000 == 0).all()
         assert (np.diff(gps.itow_ms) == 200).all()
 
-    def test_fixes_drop_out(self, flight: SimulatedFlight) -> None:
+    def test_fixes_are_missing_before_first_fix_and_in_outages(
+        self, flight: SimulatedFlight
+    ) -> None:
         gps = flight.gps
         assert not gps.has_fix[gps.valid_time_s < 5.0].any()
         for start_s, length_s in SETTINGS.gps_outages_s:
@@ -84,7 +86,7 @@ class TestSamples:
         assert gps.time_valid[-1]
 
     @pytest.mark.parametrize("rate_hz", [60, 200, 1000])
-    def test_imu_rate(self, rate_hz: int) -> None:
+    def test_imu_samples_follow_set_rate(self, rate_hz: int) -> None:
         settings = msgspec.structs.replace(SETTINGS, imu_rate_hz=rate_hz)
         imu = fly(settings, duration_s=4.0).imu
         assert len(imu.time_s) == pytest.approx(4 * rate_hz, abs=1)
@@ -93,7 +95,7 @@ class TestSamples:
 
 class TestPieces:
     @pytest.mark.parametrize("sensor", ["imu", "baro", "gps"])
-    def test_equal_the_whole(self, sensor: str) -> None:
+    def test_pieces_equal_whole_flight(self, sensor: str) -> None:
         whole = columns(getattr(SimulatedAircraft(SETTINGS), sensor).take(24.0))
         sampler = getattr(SimulatedAircraft(SETTINGS), sensor)
         pieces = [columns(sampler.take(until)) for until in (0.003, 0.003, 7.0, 7.5, 24.0)]
@@ -111,7 +113,7 @@ class TestPieces:
         assert (first != start(2, 0)).any()
         assert (first != start(1, 1)).any()
 
-    def test_a_second_flight_goes_on(self) -> None:
+    def test_receiver_stays_on_in_second_flight(self) -> None:
         gps = SimulatedAircraft(SETTINGS).gps.take(2.0 * FLIGHT_S)
         assert (np.diff(gps.valid_time_s) > 0.19).all()
         again = (gps.valid_time_s >= FLIGHT_S) & (gps.valid_time_s < FLIGHT_S + 5.0)
@@ -119,7 +121,7 @@ class TestPieces:
 
 
 class TestRecords:
-    def test_are_in_order_and_complete(self, flight: SimulatedFlight) -> None:
+    def test_records_are_ordered_and_complete(self, flight: SimulatedFlight) -> None:
         records = list(flight.records())
         times = [record.time_us for record in records]
         assert times == sorted(times)
@@ -137,7 +139,7 @@ class TestRecords:
 
 
 @pytest.mark.parametrize("skew_ppm", [-200.0, 0.0, 1500.0])
-def test_device_clock(skew_ppm: float) -> None:
+def test_device_clock_converts_both_ways_with_skew(skew_ppm: float) -> None:
     clock = DeviceClock(1_000_000, skew_ppm)
     assert clock.at(0.0) == 1_000_000
     assert clock.at(1000.0) == pytest.approx(1_001_000_000 + 1000 * skew_ppm, abs=1)

@@ -48,7 +48,7 @@ def of_kind(sent: list[Sent], kind: type) -> list[Sent]:
 
 
 class TestImuNode:
-    def test_sends_the_flight(self, imu_sent: list[Sent]) -> None:
+    def test_imu_payloads_contain_simulated_samples(self, imu_sent: list[Sent]) -> None:
         imu = fly(SETTINGS, duration_s=SECONDS).imu
         payloads = [s.payload for s in of_kind(imu_sent, ImuPayload)]
         np.testing.assert_array_equal([p.accel for p in payloads], imu.accel_raw[: len(payloads)])
@@ -58,7 +58,7 @@ class TestImuNode:
         assert payloads[0].flags & ImuFlags.MAG_NEW
         assert (payloads[0].accel_range, payloads[0].gyro_range, payloads[0].mag_gain) == (2, 2, 1)
 
-    def test_sends_barometer_and_status(self, imu_sent: list[Sent]) -> None:
+    def test_barometer_and_status_are_sent_at_their_rates(self, imu_sent: list[Sent]) -> None:
         baro = [s.payload for s in of_kind(imu_sent, BaroPayload)]
         assert len(baro) == pytest.approx(500, abs=1)
         assert all(9_900_000 < p.pressure_centipa < 10_130_000 for p in baro)
@@ -66,7 +66,7 @@ class TestImuNode:
         assert len(status) == 20
         assert (status[0].sensors_present, status[0].sample_rate_hz) == (0b0111, 100)
 
-    def test_stamps_the_sampling(self, imu_sent: list[Sent]) -> None:
+    def test_node_time_is_that_of_sampling(self, imu_sent: list[Sent]) -> None:
         stamps = [s.node_time_us for s in of_kind(imu_sent, ImuPayload)]
         assert set(np.diff(stamps)) == {10_000}
         times = np.array([s.time_s for s in of_kind(imu_sent, ImuPayload)])
@@ -74,7 +74,7 @@ class TestImuNode:
 
 
 class TestGpsNode:
-    def test_sends_quality_before_its_fix(self, gps_sent: list[Sent]) -> None:
+    def test_quality_is_sent_before_its_fix(self, gps_sent: list[Sent]) -> None:
         messages = [s.payload for s in gps_sent if not isinstance(s.payload, NodeStatusPayload)]
         for quality, fix in zip(messages[::2], messages[1::2], strict=True):
             assert isinstance(quality, GpsQualityPayload)
@@ -93,7 +93,7 @@ class TestGpsNode:
         assert qualities[-1].utc is not None
         assert qualities[-1].geoid_separation_cm == 2300
 
-    def test_leads_to_the_place(self, gps_sent: list[Sent]) -> None:
+    def test_fix_is_near_simulated_position(self, gps_sent: list[Sent]) -> None:
         fix = of_kind(gps_sent, GpsFixPayload)[50].payload
         assert fix.lat_dege7 == pytest.approx(-77_656_000, abs=1000)
         assert fix.lon_dege7 == pytest.approx(1_103_728_000, abs=2000)

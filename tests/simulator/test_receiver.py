@@ -53,12 +53,12 @@ class TestLine:
         sequence = [content.frame_seq for content in contents]
         assert all((b - a) % 256 == 1 for a, b in itertools.pairwise(sequence))
 
-    def test_time_goes_on_and_the_line_is_not_too_fast(self, line: list[TimedFrame]) -> None:
+    def test_frame_times_allow_for_transmission_at_line_speed(self, line: list[TimedFrame]) -> None:
         for before, after in itertools.pairwise(line):
             assert after.time_s - before.time_s >= len(after.data) * 10 / 500_000 - 1e-9
         assert line[-1].time_s < SECONDS + 0.01
 
-    def test_receiver_stamps_the_arrival(self, line: list[TimedFrame]) -> None:
+    def test_receiver_time_is_that_of_arrival(self, line: list[TimedFrame]) -> None:
         for frame, content in zip(line, decoded(line), strict=True):
             heard_s = (content.receiver_time_us - 1_618_033) * 1e-6 / (1.0 + 60e-6)
             assert 0.0 < frame.time_s - heard_s < 0.006
@@ -70,13 +70,15 @@ class TestLine:
         assert reports[-1].pipes[1].received == pytest.approx(19 * 11, rel=0.05)
         assert reports[-1].pipes[2].received == 0
 
-    def test_seeds(self, line: list[TimedFrame]) -> None:
+    def test_equal_seeds_give_equal_frames(self, line: list[TimedFrame]) -> None:
         same, other = frames(5.0), frames(5.0, seed=2)
         assert same == line[: len(same)]
         assert same != other
 
-    def test_no_frame_makes_more_than_a_piece(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Or it would hold up the loop that asks for it."""
+    def test_each_frame_needs_at_most_one_piece_of_samples(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """More would block the event loop that asks for the frame."""
         made: list[int] = []
 
         def counted(sampler: type[ImuSampler | BaroSampler | GpsSampler]) -> None:
@@ -100,14 +102,14 @@ class TestLine:
         assert total > 100
         assert max(made) <= 21
 
-    def test_too_slow_a_line_drops_and_counts(self) -> None:
+    def test_too_slow_line_drops_frames_and_counts_them(self) -> None:
         contents = decoded(frames(10.0, baud=38_400, imu_rate_hz=200))
         report = [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1]
         assert report.uart_dropped > 100
         radio = [c.frame_seq for c in contents]
         assert any((b - a) % 256 > 1 for a, b in itertools.pairwise(radio)), "the gap shows"
 
-    def test_thousand_samples_a_second_fit(self) -> None:
+    def test_1000_samples_per_second_fit_on_the_line(self) -> None:
         contents = decoded(frames(3.0, imu_rate_hz=1000, radio_loss=0.0))
         assert [c for c in contents if isinstance(c, ReceiverStatusFrame)][-1].uart_dropped == 0
         assert len(contents) == pytest.approx(3 * 1037, rel=0.01)
@@ -115,7 +117,7 @@ class TestLine:
 
 class TestRadio:
     @pytest.mark.parametrize(("loss", "burst"), [(0.0, 1.0), (0.01, 1.0), (0.1, 1.0), (0.1, 20.0)])
-    def test_loss_is_as_set(self, loss: float, burst: float) -> None:
+    def test_loss_equals_its_setting(self, loss: float, burst: float) -> None:
         line = frames(
             60.0, baro_rate_hz=1, radio_loss=loss, radio_burst=burst, radio_duplicates=0.0
         )
@@ -131,7 +133,7 @@ class TestRadio:
         if loss:
             assert gaps[gaps > 0].mean() == pytest.approx(burst, rel=0.35)
 
-    def test_duplicates(self) -> None:
+    def test_duplicates_are_counted_and_not_lost(self) -> None:
         link = feed(frames(30.0, radio_duplicates=0.05, radio_loss=0.0))
         report = link.report(30_000_000, connected=True, port="")
         imu = next(node for node in report.nodes if node.node == NodeId(1, 0))
@@ -147,14 +149,14 @@ def feed(line: list[TimedFrame]) -> Link:
 
 
 class TestThroughTheWire:
-    def test_clocks_run_as_set(self) -> None:
+    def test_clock_skew_equals_its_setting(self) -> None:
         link = feed(frames(60.0, clock_skew_ppm=300.0))
         nodes = link.report(60_000_000, connected=True, port="").nodes
         skews = {node.node.node_id: node.clock_skew_ppm for node in nodes}
         assert skews[0] == pytest.approx(300.0, abs=5.0)
         assert skews[1] == pytest.approx(-300.0, abs=15.0)
 
-    def test_records_are_those_of_the_flight(self) -> None:
+    def test_decoded_records_equal_those_of_the_flight(self) -> None:
         # Without losses, since a fix whose quality payload was lost has no accuracy or time.
         line, link = frames(radio_loss=0.0), Link()
         records = [r for f in line for r in link.feed(f.data, round(f.time_s * 1e6))]
@@ -174,7 +176,7 @@ class TestThroughTheWire:
                         original.lat_dege7, original.utc_us, original.fix_type
                     )  # fmt: skip
 
-    def test_node_restarts(self) -> None:
+    def test_node_restart_is_counted_and_leaves_a_gap(self) -> None:
         link = Link()
         imu = [
             record
@@ -201,10 +203,10 @@ class TestThroughTheWire:
     ("start_unix_us", "years"),
     [(0, set()), (-(10**15), set()), (10**18, {2254}), (8 * 10**15, {2223})],
 )
-def test_a_clock_that_was_never_set_does_not_stop_the_simulator(
+def test_impossible_start_time_is_limited_to_range_of_gps(
     start_unix_us: int, years: set[int]
 ) -> None:
-    """Its receiver then reports the year 2000, which is rejected."""
+    """A clock that was never set gives the year 2000, which is rejected."""
     line = list(simulate(settings(gps_first_fix_s=0.5), start_unix_us).frames(3.0))
     link = Link()
     records = [record for frame in line for record in link.feed(frame.data, 0)]
@@ -220,7 +222,7 @@ def test_vehicle_ids_must_fit_the_protocol() -> None:
 
 
 class TestDamage:
-    def test_hits_the_share_of_bytes(
+    def test_damage_affects_the_set_share_of_bytes(
         self, rng: np.random.Generator, line: list[TimedFrame]
     ) -> None:
         hit = list(damage(iter(line), 0.1, rng))
@@ -232,7 +234,7 @@ class TestDamage:
             assert after.time_s == before.time_s
 
     @pytest.mark.parametrize("share", [0.002, 0.02, 0.1])
-    def test_which_frames_are_damaged_is_known(self, share: float) -> None:
+    def test_undamaged_frames_are_the_ones_that_decode(self, share: float) -> None:
         """A frame survives if it and the delimiter before it are whole."""
         clean = frames(10.0)
         hit = frames(10.0, corrupt_bytes=share)
@@ -250,10 +252,10 @@ class TestDamage:
 
 
 @pytest.mark.slow
-def test_memory_stays_the_same() -> None:
-    """Nothing is kept but what waits for its moment, however long it runs."""
+def test_memory_does_not_grow_with_flight_time() -> None:
+    """The simulator keeps only frames that are not yet due."""
     assert _growth_bytes(kept=None) < 30_000
-    # The same measure, were everything kept that was sent.
+    # The same measurement shows growth where all frames are kept.
     assert _growth_bytes(kept=[]) > 80_000
 
 

@@ -223,7 +223,7 @@ def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
     assert [node.lost for node in report.nodes] == [0, 0]
 
 
-def test_a_flight_without_barometer_and_gps_goes_round_too() -> None:
+def test_flight_without_barometer_and_gps_goes_round_too() -> None:
     bare = RecordedFlight.from_columns(columns(baro_alt_m=None, gps_lat=None))
     frames = replay(QUIET, bare, endless=True).frames()
     assert sum(1 for _, frame in zip(range(3 * ROWS), frames, strict=False)) == 3 * ROWS
