@@ -22,7 +22,7 @@ def test_frames_are_numbered_in_one_sequence_per_system() -> None:
     assert {m.get_srcComponent() for m in found} == {1}
 
 
-def test_frames_are_mavlink_2_and_cut_short() -> None:
+def test_frames_are_mavlink_2_without_trailing_zeros() -> None:
     frame = Encoder(1).encode(mavlink.MAVLink_ping_message(7, 0, 0, 0), client_id=9)
     assert frame.frame[0] == 0xFD
     assert frame.frame[1] == 1
@@ -30,7 +30,7 @@ def test_frames_are_mavlink_2_and_cut_short() -> None:
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e300, -1e300, math.nan])
-def test_no_number_stops_the_telemetry(value: float) -> None:
+def test_numbers_beyond_their_fields_are_saturated(value: float) -> None:
     huge = 10**30 if value > 0 else -(10**30)
     message = mavlink.MAVLink_global_position_int_message(*[huge] * 9)
     [found] = decode([Encoder(1).encode(message)])
@@ -117,7 +117,9 @@ UNKNOWN = [
 
 
 @pytest.mark.parametrize(("fit", "unknown", "low", "high"), UNKNOWN)
-def test_ends_and_unknown(fit: object, unknown: int, low: int, high: int) -> None:
+def test_integer_is_saturated_and_nan_is_its_unknown_value(
+    fit: object, unknown: int, low: int, high: int
+) -> None:
     assert fit(math.nan) == unknown
     assert fit(-math.inf) == fit(-1e300) == low
     assert fit(math.inf) == fit(1e300) == high
@@ -129,11 +131,11 @@ def test_ends_and_unknown(fit: object, unknown: int, low: int, high: int) -> Non
     ("deg", "cdeg", "whole"),
     [(0.0, 0, 0), (-0.001, 0, 0), (359.999, 0, 0), (-90.0, 27000, 270), (180.0, 18000, 180)],
 )
-def test_compass(deg: float, cdeg: int, whole: int) -> None:
+def test_heading_is_encoded_between_0_and_360_degrees(deg: float, cdeg: int, whole: int) -> None:
     assert encoding.compass_cdeg(math.radians(deg)) == cdeg
     assert encoding.compass_deg(math.radians(deg)) == whole
     assert encoding.compass_cdeg(math.nan) == 65535
 
 
-def test_a_field_without_a_mark_uses_its_whole_range() -> None:
+def test_field_with_another_unknown_value_uses_its_whole_range() -> None:
     assert encoding.uint16(1e9, unknown=0) == 65535

@@ -50,7 +50,7 @@ def nowhere(clock: ManualClock) -> GroundStation:
     return GroundStation(Vehicle(VehicleSettings(), 1), clock)
 
 
-def test_the_home_of_the_gps_is_shown_as_parameters(nowhere: GroundStation) -> None:
+def test_home_of_the_gps_is_reported_as_parameters(nowhere: GroundStation) -> None:
     assert home(nowhere) == [NONE, 0.0, 0.0, 0.0]
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
     assert set(NAMES) <= {m.param_id for m in of_kind(nowhere.inbox, "PARAM_VALUE")}
@@ -58,7 +58,7 @@ def test_the_home_of_the_gps_is_shown_as_parameters(nowhere: GroundStation) -> N
     assert nowhere.of(SavePlan) == [], "it is measured again at every start"
 
 
-def test_one_number_moves_home_and_leaves_the_others_exact(station: GroundStation) -> None:
+def test_one_parameter_moves_home_and_leaves_the_others_exact(station: GroundStation) -> None:
     found = station.set_parameter("HOME_LAT", 47.5)
     assert sent_homes(found) == [(475_000_000, -87_654_321, 520_250)]
     assert home(station)[:2] == [OPERATOR, 47.5]
@@ -71,13 +71,13 @@ def test_one_number_moves_home_and_leaves_the_others_exact(station: GroundStatio
     assert home(station)[:2] == [OPERATOR, 47.5], "home has no default"
 
 
-def test_a_longitude_is_as_fine_as_a_float_can_be(station: GroundStation) -> None:
+def test_longitude_keeps_the_resolution_of_a_float(station: GroundStation) -> None:
     sent = float32(-122.123_456)
     [(_, lon, _)] = sent_homes(station.set_parameter("HOME_LON", sent))
     assert lon / 1e7 == pytest.approx(sent, abs=4e-6)
 
 
-def test_numbers_sent_back_as_they_were_shown_change_nothing(station: GroundStation) -> None:
+def test_parameters_written_back_unchanged_do_not_move_home(station: GroundStation) -> None:
     for name, value in zip(NAMES, home(station), strict=True):
         assert sent_homes(station.set_parameter(name, value)) == []
     assert station.vehicle.telemetry.home.location == pytest.approx(FIELD)
@@ -85,7 +85,7 @@ def test_numbers_sent_back_as_they_were_shown_change_nothing(station: GroundStat
 
 
 @pytest.mark.parametrize("first", ["HOME_LAT", "HOME_LON", "HOME_ALT"])
-def test_a_home_begins_only_with_its_last_number(nowhere: GroundStation, first: str) -> None:
+def test_home_is_set_only_by_its_last_parameter(nowhere: GroundStation, first: str) -> None:
     """Half a home would be thousands of kilometres off; zero is a number like any other."""
     wanted = {"HOME_LAT": 51.5, "HOME_LON": 0.0, "HOME_ALT": 45.0}
     *names, last = [first, *(name for name in wanted if name != first)]
@@ -98,7 +98,7 @@ def test_a_home_begins_only_with_its_last_number(nowhere: GroundStation, first: 
     assert home(nowhere) == [OPERATOR, 51.5, 0.0, 45.0]
 
 
-def test_a_fix_overrides_half_a_home(nowhere: GroundStation) -> None:
+def test_fix_replaces_an_incomplete_home(nowhere: GroundStation) -> None:
     nowhere.set_parameter("HOME_LAT", 1.0)
     nowhere.receive(nowhere.vehicle.on_gps(FIX, 0))
     assert home(nowhere)[:2] == [GPS, float32(47.123_456_7)]
@@ -115,12 +115,12 @@ def test_invalid_coordinates_are_refused(station: GroundStation, name: str, valu
     assert home(station) == before
 
 
-def test_a_command_keeps_it_at_once(station: GroundStation) -> None:
+def test_home_set_by_a_command_is_stored_at_once(station: GroundStation) -> None:
     station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
     assert kept(station) == [pytest.approx(Location(47.5, -8.5, 400.0))]
 
 
-def test_the_home_of_the_gps_can_be_kept(station: GroundStation) -> None:
+def test_home_of_the_gps_can_be_stored(station: GroundStation) -> None:
     station.set_parameter("HOME_SOURCE", OPERATOR)
     assert store(station) == pytest.approx(FIELD)
 
@@ -140,7 +140,7 @@ def test_cleared_home_is_measured_again(clock: ManualClock) -> None:
     assert home(station)[0] == GPS
 
 
-def test_a_source_without_a_home_is_refused(nowhere: GroundStation) -> None:
+def test_source_without_a_home_is_refused(nowhere: GroundStation) -> None:
     for source in (GPS, OPERATOR):
         error, echo = nowhere.set_parameter("HOME_SOURCE", source)
         assert (error.get_type(), echo.param_value) == ("PARAM_ERROR", NONE)

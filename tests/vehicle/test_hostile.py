@@ -39,7 +39,9 @@ FIXED_MAG_CAL_YAW = 42006
 
 @pytest.mark.parametrize("trusted", [True, False])
 @pytest.mark.parametrize("seed", range(4))
-def test_random_values_in_every_message(station: GroundStation, seed: int, trusted: bool) -> None:
+def test_messages_with_random_values_are_handled(
+    station: GroundStation, seed: int, trusted: bool
+) -> None:
     rng = np.random.default_rng(seed)
     station.trusted = trusted
     for frame in every_message(rng):
@@ -50,7 +52,7 @@ def test_random_values_in_every_message(station: GroundStation, seed: int, trust
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_random_bytes(station: GroundStation, seed: int) -> None:
+def test_random_bytes_are_counted_and_not_answered(station: GroundStation, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for size in rng.integers(0, 300, 2000):
         data = bytearray(rng.bytes(int(size)))
@@ -61,7 +63,9 @@ def test_random_bytes(station: GroundStation, seed: int) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_cut_and_broken_frames(station: GroundStation, version: int) -> None:
+def test_truncated_and_corrupt_frames_are_not_answered(
+    station: GroundStation, version: int
+) -> None:
     station.version = version
     frame = station.frame(mavlink.MAVLink_param_request_list_message(1, 1))
     for size in range(len(frame)):
@@ -73,7 +77,7 @@ def test_cut_and_broken_frames(station: GroundStation, version: int) -> None:
     assert station.send_bytes(frame) != []
 
 
-def test_unknown_messages_and_flags(station: GroundStation) -> None:
+def test_unknown_messages_and_flags_are_counted(station: GroundStation) -> None:
     head = bytes([0xFD, 1, 0, 0, 0, 255, 190]) + (70_000).to_bytes(3, "little")
     assert station.send_bytes(head + b"\x01\x00\x00") == []
     assert station.vehicle.faults["unknown"] == 1

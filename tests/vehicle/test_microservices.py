@@ -203,7 +203,9 @@ def answers(message: Any, field: str) -> Any:
 
 @pytest.mark.parametrize("loss", [0.0, 0.33])
 @pytest.mark.parametrize("row", TABLE)
-def test_the_answer(station: GroundStation, row: str, loss: float) -> None:
+def test_every_request_gets_the_answer_of_its_page(
+    station: GroundStation, row: str, loss: float
+) -> None:
     request, kind, fields = TABLE[row]
     rng = np.random.default_rng([*row.encode()])
     station.loses = lambda *_: rng.random() < loss
@@ -239,7 +241,7 @@ def test_answer_is_sent_once_and_to_the_requesting_client_only(
 
 
 @pytest.mark.parametrize("target", [(2, 1), (2, 0), (1, 100), (255, 190)])
-def test_messages_for_others_are_left_alone(
+def test_messages_for_other_systems_are_ignored(
     station: GroundStation, target: tuple[int, int]
 ) -> None:
     assert station.command(31_999, target=target) == []
@@ -260,7 +262,7 @@ def test_answers_to_ping_and_timesync_are_not_answered(station: GroundStation) -
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_qgroundcontrol_is_through_in_less_than_a_second(
+def test_qgroundcontrol_connects_in_less_than_a_second(
     station: GroundStation, version: int
 ) -> None:
     station.version = version
@@ -270,13 +272,13 @@ def test_qgroundcontrol_is_through_in_less_than_a_second(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_qgroundcontrol_gets_through_a_lossy_link(station: GroundStation, seed: int) -> None:
+def test_qgroundcontrol_connects_over_a_lossy_link(station: GroundStation, seed: int) -> None:
     rng = np.random.default_rng(seed)
     station.loses = lambda *_: rng.random() < 0.2
     qgroundcontrol(station)
 
 
-def test_versions(station: GroundStation) -> None:
+def test_versions_and_capabilities_are_reported(station: GroundStation) -> None:
     ack, version = station.request(148)
     assert (ack.target_system, ack.target_component) == (255, 190)
     assert version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
@@ -291,11 +293,11 @@ def test_versions(station: GroundStation) -> None:
     ("text", "number"),
     [("1.2.3", 0x010203FF), ("0.10.0", 0x000A00FF), ("2.0", 0x020000FF), ("1.2rc1.3", 0x010003FF)],
 )
-def test_software_version(text: str, number: int) -> None:
+def test_software_version_is_encoded_in_four_bytes(text: str, number: int) -> None:
     assert encoding.software_version(text) == number
 
 
-def test_modes_are_as_the_development_dialect_has_them() -> None:
+def test_modes_are_decoded_by_the_development_dialect() -> None:
     parser = development.MAVLink(None)
     modes, mode = (
         parser.decode(bytearray(Encoder(1).encode(message).frame))
@@ -322,7 +324,7 @@ def test_modes_are_as_the_development_dialect_has_them() -> None:
         ),
     ],
 )
-def test_crc_seeds_follow_from_the_definitions(kind: Any, fields: str) -> None:
+def test_crc_extra_follows_from_the_definition(kind: Any, fields: str) -> None:
     """CRC_EXTRA is the checksum of the message's own definition, in wire order."""
     definition = f"{kind.msgname} {fields.replace('/', ' ')}"
     crc = mavlink.x25crc(bytearray(definition, "latin1")).crc
@@ -338,13 +340,15 @@ STREAMED = {
 }  # fmt: skip
 
 
-def test_every_message_that_is_sent_can_be_requested(station: GroundStation) -> None:
+def test_every_streamed_message_can_be_requested(station: GroundStation) -> None:
     for kind, message_id in STREAMED.items():
         assert kinds(station.request(message_id)) == [ACK, kind]
     assert set(results(station.inbox)) == {mavlink.MAV_RESULT_ACCEPTED}
 
 
-def test_a_message_without_content_yet_is_put_off(clock: ManualClock, vehicle: Vehicle) -> None:
+def test_request_of_a_message_without_content_is_temporarily_rejected(
+    clock: ManualClock, vehicle: Vehicle
+) -> None:
     fresh = GroundStation(vehicle, clock)
     for message_id in (242, 31, 33, 62):
         assert results(fresh.request(message_id)) == [mavlink.MAV_RESULT_TEMPORARILY_REJECTED]

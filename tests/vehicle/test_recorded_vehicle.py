@@ -58,21 +58,21 @@ def asking(clock: ManualClock) -> GroundStation:
     return GroundStation(RecordedVehicle(SYSTEM, LogContents(26)), clock)
 
 
-def test_all_parameters_arrive(asking: GroundStation) -> None:
+def test_recorded_parameters_are_sent_to_the_requesting_client_only(asking: GroundStation) -> None:
     found = asking.send(LIST) + asking.wait(1.0)
     assert [m.param_id for m in found] == [f"P{i}" for i in range(26)]
     assert {frame.client_id for frame in asking.frames} == {asking.client_id}
     assert asking.vehicle.next_due_us() is None
 
 
-def test_a_list_ends_with_its_client(asking: GroundStation) -> None:
+def test_parameter_list_ends_when_its_client_is_removed(asking: GroundStation) -> None:
     asking.send(LIST)
     asking.vehicle.remove_client(asking.client_id)
     assert asking.vehicle.next_due_us() is None
     assert asking.vehicle.poll(1_000_000) == []
 
 
-def test_single_parameters(asking: GroundStation) -> None:
+def test_parameter_is_read_by_index_or_name(asking: GroundStation) -> None:
     read = mavlink.MAVLink_param_request_read_message
     by_index, by_name, missing = (read(*ME, b"", 4), read(*ME, b"P5", -1), read(*ME, b"", 26))
     expected = ["PARAM_VALUE", "PARAM_VALUE", "PARAM_ERROR"]
@@ -80,13 +80,13 @@ def test_single_parameters(asking: GroundStation) -> None:
     assert asking.send(by_name)[0].param_value == 5.0
 
 
-def test_a_parameter_stays_whoever_sets_it(asking: GroundStation) -> None:
+def test_set_parameter_is_refused_with_its_recorded_value(asking: GroundStation) -> None:
     found = asking.set_parameter("P5", 9.0)
     assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE"]
     assert found[1].param_value == 5.0
 
 
-def test_without_parameters_the_list_is_declined(clock: ManualClock) -> None:
+def test_parameter_list_of_a_log_without_parameters_is_an_error(clock: ManualClock) -> None:
     asking = GroundStation(RecordedVehicle(SYSTEM, LogContents()), clock)
     assert kinds(asking.send(LIST)) == ["PARAM_ERROR"]
 
@@ -112,7 +112,9 @@ def test_without_parameters_the_list_is_declined(clock: ManualClock) -> None:
         (mavlink.MAVLink_timesync_message(0, 5), "TIMESYNC", {"ts1": 5}),
     ],
 )
-def test_answers(asking: GroundStation, message: Any, kind: str, fields: dict[str, Any]) -> None:
+def test_request_is_answered_with_the_contents_of_the_log(
+    asking: GroundStation, message: Any, kind: str, fields: dict[str, Any]
+) -> None:
     [answer] = asking.send(message)
     assert answer.get_type() == kind
     assert {name: getattr(answer, name) for name in fields} == fields
@@ -122,12 +124,16 @@ def test_answers(asking: GroundStation, message: Any, kind: str, fields: dict[st
     ("number", "params"),
     [(mavlink.MAV_CMD_REQUEST_MESSAGE, (HOME,)), (mavlink.MAV_CMD_GET_HOME_POSITION, ())],
 )
-def test_home_of_that_day(asking: GroundStation, number: int, params: tuple[float, ...]) -> None:
+def test_recorded_home_is_sent_on_request(
+    asking: GroundStation, number: int, params: tuple[float, ...]
+) -> None:
     ack, home = asking.command(number, *params)
     assert (ack.result, home.latitude) == (ACCEPTED, 470_000_000)
 
 
-def test_commands_that_a_log_cannot_carry_out(asking: GroundStation) -> None:
+def test_unrecorded_message_is_unsupported_and_other_commands_are_denied(
+    asking: GroundStation,
+) -> None:
     assert results(asking.request(VERSION)) == [UNSUPPORTED]
     for number in (
         mavlink.MAV_CMD_COMPONENT_ARM_DISARM,
@@ -154,10 +160,10 @@ def test_client_may_reduce_the_rate_of_a_played_message(
     assert requested == ([(message_id, interval_us)] if result == ACCEPTED else [])
 
 
-def test_files_are_declined_at_once(asking: GroundStation) -> None:
+def test_file_of_a_log_without_metadata_is_refused(asking: GroundStation) -> None:
     assert FtpClient(asking).open(b"@PARAM/param.pck").opcode == 129
 
 
-def test_other_vehicles_and_garbage_are_left_alone(asking: GroundStation) -> None:
+def test_requests_for_other_systems_and_garbage_are_ignored(asking: GroundStation) -> None:
     assert asking.send(mavlink.MAVLink_param_request_list_message(9, 1)) == []
     assert asking.vehicle.handle(Incoming(7, b"\xfd\x00\x00", trusted=True), 0) == []

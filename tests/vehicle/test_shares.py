@@ -30,7 +30,7 @@ def sent_to(crowd: list[GroundStation], greedy: Callable[[int], Any], kind: int)
     return sum(f.message_id == kind for each in (vehicle, *crowd) for f in each.frames)
 
 
-def test_lists_of_parameters_for_a_crowd_are_no_more_work_than_for_one(
+def test_parameter_lists_of_many_clients_share_one_rate_limit(
     station: GroundStation, crowd: list[GroundStation]
 ) -> None:
     sent = sent_to(crowd, lambda n: crowd[n].send(LIST), mavlink.MAVLINK_MSG_ID_PARAM_VALUE)
@@ -38,7 +38,7 @@ def test_lists_of_parameters_for_a_crowd_are_no_more_work_than_for_one(
     assert load_parameters(station)["TUNING_CUTOFF"] == 10.0, "also while others request it"
 
 
-def test_bursts_of_single_bytes_for_a_crowd_are_no_more_work_than_for_one(
+def test_ftp_bursts_of_many_clients_share_one_rate_limit(
     crowd: list[GroundStation],
 ) -> None:
     clients = [FtpClient(each) for each in crowd]
@@ -54,7 +54,7 @@ def test_bursts_of_single_bytes_for_a_crowd_are_no_more_work_than_for_one(
     assert sent_to(crowd, greedy, kind) <= 2 * FRAMES_A_SECOND + 10
 
 
-def test_a_flood_for_the_parameters_is_one_list_and_not_a_thousand(station: GroundStation) -> None:
+def test_repeated_list_requests_restart_one_transfer(station: GroundStation) -> None:
     for _ in range(1000):
         station.send(LIST)
     station.inbox.clear()
@@ -64,7 +64,7 @@ def test_a_flood_for_the_parameters_is_one_list_and_not_a_thousand(station: Grou
 
 
 @pytest.mark.parametrize("trusted", [True, False])
-def test_only_the_trusted_may_have_an_answer_sent_to_all(
+def test_only_a_trusted_client_may_have_an_answer_sent_to_all(
     station: GroundStation, trusted: bool
 ) -> None:
     station.trusted = trusted

@@ -46,37 +46,37 @@ def changed(found: list[Any]) -> bool:
     return [m.param_value for m in of_kind(found, "PARAM_VALUE")] == [5.0]
 
 
-def test_the_key_is_the_hash_of_the_passphrase() -> None:
+def test_key_is_the_hash_of_the_passphrase() -> None:
     assert len(KEY) == KEY_BYTES
     assert KEY.hex().startswith("4104d36f"), "sha256sum of the passphrase"
 
 
-def test_a_signed_request_changes_something(station: GroundStation) -> None:
+def test_signed_request_changes_a_parameter(station: GroundStation) -> None:
     sign(station)
     assert changed(station.send(SET))
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_an_unsigned_one_does_not_but_may_read(station: GroundStation, version: int) -> None:
+def test_unsigned_request_may_only_read(station: GroundStation, version: int) -> None:
     station.version = version
     assert not changed(station.send(SET))
     read = mavlink.MAVLink_param_request_read_message(1, 1, b"RATE_ATT", -1)
     assert station.send(read)[0].param_value == 50.0
 
 
-def test_a_signature_does_not_make_a_client_trusted(station: GroundStation) -> None:
+def test_signature_does_not_make_a_client_trusted(station: GroundStation) -> None:
     sign(station)
     station.trusted = False
     assert not changed(station.send(SET))
 
 
-def test_another_key_is_dropped(station: GroundStation) -> None:
+def test_frame_signed_with_another_key_is_dropped(station: GroundStation) -> None:
     sign(station, key_from_passphrase("wrong"))
     assert station.send(SET) == []
     assert station.vehicle.faults["bad signature"] == 1
 
 
-def test_a_replayed_frame_is_dropped(station: GroundStation) -> None:
+def test_replayed_frame_is_dropped(station: GroundStation) -> None:
     sign(station)
     frame = station.frame(SET)
     assert changed(station.send_bytes(frame))
@@ -85,12 +85,12 @@ def test_a_replayed_frame_is_dropped(station: GroundStation) -> None:
     assert station.vehicle.faults["bad signature"] == 10
 
 
-def test_an_old_recording_is_dropped(station: GroundStation) -> None:
+def test_first_frame_of_a_stream_is_dropped_if_it_is_old(station: GroundStation) -> None:
     sign(station, at_us=NOW_UNIX_US - 120_000_000)
     assert station.send(SET) == []
 
 
-def test_a_forged_frame_does_not_lock_the_true_sender_out(station: GroundStation) -> None:
+def test_forged_frame_does_not_lock_out_the_true_sender(station: GroundStation) -> None:
     sign(station, key_from_passphrase("wrong"), at_us=NOW_UNIX_US + 10**15)
     station.send(SET)
     sign(station)
@@ -98,14 +98,16 @@ def test_a_forged_frame_does_not_lock_the_true_sender_out(station: GroundStation
 
 
 @pytest.mark.parametrize("position", [3, 5, 10, 20, -1, -7, -13])
-def test_a_changed_byte_is_noticed(station: GroundStation, position: int) -> None:
+def test_signed_frame_with_a_changed_byte_is_rejected(
+    station: GroundStation, position: int
+) -> None:
     sign(station)
     frame = bytearray(station.frame(SET))
     frame[position] ^= 0x01
     assert not changed(station.send_bytes(bytes(frame)))
 
 
-def test_without_a_key_signed_frames_are_taken_as_they_are(clock: ManualClock) -> None:
+def test_signed_frame_is_accepted_unchecked_without_a_key(clock: ManualClock) -> None:
     station = GroundStation(Vehicle(VehicleSettings(), 1), clock)
     sign(station)
     assert changed(station.send(SET))
@@ -116,7 +118,7 @@ def change(station: GroundStation, passphrase: str) -> None:
     station.vehicle.take_settings("vehicle", settings)
 
 
-def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
+def test_changed_passphrase_takes_effect_at_once(station: GroundStation) -> None:
     sign(station)
     old = station.frame(SET)
     change(station, "another horse")
@@ -130,7 +132,7 @@ def test_another_passphrase_holds_at_once(station: GroundStation) -> None:
     assert station.vehicle.signing_key is None
 
 
-def test_streams_are_bounded() -> None:
+def test_number_of_streams_is_bounded() -> None:
     verifier = Verifier(KEY, SigningClock(NOW_UNIX_US))
     accepted = sum(
         verifier.accepts(ping(sender=(number % 256, 1 + number // 256)), 0)
@@ -139,7 +141,7 @@ def test_streams_are_bounded() -> None:
     assert accepted == MAX_STREAMS
 
 
-def test_a_short_key_is_a_fault_of_the_caller() -> None:
+def test_short_key_raises_value_error() -> None:
     with pytest.raises(ValueError, match="31 bytes"):
         Verifier(bytes(31), SigningClock(0))
 
@@ -150,7 +152,7 @@ def ping(at_us: int = NOW_UNIX_US, sender: tuple[int, int] = (255, 190)) -> byte
 
 
 @pytest.mark.parametrize("orderly", [True, False])
-def test_a_command_cannot_be_sent_again_after_a_restart(orderly: bool) -> None:
+def test_frame_is_not_accepted_again_after_a_restart(orderly: bool) -> None:
     clock, book = SigningClock(NOW_UNIX_US), SigningTimestamps()
     verifier, kept = Verifier(KEY, clock, book), book.to_keep()
     taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
@@ -165,7 +167,7 @@ def test_a_command_cannot_be_sent_again_after_a_restart(orderly: bool) -> None:
     assert verifier.accepts(ping(NOW_UNIX_US + 10_000_000 + reserve_us), 0)
 
 
-def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
+def test_timestamps_of_a_busy_stream_are_written_every_few_seconds() -> None:
     book = SigningTimestamps()
     verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), book), 0
     for n in range(600):
@@ -176,7 +178,9 @@ def test_a_busy_stream_is_written_but_every_few_seconds() -> None:
     assert 12 <= written <= 13, "a minute"
 
 
-def test_another_passphrase_and_back_keeps_the_replay_protection(station: GroundStation) -> None:
+def test_replayed_frame_is_dropped_after_a_passphrase_was_changed_and_restored(
+    station: GroundStation,
+) -> None:
     sign(station)
     frame = station.frame(SET)
     assert changed(station.send_bytes(frame)), "which is a change of the vehicle's settings"
@@ -195,7 +199,7 @@ def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
     assert Verifier(KEY, clock).accepts(ping(NOW_UNIX_US), 0)
 
 
-def test_keys_are_bounded_and_the_oldest_goes() -> None:
+def test_oldest_key_is_discarded_beyond_the_limit() -> None:
     book = SigningTimestamps()
     for n in range(2 * MAX_KEYS):
         assert book.accept(f"{n}", "0.1.1", n, oldest=0)

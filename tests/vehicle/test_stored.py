@@ -40,7 +40,7 @@ def random_plan(seed: int) -> StoredPlan:
 
 
 @pytest.mark.parametrize("plan", [StoredPlan(), FULL, *map(random_plan, range(2))])
-def test_round_trip(plan: StoredPlan) -> None:
+def test_decoded_plan_equals_the_encoded_one(plan: StoredPlan) -> None:
     # NaN is not equal to itself.
     assert repr(decode_plan(encode_plan(plan))) == repr(plan)
 
@@ -72,7 +72,7 @@ def location(lat_deg: float, alt_amsl_m: float = 0.0) -> dict[str, float]:
         (changed(rally=[msgspec.to_builtins(FULL.rally[0])] * 101), "rally: more than 100"),
     ],
 )
-def test_a_text_that_nobody_could_have_stored_is_refused(text: str, why: str) -> None:
+def test_invalid_text_of_a_plan_is_refused(text: str, why: str) -> None:
     with pytest.raises(ValueError, match=why):
         decode_plan(text)
 
@@ -101,7 +101,7 @@ def test_items_survive_a_restart(station: GroundStation, kind: int) -> None:
     assert list(map(content, found)) == list(map(content, items))
 
 
-def test_the_current_item_and_its_mark_survive(station: GroundStation) -> None:
+def test_current_item_and_its_mark_survive_a_restart(station: GroundStation) -> None:
     upload(station, [item(seq) for seq in range(5)])
     station.send(mavlink.MAVLink_mission_set_current_message(1, 1, 3))
     marked = station.vehicle.plan.mark.location
@@ -113,7 +113,7 @@ def test_the_current_item_and_its_mark_survive(station: GroundStation) -> None:
     assert restarted(after).vehicle.plan.missions.items[0] == ()
 
 
-def test_home_and_a_mark_that_were_set_survive(station: GroundStation) -> None:
+def test_home_and_mark_set_by_an_operator_survive_a_restart(station: GroundStation) -> None:
     station.command(mavlink.MAV_CMD_DO_SET_HOME, 0, 0, 0, 0, 47.5, -8.5, 400.0)
     station.receive(station.vehicle.put_mark(Location(47.0, 8.0, NAN), 0))
     after = restarted(station)

@@ -72,7 +72,7 @@ def bench() -> Bench:
     return Bench()
 
 
-def test_a_gyro_bias_is_measured_and_gone(bench: Bench) -> None:
+def test_gyro_bias_is_removed_by_its_calibration(bench: Bench) -> None:
     biased = {"gyro_raw": (33, -66, 16)}
     before = bench.run(0.5, **biased).sample.gyro_b_radps
     assert max(map(abs, before)) > 0.03
@@ -83,7 +83,7 @@ def test_a_gyro_bias_is_measured_and_gone(bench: Bench) -> None:
     assert bench.parameters()["CAL_GYRO_BIAS_X"] == pytest.approx(before[0], rel=1e-6)
 
 
-def test_a_tilted_mounting_is_levelled(bench: Bench) -> None:
+def test_tilt_of_the_mounting_is_removed_by_its_calibration(bench: Bench) -> None:
     tilted = {"accel_raw": (400, -300, 4066)}
     assert abs(bench.run(0.5, **tilted).state.q_nb[1]) > 0.01
     bench.calibrate(0, 0, 0, 0, 2)
@@ -92,7 +92,7 @@ def test_a_tilted_mounting_is_levelled(bench: Bench) -> None:
     assert sample.accel_b_mps2[:2] == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
-def test_the_mounting_is_set_angle_by_angle(bench: Bench) -> None:
+def test_mounting_is_set_angle_by_angle(bench: Bench) -> None:
     """A pitch of 90° on the way: there, roll and yaw turn about the same axis."""
     down_b = bench.run(0.1).sample.accel_b_mps2
     assert down_b == pytest.approx((0.0, 0.0, -9.80665), abs=1e-6)
@@ -107,7 +107,7 @@ def test_the_mounting_is_set_angle_by_angle(bench: Bench) -> None:
     assert [reported[f"CAL_MNT_{angle}"] for angle in ("ROLL", "PIT", "YAW")] == [30.0, 90.0, -45.0]
 
 
-def test_angles_follow_a_mounting_that_was_measured(bench: Bench) -> None:
+def test_mounting_angles_follow_a_level_calibration(bench: Bench) -> None:
     bench.run(0.1)
     bench.set("CAL_MNT_ROLL", 170.0)
     bench.calibrate(0, 0, 0, 0, 2)
@@ -115,7 +115,7 @@ def test_angles_follow_a_mounting_that_was_measured(bench: Bench) -> None:
     assert abs(bench.parameters()["CAL_MNT_ROLL"]) == pytest.approx(180.0, abs=1e-3)
 
 
-def test_an_angle_out_of_range_changes_nothing(bench: Bench) -> None:
+def test_mounting_angle_out_of_range_changes_nothing(bench: Bench) -> None:
     bench.run(0.1)
     before = bench.pipeline.aircraft[1].settings.calibration
     for name, angle in (("CAL_MNT_PIT", 91.0), ("CAL_MNT_YAW", -181.0), ("CAL_MNT_ROLL", math.nan)):
@@ -124,7 +124,7 @@ def test_an_angle_out_of_range_changes_nothing(bench: Bench) -> None:
     assert bench.pipeline.aircraft[1].settings.calibration == before
 
 
-def test_an_accelerometer_bias_is_gone(bench: Bench) -> None:
+def test_accelerometer_bias_is_removed_by_its_calibration(bench: Bench) -> None:
     biased = {"accel_raw": (100, -50, 4196)}
     bench.run(0.5, **biased)
     bench.calibrate(0, 0, 0, 0, 4)
@@ -133,7 +133,7 @@ def test_an_accelerometer_bias_is_gone(bench: Bench) -> None:
     assert found == pytest.approx((0.0, 0.0, -9.80665), abs=1e-6)
 
 
-def test_a_new_weight_does_not_restart_the_estimator(bench: Bench) -> None:
+def test_changed_weight_does_not_restart_the_estimator(bench: Bench) -> None:
     """Turned by the gyroscope alone: a restarted estimator would lose the turn."""
     bench.run(2.0)
     turning = {"gyro_raw": (0, 0, -3280)}
@@ -149,7 +149,7 @@ def test_a_new_weight_does_not_restart_the_estimator(bench: Bench) -> None:
     ("estimator", "name", "value"),
     [("eskf", "ESKF_MAG_NOISE", 3.0), ("eskf", "REF_GPS_LATENCY", 0.2)],
 )
-def test_every_estimator_goes_on_when_retuned(estimator: str, name: str, value: float) -> None:
+def test_retuned_kalman_filter_keeps_its_state(estimator: str, name: str, value: float) -> None:
     bench = Bench(estimator)
     before = bench.run(5.0).state
     bench.set(name, value)

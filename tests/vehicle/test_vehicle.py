@@ -47,7 +47,7 @@ def fly(vehicle: Vehicle, start_s: int, seconds: int, **state: Any) -> list[Outg
     return found
 
 
-def test_every_message_at_its_own_rate() -> None:
+def test_every_message_is_sent_at_its_own_rate() -> None:
     vehicle = make()
     fly(vehicle, 0, 2)
     counted = Counter(kinds(fly(vehicle, 2, 10)))
@@ -82,7 +82,7 @@ def test_rate_of_zero_disables_a_message() -> None:
     assert not found & {"ATTITUDE", "GPS_RAW_INT", "SYS_STATUS"}
 
 
-def test_attitude_goes_on_without_any_position_and_none_is_made_up() -> None:
+def test_attitude_is_sent_without_a_position_and_positions_are_not() -> None:
     vehicle = make()
     found = []
     for time_us in range(0, 10 * ONE_S, 5_000):
@@ -163,7 +163,7 @@ def test_home_is_the_first_good_fix() -> None:
     assert {m.relative_alt for m in found} == {523_456 - 520_250}
 
 
-def test_a_home_elsewhere_does_not_make_it_fly() -> None:
+def test_stored_home_elsewhere_does_not_mean_in_flight() -> None:
     """One that was kept of another field, two hundred metres lower."""
     stored = StoredPlan(home=Location(46.0, 8.0, 300.0))
     vehicle = Vehicle(VehicleSettings(), 1, stored=stored)
@@ -185,9 +185,7 @@ def test_a_home_elsewhere_does_not_make_it_fly() -> None:
         ("never", True, 20.0, False),
     ],
 )
-def test_the_armed_bit_follows_the_rule(
-    rule: str, recording: bool, speed: float, armed: bool
-) -> None:
+def test_armed_bit_follows_the_rule(rule: str, recording: bool, speed: float, armed: bool) -> None:
     vehicle = make(armed_when=rule)
     vehicle.on_recorder("", 0, recording=recording)
     found = fly(vehicle, 0, 4, vel_n_mps=(speed, 0.0, 0.0), alt_amsl_m=521.0)
@@ -223,7 +221,7 @@ def test_link_and_nodes_are_reported() -> None:
         assert texts(vehicle.on_link(found, time_s * ONE_S)) == expected
 
 
-def test_good_news_is_info() -> None:
+def test_good_news_has_severity_info() -> None:
     """Stations speak a NOTICE and show it as trouble."""
     vehicle = make()
     said = fly(vehicle, 0, 2) + vehicle.on_link(report(link(), connected=False), ONE_S)
@@ -234,13 +232,13 @@ def test_good_news_is_info() -> None:
     assert trouble == {"Receiver lost: /dev/ttyUSB0"}
 
 
-def test_a_node_that_restarts_is_reported() -> None:
+def test_restarted_node_is_reported() -> None:
     vehicle = make()
     assert "Node 0 restarted" not in texts(vehicle.on_link(report(link(restarts=3)), ONE_S))
     assert texts(vehicle.on_link(report(link(restarts=4)), ONE_S)) == ["Node 0 restarted"]
 
 
-def test_a_node_that_keeps_restarting_is_reported_once() -> None:
+def test_node_that_keeps_restarting_is_reported_once() -> None:
     """As with two trackers of one id, whose stamps disagree with each sample."""
     vehicle, reported = make(), []
     for second in range(60):
@@ -269,7 +267,7 @@ def test_compass_with_wrong_axes_is_reported_once_with_the_remedy() -> None:
     ("flag", "sensor"),
     [(ImuFlags.MAG_UNCALIBRATED, "Compass"), (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer")],
 )
-def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
+def test_uncalibrated_sensor_is_reported_until_it_is_calibrated(
     flag: ImuFlags, sensor: str
 ) -> None:
     vehicle, reported = make(), []
@@ -281,7 +279,7 @@ def test_a_sensor_that_was_never_calibrated_is_reported_until_it_is(
     assert reported == [f"{sensor} not calibrated", f"{sensor} calibrated"]
 
 
-def test_a_latency_that_stands_for_a_lost_fix_is_not_announced_yet() -> None:
+def test_gps_latency_is_announced_once_its_estimate_has_settled() -> None:
     """It moves on until it is what the motion shows."""
     vehicle, reported = make(), []
     for n in range(200):
@@ -313,7 +311,7 @@ def test_system_time_follows_gps() -> None:
     assert after[0].time_unix_usec == 1_790_000_002_000_000
 
 
-def test_each_aircraft_answers_for_itself(clock: ManualClock) -> None:
+def test_each_aircraft_answers_only_requests_for_itself_or_all(clock: ManualClock) -> None:
     one = GroundStation(Vehicle(VehicleSettings(), 1), clock)
     two = GroundStation(Vehicle(VehicleSettings(rates=RateSettings(attitude_hz=7.0)), 2), clock)
 

@@ -72,7 +72,7 @@ def assert_failed(station: GroundStation, found: list[Any], why: str = "") -> No
     assert station.of(CalibrationMeasured) == []
 
 
-def test_gyro(station: GroundStation) -> None:
+def test_gyro_calibration_measures_the_bias_at_rest(station: GroundStation) -> None:
     found = station.command(CALIBRATE, *GYRO)
     assert results(found) == [IN_PROGRESS]
     assert cal_texts(found) == ["calibration started: 2 gyro"]
@@ -84,7 +84,7 @@ def test_gyro(station: GroundStation) -> None:
     assert correction(station).gyro_bias_radps == pytest.approx((0.02, -0.03, 0.01), abs=0.003)
 
 
-def test_level(station: GroundStation) -> None:
+def test_level_calibration_measures_the_tilt_of_the_mounting(station: GroundStation) -> None:
     station.command(CALIBRATE, *LEVEL)
     tilted = rotate_inverse(from_euler(0.1, -0.05, 0.0), (0.0, 0.0, -G))
     run(station, 4.0, rest(accel=tilted))
@@ -92,13 +92,13 @@ def test_level(station: GroundStation) -> None:
     assert level == pytest.approx((0.0, 0.0, -G), abs=0.02)
 
 
-def test_simple_accelerometer(station: GroundStation) -> None:
+def test_accelerometer_calibration_measures_the_bias_while_level(station: GroundStation) -> None:
     station.command(CALIBRATE, *SIMPLE)
     run(station, 4.0, rest(accel=(0.3, -0.2, -G + 0.1)))
     assert correction(station).accel_bias_mps2 == pytest.approx((0.3, -0.2, 0.1), abs=0.005)
 
 
-def test_accelerometer_on_six_sides(station: GroundStation) -> None:
+def test_six_side_calibration_names_the_sides_and_measures_the_bias(station: GroundStation) -> None:
     bias = np.array((0.3, -0.2, 0.1))
     assert results(station.command(CALIBRATE, *SIX_SIDES)) == [IN_PROGRESS]
     found = []
@@ -129,7 +129,7 @@ def tumble(centre: Vec3, radius: float) -> Motion:
     return motion
 
 
-def test_magnetometer(station: GroundStation) -> None:
+def test_magnetometer_calibration_measures_the_hard_iron(station: GroundStation) -> None:
     station.command(CALIBRATE, *MAG)
     found = run(station, 30.0, tumble((12.0, -7.0, 30.0), 48.0))
     assert results(found)[-1] == ACCEPTED
@@ -144,7 +144,7 @@ def test_magnetometer_fit_corrects_soft_iron_too(station: GroundStation) -> None
     assert matrix[1, 1] / matrix[0, 0] == pytest.approx(1.2, rel=1e-3)
 
 
-def test_fixed_yaw_sets_the_hard_iron(station: GroundStation) -> None:
+def test_fixed_yaw_calibration_measures_the_hard_iron(station: GroundStation) -> None:
     found = station.command(FIXED_MAG_CAL_YAW, 90.0, 0.0, 0.0, 0.0, 47.4, 8.5)
     assert results(found) == [IN_PROGRESS]
     lying = rest()
@@ -154,14 +154,16 @@ def test_fixed_yaw_sets_the_hard_iron(station: GroundStation) -> None:
 
 
 @pytest.mark.parametrize("params", [GYRO, LEVEL, SIMPLE])
-def test_movement_fails(station: GroundStation, params: tuple[int, ...]) -> None:
+def test_movement_fails_a_calibration_at_rest(
+    station: GroundStation, params: tuple[int, ...]
+) -> None:
     station.command(CALIBRATE, *params)
     found = run(station, 4.0, lambda t: {"gyro_b_radps": (math.sin(5.0 * t), 0.0, 0.0)})
     assert_failed(station, found, "it was moved")
 
 
 @pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES, LEVEL, SIMPLE])
-def test_none_is_begun_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
+def test_calibration_is_denied_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
     fly(station)
     found = station.command(CALIBRATE, *params)
     assert (results(found), cal_texts(found)) == ([DENIED], ["calibration failed: in flight"])
@@ -169,7 +171,9 @@ def test_none_is_begun_in_flight(station: GroundStation, params: tuple[int, ...]
 
 
 @pytest.mark.parametrize("params", [GYRO, MAG, SIX_SIDES])
-def test_none_goes_on_in_flight(station: GroundStation, params: tuple[int, ...]) -> None:
+def test_take_off_fails_a_running_calibration(
+    station: GroundStation, params: tuple[int, ...]
+) -> None:
     station.command(CALIBRATE, *params)
     assert_failed(station, fly(station), "in flight")
 
@@ -226,17 +230,19 @@ def shake(noise_mps2: float) -> Motion:
         *((shake(0.25), ACCEPTED), (shake(0.4), FAILED)),
     ],
 )
-def test_small_motion_is_no_rest(station: GroundStation, motion: Motion, result: int) -> None:
+def test_gyro_calibration_fails_in_motion_beyond_a_trembling_hand(
+    station: GroundStation, motion: Motion, result: int
+) -> None:
     station.command(CALIBRATE, *GYRO)
     assert results(run(station, 4.0, motion))[-1] == result
 
 
-def test_no_samples_fail_in_the_end(station: GroundStation) -> None:
+def test_calibration_without_samples_times_out(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     assert results(station.wait(61.0)) == [FAILED]
 
 
-def test_cancelling(station: GroundStation) -> None:
+def test_cancelled_calibration_has_no_result(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     found = station.command(CALIBRATE)
     assert (results(found), cal_texts(found)) == ([ACCEPTED], ["calibration cancelled"])
@@ -244,7 +250,7 @@ def test_cancelling(station: GroundStation) -> None:
     assert results(station.command(CALIBRATE)) == [ACCEPTED], "nothing to cancel is no fault"
 
 
-def test_one_at_a_time(station: GroundStation) -> None:
+def test_second_calibration_is_temporarily_rejected(station: GroundStation) -> None:
     station.command(CALIBRATE, *GYRO)
     assert results(station.command(CALIBRATE, *GYRO)) == [IN_PROGRESS], "sent again for a lost ACK"
     assert results(station.command(CALIBRATE, *MAG)) == [NOT_NOW]
@@ -253,7 +259,9 @@ def test_one_at_a_time(station: GroundStation) -> None:
 @pytest.mark.parametrize(
     "params", [(1, 1), (2,), (0, 0, 1), (0, 0, 0, 1), (0,) * 6 + (1,), (1, 0, 0, 0, 2)]
 )
-def test_unknown_calibrations_are_refused(station: GroundStation, params: tuple[int, ...]) -> None:
+def test_unknown_calibration_is_unsupported(
+    station: GroundStation, params: tuple[int, ...]
+) -> None:
     assert results(station.command(CALIBRATE, *params)) == [UNSUPPORTED]
 
 
@@ -264,7 +272,7 @@ def test_heartbeat_reports_a_running_calibration(station: GroundStation) -> None
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_sphere(seed: int) -> None:
+def test_sphere_fit_finds_centre_and_radius(seed: int) -> None:
     rng = np.random.default_rng(seed)
     centre, radius = rng.normal(scale=20.0, size=3), float(rng.uniform(20.0, 60.0))
     points = rng.normal(size=(200, 3))

@@ -80,7 +80,7 @@ def test_home_with_invalid_coordinates_is_denied(station: GroundStation, message
 
 
 @pytest.mark.parametrize("number", CHANGING)
-def test_an_untrusted_client_commands_nothing(station: GroundStation, number: int) -> None:
+def test_command_of_an_untrusted_client_is_denied(station: GroundStation, number: int) -> None:
     station.trusted = False
     assert results(station.command(number, 1)) == [DENIED]
     assert station.actions == []
@@ -88,21 +88,23 @@ def test_an_untrusted_client_commands_nothing(station: GroundStation, number: in
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e30])
-def test_odd_parameters_do_no_harm(station: GroundStation, bad: float) -> None:
+def test_command_with_extreme_parameters_is_acknowledged_once(
+    station: GroundStation, bad: float
+) -> None:
     for number in (512, 511, 510, 410, 519, 520, *CHANGING):
         answered = [n for n, _ in acks(station.command(number, *[bad] * 7))]
         assert answered.count(number) == 1
 
 
 @pytest.mark.parametrize("coordinates", [(90.1, 0.0), (0.0, 180.1), (math.nan, 8.0)])
-def test_a_mark_beyond_the_earth_is_a_fault_of_the_caller(
+def test_mark_with_invalid_coordinates_raises_value_error(
     vehicle: Vehicle, coordinates: tuple[float, float]
 ) -> None:
     with pytest.raises(ValueError, match="must be between"):
         vehicle.put_mark(Location(*coordinates, 0.0), 0)
 
 
-def test_the_mark_of_the_command_line(station: GroundStation) -> None:
+def test_mark_of_the_command_line_is_announced_and_sent(station: GroundStation) -> None:
     found = station.receive(station.vehicle.put_mark(Location(47.0, 8.0, math.nan), 0))
     assert texts(found) == ["Marked 47.000000, 8.000000"]
     assert results(station.request(62)) == [ACCEPTED]
@@ -120,7 +122,7 @@ def recorder(station: GroundStation, trouble: str = "", *, recording: bool = Fal
     return station.receive(station.vehicle.on_recorder(trouble, now_us, recording=recording))
 
 
-def test_a_start_is_accepted_once_the_files_are_open(station: GroundStation) -> None:
+def test_start_of_a_recording_is_accepted_once_the_files_are_open(station: GroundStation) -> None:
     for _ in range(3):
         assert acks(station.command(START)) == [(START, IN_PROGRESS)]
     assert station.of(RecordingRequest) == [RecordingRequest(start=True)] * 3
@@ -132,7 +134,7 @@ def test_a_start_is_accepted_once_the_files_are_open(station: GroundStation) -> 
     assert station.of(RecordingRequest)[3:] == [RecordingRequest(start=True)]
 
 
-def test_a_start_that_fails_is_reported_and_why(station: GroundStation) -> None:
+def test_failed_start_of_a_recording_is_reported_with_the_reason(station: GroundStation) -> None:
     assert recorder(station, "Read-only file system") == [], "not requested"
     station.command(START)
     found = recorder(station, "Read-only file system")
@@ -141,7 +143,7 @@ def test_a_start_that_fails_is_reported_and_why(station: GroundStation) -> None:
     assert recorder(station, "Read-only file system") == []
 
 
-def test_a_disk_that_never_answers(station: GroundStation) -> None:
+def test_start_of_a_recording_fails_if_the_disk_does_not_answer(station: GroundStation) -> None:
     station.command(START)
     assert acks(station.wait(RECORDER_TIMEOUT_US / 1e6 - 0.001)) == []
     found = station.wait(0.002)
@@ -149,7 +151,7 @@ def test_a_disk_that_never_answers(station: GroundStation) -> None:
     assert texts(found) == ["Cannot record: no answer from the disk"]
 
 
-def test_a_stop_is_accepted_and_ends_a_start(station: GroundStation) -> None:
+def test_stop_of_a_recording_is_accepted_and_fails_a_pending_start(station: GroundStation) -> None:
     assert acks(station.command(STOP)) == [(STOP, ACCEPTED)]
     station.command(START)
     assert acks(station.command(STOP)) == [(STOP, ACCEPTED), (START, FAILED)]
@@ -157,7 +159,7 @@ def test_a_stop_is_accepted_and_ends_a_start(station: GroundStation) -> None:
     assert recorder(station, recording=True) == []
 
 
-def test_each_station_gets_its_own_answer(station: GroundStation) -> None:
+def test_each_station_that_starts_a_recording_gets_its_own_answer(station: GroundStation) -> None:
     stations = [station.other(100 + n) for n in range(MAX_WAITING + 1)]
     found = [results(each.command(START)) for each in stations]
     assert found == [[IN_PROGRESS]] * MAX_WAITING + [[NOT_NOW]]
@@ -216,7 +218,7 @@ def test_only_failed_requests_are_logged(station: GroundStation) -> None:
     assert (entry.request, entry.outcome) == ("PARAM_SET RATE_ATT", "refused: not trusted")
 
 
-def test_log_is_bounded_and_keeps_the_newest(station: GroundStation) -> None:
+def test_request_log_is_bounded_and_keeps_the_newest(station: GroundStation) -> None:
     for number in range(2 * MAX_ENTRIES):
         station.request(30_000 + number)
     entries = station.vehicle.requests.entries

@@ -30,7 +30,7 @@ def refusal(answer: Packet) -> FtpError:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.25])
-def test_the_metadata_is_found_and_describes_every_parameter(ftp: FtpClient, loss: float) -> None:
+def test_metadata_is_announced_and_describes_every_parameter(ftp: FtpClient, loss: float) -> None:
     _, announced = ftp.station.request(397)
     file_crc, uri = struct.unpack("<I100s", announced.payload[4:108])
     assert uri.rstrip(b"\0") == b"mftp:///general.json"
@@ -55,7 +55,7 @@ def test_the_metadata_is_found_and_describes_every_parameter(ftp: FtpClient, los
     assert [parameters[name]["decimalPlaces"] for name in ("HOME_LAT", "HOME_LON")] == [7, 7]
 
 
-def test_every_key_of_the_metadata_is_of_the_schema(ftp: FtpClient) -> None:
+def test_metadata_has_only_keys_of_the_schema(ftp: FtpClient) -> None:
     allowed = {
         "name", "type", "shortDesc", "longDesc", "units", "default", "decimalPlaces", "min", "max",
         "increment", "rebootRequired", "group", "category", "volatile", "values", "bitmask",
@@ -85,12 +85,12 @@ def test_parameter_metadata_of_the_gateway_is_small() -> None:
         b"MFTP:///general.json",
     ],
 )
-def test_every_way_to_write_a_path(ftp: FtpClient, path: bytes) -> None:
+def test_file_is_opened_by_every_form_of_its_path(ftp: FtpClient, path: bytes) -> None:
     assert ftp.open(path).opcode == ACK
 
 
 @pytest.mark.parametrize("path", [b"/", b"", b".", b"//", b"/.", b"./"])
-def test_every_way_to_write_the_folder(ftp: FtpClient, path: bytes) -> None:
+def test_root_folder_is_listed_by_every_form_of_its_path(ftp: FtpClient, path: bytes) -> None:
     listed = ftp.ask(Opcode.LIST_DIRECTORY, path)
     names = [entry.split(b"\t")[0] for entry in listed.data.split(b"\0") if entry]
     assert names == [b"Fgeneral.json", b"Fparameter.json.xz"]
@@ -117,7 +117,7 @@ def test_client_that_read_the_packed_parameters_is_sent_changes(ftp: FtpClient) 
     assert (value.param_id, value.param_value) == ("VEH_TKOFF_SPEED", 7.0)
 
 
-def test_the_crc_is_the_one_of_mavlink(ftp: FtpClient) -> None:
+def test_crc_of_a_file_is_that_of_mavlink_ftp(ftp: FtpClient) -> None:
     """CRC-32 of the Ethernet polynomial, started at 0 and not inverted at the end."""
     content = ftp.read(GENERAL)
     expected = 0
@@ -132,7 +132,7 @@ def test_the_crc_is_the_one_of_mavlink(ftp: FtpClient) -> None:
 @pytest.mark.parametrize(
     "path", [b"@SYS/threads.txt", b"@PARAM", b"/../general.json", b"/general.json/x", b"/general"]
 )
-def test_a_path_that_does_not_exist_is_refused_with_everything_echoed(
+def test_missing_path_is_refused_with_session_and_opcode_echoed(
     ftp: FtpClient, path: bytes
 ) -> None:
     """A client without an answer repeats its request for a quarter of a minute."""
@@ -155,7 +155,9 @@ def test_a_path_that_does_not_exist_is_refused_with_everything_echoed(
         (128, FtpError.UNKNOWN_COMMAND),
     ],
 )
-def test_refusals(ftp: FtpClient, opcode: int, error: FtpError) -> None:
+def test_unsupported_request_is_refused_with_its_error(
+    ftp: FtpClient, opcode: int, error: FtpError
+) -> None:
     answer = ftp.ask(opcode, b"/x", session=3)
     assert (refusal(answer), answer.request_opcode, answer.session) == (error, opcode, 3)
 
@@ -165,14 +167,14 @@ def test_none_and_reset_are_always_acknowledged(ftp: FtpClient) -> None:
     assert ftp.ask(Opcode.RESET_SESSIONS).opcode == ACK
 
 
-def test_a_repeated_request_gets_the_same_answer(ftp: FtpClient) -> None:
+def test_repeated_request_gets_the_same_answer(ftp: FtpClient) -> None:
     request = ftp.packet(Opcode.OPEN_FILE_RO, GENERAL)
     [first] = ftp.send(request)
     assert ftp.send(request) == [first]
     assert ftp.open(GENERAL).session == first.session + 1
 
 
-def test_reading_to_the_end_and_beyond(ftp: FtpClient) -> None:
+def test_read_ends_at_the_end_of_the_file_and_is_refused_beyond(ftp: FtpClient) -> None:
     opened = ftp.open(GENERAL)
     size = struct.unpack("<I", opened.data)[0]
     last = ftp.ask(Opcode.READ_FILE, session=opened.session, offset=size - 5, size=239)
@@ -193,7 +195,7 @@ def test_clients_keep_their_own_sessions(ftp: FtpClient) -> None:
     assert ftp.ask(Opcode.READ_FILE, session=81, size=9).opcode == ACK
 
 
-def test_sessions_left_open_do_not_shut_others_out(ftp: FtpClient) -> None:
+def test_sessions_left_open_by_others_do_not_prevent_a_new_one(ftp: FtpClient) -> None:
     for client_id in range(100, 200):
         client = FtpClient(ftp.station.other(client_id))
         client.open(b"/parameter.json.xz")

@@ -26,7 +26,7 @@ def fly(station: GroundStation, seconds: float) -> Counter:
 @pytest.mark.parametrize(
     ("requested_us", "reported_us"), [(200_000, 200_000), (-1, -1), (0, 20_000)]
 )
-def test_a_slower_rate_is_the_hubs_work(
+def test_slower_rate_is_passed_to_the_hub(
     station: GroundStation, requested_us: int, reported_us: int
 ) -> None:
     """Also none at all, and that of the settings."""
@@ -72,21 +72,21 @@ def test_origin_of_the_local_frame_does_not_move_with_home(station: GroundStatio
 
 
 @pytest.mark.parametrize(("requested_us", "sent"), [(100_000, 20), (1, 100)])
-def test_a_faster_rate_of_a_message_that_no_sample_carries_is_bounded(
+def test_faster_rate_of_a_timed_message_is_bounded(
     station: GroundStation, requested_us: int, sent: int
 ) -> None:
     station.command(SET, HOME, requested_us)
     assert fly(station, 2.0)["HOME_POSITION"] == pytest.approx(sent + 2, abs=4)
 
 
-def test_a_faster_rate_is_not_for_every_client(station: GroundStation) -> None:
+def test_faster_rate_is_denied_to_an_untrusted_client(station: GroundStation) -> None:
     station.trusted = False
     assert results(station.command(SET, QUATERNION, 10_000)) == [DENIED]
     assert station.command(SET, QUATERNION, 100_000)[0].result == ACCEPTED
     assert station.requested_intervals == [ClientInterval(7, 1, QUATERNION, 100_000)]
 
 
-def test_requested_intervals_end_with_the_client(station: GroundStation) -> None:
+def test_requested_intervals_end_when_the_client_is_removed(station: GroundStation) -> None:
     station.command(SET, QUATERNION, 10_000)
     station.vehicle.remove_client(7)
     assert fly(station, 2.0)["ATTITUDE_QUATERNION"] == pytest.approx(100, abs=2)
@@ -99,7 +99,9 @@ def test_heartbeats_cannot_be_switched_off(station: GroundStation, requested: in
 
 
 @pytest.mark.parametrize("message_id", [77, 148, 9999])
-def test_messages_that_are_not_streamed(station: GroundStation, message_id: int) -> None:
+def test_interval_of_an_unstreamed_message_is_refused_and_reported_as_zero(
+    station: GroundStation, message_id: int
+) -> None:
     assert station.command(SET, message_id, 100_000)[0].result in (DENIED, UNSUPPORTED)
     [_, reported] = station.command(GET, message_id)
     assert reported.interval_us == 0

@@ -107,7 +107,7 @@ class Uploader:
         (0.02, 0.5, 0.6, 14),
     ],
 )
-def test_of_twenty_uploads_one_after_the_other(
+def test_uploads_are_stored_over_lossy_and_slow_links(
     clock: ManualClock, loss: float, shortest_s: float, longest_s: float, stored: int
 ) -> None:
     station = GroundStation(Vehicle(VehicleSettings(rates=NO_TELEMETRY), 1), clock)

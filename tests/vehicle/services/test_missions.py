@@ -68,7 +68,9 @@ def test_downloaded_items_equal_the_uploaded_ones(station: GroundStation, kind: 
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_up_and_down_over_a_lossy_link(station: GroundStation, seed: int) -> None:
+def test_items_are_uploaded_and_downloaded_over_a_lossy_link(
+    station: GroundStation, seed: int
+) -> None:
     rng = np.random.default_rng(seed)
     station.loses = lambda *_: rng.random() < 0.15
     items = [item(seq) for seq in range(20)]
@@ -118,12 +120,12 @@ def test_items_of_mavlink_1_are_stored_and_returned_as_floats(station: GroundSta
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -1e30])
-def test_floats_that_are_no_coordinates_are_refused(station: GroundStation, bad: float) -> None:
+def test_item_with_invalid_float_coordinates_is_refused(station: GroundStation, bad: float) -> None:
     station.send(count(1))
     assert station.send(old_item(bad, lon=bad))[0].type == mavlink.MAV_MISSION_INVALID_PARAM5_X
 
 
-def test_items_are_asked_for_in_order_and_at_once(station: GroundStation) -> None:
+def test_items_are_requested_in_order_and_at_once(station: GroundStation) -> None:
     for seq in range(3):
         [wanted] = station.send(count(3) if seq == 0 else item(seq - 1))
         assert (wanted.get_type(), wanted.seq) == ("MISSION_REQUEST_INT", seq)
@@ -133,7 +135,7 @@ def test_items_are_asked_for_in_order_and_at_once(station: GroundStation) -> Non
     assert asked_in(station, 5.0) == [], "nothing was lost"
 
 
-def test_a_lost_item_is_asked_for_again_for_five_seconds(station: GroundStation) -> None:
+def test_lost_item_is_requested_again_for_five_seconds(station: GroundStation) -> None:
     station.send(count(2))
     station.send(item(0))
     assert asked_in(station, 4.9) == [1] * 12
@@ -180,7 +182,7 @@ ITEM = [item(seq) for seq in range(6)]
         [(count(3), [0]), (ack(mavlink.MAV_MISSION_OPERATION_CANCELLED), []), (2.0, [])],
     ],
 )  # fmt: skip
-def test_upload_step_by_step(
+def test_upload_continues_after_lost_late_or_repeated_messages(
     station: GroundStation, steps: list[tuple[Any, list[int] | str]]
 ) -> None:
     """Each step is a message or a time in s, and the items asked for then, or its ACK."""
@@ -192,7 +194,7 @@ def test_upload_step_by_step(
         assert (ended or asked) == ([expected] if isinstance(expected, str) else expected), number
 
 
-def test_a_failed_upload_leaves_the_old_mission(station: GroundStation) -> None:
+def test_failed_upload_leaves_the_old_mission(station: GroundStation) -> None:
     upload(station, [item(0), item(1)])
     broken = [item(0), item(1, x=910_000_000)]
     assert upload(station, broken) == mavlink.MAV_MISSION_INVALID_PARAM5_X
@@ -216,7 +218,7 @@ def test_a_failed_upload_leaves_the_old_mission(station: GroundStation) -> None:
         (MISSION, {"command": 178, "frame": MISSION_FRAME, "x": -1, "y": 2**31 - 1}, ACCEPTED),
     ],
 )
-def test_items_are_checked(
+def test_invalid_item_is_refused_with_its_result(
     station: GroundStation, kind: int, changes: dict[str, Any], result: int
 ) -> None:
     assert upload(station, [item(0, kind, **changes)], kind) == result
@@ -231,13 +233,13 @@ def test_too_many_items_are_refused(station: GroundStation, kind: int, number: i
     assert kinds(station.send(count(MAX_ITEMS[kind], kind))) == ["MISSION_REQUEST_INT"]
 
 
-def test_unknown_kinds_are_refused(station: GroundStation) -> None:
+def test_unknown_mission_type_is_refused(station: GroundStation) -> None:
     for message in (count(1, 7), count(9, ALL), request_item(0, 7), item(0, mission_type=7)):
         assert station.send(message)[0].type != ACCEPTED
 
 
 @pytest.mark.parametrize("kind", [MISSION, ALL])
-def test_clearing(station: GroundStation, kind: int) -> None:
+def test_clear_removes_the_items_of_one_type_or_all(station: GroundStation, kind: int) -> None:
     upload(station, [item(0)])
     upload(station, [item(0, RALLY)], RALLY)
     [end] = station.send(clear(kind))
@@ -246,13 +248,13 @@ def test_clearing(station: GroundStation, kind: int) -> None:
     assert len(download(station, RALLY)) == (kind == MISSION)
 
 
-def test_an_empty_upload_clears(station: GroundStation) -> None:
+def test_empty_upload_clears_the_mission(station: GroundStation) -> None:
     upload(station, [item(0)])
     assert station.send(count(0))[0].type == ACCEPTED
     assert download(station) == []
 
 
-def test_two_uploads_do_not_mix(station: GroundStation) -> None:
+def test_second_upload_is_denied_during_the_first(station: GroundStation) -> None:
     """Not on a slow link either."""
     other = station.other(system_id=254)
     station.send(count(2))
@@ -274,7 +276,7 @@ def test_upload_without_progress_gives_way_after_the_timeout(station: GroundStat
     assert upload(station.other(system_id=254), [item(0)]) == ACCEPTED
 
 
-def test_an_untrusted_client_may_read_only(station: GroundStation) -> None:
+def test_untrusted_client_may_only_read(station: GroundStation) -> None:
     upload(station, [item(0)])
     station.trusted = False
     for message in (count(1), count(0), item(0), clear(ALL)):
@@ -282,7 +284,7 @@ def test_an_untrusted_client_may_read_only(station: GroundStation) -> None:
     assert len(download(station)) == 1
 
 
-def test_setting_the_current_item(station: GroundStation) -> None:
+def test_current_item_is_set_and_reported(station: GroundStation) -> None:
     _, current = station.request(42)
     assert (current.seq, current.total) == (0, 65535)
     assert current.mission_state == mavlink.MISSION_STATE_NO_MISSION
@@ -307,7 +309,9 @@ def mark(station: GroundStation, *location: float) -> Any:
     return to_mark(station)
 
 
-def test_distance_and_bearing_to_the_mark(station: GroundStation) -> None:
+def test_distance_and_bearing_to_the_mark_are_those_on_the_ellipsoid(
+    station: GroundStation,
+) -> None:
     """A tenth of a degree north of 47.1 is 11118 m by the ellipsoid."""
     assert to_mark(station) is None
     found = mark(station, STATE.lat_deg + 0.1, STATE.lon_deg, 623.456)
@@ -326,7 +330,7 @@ def test_distance_and_bearing_to_the_mark(station: GroundStation) -> None:
     assert opposite == pytest.approx((19_944_127.421, math.radians(15.556883)), abs=1e-3)
 
 
-def test_an_uploaded_mission_marks_its_current_item(station: GroundStation) -> None:
+def test_uploaded_mission_marks_its_current_item(station: GroundStation) -> None:
     jump = item(0, command=177, frame=MISSION_FRAME, x=1, y=2)
     upload(station, [jump, item(1), item(2, x=480_000_000)])
     near = to_mark(station).wp_dist
@@ -336,14 +340,14 @@ def test_an_uploaded_mission_marks_its_current_item(station: GroundStation) -> N
     assert to_mark(station) is None
 
 
-def test_a_rally_point_is_marked_and_a_fence_is_not(station: GroundStation) -> None:
+def test_rally_point_is_marked_and_a_fence_is_not(station: GroundStation) -> None:
     upload(station, [item(0, FENCE)], FENCE)
     assert to_mark(station) is None
     upload(station, [item(0, RALLY, frame=RELATIVE_INT, z=100.0)], RALLY)
     assert to_mark(station).alt_error == pytest.approx(620.25 - 523.456, abs=0.01), "above home"
 
 
-def test_a_roi_outlives_the_mission_it_replaced(station: GroundStation) -> None:
+def test_roi_stays_marked_when_the_mission_is_cleared(station: GroundStation) -> None:
     upload(station, [item(0)])
     station.command(mavlink.MAV_CMD_DO_SET_ROI, 3, 0, 0, 0, 47.2, -8.7, 500.0)
     station.send(clear())

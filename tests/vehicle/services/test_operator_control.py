@@ -70,7 +70,9 @@ def test_takeover_needs_the_consent_of_the_station_in_control(
     assert not changes(first)
 
 
-def test_release_is_for_the_station_in_control(first: GroundStation, second: GroundStation) -> None:
+def test_only_the_station_in_control_may_release_it(
+    first: GroundStation, second: GroundStation
+) -> None:
     control(first)
     assert control(second, RELEASE) == DENIED
     assert control(first, RELEASE) == ACCEPTED
@@ -109,7 +111,7 @@ def test_control_status_is_sent_regularly_and_at_every_change(first: GroundStati
     assert len(statuses(first)) - before == pytest.approx(10, abs=1)
 
 
-def test_nothing_of_it_is_sent_while_control_is_open(station: GroundStation) -> None:
+def test_control_status_is_not_sent_while_control_is_open(station: GroundStation) -> None:
     station.wait(10.0)
     assert control(station) == ACCEPTED
     assert control(station, RELEASE) == ACCEPTED
@@ -120,7 +122,7 @@ def test_nothing_of_it_is_sent_while_control_is_open(station: GroundStation) -> 
     ("version", "trusted", "taken", "ack"),
     [(0, True, False, 0), (1, True, False, 2), (0, False, False, 1), (0, True, True, 3)],
 )
-def test_older_request(
+def test_change_operator_control_is_answered(
     first: GroundStation, second: GroundStation, version: int, trusted: bool, taken: bool, ack: int
 ) -> None:
     if taken:

@@ -37,11 +37,13 @@ def read(name: str, index: int = -1) -> mavlink.MAVLink_param_request_read_messa
         ("compass", "norm_tolerance", "", "COMPASS_NORM_TOL"),
     ],
 )
-def test_names(section: str, key: str, axis: str, name: str) -> None:
+def test_parameter_name_is_abbreviated_from_the_keys(
+    section: str, key: str, axis: str, name: str
+) -> None:
     assert parameter_name(section, key, axis) == name
 
 
-def test_the_list_has_every_setting_once(station: GroundStation) -> None:
+def test_list_contains_numbers_switches_and_choices_but_no_texts(station: GroundStation) -> None:
     found = load_parameters(station)
     names = ("CUTOFF", "ORDER", "ENABLED", "BIAS_X", "BIAS_Y", "BIAS_Z")
     assert [found[f"TUNING_{name}"] for name in names] == [10.0, 2.0, 1.0, 0.0, 1.0, 2.0]
@@ -62,13 +64,13 @@ def test_parameter_list_is_paced_and_sent_to_the_requesting_client_only(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_lost_values_are_asked_for_again(station: GroundStation, seed: int) -> None:
+def test_parameters_are_loaded_over_a_lossy_link(station: GroundStation, seed: int) -> None:
     rng = np.random.default_rng(seed)
     station.loses = lambda *_: rng.random() < 0.3
     load_parameters(station)
 
 
-def test_read_by_name_and_by_index(station: GroundStation) -> None:
+def test_parameter_is_read_by_name_or_index(station: GroundStation) -> None:
     [named] = station.send(read("TUNING_ORDER"))
     [indexed] = station.send(read("", named.param_index))
     assert named.param_id == indexed.param_id == "TUNING_ORDER"
@@ -118,14 +120,14 @@ def test_change_is_only_recorded_while_no_client_has_requested_parameters(
     assert pushed == [RECORDED_ONLY] * 4
 
 
-def test_no_change_is_sent_to_a_client_that_has_gone(station: GroundStation) -> None:
+def test_change_is_not_sent_to_a_removed_client(station: GroundStation) -> None:
     station.send(read("TUNING_ORDER"))
     station.vehicle.remove_client(station.client_id)
     changed = VehicleSettings(takeoff_speed_mps=7.0)
     assert station.receive(station.vehicle.take_settings("vehicle", changed)) == []
 
 
-def test_rates_change_live(station: GroundStation) -> None:
+def test_changed_rate_takes_effect_at_once(station: GroundStation) -> None:
     station.set_parameter("RATE_ATT_QUAT", 5.0)
     assert station.vehicle.telemetry.streams[31].interval_us == 200_000
     station.set_parameter("VEH_TYPE", 2.0)
@@ -140,7 +142,7 @@ def test_rates_change_live(station: GroundStation) -> None:
         *(("TUNING_ORDER", 9.0), ("VEH_TYPE", 99.0), ("VEH_TYPE", -1.0)),
     ],
 )
-def test_a_value_out_of_range_changes_nothing(
+def test_value_out_of_range_changes_nothing(
     station: GroundStation, name: str, value: float
 ) -> None:
     before = load_parameters(station)
@@ -169,7 +171,7 @@ def test_integers_encoded_byte_wise_are_understood(
     assert load_parameters(station)["TUNING_ORDER"] == 5.0
 
 
-def test_an_untrusted_client_changes_nothing_and_is_reported(station: GroundStation) -> None:
+def test_untrusted_client_changes_nothing_and_is_reported(station: GroundStation) -> None:
     station.trusted = False
     found = station.set_parameter("TUNING_ORDER", 5.0)
     assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
@@ -202,7 +204,7 @@ def test_storage_is_acknowledged_when_the_disk_has_answered(
     assert station.frames[-2].client_id == station.client_id, "only who asked"
 
 
-def test_storage_goes_back_to_the_defaults(station: GroundStation) -> None:
+def test_storage_command_restores_the_defaults(station: GroundStation) -> None:
     station.set_parameter("TUNING_ORDER", 5.0)
     station.set_parameter("RATE_ATT", 1.0)
     found = of_kind(station.command(STORAGE, 2), "PARAM_VALUE")
@@ -217,14 +219,14 @@ def test_defaults_do_not_change_settings_that_are_no_parameters() -> None:
     assert table.reset("vehicle") == VehicleSettings(signing_passphrase="correct horse")
 
 
-def test_a_second_vehicle_costs_no_second_walk_through_the_settings() -> None:
+def test_vehicles_share_one_list_of_parameters() -> None:
     first, second = (ParameterTable({"vehicle": VehicleSettings()}) for _ in range(2))
     assert first.parameters is second.parameters
     first.change(first.parameters["RATE_ATT"], 7.0)
     assert second.sections == {"vehicle": VehicleSettings()}
 
 
-def test_two_settings_of_one_name_are_a_fault_of_the_caller() -> None:
+def test_two_settings_of_one_name_raise_value_error() -> None:
     class Twice(Settings, frozen=True):
         """Two keys that differ beyond sixteen characters."""
 
@@ -253,7 +255,7 @@ def test_every_setting_of_the_gateway_has_a_readable_parameter_name() -> None:
         assert parameter.field.meaning, name
 
 
-def test_an_angle_of_a_mounting_is_described_by_the_first_sentence_of_the_mounting() -> None:
+def test_mounting_angle_is_described_by_the_first_sentence_of_the_mounting() -> None:
     table = ParameterTable({"calibration": NodeCalibration()})
     meaning = table.parameters["CAL_MNT_ROLL"].field.meaning
     reported = {f.name: f.meaning for f in fields_of(NodeCalibration)}["mounting"].split(". ")[0]

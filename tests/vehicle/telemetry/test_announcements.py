@@ -72,7 +72,7 @@ def test_healthy_board_is_not_announced(flying: Flying) -> None:
     assert flying.reported == [], "a restart is no error"
 
 
-def test_a_supply_that_sags_and_recovers(flying: Flying) -> None:
+def test_low_supply_and_its_recovery_are_announced_once(flying: Flying) -> None:
     for supply_mv in (3000, 2980, 2960, 3050, 3090, 3000, 2990, *(3100,) * 6):
         flying.report(supply_mv=supply_mv)
     assert flying.reported == [
@@ -98,7 +98,7 @@ def test_bus_errors_are_reported_once_even_after_the_counter_restarts(flying: Fl
     assert flying.reported[1:] == [(INFO, "IMU node 0: bus OK again")]
 
 
-def test_a_radio_that_is_not_heard(flying: Flying) -> None:
+def test_failed_radio_sends_and_their_end_are_announced_once(flying: Flying) -> None:
     flying.report(radio_failed=50)
     flying.report(radio_failed=109)
     assert flying.reported == []
@@ -110,7 +110,7 @@ def test_a_radio_that_is_not_heard(flying: Flying) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [10, 0])
-def test_few_lost_payloads_are_no_trouble(flying: Flying, rate_hz: int) -> None:
+def test_few_failed_radio_sends_are_not_announced(flying: Flying, rate_hz: int) -> None:
     """Of a slow node, or of one without samples."""
     for second in range(60):
         flying.report(sample_rate_hz=rate_hz, radio_failed=10 + second // 3)
@@ -128,7 +128,7 @@ def test_radio_trouble_within_the_hold_time_is_announced_at_its_end(flying: Flyi
     assert texts(found) == ["IMU node 0: radio sends failed, 140 in 10 s"]
 
 
-def test_overruns_of_the_receiver(flying: Flying) -> None:
+def test_new_overruns_of_the_receiver_are_announced(flying: Flying) -> None:
     # What was lost before the gateway came is no news.
     flying.link(2)
     flying.link(3)
@@ -138,7 +138,7 @@ def test_overruns_of_the_receiver(flying: Flying) -> None:
     ]
 
 
-def test_battery_status_is_the_supply(flying: Flying) -> None:
+def test_battery_status_contains_the_supply_voltage(flying: Flying) -> None:
     (battery,) = flying.messages
     assert (battery.id, battery.voltages[:2]) == (0, [3300, 65535])
     assert battery.charge_state == mavlink.MAV_BATTERY_CHARGE_STATE_OK
@@ -147,13 +147,13 @@ def test_battery_status_is_the_supply(flying: Flying) -> None:
 
 
 @pytest.mark.parametrize(("rate_hz", "count"), [(0.0, 0), (0.5, 5), (10.0, 10)])
-def test_it_comes_at_its_own_rate(rate_hz: float, count: int) -> None:
+def test_battery_status_is_sent_at_its_own_rate(rate_hz: float, count: int) -> None:
     flying = Flying(rates=RateSettings(battery_status_hz=rate_hz))
     found = [kind for _ in range(10) for kind in kinds(flying.report())]
     assert found.count("BATTERY_STATUS") == count
 
 
-def test_the_lowest_supply_answers_a_request() -> None:
+def test_requested_battery_status_is_that_of_the_lowest_supply() -> None:
     health = Health(1, 2.0)
     assert health.lowest() is None
     health.on_node_status(WELL)
@@ -161,14 +161,14 @@ def test_the_lowest_supply_answers_a_request() -> None:
     assert health.lowest().id == 1
 
 
-def test_counters_stand_in_sys_status(flying: Flying) -> None:
+def test_sys_status_contains_the_error_counters(flying: Flying) -> None:
     flying.link(7)
     found = flying.vehicle.health.sys_status(flying.status.time_us)
     counts = [getattr(found, f"errors_count{n}") for n in (1, 2, 3, 4)]
     assert counts == [65_534, 10, 300, 7]
 
 
-def test_the_firmware_is_reported_as_a_version(flying: Flying) -> None:
+def test_autopilot_version_contains_the_firmware_version(flying: Flying) -> None:
     [version] = of_kind(flying.vehicle.introduction(), "AUTOPILOT_VERSION")
     assert version.os_sw_version == 1 << 24 | 4 << 16
 
@@ -181,7 +181,7 @@ def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
     return [m.text for m in announcer.track(finding, now_us)]
 
 
-def test_a_change_is_reported_once() -> None:
+def test_change_is_announced_once() -> None:
     announcer = Announcer()
     assert track(announcer, True, 0) == []
     assert track(announcer, False, 1) == ["bad"]
@@ -189,7 +189,7 @@ def test_a_change_is_reported_once() -> None:
     assert announcer.next_due_us() is None
 
 
-def test_flapping_cannot_flood_and_the_last_text_is_true() -> None:
+def test_announcements_of_a_flapping_state_are_limited_and_end_with_the_true_one() -> None:
     announcer = Announcer()
     reported = []
     for n in range(10_000):
@@ -202,7 +202,7 @@ def test_flapping_cannot_flood_and_the_last_text_is_true() -> None:
     assert reported[-1] == "bad"
 
 
-def test_a_change_while_held_is_reported_when_the_hold_ends() -> None:
+def test_change_within_the_hold_time_is_announced_at_its_end() -> None:
     announcer = Announcer()
     track(announcer, False, 0)
     assert track(announcer, True, 1000) == []
@@ -211,7 +211,7 @@ def test_a_change_while_held_is_reported_when_the_hold_ends() -> None:
     assert [m.text for m in announcer.poll(HOLD_US)] == ["good"]
 
 
-def test_single_events_are_limited() -> None:
+def test_single_events_are_limited_in_rate() -> None:
     announcer = Announcer()
     assert sum(len(announcer.say(GOOD, 0)) for _ in range(100)) == BUCKET
     assert len(announcer.say(GOOD, 500_000)) == 1

@@ -42,7 +42,7 @@ def later(_health: Health) -> None:
         ),
     ],
 )
-def test_bits_of_sys_status(
+def test_sys_status_reports_outages_and_faults_of_sensors(
     health: Health, change: Callable[[Health], object], now_us: int, absent: int, bad: int
 ) -> None:
     change(health)
@@ -75,7 +75,7 @@ def test_load_is_the_share_of_the_longest_loop(health: Health) -> None:
     assert health.sys_status(0).load == 500
 
 
-def test_losses_of_this_aircraft_only(health: Health) -> None:
+def test_sys_status_counts_losses_of_its_own_aircraft_only(health: Health) -> None:
     other = link(NodeId(2, 0), received=10, lost=990)
     health.on_link(report(link(received=900, lost=100), link(GPS_NODE, received=100), other))
     found = health.sys_status(0)
@@ -94,7 +94,7 @@ def test_stall_of_the_gateway_is_no_outage_of_a_sensor(health: Health) -> None:
     assert not health.sensors(60_000_000)[2] & ALL, "they were silent before"
 
 
-def test_silent_nodes(health: Health) -> None:
+def test_known_node_without_new_payloads_is_silent(health: Health) -> None:
     never = link(NodeId(1, 2), received=0, last_time_us=0)
     health.on_link(report(link(), link(GPS_NODE, last_time_us=0), never))
     assert health.silent_nodes(2_500_000) == {GPS_NODE.node_id}

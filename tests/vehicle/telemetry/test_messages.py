@@ -177,7 +177,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("name", VALUES)
-def test_values(name: str) -> None:
+def test_fields_have_the_units_and_signs_of_the_definition(name: str) -> None:
     message, expected = VALUES[name]
     found = through_the_wire(message)
     for field, value in expected.items():
@@ -200,7 +200,7 @@ def test_heading_of_vfr_hud_is_in_whole_degrees() -> None:
         {"fix_ok": False},
     ],
 )
-def test_dilutions_that_are_not_known(change: dict[str, Any]) -> None:
+def test_dilutions_are_unknown_without_a_fix_or_its_accuracy(change: dict[str, Any]) -> None:
     found = through_the_wire(messages.gps_raw_int(replace(FIX, **change)))
     assert (found.eph, found.epv) == (65535, 65535)
 
@@ -217,7 +217,9 @@ def test_dilutions_that_are_not_known(change: dict[str, Any]) -> None:
         (GpsFixType.TIME_ONLY, True, mavlink.GPS_FIX_TYPE_NO_FIX),
     ],
 )
-def test_fix_types(fix_type: GpsFixType, fix_ok: bool, expected: int) -> None:
+def test_fix_type_is_reported_for_a_valid_fix_only(
+    fix_type: GpsFixType, fix_ok: bool, expected: int
+) -> None:
     fix = replace(FIX, fix_type=fix_type, fix_ok=fix_ok)
     assert through_the_wire(messages.gps_raw_int(fix)).fix_type == expected
 
@@ -262,7 +264,7 @@ def summary(
     return through_the_wire(messages.high_latency2(kind, 0, state, fix, health, now_us))
 
 
-def test_high_latency2(health: Health) -> None:
+def test_high_latency2_contains_state_and_fix(health: Health) -> None:
     message = summary(STATE, FIX, health)
     assert (message.latitude, message.longitude) == (471_234_567, -87_654_321)
     assert (message.altitude, message.heading * 2) == (523, 272)
@@ -307,7 +309,7 @@ def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(health: Health) -> N
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e30])
-def test_wild_values_are_saturated(health: Health, value: float) -> None:
+def test_extreme_values_of_high_latency2_are_saturated(health: Health, value: float) -> None:
     wild = replace(STATE, lat_deg=value, alt_amsl_m=value, vel_n_mps=(value, value, value))
     assert summary(wild, replace(FIX, h_acc_m=abs(value)), health)
 

@@ -38,7 +38,7 @@ def sample_times(
         (60, 40, 40),
     ],
 )
-def test_rate_is_the_wanted_one_or_the_samples(
+def test_rate_is_the_lower_of_the_requested_and_the_sample_rate(
     sample_hz: float, wanted_hz: float, expected_hz: float
 ) -> None:
     times = sample_times(sample_hz, 60.0, jitter_us=0.05e6 / sample_hz)
@@ -48,18 +48,20 @@ def test_rate_is_the_wanted_one_or_the_samples(
 
 @pytest.mark.parametrize("skew_ppm", [-300.0, 0.0, 300.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_no_beating_where_the_samples_are_nearly_a_multiple(skew_ppm: float, seed: int) -> None:
+def test_every_fourth_sample_is_sent_despite_clock_skew_and_jitter(
+    skew_ppm: float, seed: int
+) -> None:
     """A node's crystal is off by some hundred ppm and its stamps jitter: still every 4th sample."""
     times = sample_times(200.0 * (1.0 + skew_ppm * 1e-6), 120.0, jitter_us=1000.0, seed=seed)
     found = np.searchsorted(times, sent(Stream(20_000), times))
     assert set(np.diff(found[50:])) == {4}
 
 
-def test_the_first_sample_is_sent_at_once() -> None:
+def test_first_sample_is_sent_at_once() -> None:
     assert Stream(1_000_000).offer(123_456)
 
 
-def test_no_burst_after_a_gap() -> None:
+def test_gap_is_not_followed_by_a_burst() -> None:
     stream = Stream(20_000)
     times = [*range(0, 1_000_000, 10_000), *range(60_000_000, 61_000_000, 10_000)]
     found = [t for t in times if stream.offer(t)]
@@ -68,7 +70,7 @@ def test_no_burst_after_a_gap() -> None:
     assert len(late) == 50
 
 
-def test_a_gap_does_not_bring_apart_streams_together() -> None:
+def test_streams_keep_their_phases_after_a_gap() -> None:
     streams = [Stream(100_000), Stream(100_000)]
     for k, stream in enumerate(streams):
         stream.begin(30_000 * k)
@@ -78,7 +80,7 @@ def test_a_gap_does_not_bring_apart_streams_together() -> None:
 
 
 @pytest.mark.parametrize("ask", [Stream.offer, Stream.tick])
-def test_off_sends_nothing(ask: object) -> None:
+def test_stream_of_rate_zero_sends_nothing(ask: object) -> None:
     stream = Stream(interval_us(0.0))
     assert stream.interval_us == OFF
     assert not any(ask(stream, t) for t in range(0, 10_000_000, 100_000))
@@ -93,7 +95,7 @@ def test_timed_messages_keep_their_grid_when_polled_late() -> None:
     assert stream.due_us == 5_000_000
 
 
-def test_a_new_interval_takes_effect_at_the_next_sample() -> None:
+def test_new_interval_takes_effect_at_the_next_sample() -> None:
     stream = Stream(1_000_000)
     assert stream.offer(0)
     stream.change(100_000)
@@ -102,7 +104,7 @@ def test_a_new_interval_takes_effect_at_the_next_sample() -> None:
     ]  # fmt: skip
 
 
-def test_samples_from_the_past_do_no_harm() -> None:
+def test_samples_with_earlier_times_do_not_stop_a_stream() -> None:
     stream = Stream(20_000)
     for time_us in (100_000, 110_000, 50_000, 120_000, 0, 130_000):
         stream.offer(time_us)
@@ -118,7 +120,7 @@ def run(motion: Motion, start_s: float, seconds: float, speed: float, height: fl
     return motion.landed_state
 
 
-def test_a_flight() -> None:
+def test_landed_state_follows_a_flight() -> None:
     motion = Motion(5.0, 10.0)
     assert run(motion, 0, 1.9, 0.0, 0.0) == UNDEFINED
     assert run(motion, 2, 1, 0.0, 0.0) == ON_GROUND
@@ -131,7 +133,7 @@ def test_a_flight() -> None:
     assert run(motion, 60, 6, 1.0, 0.5) == ON_GROUND
 
 
-def test_nothing_is_known_without_velocity() -> None:
+def test_landed_state_is_undefined_without_velocity() -> None:
     motion = Motion(5.0, 10.0)
     for n in range(500):
         motion.update(replace(STATE, time_us=n * 20_000, flags=NavFlags.ATTITUDE_VALID), 500.0)
@@ -139,7 +141,7 @@ def test_nothing_is_known_without_velocity() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_odd_values_do_no_harm(bad: float) -> None:
+def test_non_finite_motion_is_not_reported_as_on_ground(bad: float) -> None:
     motion = Motion(5.0, 10.0)
     for n in range(500):
         state = state_at(n * 20_000, vel_n_mps=(bad, 0.0, 0.0), alt_amsl_m=bad)
