@@ -1,4 +1,4 @@
-"""Values that cannot be, in every record: all frames stay well-formed, and unknown is unknown."""
+"""Impossible values in every record: frames stay well-formed, and unknown values marked so."""
 
 import math
 import xml.etree.ElementTree as ET

@@ -16,7 +16,7 @@ FRAMES_A_SECOND = 1000
 
 @pytest.fixture
 def crowd(station: GroundStation) -> list[GroundStation]:
-    """Thirty-one clients that nobody trusts."""
+    """Thirty-one untrusted clients."""
     return [station.other(100 + n, trusted=False) for n in range(31)]
 
 

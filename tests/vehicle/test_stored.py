@@ -1,4 +1,4 @@
-"""What a vehicle keeps, as a text, and what it is after a restart."""
+"""The stored plan of a vehicle: its text, and the vehicle after a restart."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""What a ground station changes reaches the stage that it concerns, and only that one."""
+"""A change by a ground station reaches the stage that it concerns, and only that one."""
 
 import math
 from typing import Any

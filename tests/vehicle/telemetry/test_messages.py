@@ -311,7 +311,10 @@ def test_accuracy_is_unknown_after_the_gps_receiver_is_lost(health: Health) -> N
 @pytest.mark.parametrize("value", [math.inf, -math.inf, 1e30, -1e30])
 def test_extreme_values_of_high_latency2_are_saturated(health: Health, value: float) -> None:
     wild = replace(STATE, lat_deg=value, alt_amsl_m=value, vel_n_mps=(value, value, value))
-    assert summary(wild, replace(FIX, h_acc_m=abs(value)), health)
+    found = summary(wild, replace(FIX, h_acc_m=abs(value)), health)
+    assert (found.groundspeed, found.eph) == (255, 254)
+    ends = (32767, -127) if value > 0.0 else (-32768, 127)
+    assert (found.altitude, found.climb_rate) == ends
 
 
 def test_high_latency2_is_sent_every_five_seconds(station: GroundStation) -> None:
