@@ -54,7 +54,7 @@ async def ask(server: ControlServer, verb: str, params: dict[str, Any] | None = 
     return await asyncio.to_thread(request, server.path, verb, params)
 
 
-async def test_a_request_is_answered(server: ControlServer) -> None:
+async def test_request_is_answered(server: ControlServer) -> None:
     assert await ask(server, "seek", {"offset_s": 80}) == {"position_s": 80.0}
     assert await ask(server, "verbs") == ["refuse", "seek", "verbs"]
 
@@ -92,12 +92,12 @@ async def test_invalid_requests_are_answered_with_an_error(
     assert answer["error"]
 
 
-async def test_only_the_user_may_open_it(server: ControlServer) -> None:
+async def test_socket_is_accessible_to_its_user_only(server: ControlServer) -> None:
     assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
     assert stat.S_IMODE(server.path.parent.stat().st_mode) == 0o700
 
 
-async def test_several_requests_on_one_connection(server: ControlServer) -> None:
+async def test_several_requests_are_answered_on_one_connection(server: ControlServer) -> None:
     reader, writer = await asyncio.open_unix_connection(str(server.path))
     writer.write(b'{"verb":"seek","params":{"offset_s":1}}\n{"verb":"refuse"}\n')
     first, second = await reader.readline(), await reader.readline()
@@ -107,7 +107,7 @@ async def test_several_requests_on_one_connection(server: ControlServer) -> None
     await writer.wait_closed()
 
 
-async def test_a_line_without_end_ends_the_connection_alone(server: ControlServer) -> None:
+async def test_endless_line_closes_its_own_connection_only(server: ControlServer) -> None:
     reader, writer = await asyncio.open_unix_connection(str(server.path))
     writer.write(b"x" * (2 * MAX_LINE))
     assert await reader.read() == b""
@@ -127,7 +127,7 @@ async def test_too_many_connections_are_turned_away(server: ControlServer) -> No
         await writer.wait_closed()
 
 
-async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Path) -> None:
+async def test_connection_accepted_just_before_the_end_is_closed(tmp_path: Path) -> None:
     server = ControlServer(tmp_path / "run.sock")
     accepted, ended, serve = asyncio.Event(), asyncio.Event(), server._serve
 
@@ -148,7 +148,7 @@ async def test_a_connection_accepted_just_before_the_end_is_closed(tmp_path: Pat
     await writer.wait_closed()
 
 
-async def test_a_path_that_is_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
+async def test_path_too_long_for_a_socket_is_reported(tmp_path: Path) -> None:
     path = tmp_path / ("x" * 100) / "run.sock"
     with pytest.raises(ControlError, match="at most 107; let XDG_RUNTIME_DIR name a shorter"):
         await ControlServer(path).start()
@@ -179,7 +179,7 @@ async def test_gateways_of_one_user_have_a_socket_each(server: ControlServer) ->
         (2, (8,), True, False),
     ],
 )
-async def test_only_its_owner_root_and_a_services_group_are_answered(
+async def test_only_owner_root_and_group_of_a_service_are_answered(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     user: int,
@@ -224,7 +224,7 @@ async def test_user_and_groups_of_a_request_are_those_of_the_process(
     assert os.getgid() in groups
 
 
-async def test_the_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
+async def test_socket_of_a_killed_gateway_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "run.sock"
     with socket.socket(socket.AF_UNIX) as dead:
         dead.bind(str(path))
@@ -244,7 +244,7 @@ def test_missing_gateway_is_reported(folders: Path) -> None:
         find_socket("play")
 
 
-async def test_a_command_finds_the_gateway_that_is_meant(folders: Path) -> None:
+async def test_command_finds_the_gateway_of_its_user_before_the_service(folders: Path) -> None:
     service = ControlServer(folders / "run.sock")
     await service.start()
     assert find_socket("run") == service.path, "the service's, where the user has none"
@@ -271,7 +271,7 @@ async def test_error_without_access_to_a_service_names_its_group(
     service.close()
 
 
-def test_the_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_socket_is_in_the_runtime_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/1")
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     assert socket_path("run") == Path("/run/user/1/mavgate/run.sock")

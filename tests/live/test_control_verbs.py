@@ -35,7 +35,9 @@ async def bench(tmp_path: Path, clock: ManualClock) -> AsyncIterator[Bench]:
     made.recorder.close()
 
 
-async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) -> None:
+async def test_recording_is_started_renamed_stopped_listed_and_deleted(
+    bench: Bench, tmp_path: Path
+) -> None:
     server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
     started = (await ask(server, "record.start"))["result"]
     assert (started["state"], started["part"]) == ("recording", 1)
@@ -58,7 +60,7 @@ async def test_a_recording_from_start_to_deletion(bench: Bench, tmp_path: Path) 
     assert bench.announced[1] == (False, "Mark: here")
 
 
-async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
+async def test_recordings_are_listed_off_the_event_loop(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder).verbs())
@@ -73,7 +75,7 @@ async def test_a_folder_of_thousands_of_files_holds_up_no_telemetry(
     assert looked != [threading.main_thread()]
 
 
-async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
+async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
     marked: list[tuple[Location | None, int | None]] = []
 
     def mark(place: Location | None, vehicle_id: int | None) -> None:
@@ -95,7 +97,7 @@ async def test_a_place_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None
     assert marked[2] == (None, None)
 
 
-async def test_a_player_is_steered(clock: ManualClock, tmp_path: Path) -> None:
+async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> None:
     path = tmp_path / "flight.tlog"
     path.write_bytes(make_tlog(make_records(500)))
     played = Played(path, clock)

@@ -51,7 +51,7 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
 
 
 @pytest.mark.parametrize("orderly", [True, False])
-def test_a_signed_frame_is_taken_once_whatever_restarts(tmp_path: Path, orderly: bool) -> None:
+def test_signed_frame_is_not_accepted_again_after_a_restart(tmp_path: Path, orderly: bool) -> None:
     # First, since it may compile for more than the minute in which a stamp is new.
     first = make_daemon(tmp_path, "correct horse")
     mav = mavlink.MAVLink(None, 255, 190)
@@ -92,7 +92,7 @@ def test_untrusted_requests_are_recorded_only_with_an_effect(
     assert recorded == [frame(HEARTBEAT)]
 
 
-def test_untrusted_client_that_floods_requests_fills_no_disk(
+def test_requests_of_a_flooding_untrusted_client_are_recorded_up_to_a_quota(
     daemon: Daemon, recorded: list[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(daemon, "now_us", lambda: 1_000_000)
@@ -138,7 +138,7 @@ async def test_ready_is_notified_once_the_control_socket_listens(
     assert ready == [True]
 
 
-async def test_the_thread_for_look_ups_is_there_before_the_first(daemon: Daemon) -> None:
+async def test_thread_of_look_ups_is_started_before_the_first_one(daemon: Daemon) -> None:
     others = set(threading.enumerate())
     daemon.start()
     begun = {thread for thread in set(threading.enumerate()) - others if "lookups" in thread.name}

@@ -32,7 +32,7 @@ def samples(count: int, begin_us: int = 0) -> list[FusedSample]:
     ]
 
 
-def test_samples_are_collected_only_while_they_are_asked_for() -> None:
+def test_samples_are_collected_only_while_they_are_requested() -> None:
     tap = ImuTap(lambda _: NodeCalibration(), lambda *_: None)
     for sample in samples(10):
         tap.add(sample)

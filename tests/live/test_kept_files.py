@@ -41,7 +41,7 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     made.files.close()
 
 
-async def test_saved_places_are_loaded(bench: Bench) -> None:
+async def test_saved_plans_are_loaded(bench: Bench) -> None:
     assert bench.files.load() == {}
     await bench.save(1, FIRST)
     await bench.save(31, SECOND)
@@ -51,7 +51,7 @@ async def test_saved_places_are_loaded(bench: Bench) -> None:
     assert sorted(f.name for f in bench.folder.iterdir()) == ["1.places.json", "31.places.json"]
 
 
-async def test_only_the_newest_of_many_is_written(
+async def test_only_the_newest_of_many_plans_is_written(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = counted(monkeypatch)
@@ -63,14 +63,14 @@ async def test_only_the_newest_of_many_is_written(
     assert len(written) <= 2
 
 
-async def test_closing_writes_pending_places(bench: Bench) -> None:
+async def test_closing_writes_pending_plans(bench: Bench) -> None:
     bench.files.save(1, FIRST)
     bench.files.save(2, SECOND)
     bench.files.close()
     assert bench.read() == {1: FIRST, 2: SECOND}
 
 
-async def test_a_disk_that_refuses_is_counted_and_reported(
+async def test_failed_write_is_counted_and_reported_with_its_end(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await bench.save(1, FIRST)
@@ -114,7 +114,7 @@ async def test_failed_write_is_retried_and_reported_once(
     assert bench.files._retry is None
 
 
-async def test_unwritable_file_does_not_delay_others(
+async def test_unwritable_plan_does_not_delay_others(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await bench.save(2, FIRST)
@@ -131,7 +131,7 @@ async def test_unwritable_file_does_not_delay_others(
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"version": 7}'])
-async def test_a_broken_file_is_reported_and_left_alone(
+async def test_broken_plan_is_reported_and_not_overwritten(
     bench: Bench, content: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     await bench.save(2, SECOND)
@@ -166,7 +166,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 STAMPS = {1: {"0123456789abcdef": {"0.255.190": 36_000_000_000_000}}, 31: {"ff": {"1.2.3": 7}}}
 
 
-def test_saved_stamps_are_loaded_again(tmp_path: Path) -> None:
+def test_saved_timestamps_are_loaded(tmp_path: Path) -> None:
     file = StampFile(tmp_path / "new")
     assert file.load() == {}
     file.save({1: {}})
@@ -175,14 +175,14 @@ def test_saved_stamps_are_loaded_again(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "new" / STAMPS_NAME).stat().st_mode) == 0o600
 
 
-def test_no_stamps_leave_the_file_as_it_is(tmp_path: Path) -> None:
+def test_closing_without_timestamps_leaves_the_file_unchanged(tmp_path: Path) -> None:
     StampFile(tmp_path).close(STAMPS)
     StampFile(tmp_path).close({})
     assert StampFile(tmp_path).load() == STAMPS
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"1":{"k":{"0.1":3}}}', '{"1":{"k":{"0.1.1":-3}}}'])
-def test_a_broken_file_of_stamps_is_reported(
+def test_broken_file_of_timestamps_is_reported(
     tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / STAMPS_NAME).write_text(text)
@@ -190,7 +190,7 @@ def test_a_broken_file_of_stamps_is_reported(
     assert "cannot be read" in caplog.text
 
 
-def test_stamps_that_cannot_be_written_are_reported_once(
+def test_unwritable_timestamps_are_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / STAMPS_NAME).mkdir()

@@ -96,12 +96,12 @@ def test_link_node_aircraft_and_client_are_shown() -> None:
         assert part in text
 
 
-def test_a_single_frame_is_one_frame() -> None:
+def test_single_frame_is_written_in_the_singular() -> None:
     once = msgspec.structs.replace(REPORT, frames=1)
     assert " 1 frame, " in text_of(replace(SNAPSHOT, report=once))
 
 
-def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
+def test_view_fits_a_terminal_of_80_by_24() -> None:
     far = msgspec.structs.replace(
         FLYING, lat_deg=-77.123456, lon_deg=-170.123456, alt_amsl_m=12_345.6
     )
@@ -116,7 +116,7 @@ def test_a_terminal_of_80_by_24_holds_it_all_uncut() -> None:
     assert len(text.splitlines()) <= 24
 
 
-def test_a_client_is_called_by_its_name() -> None:
+def test_client_is_shown_by_its_name() -> None:
     tablet = replace(CLIENT, name="tablet", remote="10.0.0.7:14550")
     assert "tablet 10.0.0.7:14550" in text_of(replace(SNAPSHOT, clients=(tablet,)))
 
@@ -138,19 +138,19 @@ def test_reasons_of_closed_ports_and_clients_are_shown() -> None:
 
 
 @pytest.mark.parametrize("word", ["nan", "None"])
-def test_unknown_is_a_dash(word: str) -> None:
+def test_unknown_position_is_shown_as_a_dash(word: str) -> None:
     assert word not in text_of(replace(SNAPSHOT, states=((1, LOST),)))
     assert word not in summary_line(replace(SNAPSHOT, states=((1, LOST),)))
 
 
-def test_an_empty_gateway_can_be_drawn() -> None:
+def test_gateway_without_nodes_is_drawn() -> None:
     report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
     text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
     assert "auto not connected" in text
     assert "No aircraft yet" in text
 
 
-def test_the_newest_log_lines_are_on_the_screen() -> None:
+def test_newest_log_lines_are_shown() -> None:
     view = LiveView()
     for number in range(20):
         record = logging.LogRecord("x", logging.WARNING, "", 0, "trouble %d", (number,), None)
@@ -162,7 +162,7 @@ def test_the_newest_log_lines_are_on_the_screen() -> None:
     assert "trouble 14" not in captured.get()
 
 
-def test_summary_line() -> None:
+def test_summary_line_contains_receiver_nodes_aircraft_and_clients() -> None:
     assert summary_line(SNAPSHOT) == (
         "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
         "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
@@ -188,7 +188,7 @@ FIGURES = {
 
 
 @pytest.mark.parametrize("width", [200, 150, 100, 80, 60, 40])
-def test_everything_is_legible_at_any_width(width: int) -> None:
+def test_figures_are_below_their_headings_at_any_width(width: int) -> None:
     text = text_of(WELL_KNOWN, width=width)
     lines = text.splitlines()
     assert max(map(len, lines)) <= width
@@ -200,7 +200,7 @@ def test_everything_is_legible_at_any_width(width: int) -> None:
     assert "recording alps, part 2: 12.3 MB" in " ".join(text.split())
 
 
-def test_a_wide_terminal_is_used() -> None:
+def test_wide_terminal_shows_clients_next_to_the_aircraft() -> None:
     wide, narrow = (text_of(WELL_KNOWN, width=w).splitlines() for w in (160, 100))
     (line,) = (line for line in wide if "lost %" in line)
     assert "client" in line
@@ -214,11 +214,11 @@ def test_a_wide_terminal_is_used() -> None:
         (replace(WELL_KNOWN.recorder, reason="disk is full"), "not recorded: disk is full"),
     ],
 )
-def test_the_recorder_is_reported(recorder: RecorderStatus, text: str) -> None:
+def test_state_of_the_recorder_is_shown(recorder: RecorderStatus, text: str) -> None:
     assert text in text_of(replace(WELL_KNOWN, recorder=recorder))
 
 
-def test_a_fix_that_is_none_is_red() -> None:
+def test_invalid_fix_is_red() -> None:
     [known] = WELL_KNOWN.aircraft
     assert known.fix is not None
     lost = replace(known, fix=msgspec.structs.replace(known.fix, fix_ok=False))
@@ -227,7 +227,7 @@ def test_a_fix_that_is_none_is_red() -> None:
     assert "\x1b[31m3D" not in text_of(WELL_KNOWN, coloured=True)
 
 
-def test_unknown_values_are_dashes() -> None:
+def test_unknown_status_is_shown_as_dashes() -> None:
     unknown = AircraftStatus(1, None, None, Way(1.0, 2.0, 3.0, None, None), ())
     lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
     for head in ("supply", "fix", "home m", "mark m", "mark at°"):

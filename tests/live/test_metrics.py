@@ -67,7 +67,7 @@ LABELS = '{client="7",name="the \\"tablet\\"",remote="127.0.0.1:14550"}'
         'mavgate_vehicle_trouble{kind="gps_rejected",vehicle="1"} 1.0',
     ],
 )
-def test_samples(line: str) -> None:
+def test_text_contains_the_sample(line: str) -> None:
     assert line in TEXT.splitlines()
 
 
@@ -114,7 +114,7 @@ class TestServer:
         writer.close()
         return answer
 
-    async def test_serves_and_refuses(self, server: MetricsServer) -> None:
+    async def test_get_and_head_are_served_and_post_is_refused(self, server: MetricsServer) -> None:
         answer = await self.ask(server.port, b"GET /metrics HTTP/1.1\r\nHost: localhost:9\r\n\r\n")
         head, _, body = answer.partition(b"\r\n\r\n")
         assert head.startswith(b"HTTP/1.1 200 OK")
@@ -149,11 +149,11 @@ class TestServer:
             assert answer.startswith(b"HTTP/1.1 " + status)
 
     @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="needs IPv6")
-    async def test_serves_ipv6_too(self, server: MetricsServer) -> None:
+    async def test_metrics_are_served_over_ipv6(self, server: MetricsServer) -> None:
         answer = await self.ask(server.port, b"GET / HTTP/1.1\r\n\r\n", "::1")
         assert answer.endswith(TEXT.encode())
 
-    async def test_the_loop_goes_on_between_two_families(self) -> None:
+    async def test_event_loop_runs_between_two_families(self) -> None:
         called: list[int] = []
         before: list[int] = []
 
@@ -169,11 +169,11 @@ class TestServer:
         server.close()
         assert before == list(range(TEXT.count("# TYPE")))
 
-    async def test_zero_serves_none(self, server: MetricsServer) -> None:
+    async def test_port_zero_serves_no_metrics(self, server: MetricsServer) -> None:
         server.listen(0)
         assert (server.port, server.listeners()) == (0, ())
 
-    async def test_idle_connections_are_no_more_than_a_few(self, server: MetricsServer) -> None:
+    async def test_number_of_idle_connections_is_bounded(self, server: MetricsServer) -> None:
         idle = [
             await asyncio.open_connection("127.0.0.1", server.port)
             for _ in range(metrics_server.MAX_CONNECTIONS)
@@ -193,7 +193,7 @@ class TestServer:
         while any(task.get_coro().__name__ == "_serve" for task in asyncio.all_tasks()):
             await asyncio.sleep(0)
 
-    async def test_a_taken_port_is_reported_and_used_when_it_is_free(
+    async def test_taken_port_is_reported_and_used_when_it_is_free(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(metrics_server, "RETRY_S", 0.0)

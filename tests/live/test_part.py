@@ -77,7 +77,7 @@ def tlog(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_tlog_of_any_size_is_shifted_in_small_steps(tlog: Path) -> None:
+def test_tlog_is_shifted_in_small_steps(tlog: Path) -> None:
     before = tlog.read_bytes()
     assert len(before) > 5 * STEP
     restamper = Restamper(0)
@@ -118,7 +118,7 @@ def test_deleted_file_is_not_restored(tlog: Path) -> None:
     assert list(tlog.parent.iterdir()) == []
 
 
-def test_a_full_disk_leaves_the_file_and_does_the_next(
+def test_full_disk_leaves_the_file_and_the_next_is_shifted(
     tlog: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = tlog.with_name("a_02.tlog")
@@ -142,7 +142,7 @@ def test_a_full_disk_leaves_the_file_and_does_the_next(
     assert sorted(tlog.parent.iterdir()) == [tlog, other]
 
 
-def test_a_copy_never_takes_the_last_space(tlog: Path) -> None:
+def test_copy_does_not_use_the_last_space(tlog: Path) -> None:
     before = tlog.read_bytes()
     restamper = Restamper(1 << 60)
     restamper.add(tlog, SHIFT_US)

@@ -48,7 +48,7 @@ class Played:
         self.file.close()
 
 
-async def test_it_plays_to_the_end_by_itself(tlog: Path) -> None:
+async def test_player_emits_every_frame_and_ends(tlog: Path) -> None:
     played = Played(tlog, GatewayClock(), speed=math.inf)
     played.edge.start()
     await asyncio.wait_for(played.ended.wait(), 60)
@@ -84,7 +84,7 @@ async def test_player_follows_each_command(tlog: Path, clock: ManualClock) -> No
     played.close()
 
 
-def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
+def test_file_is_indexed_and_read_at_any_position(tlog: Path) -> None:
     seen: list[int] = []
     file = TlogFile(tlog, seen.append)
     assert sum(seen) == tlog.stat().st_size
@@ -95,7 +95,7 @@ def test_a_file_is_indexed_and_read_at_any_place(tlog: Path) -> None:
     file.close()
 
 
-def test_a_file_that_shrinks_while_it_plays_just_ends(tlog: Path) -> None:
+def test_file_that_shrinks_during_playback_ends_early(tlog: Path) -> None:
     file = TlogFile(tlog)
     track = Track(file)
     tlog.write_bytes(make_tlog(RECORDS[:10]))
@@ -108,7 +108,7 @@ def test_a_file_that_shrinks_while_it_plays_just_ends(tlog: Path) -> None:
     assert file.read(0, 10) == b""
 
 
-def test_a_packed_tlog_is_played_from_an_unpacked_copy(tlog: Path) -> None:
+def test_compressed_tlog_is_played_from_an_unpacked_copy(tlog: Path) -> None:
     plain = TlogFile(tlog)
     packed = tlog.with_name("packed.tlog")
     packed.write_bytes(gzip.compress(tlog.read_bytes()))

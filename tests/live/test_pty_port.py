@@ -71,7 +71,7 @@ async def play() -> Iterator[Callable[..., PtyPort]]:  # type: ignore[misc]
         port.close()
 
 
-async def test_every_frame_arrives(play: Callable[..., PtyPort]) -> None:
+async def test_every_frame_reaches_the_reader(play: Callable[..., PtyPort]) -> None:
     def paced() -> Iterator[TimedFrame]:
         for sent, frame in enumerate(frames(2000)):
             # The kernel keeps some kB only, and hands them over when it has the time.
@@ -111,7 +111,9 @@ async def test_frames_without_a_reader_are_dropped(play: Callable[..., PtyPort])
     assert port.dropped > 500
 
 
-async def test_reader_comes_late_leaves_and_returns(play: Callable[..., PtyPort]) -> None:
+async def test_reader_that_opens_late_and_again_gets_whole_frames(
+    play: Callable[..., PtyPort],
+) -> None:
     port = play(frames(10**9))
     port.start()
     while not port.dropped:
@@ -126,7 +128,9 @@ async def test_reader_comes_late_leaves_and_returns(play: Callable[..., PtyPort]
     assert not port.ended.is_set()
 
 
-async def test_a_frame_is_never_torn(play: Callable[..., PtyPort]) -> None:
+async def test_partly_written_frame_is_finished_before_the_next(
+    play: Callable[..., PtyPort],
+) -> None:
     """A frame that half fits is finished before any other is begun."""
     port = play(frames(4000))
     slave = os.open(port.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
@@ -154,7 +158,7 @@ async def test_closing_removes_the_terminal(play: Callable[..., PtyPort]) -> Non
     assert not Path(port.path).exists()
 
 
-async def test_goes_on_after_a_standstill(
+async def test_frames_continue_at_their_rate_after_a_standstill(
     play: Callable[..., PtyPort], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = play(frames(1000, rate_hz=100.0))

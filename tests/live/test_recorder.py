@@ -92,7 +92,7 @@ async def test_every_frame_is_in_the_tlog_at_its_time(bench: Bench) -> None:
     assert bench.announced == [(False, f"Recording {NAME}")]
 
 
-async def test_a_flight_is_in_the_table_with_its_head(
+async def test_table_contains_the_flight_and_its_header(
     bench: Bench, rng: np.random.Generator
 ) -> None:
     await bench.turn()
@@ -123,7 +123,7 @@ async def test_a_flight_is_in_the_table_with_its_head(
     assert [e.text for e in events if isinstance(e, TableMark)] == ["over the wood"]
 
 
-async def test_changed_settings_make_a_new_head_behind_what_came_before(
+async def test_changed_settings_write_a_new_header_after_the_samples_before(
     bench: Bench, rng: np.random.Generator
 ) -> None:
     await bench.turn()
@@ -138,7 +138,9 @@ async def test_changed_settings_make_a_new_head_behind_what_came_before(
     assert [type(event) for event in events] == [TableRow, TableRow, TableHeader, TableRow]
 
 
-async def test_a_recording_begun_in_flight_says_so(bench: Bench, rng: np.random.Generator) -> None:
+async def test_header_of_a_recording_begun_in_flight_reports_no_cold_start(
+    bench: Bench, rng: np.random.Generator
+) -> None:
     flight = make_flight(rng, 10)
     bench.recorder.flight(flight[0])
     await bench.turn()
@@ -203,7 +205,7 @@ async def test_stop_and_start_make_two_recordings(bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("number", "text"), [(errno.ENOSPC, "disk is full"), (errno.EROFS, "disk is read-only")]
 )
-async def test_a_failing_disk_stops_recording_until_it_recovers(
+async def test_failing_disk_stops_recording_until_it_recovers(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, number: int, text: str
 ) -> None:
     await bench.turn()
@@ -223,7 +225,7 @@ async def test_a_failing_disk_stops_recording_until_it_recovers(
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
-async def test_folder_that_vanishes_is_made_again(bench: Bench) -> None:
+async def test_deleted_folder_is_created_again(bench: Bench) -> None:
     await bench.turn()
     await bench.record(FRAMES[:5])
     shutil.rmtree(bench.recorder.folder)
@@ -234,7 +236,7 @@ async def test_folder_that_vanishes_is_made_again(bench: Bench) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES[6:]
 
 
-async def test_a_disk_that_hangs_costs_recording_not_memory(bench: Bench) -> None:
+async def test_hanging_disk_stops_recording_and_bounds_the_buffer(bench: Bench) -> None:
     await bench.turn()
     part = bench.recorder._part
     assert part is not None
@@ -277,7 +279,7 @@ async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     assert UNIX_US < times[0] < times[-1] <= UNIX_US + bench.clock()
 
 
-async def test_two_aircraft_whose_times_differ_split_no_session_for_ever(
+async def test_differing_times_of_two_aircraft_split_a_session_once_at_most(
     tmp_path: Path, clock: ManualClock
 ) -> None:
     bench = Bench(tmp_path / "recordings", clock)
@@ -292,7 +294,7 @@ async def test_two_aircraft_whose_times_differ_split_no_session_for_ever(
     assert len(list(bench.recorder.folder.glob("*.tlog"))) <= 2
 
 
-async def test_save_renames_while_it_runs(tmp_path: Path, clock: ManualClock) -> None:
+async def test_save_renames_a_running_recording(tmp_path: Path, clock: ManualClock) -> None:
     bench = Bench(tmp_path, clock, rotate_min=1)
     await bench.turn()
     await bench.record(FRAMES[:5])
@@ -326,7 +328,7 @@ async def test_recording_wanted_at_start_misses_no_frame(bench: Bench) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-async def test_a_start_on_a_bad_disk_is_reported_and_mended(
+async def test_failed_start_is_reported_and_retried(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.recorder.folder.write_text("a file where the folder should be")
@@ -337,7 +339,7 @@ async def test_a_start_on_a_bad_disk_is_reported_and_mended(
     assert bench.recorder.status().state == "recording"
 
 
-async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
+async def test_recording_begins_on_request(tmp_path: Path, clock: ManualClock) -> None:
     bench = Bench(tmp_path, clock, mode="manual")
     bench.recorder.start()
     await bench.recorder.settle()
@@ -350,9 +352,7 @@ async def test_it_runs_by_itself(tmp_path: Path, clock: ManualClock) -> None:
     assert frames_of(bench.recorder.folder) == FRAMES
 
 
-def test_a_file_that_got_nothing_is_not_left_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_without_content_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     files = PartFiles(tmp_path, "a", 1)
 
     def refuse(*args: object) -> int:
@@ -366,7 +366,7 @@ def test_a_file_that_got_nothing_is_not_left_behind(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_is_never_opened_twice(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     first = PartFiles(tmp_path, "a", 2)
     first.write({".tlog": b"x"})
     second = PartFiles(tmp_path, "a", 2)
@@ -398,7 +398,7 @@ async def test_two_gateways_that_record_in_one_folder_lose_nothing(
         assert [record.frame for record in records] == 2 * FRAMES
 
 
-async def test_it_records_only_once_the_disk_has_taken_something(
+async def test_recording_is_reported_once_the_disk_has_written_something(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def outcome() -> tuple[bool, str]:

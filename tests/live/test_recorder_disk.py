@@ -46,7 +46,7 @@ async def bench(disk: Path, clock: ManualClock) -> AsyncIterator[Bench]:
     made.recorder.close()
 
 
-async def test_a_full_disk(bench: Bench, disk: Path) -> None:
+async def test_full_disk_stops_recording_until_there_is_space(bench: Bench, disk: Path) -> None:
     ballast = disk / "ballast"
     with pytest.raises(OSError, match="No space left"):
         ballast.write_bytes(bytes(2 * SIZE))
@@ -65,7 +65,9 @@ async def test_a_full_disk(bench: Bench, disk: Path) -> None:
     assert len(bench.troubles) == 1
 
 
-async def test_a_disk_that_turns_read_only(bench: Bench, disk: Path) -> None:
+async def test_read_only_disk_stops_recording_until_it_is_writable(
+    bench: Bench, disk: Path
+) -> None:
     # With a file open for writing the kernel would refuse.
     bench.recorder.stop()
     await bench.turn()

@@ -84,7 +84,7 @@ async def test_writes_do_not_wait_for_a_sync(bench: Bench, disk: SlowDisk) -> No
     assert bench.recorder._syncing is syncing
 
 
-async def test_the_next_sync_begins_once_the_last_has_ended(bench: Bench, disk: SlowDisk) -> None:
+async def test_next_sync_begins_once_the_last_has_ended(bench: Bench, disk: SlowDisk) -> None:
     await bench.turn()
     disk.may_end.set()
     assert bench.recorder._syncing is not None
@@ -96,7 +96,7 @@ async def test_the_next_sync_begins_once_the_last_has_ended(bench: Bench, disk: 
     assert disk.most == 1
 
 
-async def test_a_sync_that_fails_stops_recording_until_the_disk_recovers(
+async def test_failed_sync_stops_recording_until_the_disk_recovers(
     bench: Bench, disk: SlowDisk
 ) -> None:
     disk.fails = True
@@ -113,7 +113,7 @@ async def test_a_sync_that_fails_stops_recording_until_the_disk_recovers(
     assert bench.announced[-1] == (False, f"Recording {NAME}")
 
 
-async def test_a_recording_ends_behind_the_sync_that_runs(
+async def test_recording_ends_after_the_running_sync(
     bench: Bench, disk: SlowDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed: list[int] = []
@@ -139,7 +139,7 @@ async def test_a_recording_ends_behind_the_sync_that_runs(
 
 
 @pytest.mark.parametrize("by", ["stop", "end"])
-async def test_a_last_sync_that_fails_is_reported(
+async def test_failed_last_sync_is_reported(
     bench: Bench, disk: SlowDisk, caplog: pytest.LogCaptureFixture, by: str
 ) -> None:
     disk.fails = True
@@ -153,7 +153,7 @@ async def test_a_last_sync_that_fails_is_reported(
     assert frames_of(bench.recorder.folder) == FRAMES[:5]
 
 
-async def test_a_recorder_that_ends_while_a_part_is_closed_closes_it(
+async def test_recorder_closed_during_the_end_of_a_part_closes_its_files(
     bench: Bench, disk: SlowDisk
 ) -> None:
     files = bench.recorder._files
@@ -171,7 +171,7 @@ async def test_a_recorder_that_ends_while_a_part_is_closed_closes_it(
 
 
 @pytest.mark.parametrize("between", [[], [CorrectTimes()]])
-async def test_the_next_part_waits_for_no_sync_of_the_one_before(
+async def test_next_part_does_not_wait_for_the_sync_of_the_last(
     bench: Bench, disk: SlowDisk, between: list[SessionAction]
 ) -> None:
     """Also where the recording gets its true time."""
@@ -188,9 +188,7 @@ async def test_the_next_part_waits_for_no_sync_of_the_one_before(
     assert disk.most == 1
 
 
-async def test_a_recording_is_saved_under_a_name_while_it_is_written(
-    bench: Bench, disk: SlowDisk
-) -> None:
+async def test_recording_is_renamed_during_a_slow_sync(bench: Bench, disk: SlowDisk) -> None:
     saving = asyncio.create_task(bench.recorder.save("first flight"))
     await record_each(bench, FRAMES[5:])
     assert {path.name for path in bench.recorder.folder.glob("*.tlog")} == {"first flight_01.tlog"}

@@ -43,7 +43,9 @@ BUILT_IN = Port("/dev/ttyS0", "", "", "n/a", known=False)
         ("usb:0403:6001:a50285bi", [FTDI_2, FTDI], "/dev/ttyUSB1"),
     ],
 )
-def test_find_port(wanted: str, ports: list[Port], device: str) -> None:
+def test_port_is_found_by_device_adapter_or_usb_id(
+    wanted: str, ports: list[Port], device: str
+) -> None:
     assert find_port(wanted, ports) == device
 
 
@@ -74,7 +76,9 @@ def test_error_of_find_port_lists_the_ports(wanted: str, ports: list[Port], mess
         ("/dev/null", [CH340], "not a serial port"),
     ],
 )
-def test_reason_of_a_failed_opening(device: str, ports: list[Port], reason: str) -> None:
+def test_reason_of_a_failed_opening_names_the_known_adapters(
+    device: str, ports: list[Port], reason: str
+) -> None:
     with pytest.raises(serial.SerialException) as raised:
         serial.Serial(device, timeout=0)
     assert why_not_open(raised.value, ports) == reason
@@ -164,7 +168,7 @@ def fast_retry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.io
 @pytest.mark.usefixtures("fast_retry")
-async def test_unplugged_and_plugged_again(
+async def test_port_is_opened_again_after_it_was_unplugged(
     bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
 ) -> None:
     link = listener.port(str(bench.link))
@@ -216,7 +220,7 @@ async def test_retries_back_off(listener: Listener, monkeypatch: pytest.MonkeyPa
 
 @pytest.mark.io
 @pytest.mark.parametrize("can", [True, False])
-async def test_the_adapter_is_asked_to_hold_no_bytes_back(
+async def test_low_latency_of_the_adapter_is_requested(
     bench: Bench,
     listener: Listener,
     monkeypatch: pytest.MonkeyPatch,
@@ -239,7 +243,7 @@ async def test_the_adapter_is_asked_to_hold_no_bytes_back(
     link.close()
 
 
-def test_a_backlog_is_read_as_fast_as_the_line_brings_more(listener: Listener) -> None:
+def test_backlog_is_read_at_the_rate_of_the_line(listener: Listener) -> None:
     """Samples are lost where turns of the loop are long and each reads no more than one sample."""
     times_us = (0, 300, 40_300, 40_600, 60_600, 90_000)
     link = listener.port(now_us=iter(times_us).__next__)

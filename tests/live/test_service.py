@@ -26,7 +26,7 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield sock
 
 
-async def test_life_of_a_service(systemd: socket.socket) -> None:
+async def test_systemd_is_notified_of_every_state(systemd: socket.socket) -> None:
     notifier = ServiceNotifier()
     notifier.ready()
     notifier.status("2 clients")
@@ -38,7 +38,7 @@ async def test_life_of_a_service(systemd: socket.socket) -> None:
     assert notified[3] == "STOPPING=1"
 
 
-async def test_the_watchdog_is_fed_at_twice_its_rate(
+async def test_watchdog_is_notified_at_twice_its_rate(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "20000")
@@ -60,7 +60,7 @@ async def test_the_watchdog_is_fed_at_twice_its_rate(
     assert notifier._timer is None
 
 
-async def test_a_watchdog_of_another_process_is_not_ours(
+async def test_watchdog_of_another_process_is_not_notified(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", "20000")
@@ -71,14 +71,14 @@ async def test_a_watchdog_of_another_process_is_not_ours(
         systemd.recv(200)
 
 
-async def test_without_systemd_nothing_happens(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_notifier_does_nothing_without_systemd(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     ServiceNotifier().ready()
     monkeypatch.setenv("NOTIFY_SOCKET", "/no/such/socket")
     ServiceNotifier().ready()
 
 
-def test_realtime_is_asked_for_or_a_refusal_logged(
+def test_realtime_priority_is_requested_and_a_refusal_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     asked: list[tuple[int, int]] = []
@@ -116,7 +116,7 @@ print(policies == [os.SCHED_RR, os.SCHED_OTHER, os.SCHED_OTHER])
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may have real-time priority")
-def test_the_kernel_grants_real_time_to_the_one_thread() -> None:
+def test_kernel_grants_realtime_priority_to_the_calling_thread_only() -> None:
     run = subprocess.run(
         [sys.executable, "-c", REAL_TIME], capture_output=True, text=True, check=True
     )

@@ -45,12 +45,12 @@ def test_names_are_in_utc_and_sort_by_time() -> None:
 
 
 @pytest.mark.parametrize("name", ["first flight", "Ünal-3", "a.b_c", "x" * 100])
-def test_good_names(name: str) -> None:
+def test_valid_name_is_accepted(name: str) -> None:
     assert check_name(name) == name
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "a\0", "-rf", "x" * 101, "a."])
-def test_names_that_would_harm(name: str) -> None:
+def test_unsafe_name_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="no name"):
         check_name(name)
 
@@ -82,7 +82,7 @@ def test_commands_override_the_mode_until_the_next_flight() -> None:
     assert session.wanted
 
 
-def test_stop_closes() -> None:
+def test_stop_closes_the_part() -> None:
     session = recording()
     session.stop()
     assert poll(session) == [
@@ -107,7 +107,7 @@ def test_wrong_clock_corrects_the_times_and_keeps_the_announced_name() -> None:
     assert actions == [ClosePart(), CorrectTimes(), OpenPart(NAME, 2)]
 
 
-def test_a_full_disk_blocks_until_there_is_room_again() -> None:
+def test_full_disk_blocks_recording_until_there_is_space() -> None:
     session = recording(RecordingSettings(mode="always", free_floor_mb=100))
     closing, announcement = poll(session, free=99_000_000)
     assert closing == ClosePart()
@@ -120,7 +120,7 @@ def test_a_full_disk_blocks_until_there_is_room_again() -> None:
     assert session.opened(RETRY_US) == [STARTED]
 
 
-def test_the_same_trouble_is_announced_once_and_wastes_no_part_number() -> None:
+def test_repeated_failure_is_announced_once_and_uses_no_part_number() -> None:
     session = Session(ALWAYS)
     assert poll(session) == [OpenPart(NAME, 1)]
     assert len(session.failed("read-only disk", 0)) == 1
@@ -129,14 +129,14 @@ def test_the_same_trouble_is_announced_once_and_wastes_no_part_number() -> None:
     assert len(session.failed("no such directory", RETRY_US)) == 1
 
 
-def test_a_write_that_fails_closes_and_retries_in_a_new_part() -> None:
+def test_failed_write_closes_the_part_and_retries_in_a_new_one() -> None:
     session = recording()
     assert session.failed("disk full", 5)[0] == ClosePart()
     assert session.state is SessionState.BLOCKED
     assert poll(session, 5 + RETRY_US) == [OpenPart(NAME, 2)]
 
 
-def test_stop_while_blocked_gives_up() -> None:
+def test_stop_ends_a_blocked_recording() -> None:
     session = recording()
     session.failed("disk full", 0)
     session.stop()
@@ -145,7 +145,7 @@ def test_stop_while_blocked_gives_up() -> None:
     assert poll(session, 10 * RETRY_US) == []
 
 
-def test_nothing_is_opened_on_a_disk_that_is_full_already() -> None:
+def test_no_part_is_opened_on_a_full_disk() -> None:
     session = Session(ALWAYS)
     (announcement,) = poll(session, free=0)
     assert isinstance(announcement, Announce)
@@ -153,7 +153,7 @@ def test_nothing_is_opened_on_a_disk_that_is_full_already() -> None:
     assert poll(session, RETRY_US) == [OpenPart(NAME, 1)]
 
 
-def test_a_full_disk_needs_some_room_even_without_a_floor() -> None:
+def test_retry_needs_some_space_even_without_a_floor() -> None:
     session = recording(RecordingSettings(mode="always", free_floor_mb=0))
     session.failed("disk is full", 0)
     assert poll(session, RETRY_US, free=900_000) == []

@@ -49,7 +49,7 @@ child.wait()
 """
 
 
-def test_a_parent_that_is_killed_takes_its_child_along() -> None:
+def test_child_ends_when_its_parent_is_killed() -> None:
     words = [sys.executable, "-c", PARENT, CHILD]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
@@ -65,7 +65,7 @@ def test_a_parent_that_is_killed_takes_its_child_along() -> None:
 
 
 @pytest.mark.parametrize("is_ignored", [False, True])
-async def test_the_end_of_the_terminal_stays_ignored_where_it_is(is_ignored: bool) -> None:
+async def test_ignored_hangup_stays_ignored(is_ignored: bool) -> None:
     """As `nohup` has it."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN if is_ignored else signal.SIG_DFL)
     calls: list[bool] = []
@@ -130,7 +130,7 @@ def test_unread_pipe_does_not_block_the_writer(pipe: tuple[TextIO, TextIO], bloc
 
 
 @pytest.mark.usefixtures("patient")
-def test_a_reader_that_has_gone_is_no_error() -> None:
+def test_closed_reader_is_no_error() -> None:
     reader, writer = os.pipe()
     os.close(reader)
     with os.fdopen(writer, "w", encoding="utf-8") as into:
@@ -176,7 +176,7 @@ LOCAL_FLAGS = 3
         ("", []),
     ],
 )
-def test_keys_have_names(text: str, names: list[str]) -> None:
+def test_key_sequences_are_named(text: str, names: list[str]) -> None:
     assert list(keys_of(text)) == names
 
 
@@ -226,7 +226,7 @@ async def test_keyboard_leaves_a_pipe_unchanged(tmp_path: object) -> None:
     os.close(write)
 
 
-async def test_a_job_in_the_background_leaves_the_terminal_alone(
+async def test_background_job_does_not_change_the_terminal(
     terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)

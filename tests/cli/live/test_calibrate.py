@@ -70,7 +70,7 @@ def run(config: Path, *arguments: str) -> str:
     return result.output
 
 
-def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None:
+def test_steps_are_guided_and_saved_with_residuals(config: Path) -> None:
     output = run(config, "gyro", "accel", "mag")
     assert [f"{step}: done" in output for step in ("gyro", "accel", "mag")] == [True] * 3
     assert "5 of 6 sides are done. Lay the node on one of these and let it go: chips up" in output
@@ -82,7 +82,7 @@ def test_guides_through_the_steps_and_saves_with_residuals(config: Path) -> None
     assert 0.0 < saved.accel_residual_mps2 < 0.05
 
 
-def test_a_port_that_is_not_there_is_said_before_anything_is_asked(tmp_path: Path) -> None:
+def test_missing_port_is_reported_before_the_first_question(tmp_path: Path) -> None:
     command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
     result = invoke(*command, answers="\n")
     assert result.exit_code == 2
@@ -95,7 +95,7 @@ def test_dry_run_saves_nothing(config: Path) -> None:
     assert not load_aircraft(load(config))
 
 
-def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failed_step_is_reported(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def moving(seconds: float) -> NodeSamples:
         noise = np.random.default_rng(1).normal(0, 5.0, (300, 3))
         return NodeSamples(
@@ -113,7 +113,7 @@ def test_a_step_that_fails_is_said(config: Path, monkeypatch: pytest.MonkeyPatch
     assert "nothing changed" in output
 
 
-def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
+def test_interrupt_keeps_the_finished_steps(config: Path, link: Link) -> None:
     link.breaks_at = 4
     output = run(config, "gyro", "accel", "mag")
     assert "Broken off. Not done: accel, mag." in output
@@ -122,7 +122,7 @@ def test_broken_off_keeps_what_is_done(config: Path, link: Link) -> None:
     assert saved.accel_bias_mps2 == (0.0, 0.0, 0.0)
 
 
-def test_leaving_at_a_question_keeps_what_is_done(config: Path) -> None:
+def test_end_of_input_keeps_the_finished_steps(config: Path) -> None:
     command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
     result = invoke(*command, answers="\n")
     assert result.exit_code == 0, result.output
@@ -140,7 +140,7 @@ def gyro_bias_of(config: Path, records: Sequence[ImuRaw | GpsFix]) -> Vec3:
     return load_aircraft(load(config))[3].calibration.gyro_bias_radps
 
 
-def test_the_gyroscope_from_a_flight(config: Path) -> None:
+def test_gyroscope_is_calibrated_from_a_recorded_flight(config: Path) -> None:
     """A flight with a rest before and steady turns: the bias is that of the rest."""
     flight = fly(SimulatorSettings(imu_rate_hz=50))
     records = [record for record in flight.records() if isinstance(record, ImuRaw | GpsFix)]
@@ -149,7 +149,7 @@ def test_the_gyroscope_from_a_flight(config: Path) -> None:
     assert np.degrees(np.abs(off)).max() < 0.2
 
 
-def test_a_steady_turn_counts_as_no_rest(config: Path) -> None:
+def test_steady_turn_is_not_taken_for_rest(config: Path) -> None:
     """In smooth air a long turn is as even as a rest: only the fixes distinguish them."""
     rng = np.random.default_rng(2)
     records: list[ImuRaw | GpsFix] = []

@@ -132,7 +132,7 @@ async def run(*words: object, code: int = 0) -> str:
     return (await asyncio.to_thread(invoke, *words, code=code)).output
 
 
-async def test_status_for_people(asked: list[object]) -> None:
+async def test_status_is_printed_as_text(asked: list[object]) -> None:
     text = await run("status")
     assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in text
     assert "serial: 103 frames, 4 lost; radio: 100 payloads, 7 lost" in text
@@ -157,7 +157,7 @@ async def test_failed_requests_are_listed(asked: list[object]) -> None:
     assert json.loads(await run("status", "--requests", "--json"))[0]["count"] == 3
 
 
-async def test_status_for_programs(asked: list[object]) -> None:
+async def test_status_is_printed_as_json(asked: list[object]) -> None:
     found = json.loads(await run("status", "--json"))
     assert found["clients"][0]["round_trip_us"] == 1500
     assert found["states"][0][1]["lon_deg"] is None
@@ -174,7 +174,7 @@ async def test_clients_are_listed_added_and_removed(asked: list[object]) -> None
     assert "no endpoint is called 'phone'" in await run("clients", "remove", "phone", code=2)
 
 
-def test_client_stands_on_one_line_of_a_narrow_terminal() -> None:
+def test_client_fits_on_one_line_of_a_narrow_terminal() -> None:
     client = dataclasses.replace(
         CLIENT,
         name="udp:127.0.0.1:14550",
@@ -201,17 +201,17 @@ async def test_piped_tables_and_texts_are_never_wrapped(
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
 
 
-async def test_mark_takes_places_of_the_south_and_west(asked: list[object]) -> None:
+async def test_mark_accepts_negative_coordinates(asked: list[object]) -> None:
     assert (await run("mark", "-7.76", "-110.4", "--alt", "-3")) == "marked\n"
     assert asked == [(-7.76, -110.4, -3.0, None)]
     await run("mark", "--hight", "3", code=2)
 
 
-async def test_reload(asked: list[object]) -> None:
+async def test_reload_prints_what_was_applied(asked: list[object]) -> None:
     assert "applied" in await run("reload")
 
 
-async def test_an_added_client_is_kept_on_demand(asked: list[object], tmp_path: Path) -> None:
+async def test_added_client_is_saved_on_request(asked: list[object], tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
     words = ("clients", "add", "udp:127.0.0.1:9", "--save", "--config", file)
     assert f"saved in {file}" in await run(*words)
@@ -219,6 +219,6 @@ async def test_an_added_client_is_kept_on_demand(asked: list[object], tmp_path: 
     assert "added, but not saved" in await run(*words, code=2)
 
 
-def test_nothing_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_gateway_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     assert "nothing runs" in invoke("status", code=2).output

@@ -51,7 +51,7 @@ def settings_of_demo(
     return run
 
 
-def test_the_users_aircraft_are_not_the_demos(
+def test_demo_does_not_use_the_aircraft_folder_of_the_user(
     settings_of_demo: Callable[..., list[GatewaySettings]], tmp_path: Path
 ) -> None:
     """What a ground station has the demo save must not become a real aircraft's calibration."""
@@ -63,7 +63,7 @@ def test_the_users_aircraft_are_not_the_demos(
 
 
 @pytest.mark.parametrize(("options", "mode"), [((), "manual"), (("--record",), "always")])
-def test_nothing_is_recorded_unless_asked(
+def test_demo_is_recorded_only_on_request(
     settings_of_demo: Callable[..., list[GatewaySettings]], options: tuple[str, ...], mode: str
 ) -> None:
     assert [settings.recording.mode for settings in settings_of_demo(*options)] == [mode, mode]
@@ -77,13 +77,13 @@ def numbered() -> Iterator[TimedFrame]:
         yield TimedFrame(float(k), os.getpid().to_bytes(4))
 
 
-def test_frames_are_those_of_the_simulator() -> None:
+def test_frames_made_ahead_equal_those_of_the_simulator() -> None:
     made = list(islice(made_ahead(simulate(SETTINGS).frames()), 200))
     assert made == list(islice(simulate(SETTINGS).frames(), 200))
     assert any(frame.damaged for frame in made)
 
 
-def test_another_process_makes_them_and_ends_when_nobody_takes_them() -> None:
+def test_frames_are_made_by_a_process_that_ends_with_its_reader() -> None:
     before = set(multiprocessing.active_children())
     line = made_ahead(numbered())
     [child] = set(multiprocessing.active_children()) - before
@@ -95,7 +95,7 @@ def test_another_process_makes_them_and_ends_when_nobody_takes_them() -> None:
     assert child.exitcode == 0
 
 
-def test_the_end_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+def test_end_of_the_simulated_receiver_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     assert len(list(made_ahead(islice(numbered(), 40)))) == 40
     assert "the simulated receiver has ended" in caplog.text
 
@@ -118,7 +118,7 @@ class Daemon:
         """Nothing is open."""
 
 
-async def test_what_the_start_loads_is_left_to_no_collection() -> None:
+async def test_objects_loaded_at_the_start_are_excluded_from_garbage_collection() -> None:
     daemon: Any = Daemon()
     await serve(lambda: daemon, plain=True)
     assert daemon.is_collected is False

@@ -41,7 +41,7 @@ async def run(*args: str, code: int = 0) -> str:
     return result.output
 
 
-async def test_a_recording_from_start_to_deletion(gateway: Bench) -> None:
+async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: Bench) -> None:
     assert "recording" in await run("start")
     gateway.send(make_frames(9))
     assert "recording" in await run("note", "over the wood")
