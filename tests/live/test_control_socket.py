@@ -1,4 +1,4 @@
-"""The control socket: its rights, its words, and what it says to nonsense."""
+"""The control socket: its access rights, its requests, and its answers to malformed ones."""
 
 import asyncio
 import os

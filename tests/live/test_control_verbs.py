@@ -78,10 +78,10 @@ async def test_recordings_are_listed_off_the_event_loop(
 async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> None:
     marked: list[tuple[Location | None, int | None]] = []
 
-    def mark(place: Location | None, vehicle_id: int | None) -> None:
+    def mark(location: Location | None, vehicle_id: int | None) -> None:
         if vehicle_id == 9:
             raise ValueError("no such aircraft; heard so far: 1")
-        marked.append((place, vehicle_id))
+        marked.append((location, vehicle_id))
 
     server = ControlServer(tmp_path / "s", mark_verbs(mark))
     assert (await ask(server, "mark", lat_deg=-7.5, lon_deg=110.0, alt_amsl_m=90.0))["ok"]

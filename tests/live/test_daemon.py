@@ -1,4 +1,4 @@
-"""The composition root: what is recorded of whom."""
+"""The composition root: start, recording of clients, saving and reloading of settings."""
 
 import asyncio
 import errno

@@ -26,8 +26,8 @@ class Bench:
         self.reports: list[tuple[int, str | None]] = []
         self.files = PlanFiles(folder, lambda *report: self.reports.append(report))
 
-    async def save(self, vehicle_id: int, places: StoredPlan) -> None:
-        self.files.save(vehicle_id, places)
+    async def save(self, vehicle_id: int, plan: StoredPlan) -> None:
+        self.files.save(vehicle_id, plan)
         await self.files.settle()
 
     def read(self) -> dict[int, StoredPlan]:
@@ -127,7 +127,7 @@ async def test_unwritable_plan_does_not_delay_others(
     file.unlink()
     assert bench.read() == {2: SECOND}
     await bench.save(2, FIRST)
-    assert bench.read() == {1: FIRST, 2: FIRST}, "what waited went with it"
+    assert bench.read() == {1: FIRST, 2: FIRST}, "the pending plan was written with it"
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b'{"version": 7}'])

@@ -1,4 +1,4 @@
-"""The live view: what an operator reads, and that nothing unknown looks like a figure."""
+"""The live view: its figures and texts, and dashes for unknown values."""
 
 import logging
 import math

@@ -31,7 +31,7 @@ def tlog(tmp_path: Path) -> Path:
 
 
 class Played:
-    """A player edge, and what came out of it."""
+    """A player edge and its frames."""
 
     def __init__(self, path: Path, clock: GatewayClock | ManualClock, **options: object) -> None:
         self.file = TlogFile(path)

@@ -1,4 +1,4 @@
-"""The pseudo-terminal: every byte to a reader, no byte kept for none."""
+"""The pseudo-terminal: every byte reaches a reader, and none is kept without one."""
 
 import asyncio
 import os
@@ -29,7 +29,7 @@ def numbers(events: list[bytes | Fault]) -> list[int]:
 
 
 class Reader:
-    """Opens a port as the gateway does and collects what it says."""
+    """Opens a port as the gateway does and collects its frames."""
 
     def __init__(self, path: str) -> None:
         self.events: list[bytes | Fault] = []

@@ -1,4 +1,4 @@
-"""The session decides rightly, with a disk that does what it likes."""
+"""The decisions of a session, also with a disk that fails."""
 
 import pytest
 
