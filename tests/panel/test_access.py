@@ -97,7 +97,7 @@ async def websocket_answer(guard: AccessControl, path: str, **headers: str) -> s
         {"origin": HERE},
     ],
 )
-async def test_own_names_and_the_own_page_are_let_in(headers: dict[str, str]) -> None:
+async def test_own_hosts_and_own_origin_are_accepted(headers: dict[str, str]) -> None:
     async with client_of(guarded(PanelSettings(hosts=("ground.local",)))) as client:
         answer = await client.post("/", headers=headers)
     assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
@@ -113,7 +113,7 @@ async def test_own_names_and_the_own_page_are_let_in(headers: dict[str, str]) ->
         *({"origin": origin} for origin in ("null", "http://[::1")),
     ],
 )
-async def test_foreign_name_that_points_here_and_foreign_page_are_refused(
+async def test_foreign_host_and_foreign_origin_are_refused(
     headers: dict[str, str],
 ) -> None:
     async with client_of(guarded()) as client:
@@ -122,7 +122,7 @@ async def test_foreign_name_that_points_here_and_foreign_page_are_refused(
             assert answer.status_code == http.HTTPStatus.FORBIDDEN
 
 
-async def test_head_is_answered_as_get_is() -> None:
+async def test_head_is_answered_as_get() -> None:
     """Its body is left out by the server in front of the guard."""
 
     async def answers_with_the_method(scope: Scope, receive: Receive, send: Send) -> None:
@@ -150,7 +150,7 @@ async def unanswered(guard: AccessControl, method: str, path: str, received: str
 
 
 @pytest.mark.parametrize("leaves", [True, False])
-async def test_a_browser_that_leaves_unanswered_is_no_error(leaves: bool) -> None:
+async def test_disconnect_before_the_answer_is_no_error(leaves: bool) -> None:
     async def says_nothing(scope: Scope, receive: Receive, send: Send) -> None:
         await receive()
 
@@ -164,7 +164,7 @@ async def test_a_browser_that_leaves_unanswered_is_no_error(leaves: bool) -> Non
         await unanswered(guard, "GET", "/favicon.ico", received)
 
 
-async def test_upload_that_is_interrupted_is_no_error() -> None:
+async def test_interrupted_upload_is_no_error() -> None:
     async def reads_all(scope: Scope, receive: Receive, send: Send) -> None:
         await Request(scope, receive).body()
 
@@ -246,7 +246,7 @@ def test_origin_that_no_browser_sends_is_refused(origin: str) -> None:
         PanelSettings(origins=(origin,))
 
 
-async def test_too_much_is_refused_whether_its_length_is_given_or_not() -> None:
+async def test_large_body_is_refused_with_and_without_a_declared_length() -> None:
     async def chunks() -> AsyncIterator[bytes]:
         for _ in range(20):
             yield bytes(MAX_BODY // 10)
@@ -271,7 +271,7 @@ async def test_uploads_have_a_limit_of_their_own(path: str) -> None:
     assert too_large.status_code == http.HTTPStatus.REQUEST_ENTITY_TOO_LARGE
 
 
-async def test_nothing_is_shown_without_the_password(locked: httpx.AsyncClient) -> None:
+async def test_request_without_a_session_is_refused(locked: httpx.AsyncClient) -> None:
     assert (await locked.get("/")).headers["location"] == "/login"
     assert (await locked.get("/path/1")).status_code == http.HTTPStatus.UNAUTHORIZED
     locked.cookies.set(COOKIE, "forged")
@@ -291,7 +291,7 @@ async def test_password_decides_the_role(
     assert (await locked.get("/")).headers["location"] == "/login"
 
 
-async def test_cookies_of_other_programs_do_no_harm(locked: httpx.AsyncClient) -> None:
+async def test_cookies_of_other_programs_are_ignored(locked: httpx.AsyncClient) -> None:
     """A browser sends those of every port of the host, and their names may be odd."""
     await locked.post("/login", data={"password": "tower"})
     token = locked.cookies[COOKIE]
@@ -300,7 +300,7 @@ async def test_cookies_of_other_programs_do_no_harm(locked: httpx.AsyncClient) -
     assert (answer.status_code, answer.text) == (http.HTTPStatus.OK, "operator 0")
 
 
-async def test_only_a_few_parallel_attempts_of_an_address_are_checked(
+async def test_parallel_login_attempts_of_an_address_are_limited(
     locked: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hashed: list[str] = []
@@ -316,7 +316,7 @@ async def test_only_a_few_parallel_attempts_of_an_address_are_checked(
     assert answer.status_code == http.HTTPStatus.TOO_MANY_REQUESTS
 
 
-async def test_one_password_is_hashed_at_a_time(
+async def test_passwords_are_hashed_one_at_a_time(
     locked: httpx.AsyncClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running: list[int] = []
@@ -334,7 +334,7 @@ async def test_one_password_is_hashed_at_a_time(
     assert max(peak) == 1
 
 
-async def test_right_password_clears_the_attempts(locked: httpx.AsyncClient) -> None:
+async def test_correct_password_clears_the_attempts(locked: httpx.AsyncClient) -> None:
     for _ in range(2):
         for _ in range(MAX_ATTEMPTS - 1):
             await locked.post("/login", data={"password": "guess"})
@@ -375,7 +375,7 @@ async def test_inline_scripts_of_a_page_get_the_nonce_of_their_response() -> Non
     assert len(seen) == 2
 
 
-def test_hash_matches_its_password_alone() -> None:
+def test_hash_matches_only_its_password() -> None:
     assert matches("tower", OPERATOR)
     assert not matches("Tower", OPERATOR)
     assert hash_password("tower") != OPERATOR
@@ -392,7 +392,9 @@ def test_hash_matches_its_password_alone() -> None:
         ({"certificate_key": "panel.key"}, "certificate"),
     ],
 )
-def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: str) -> None:
+def test_listening_beyond_loopback_needs_password_and_certificate(
+    settings: dict[str, object], missing: str
+) -> None:
     with pytest.raises(ValueError, match=missing):
         PanelSettings(**settings)
 
@@ -406,7 +408,7 @@ def test_open_to_others_only_with_a_lock(settings: dict[str, object], missing: s
         ("here.pem", "", r"here.pem and \S*here.pem must be a certificate and its key"),
     ],
 )
-def test_a_certificate_that_cannot_be_used_is_named(
+def test_unusable_certificate_is_named(
     tmp_path: Path, certificate: str, key: str, message: str
 ) -> None:
     (tmp_path / "here.pem").write_text("junk")
@@ -419,7 +421,7 @@ def test_a_certificate_that_cannot_be_used_is_named(
 
 
 @pytest.mark.io
-def test_a_key_may_be_in_the_certificates_file_but_needs_no_password(tmp_path: Path) -> None:
+def test_key_in_the_certificate_file_is_accepted_unless_encrypted(tmp_path: Path) -> None:
     key, certificate, locked = (tmp_path / name for name in ("key", "certificate", "locked"))
     for words in (
         ["req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes",

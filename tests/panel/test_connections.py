@@ -65,7 +65,7 @@ def test_oldest_anonymous_connection_of_an_address_is_closed(
     assert limits.refused == 1
 
 
-def test_anonymous_connections_of_many_addresses_leave_room_for_users(
+def test_anonymous_connections_of_many_addresses_do_not_block_users(
     make: Callable[[], socket.socket],
 ) -> None:
     limits = ConnectionLimits()
@@ -126,7 +126,7 @@ async def served() -> AsyncIterator[int]:
 
 
 @pytest.mark.io
-async def test_silent_connections_do_not_keep_a_user_out() -> None:
+async def test_idle_connections_do_not_block_a_user() -> None:
     async with served() as port:
         silent = [await asyncio.open_connection("127.0.0.1", port) for _ in range(300)]
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -141,7 +141,9 @@ async def test_silent_connections_do_not_keep_a_user_out() -> None:
 @pytest.mark.parametrize(
     "sent", [b"", b"GET / HT", REQUEST[:-2] % b"", (REQUEST % b"") + b"GET /sec"]
 )
-async def test_incomplete_header_is_given_up(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_connection_with_an_incomplete_header_is_closed(
+    sent: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(connections, "HEADER_S", 0.2)
     async with served() as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
@@ -155,7 +157,7 @@ async def test_incomplete_header_is_given_up(sent: bytes, monkeypatch: pytest.Mo
 
 
 @pytest.mark.io
-async def test_endless_header_is_given_up() -> None:
+async def test_connection_with_an_endless_header_is_closed() -> None:
     async with served() as port:
         reader, writer = await asyncio.open_connection("127.0.0.1", port)
         writer.write(b"GET / HTTP/1.1\r\n")

@@ -17,17 +17,17 @@ def imu(time_us: int) -> mavlink.MAVLink_message:
     return mav.decode(bytearray(message.pack(mav)))
 
 
-def test_parameters_become_the_settings_that_they_are_of() -> None:
+def test_parameters_are_converted_to_settings() -> None:
     found = settings_of({"PAPER_ALPHA_GYRO": 0.75, "EST_ESTIMATOR": 1.0, "CAL_ACC_BIAS_X": 3.0})
     assert found.estimation.paper.alpha_gyro == 0.75
 
 
 @pytest.mark.parametrize("value", [7.0, float("nan")])
-def test_a_value_that_is_not_allowed_leaves_the_default(value: float) -> None:
+def test_value_out_of_range_leaves_the_default(value: float) -> None:
     assert settings_of({"PAPER_ALPHA_GYRO": value}) == settings_of({})
 
 
-def test_too_little_to_fuse_is_said() -> None:
+def test_too_few_samples_are_refused_with_the_reason() -> None:
     with pytest.raises(ComparisonError, match="no sensor samples"):
         compare([], {})
     memory = SampleMemory()
@@ -37,7 +37,7 @@ def test_too_little_to_fuse_is_said() -> None:
         compare(memory.frames(1), {})
 
 
-def test_samples_that_bunch_at_one_time_are_fused_too() -> None:
+def test_samples_with_repeated_times_are_fused() -> None:
     memory = SampleMemory()
     for n in range(1200):
         memory.take(1, imu(n // 5 * 100_000), n * 20_000)
@@ -48,7 +48,7 @@ def test_samples_that_bunch_at_one_time_are_fused_too() -> None:
     assert all(np.isfinite(each.roll_deg[10:]).all() for each in found)
 
 
-def test_only_the_last_minutes_of_sensors_are_remembered() -> None:
+def test_only_the_newest_minutes_of_sensor_frames_are_stored() -> None:
     memory = SampleMemory()
     memory.take(1, mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3), 0)
     assert memory.frames(1) == []

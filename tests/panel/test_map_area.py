@@ -49,7 +49,7 @@ def world(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("text", "metres"), [("5km", 5000), ("800 m", 800), ("2nm", 3704), ("12", 12)]
 )
-def test_length(text: str, metres: float) -> None:
+def test_length_is_read_in_metres_kilometres_and_nautical_miles(text: str, metres: float) -> None:
     assert length_m(text) == pytest.approx(metres)
 
 
@@ -59,7 +59,7 @@ def test_invalid_length_is_refused(text: str) -> None:
         length_m(text)
 
 
-async def test_area_is_read_by_ranges_and_becomes_a_map_style(world: Path, tmp_path: Path) -> None:
+async def test_extracted_area_is_a_map_style(world: Path, tmp_path: Path) -> None:
     asked: list[str] = []
     data = world.read_bytes()
 
@@ -90,12 +90,12 @@ async def test_area_is_read_by_ranges_and_becomes_a_map_style(world: Path, tmp_p
         ("gone.pmtiles", "No such file"),
     ],
 )
-def test_source_that_may_not_or_cannot_be_used(source: str, text: str, tmp_path: Path) -> None:
+def test_forbidden_or_unreadable_source_is_refused(source: str, text: str, tmp_path: Path) -> None:
     with pytest.raises(MapAreaError, match=text):
         extract_area(open_source(source), tmp_path / "x", (0, 0, 1, 1), 3)
 
 
-def test_server_without_ranges_and_too_large_areas_are_refused(world: Path, tmp_path: Path) -> None:
+def test_server_without_ranges_and_vector_tiles_are_refused(world: Path, tmp_path: Path) -> None:
     client = httpx.Client(transport=httpx.MockTransport(lambda _: httpx.Response(200)))
     with pytest.raises(MapAreaError, match="no ranges"):
         extract_area(open_source(ADDRESS, client), tmp_path / "x", (0, 0, 1, 1), 3)
@@ -104,7 +104,7 @@ def test_server_without_ranges_and_too_large_areas_are_refused(world: Path, tmp_
         extract_area(open_source(str(world)), tmp_path / "x", (0, 0, 1, 1), 3)
 
 
-def test_command_writes_into_the_folder_of_the_tiles(world: Path, tmp_path: Path) -> None:
+def test_command_writes_into_the_folder_of_tiles(world: Path, tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text(f'[panel]\ntiles_folder = "{tmp_path}/tiles"\n')
     command = ["map", "get", "--from", str(world), "--around", "47.0,8.0", "--name", "Home field"]

@@ -98,7 +98,7 @@ def tiles_of(folder: Path, url: str) -> MapTiles:
     return MapTiles(PanelSettings(tiles_folder=str(folder), map_styles=(style,)))
 
 
-async def test_seen_once_it_is_kept_on_disk(
+async def test_fetched_tile_is_cached_on_disk(
     tmp_path: Path, owner: tuple[str, type[_Owner]]
 ) -> None:
     url, asked = owner
@@ -122,7 +122,7 @@ async def test_old_tile_is_shown_while_there_is_no_network(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("place", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
-async def test_tiles_beyond_the_world_are_not_asked_for(
+async def test_tiles_beyond_the_world_are_not_requested(
     tmp_path: Path, owner: tuple[str, type[_Owner]], place: tuple[int, int, int]
 ) -> None:
     url, asked = owner
@@ -131,7 +131,7 @@ async def test_tiles_beyond_the_world_are_not_asked_for(
     assert asked.asked == []
 
 
-async def test_mbtiles_counts_rows_from_the_south(tmp_path: Path) -> None:
+async def test_rows_of_mbtiles_are_counted_from_the_south(tmp_path: Path) -> None:
     file = tmp_path / "field.mbtiles"
     write_mbtiles(file, picture(), [(2, 1, 0)])
     tiles = tiles_of(tmp_path, str(file))
@@ -209,7 +209,7 @@ def client_of(tiles: MapTiles, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
     return client_as(role, app)
 
 
-async def test_uploaded_map_is_a_style_at_once_and_hostile_ones_are_refused(tmp_path: Path) -> None:
+async def test_uploaded_map_is_a_style_and_hostile_ones_are_refused(tmp_path: Path) -> None:
     (tmp_path / "made").mkdir()
     maps, folder = hostile_maps(tmp_path / "made"), tmp_path / "tiles"
     good = (tmp_path / "made" / "good").read_bytes()
@@ -248,12 +248,12 @@ async def test_hostile_file_in_the_folder_does_not_stop_the_panel(tmp_path: Path
 
 
 @pytest.mark.parametrize("name", ["missing.mbtiles", "missing.pmtiles", "broken.pmtiles"])
-async def test_broken_file_leaves_the_grid(tmp_path: Path, name: str) -> None:
+async def test_broken_map_file_gives_no_tile(tmp_path: Path, name: str) -> None:
     (tmp_path / "broken.pmtiles").write_bytes(b"no tiles at all")
     assert await tiles_of(tmp_path, str(tmp_path / name)).tile(0, 0, 0, 0) is None
 
 
-def test_oldest_tiles_go_first(tmp_path: Path) -> None:
+def test_oldest_tiles_are_deleted_first(tmp_path: Path) -> None:
     for age in range(5):
         file = tmp_path / f"{age}"
         file.write_bytes(bytes(100))
@@ -262,7 +262,7 @@ def test_oldest_tiles_go_first(tmp_path: Path) -> None:
     assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]
 
 
-async def test_tile_without_an_end_is_not_read_to_it(tmp_path: Path) -> None:
+async def test_endless_tile_is_read_only_up_to_the_limit(tmp_path: Path) -> None:
     sent = 0
 
     async def endless() -> AsyncIterator[bytes]:

@@ -41,7 +41,7 @@ def book(wall: Wall) -> MessageBook:
 ATTITUDE = "vehicles/1/components/1/messages/ATTITUDE"
 
 
-def test_paths(book: MessageBook) -> None:
+def test_value_is_found_by_its_path(book: MessageBook) -> None:
     assert book.look_up(f"{ATTITUDE}/message/roll") == 5.0
     assert book.look_up(f"{ATTITUDE}/message/type") == "ATTITUDE"
     assert book.look_up("vehicles/2/components/5/id") == 5
@@ -53,7 +53,7 @@ def test_paths(book: MessageBook) -> None:
     assert list(book.look_up("vehicles/2/components")) == ["5"]
 
 
-def test_status(book: MessageBook) -> None:
+def test_status_has_count_frequency_and_times(book: MessageBook) -> None:
     status = book.look_up(f"{ATTITUDE}/status/time")
     assert status["counter"] == 11
     assert status["frequency"] == pytest.approx(10)
@@ -64,7 +64,7 @@ def test_status(book: MessageBook) -> None:
     assert (once["counter"], once["frequency"]) == (1, 0.0)
 
 
-def test_elements_of_an_array(book: MessageBook) -> None:
+def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
     link = mavlink.MAVLink(None, 1, 1)
     message = mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)
     book.take(link.decode(bytearray(message.pack(link))))
@@ -87,12 +87,12 @@ def test_elements_of_an_array(book: MessageBook) -> None:
         f"/{ATTITUDE}",
     ],
 )
-def test_nowhere(book: MessageBook, path: str) -> None:
+def test_unknown_path_raises_key_error(book: MessageBook, path: str) -> None:
     with pytest.raises(KeyError):
         book.look_up(path)
 
 
-def test_forged_ids_do_not_fill_the_memory(
+def test_number_of_forged_ids_is_bounded(
     book: MessageBook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rest_api, "MAX_KINDS", 3)

@@ -168,7 +168,7 @@ def test_model_in_3d_is_that_of_the_vehicle_type(page: Page, vehicle: ScriptedVe
     expect(page.locator(".chips").get_by_text("MAVLink")).to_be_visible()
 
 
-def test_no_name_or_text_of_others_runs_as_a_script(page: Page, troubles: list[str]) -> None:
+def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: list[str]) -> None:
     page.get_by_label("Aircraft", exact=True).click()
     page.get_by_role("option", name="Plane 2").click()
     for view in VIEWS:

@@ -37,7 +37,7 @@ def page(browser: Browser, demo: Process) -> Iterator[Page]:
     assert troubles == []
 
 
-def test_several_aircraft_are_distinguished_and_chosen(page: Page) -> None:
+def test_several_aircraft_are_distinguished_and_selected(page: Page) -> None:
     show(page, "map")
     page.wait_for_function("Object.keys(mavgate.vehicles).length === 2")
     expect(page.locator("section[data-view='map'] .craft")).to_have_count(2)
@@ -90,7 +90,7 @@ async () => {
 """Changes the body's classes, as its framework does; returns what is drawn meanwhile."""
 
 
-def test_3d_keeps_the_aircraft_while_the_theme_stays(page: Page) -> None:
+def test_3d_model_is_not_reloaded_while_the_theme_stays(page: Page) -> None:
     show(page, "flight")
     expect(page.locator(".scene")).to_have_attribute("data-model", "plane")
     assert page.evaluate(TOUCH_THE_BODY) == ["plane"]
@@ -159,7 +159,7 @@ def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
     assert re.fullmatch(r"-7\.7\d{5}, 110\.3\d{5}", copied)
 
 
-def test_row_marked_place_and_distance(page: Page, demo: Process) -> None:
+def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
     show(page, "map")
     view = page.locator("section[data-view='map']")
     expect(view.locator(".pin.home")).to_be_visible()
@@ -300,7 +300,7 @@ def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
     assert longest < 50
 
 
-def test_flight_view_goes_back_in_time_and_to_the_present(page: Page) -> None:
+def test_flight_view_seeks_back_and_returns_to_the_present(page: Page) -> None:
     show(page, "flight")
     view = page.locator("section[data-view='flight']")
     slider = view.get_by_role("slider", name="Moment of the flight")
@@ -315,7 +315,7 @@ def test_flight_view_goes_back_in_time_and_to_the_present(page: Page) -> None:
     page.wait_for_function(f"mavgate.state.time_us > {past_us} + 6e6")
 
 
-def test_another_page_does_not_show_the_recording_of_this_one(
+def test_recording_is_not_visible_on_another_page(
     browser: Browser, page: Page, demo: Process
 ) -> None:
     (demo.log.parent / "recordings").mkdir(exist_ok=True)
@@ -434,7 +434,7 @@ def test_no_control_is_cut_or_overlapped_and_no_error_is_logged(page: Page, widt
     assert troubles == []
 
 
-def test_view_is_shown_at_once_without_the_server(page: Page) -> None:
+def test_view_is_switched_without_the_server_within_its_limit(page: Page) -> None:
     for view in VIEWS:
         show_filled(page, view)
     times_ms = [

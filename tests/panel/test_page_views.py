@@ -136,7 +136,7 @@ def test_row_serial_mode_of_a_panel_that_the_settings_enable(desk: Desk) -> None
     expect(desk.page.locator(".chips").get_by_text("GPS 11 sats")).to_be_visible()
 
 
-def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None:
+def test_gyroscope_calibration_is_stored_only_after_confirmation(desk: Desk) -> None:
     view = desk.view("calibration")
     expect(view.locator(".now")).to_contain_text("do not touch it until this is done")
     view.get_by_role("button", name="Start").click()
@@ -152,7 +152,7 @@ def test_gyroscope_is_calibrated_and_stored_only_after_a_yes(desk: Desk) -> None
     assert "gyro_bias" in desk.kept
 
 
-def test_orientation_of_the_board_is_chosen_and_stored(desk: Desk) -> None:
+def test_selected_orientation_of_the_board_is_stored(desk: Desk) -> None:
     view = desk.view("calibration")
     view.locator(".step", has_text="Mounting").click()
     picture = view.locator(".mounting-picture")
@@ -180,7 +180,7 @@ def test_orientation_of_the_board_is_chosen_and_stored(desk: Desk) -> None:
     view.locator(".step", has_text="Gyroscope").click()
 
 
-def test_magnetometer_is_seen_as_a_cloud_and_undone_without_a_trace(desk: Desk) -> None:
+def test_magnetometer_calibration_is_drawn_and_undone(desk: Desk) -> None:
     view, kept = desk.view("calibration"), desk.kept
     view.locator(".step", has_text="Magnetometer").click()
     expect(view.locator(".guide h2")).to_have_text("Magnetometer")
@@ -197,7 +197,7 @@ def test_magnetometer_is_seen_as_a_cloud_and_undone_without_a_trace(desk: Desk) 
     assert desk.kept == kept
 
 
-def test_parameter_is_found_changed_live_and_shown_against_its_default(desk: Desk) -> None:
+def test_parameter_is_searched_changed_and_compared_with_its_default(desk: Desk) -> None:
     view = desk.view("tuning")
     view.get_by_label("Search", exact=True).fill("gyroscope bias sensor")
     rows = view.locator(".parameter")
@@ -239,7 +239,7 @@ def test_estimators_are_compared_on_the_last_minutes(desk: Desk) -> None:
     assert all(re.fullmatch(r"\d+\.\d+ deg", figure) for figure in figures)
 
 
-def test_field_is_plotted_paused_and_saved(desk: Desk, tmp_path: Path) -> None:
+def test_field_is_plotted_paused_and_exported(desk: Desk, tmp_path: Path) -> None:
     view = desk.view("plots")
     card = view.locator(".strip-card").first
     chart = card.locator(".strip-chart")
@@ -264,7 +264,7 @@ def test_field_is_plotted_paused_and_saved(desk: Desk, tmp_path: Path) -> None:
     expect(chart).to_have_attribute("data-paused", "false")
 
 
-def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
+def test_home_is_set_by_click_after_confirmation(desk: Desk) -> None:
     view = desk.view("map")
     expect(view.locator(".pin.home")).to_be_visible()
     before = desk.home
@@ -285,7 +285,7 @@ def test_home_is_set_by_click_after_a_yes(desk: Desk) -> None:
     assert desk.home == pytest.approx((lat_deg, lon_deg), abs=1e-6)
 
 
-def test_map_without_tiles_says_so_and_shows_coasts_and_towns(desk: Desk) -> None:
+def test_map_without_tiles_reports_it_and_shows_coasts_and_towns(desk: Desk) -> None:
     view = desk.view("map")
     names = view.locator("canvas.map-towns")
     owners = view.locator(".leaflet-control-attribution")
@@ -341,7 +341,7 @@ def test_serial_port_is_disconnected_and_connected_again(desk: Desk) -> None:
     assert desk.status["report"]["connected"]
 
 
-def test_silent_node_is_a_banner_over_every_view_and_an_event(desk: Desk) -> None:
+def test_node_timeout_is_a_banner_over_every_view_and_an_event(desk: Desk) -> None:
     banner = desk.page.locator(".banner", has_text="GPS node 1 silent")
     expect(banner).to_have_count(0)
     desk.receiver.has_gps = False
@@ -355,7 +355,7 @@ def test_silent_node_is_a_banner_over_every_view_and_an_event(desk: Desk) -> Non
     expect(banner).to_have_count(0)
 
 
-def test_keys_choose_a_view_wherever_the_keyboard_has_led(desk: Desk) -> None:
+def test_number_keys_select_a_view_with_a_button_focused(desk: Desk) -> None:
     view = desk.view("events")
     desk.page.locator(".rail button[data-view='link']").focus()
     desk.page.keyboard.press("Enter")
@@ -389,7 +389,7 @@ def luminance(colour: str) -> float:
     return 0.2126 * red + 0.7152 * green + 0.0722 * blue
 
 
-def test_units_are_those_that_were_chosen(desk: Desk) -> None:
+def test_selected_units_are_shown(desk: Desk) -> None:
     page, view = desk.page, desk.view("map")
     page.get_by_label("Units").click()
     page.get_by_role("option", name="aviation").click()
@@ -421,7 +421,7 @@ def write_certificate(certificate: Path, key: Path) -> None:
     )
 
 
-def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page) -> None:
+def test_viewer_over_tls_cannot_change_anything(desk: Desk, viewers_page: Page) -> None:
     page, before = viewers_page, desk.home_and_mark
     assert page.url.startswith("https://")
     page.get_by_label("Password").fill("wrong")
@@ -452,9 +452,7 @@ def test_viewer_looks_over_tls_and_does_not_touch(desk: Desk, viewers_page: Page
     assert desk.home_and_mark == before
 
 
-def test_page_finds_a_gateway_that_was_killed_and_started_again(
-    desk: Desk, viewers_page: Page
-) -> None:
+def test_page_reconnects_to_a_killed_and_restarted_gateway(desk: Desk, viewers_page: Page) -> None:
     page = viewers_page
     chips = page.locator(".chips")
     expect(chips.get_by_text("link", exact=True)).to_be_visible()

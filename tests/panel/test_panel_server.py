@@ -21,7 +21,7 @@ def taken() -> Iterator[PanelSettings]:
         yield PanelSettings(address="127.0.0.1", port=other.getsockname()[1])
 
 
-def test_a_panel_of_a_gateway_takes_another_port(
+def test_panel_of_a_gateway_takes_another_port_if_its_own_is_in_use(
     taken: PanelSettings, caplog: pytest.LogCaptureFixture
 ) -> None:
     with panel_server._bound(taken, or_any=True) as bound:
@@ -29,12 +29,12 @@ def test_a_panel_of_a_gateway_takes_another_port(
     assert f"127.0.0.1:{taken.port} is in use" in caplog.text
 
 
-def test_a_panel_of_its_own_says_which_port_is_taken(taken: PanelSettings) -> None:
+def test_standalone_panel_reports_the_port_in_use(taken: PanelSettings) -> None:
     with pytest.raises(PanelError, match=f"{taken.port}: Address already in use; --port"):
         panel_server._bound(taken, or_any=False)
 
 
-def test_the_gateway_alone_stamps_lines_of_its_panel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_log_lines_of_an_attached_panel_have_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     def run_panel(*_: object, **__: object) -> None:
         logging.getLogger("gateway").info("a page was opened")
         logging.getLogger("gateway").warning("the port is taken")

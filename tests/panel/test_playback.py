@@ -62,9 +62,7 @@ async def started(task: asyncio.Task[None], player: Player) -> asyncio.Task[None
     return task
 
 
-async def test_a_late_answer_does_not_undo_what_came_after_its_question(
-    playback: Playback, player: Player
-) -> None:
+async def test_late_status_does_not_undo_a_later_pause(playback: Playback, player: Player) -> None:
     player.answers.clear()
     asking = await started(asyncio.create_task(playback.refresh()), player)
     pausing = asyncio.create_task(playback.toggle())
@@ -76,12 +74,12 @@ async def test_a_late_answer_does_not_undo_what_came_after_its_question(
     assert playback.status["state"] == "paused"
 
 
-async def test_two_quick_presses_pause_and_resume(playback: Playback, player: Player) -> None:
+async def test_two_quick_toggles_pause_and_resume(playback: Playback, player: Player) -> None:
     await asyncio.gather(playback.toggle(), playback.toggle())
     assert player.asked == ["play.pause", "play.resume"]
 
 
-async def test_an_answer_after_the_close_opens_nothing(playback: Playback, player: Player) -> None:
+async def test_answer_after_closing_is_ignored(playback: Playback, player: Player) -> None:
     player.answers.clear()
     asking = await started(asyncio.create_task(playback.refresh()), player)
     playback.close()
@@ -99,7 +97,7 @@ class Child:
         self.returncode = -15
 
 
-async def test_a_player_that_does_not_answer_at_once_is_waited_for(
+async def test_opening_waits_for_a_player_that_refuses_at_first(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, player: Player
 ) -> None:
     """A socket is in its folder before its process listens to it."""
@@ -127,7 +125,7 @@ async def test_a_player_that_does_not_answer_at_once_is_waited_for(
     assert playback.status is None
 
 
-async def test_recording_is_visible_on_the_page_that_opened_it_alone() -> None:
+async def test_recording_is_visible_only_on_the_page_that_opened_it() -> None:
     fleet = FleetState()
     playback = Playback(None, fleet, "mine")  # type: ignore[arg-type]
     recorded = RecordedAircraft(1, RECORDED, Profile())

@@ -25,7 +25,7 @@ def flown(system_id: int, second: int, alt_m: int) -> bytes:
     return encode_record((1000 + second) * US_PER_S, packed(position, system_id))
 
 
-def test_every_aircraft_of_a_tlog_has_its_heights(tmp_path: Path) -> None:
+def test_heights_of_each_aircraft_in_a_tlog_are_read(tmp_path: Path) -> None:
     station = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
     tlog = tmp_path / "two_01.tlog"
     tlog.write_bytes(
@@ -40,7 +40,9 @@ def test_every_aircraft_of_a_tlog_has_its_heights(tmp_path: Path) -> None:
     assert second.profile.alt_amsl_m == (300.0,) * 5
 
 
-def test_a_table_is_fused_again(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_heights_of_a_table_are_those_of_its_states(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 10))[0])
     table = tmp_path / "a_01_v1.csv"
     table.write_text(encode_head(header) + "".join(map(row_to_line, rows)))
@@ -52,7 +54,7 @@ def test_a_table_is_fused_again(tmp_path: Path, rng: np.random.Generator) -> Non
     assert 40 < len(found.profile.alt_amsl_m) <= 50
 
 
-def test_played_aircraft_get_ids_that_nobody_has() -> None:
+def test_played_aircraft_get_unused_ids() -> None:
     assert free_ids(2, {1, 2}) == range(248, 250)
     assert free_ids(2, {1, 249, 247}) == range(245, 247)
     with pytest.raises(ValueError, match="3 more aircraft"):

@@ -91,7 +91,7 @@ async def test_uploaded_recording_can_be_downloaded(
 @pytest.mark.parametrize(
     "name", ["../secret", "..%2Fsecret", "%2e%2e/secret", "/etc/passwd", "%2Fetc%2Fpasswd", ".."]
 )
-async def test_no_name_leaves_the_folder(
+async def test_name_outside_the_folder_is_refused(
     client: httpx.AsyncClient, folder: Path, name: str
 ) -> None:
     before = sorted(folder.parent.rglob("*"))
@@ -112,14 +112,16 @@ async def test_invalid_upload_leaves_no_file(
     assert "no recording" in answer.text
 
 
-async def test_nothing_is_overwritten(client: httpx.AsyncClient, folder: Path) -> None:
+async def test_upload_under_an_existing_name_is_refused(
+    client: httpx.AsyncClient, folder: Path
+) -> None:
     (folder / "day_01.tlog").write_bytes(b"first")
     answer = await client.put("/recordings/day", content=flight())
     assert answer.status_code == HTTPStatus.BAD_REQUEST
     assert (folder / "day_01.tlog").read_bytes() == b"first"
 
 
-async def test_viewer_takes_and_does_not_bring(folder: Path) -> None:
+async def test_viewer_may_download_but_not_upload(folder: Path) -> None:
     (folder / "day_01.tlog").write_bytes(flight())
     async with client_of(folder, Role.VIEWER) as viewer:
         assert (await viewer.get("/recordings/day")).status_code == HTTPStatus.OK
@@ -128,7 +130,7 @@ async def test_viewer_takes_and_does_not_bring(folder: Path) -> None:
     assert [file.name for file in folder.iterdir()] == ["day_01.tlog"]
 
 
-async def test_uploads_get_the_mode_of_the_umask(client: httpx.AsyncClient, folder: Path) -> None:
+async def test_mode_of_uploads_follows_the_umask(client: httpx.AsyncClient, folder: Path) -> None:
     before = os.umask(0o027)
     try:
         await client.put("/recordings/day", content=flight())
@@ -174,7 +176,7 @@ def catalogue(folder: Path, **seconds: float) -> None:
     catalogue.close()
 
 
-def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> None:
+def test_recording_is_found_by_name_and_by_condition(tmp_path: Path) -> None:
     catalogue(tmp_path, Morning=400.0, evening=100.0)
     facts = RecordingFacts()
     facts.look(tmp_path, "morn")
@@ -187,7 +189,7 @@ def test_a_recording_is_found_by_name_and_by_what_it_holds(tmp_path: Path) -> No
     assert [facts.shows(name, "duration < 300") for name in ("Morning", "evening")] == [False, True]
 
 
-def test_a_wrong_condition_is_reported_and_shows_nothing(tmp_path: Path) -> None:
+def test_invalid_condition_is_reported_and_matches_nothing(tmp_path: Path) -> None:
     catalogue(tmp_path, a=1.0)
     facts = RecordingFacts()
     facts.look(tmp_path, "height > 3")
@@ -197,7 +199,7 @@ def test_a_wrong_condition_is_reported_and_shows_nothing(tmp_path: Path) -> None
     assert (facts.trouble, facts.shows("a", "")) == ("", True)
 
 
-def test_without_a_catalogue_names_are_searched_all_the_same(tmp_path: Path) -> None:
+def test_names_are_searched_without_a_catalogue(tmp_path: Path) -> None:
     facts = RecordingFacts()
     facts.look(tmp_path, "x")
     assert facts.of("x1") is None
@@ -219,7 +221,7 @@ def exported(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
-async def test_export_is_made_and_fetched_under_an_address_of_its_own(
+async def test_export_is_fetched_under_an_unguessable_address(
     exported: Path, kind: str, begin: bytes
 ) -> None:
     jobs, app = RecordingJobs(), FastAPI()
@@ -236,7 +238,7 @@ async def test_export_is_made_and_fetched_under_an_address_of_its_own(
 
 
 @pytest.mark.slow
-async def test_failed_export_says_why_and_leaves_no_file(
+async def test_failed_export_reports_the_reason_and_leaves_no_file(
     exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
@@ -277,7 +279,7 @@ async def test_number_of_waiting_exports_is_limited(exported: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_catalogue_and_tracks_fill_themselves(exported: Path) -> None:
+async def test_indexed_recording_has_facts_and_a_track(exported: Path) -> None:
     jobs, facts = RecordingJobs(), RecordingFacts()
     jobs.index(exported, list_recordings(exported))
     assert jobs._indexing is not None

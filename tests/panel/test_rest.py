@@ -119,7 +119,7 @@ async def world(tmp_path: Path) -> AsyncIterator[World]:
 
 
 class TestReading:
-    async def test_a_message_its_fields_and_its_status(self, world: World) -> None:
+    async def test_message_fields_and_status_are_read(self, world: World) -> None:
         world.attitude(0.5)
         await world.until_json(f"{ATTITUDE}/message/roll", 0.5)
         answer = await world.client.get(ATTITUDE)
@@ -136,13 +136,13 @@ class TestReading:
         everything = (await world.client.get("/v1/mavlink")).json()
         assert everything["vehicles"]["1"]["components"]["1"]["messages"].keys() >= {"ATTITUDE"}
 
-    async def test_nothing_there(self, world: World) -> None:
+    async def test_unknown_path_is_answered_by_none(self, world: World) -> None:
         for path in ("vehicles/9", "vehicles/", "ATTITUDE"):
             answer = await world.client.get(f"/v1/mavlink/{path}")
             assert (answer.status_code, answer.text) == (200, "None")
             assert answer.headers["content-type"] == "application/json"
 
-    async def test_helper(self, world: World) -> None:
+    async def test_helper_returns_an_empty_message(self, world: World) -> None:
         answer = (await world.client.get("/v1/helper/mavlink?name=COMMAND_LONG")).json()
         assert answer["header"] == {"system_id": 255, "component_id": 0, "sequence": 0}
         assert answer["message"]["command"] == {"type": "MAV_CMD_NAV_WAYPOINT"}
@@ -150,7 +150,7 @@ class TestReading:
         assert (wrong.status_code, wrong.json()) == (404, "Invalid message name.")
         assert (await world.client.get("/v1/helper/mavlink")).status_code == 400
 
-    async def test_info_and_documents(self, world: World) -> None:
+    async def test_info_and_api_documents_are_served(self, world: World) -> None:
         info = (await world.client.get("/info")).json()
         assert info["version"] == 0
         assert info["service"]["name"] == "mavgate"
@@ -186,7 +186,7 @@ COMMAND_IN_JSON5 = """
 
 
 class TestWriting:
-    async def test_a_command_goes_out_and_its_answer_comes_back(self, world: World) -> None:
+    async def test_command_is_sent_and_its_answer_readable(self, world: World) -> None:
         answer = await world.client.post("/v1/mavlink", json=COMMAND)
         assert (answer.status_code, answer.text) == (200, "Ok.")
         command = await world.until_commanded()
@@ -201,7 +201,7 @@ class TestWriting:
         assert (await world.client.post("/v1/mavlink", json=COMMAND)).status_code == 200
         await world.until_json(f"{sent}/status/time/counter", 2)
 
-    async def test_json5(self, world: World) -> None:
+    async def test_message_in_json5_is_sent(self, world: World) -> None:
         pytest.importorskip("pyjson5", reason="older than the lock file: install it again")
         answer = await world.client.post("/v1/mavlink", content=COMMAND_IN_JSON5)
         assert (answer.status_code, answer.text) == (200, "Ok.")
@@ -210,7 +210,7 @@ class TestWriting:
         assert math.isnan(command.param3)
         assert command.target_system == 1
 
-    async def test_under_the_vehicles_own_id_as_the_readme_has_it(self, world: World) -> None:
+    async def test_command_with_the_ids_of_the_vehicle_is_sent(self, world: World) -> None:
         """A gateway takes what bears its own id for a loop; and the telemetry must go on."""
         world.attitude(0.5)
         await world.until_json(f"{ATTITUDE}/message/roll", 0.5)
@@ -238,7 +238,7 @@ class TestWriting:
         assert answer.headers["x-error-detail"].isprintable()
         assert not world.commands()
 
-    async def test_detail_of_a_wrong_field_is_in_a_header(self, world: World) -> None:
+    async def test_invalid_field_is_named_in_a_header(self, world: World) -> None:
         body = {**COMMAND, "message": {**COMMAND["message"], "param1": "\r\nx: y"}}
         answer = await world.client.post("/v1/mavlink", json=body)
         assert "COMMAND_LONG.param1" in answer.headers["x-error-detail"]
@@ -267,7 +267,7 @@ class TestWriting:
 
 
 class TestFollowing:
-    async def test_a_filter(self, world: World) -> None:
+    async def test_filter_selects_messages_by_name(self, world: World) -> None:
         url = f"ws://{world.url}/v1/ws/mavlink?filter=ATT.*|HOME"
         async with websockets.connect(url) as stream:
             await self.until_followed(world, stream)
@@ -340,7 +340,7 @@ class TestFollowing:
             with pytest.raises(websockets.ConnectionClosed):
                 await stream.recv()
 
-    def test_expression_that_python_would_try_for_ever_is_answered_at_once(self) -> None:
+    def test_expression_that_backtracks_exponentially_in_python_is_matched(self) -> None:
         assert names_matching("(.+)+-") == frozenset()
         assert names_matching("^(ATTITUDE|HEARTBEAT)$") == {"ATTITUDE", "HEARTBEAT"}
 
@@ -365,7 +365,7 @@ class TestFollowing:
 
 
 class TestGuards:
-    async def test_a_page_of_elsewhere_and_another_name_are_refused(self, world: World) -> None:
+    async def test_foreign_origin_and_foreign_host_are_refused(self, world: World) -> None:
         for headers in ({"Origin": "https://example.org"}, {"Host": "example.org"}):
             answer = await world.client.post("/v1/mavlink", json=COMMAND, headers=headers)
             assert answer.status_code == 403
@@ -377,7 +377,7 @@ class TestGuards:
         assert not world.commands()
 
     @pytest.mark.parametrize("who", ["viewer", "nobody"])
-    async def test_only_operators_send(self, tmp_path: Path, password: str, who: str) -> None:
+    async def test_only_operators_may_send(self, tmp_path: Path, password: str, who: str) -> None:
         settings = PanelSettings(password=hash_password("other"), viewer_password=password)
         async with open_world(tmp_path, settings) as world:
             if who == "viewer":

@@ -65,7 +65,7 @@ async def served() -> AsyncIterator[tuple[FleetState, Browser]]:
         await serving
 
 
-async def test_slow_browser_gets_the_newest_only() -> None:
+async def test_slow_browser_gets_only_the_newest_state() -> None:
     async with served() as (fleet, browser):
         fleet.take(position(10.0, 20.0), 0)
         await browser.until(GRANTS)
@@ -78,7 +78,7 @@ async def test_slow_browser_gets_the_newest_only() -> None:
         assert browser.frames[-1]["vehicles"]["1"]["lat_deg"] == 10.199
 
 
-async def test_page_cannot_save_up_grants() -> None:
+async def test_unused_grants_do_not_accumulate() -> None:
     async with served() as (fleet, browser):
         await browser.until(GRANTS)
         for _ in range(50):
@@ -93,7 +93,7 @@ async def test_page_cannot_save_up_grants() -> None:
         assert len(browser.frames) <= before + GRANTS
 
 
-async def test_history_and_path_are_served_while_the_aircraft_moves() -> None:
+async def test_history_and_path_are_served_in_flight() -> None:
     fleet, app = FleetState(), FastAPI()
     add_tracks(app, fleet)
     transport = httpx.ASGITransport(app=app)
@@ -109,7 +109,7 @@ async def test_history_and_path_are_served_while_the_aircraft_moves() -> None:
     assert len(path["track"]) == 2 * MAX_HISTORY
 
 
-def test_every_endpoint_runs_on_the_loop() -> None:
+def test_every_endpoint_runs_on_the_event_loop() -> None:
     """One in a thread would read what the loop changes meanwhile."""
     app = FastAPI()
     fleet = FleetState()

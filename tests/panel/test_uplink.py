@@ -63,7 +63,7 @@ def heard(sock: socket.socket) -> list[mavlink.MAVLink_message]:
         found.append(mavlink.MAVLink(None).decode(bytearray(data)))
 
 
-async def test_played_messages_stay_in_the_panel(
+async def test_played_messages_are_not_sent_to_the_gateway(
     tmp_path: Path, sockets: tuple[socket.socket, socket.socket]
 ) -> None:
     gateway, player = sockets
@@ -111,7 +111,7 @@ async def test_played_messages_stay_in_the_panel(
 
 
 @pytest.mark.parametrize("result", [mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED])
-async def test_command_that_is_being_carried_out_is_waited_for_longer(
+async def test_command_in_progress_has_a_longer_timeout(
     monkeypatch: pytest.MonkeyPatch, result: int
 ) -> None:
     results: asyncio.Queue[int] = asyncio.Queue()
@@ -132,7 +132,7 @@ async def test_command_that_is_being_carried_out_is_waited_for_longer(
 @pytest.mark.parametrize(
     ("result", "word"), [(mavlink.MAV_RESULT_TEMPORARILY_REJECTED, "temporarily"), (200, "200")]
 )
-async def test_any_result_that_is_not_accepted_is_a_failure(
+async def test_every_result_other_than_accepted_is_a_failure(
     tmp_path: Path, result: int, word: str
 ) -> None:
     uplink = Uplink(None, FleetState(), ControlClient(tmp_path / "none.sock"), GatewayClock())
@@ -160,7 +160,7 @@ class Gateway:
         return answer
 
 
-async def test_a_late_answer_does_not_replace_a_later_one() -> None:
+async def test_late_status_does_not_replace_a_later_one() -> None:
     gateway = Gateway()
     watch = GatewayWatch(gateway, FleetState())  # type: ignore[arg-type]
     early = asyncio.create_task(watch.refresh())

@@ -28,7 +28,7 @@ def _page() -> Iterator[None]:
         yield
 
 
-def test_button_of_a_row_acts_on_that_row_only_while_it_is_shown() -> None:
+def test_button_of_a_row_acts_only_while_the_row_is_shown() -> None:
     pressed: list[str] = []
     table = DataTable(("Name",), "None.", buttons=[RowButton("close", "Remove", pressed.append)])
     table.show({"b": (("1", ""),), "d": (("2", "bad", "error"),)})
@@ -41,7 +41,7 @@ def test_button_of_a_row_acts_on_that_row_only_while_it_is_shown() -> None:
     assert pressed == ["d"]
 
 
-def test_table_shows_control_characters_escaped_and_keeps_the_key() -> None:
+def test_control_characters_in_a_table_are_escaped_except_in_keys() -> None:
     table = DataTable(("Name",))
     table.show({"a\x1b[2J": (("a\x1b[2J", ""),)})
     assert table.props["rows"] == [{"key": "a\x1b[2J", "cells": [["a\\x1b[2J", ""]]}]
@@ -63,7 +63,7 @@ def row_of(sent: list[float]) -> tuple[ParameterRow, Dialogue]:
     return ParameterRow(context, dialogue, ParameterMeta(name=NAME)), dialogue
 
 
-def test_a_value_is_sent_even_if_it_is_the_one_before_a_change_that_is_not_answered() -> None:
+def test_previous_value_is_sent_again_while_a_change_is_unanswered() -> None:
     sent: list[float] = []
     row, _ = row_of(sent)
     for value in (0.0, 0.8, 0.0):
@@ -88,7 +88,7 @@ def test_typed_value_is_not_overwritten_by_its_own_answer() -> None:
     assert row._field.value == 0.5
 
 
-def test_a_browser_that_is_slow_to_draw_a_picture_is_waited_for(
+def test_picture_has_a_longer_timeout_than_other_answers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     limits_s: list[float] = []
@@ -116,7 +116,7 @@ def test_a_browser_that_is_slow_to_draw_a_picture_is_waited_for(
         (MemoryError(), "Cannot be compared: MemoryError."),
     ],
 )
-def test_a_comparison_that_fails_says_why_and_may_be_tried_again(
+def test_failed_comparison_reports_the_reason_and_can_be_repeated(
     monkeypatch: pytest.MonkeyPatch, error: Exception, text: str
 ) -> None:
     card, failures = comparison_of(monkeypatch, [error, ComparisonError("no samples")])
@@ -130,7 +130,7 @@ def test_a_comparison_that_fails_says_why_and_may_be_tried_again(
 
 
 @pytest.mark.parametrize("may_change", [True, False])
-def test_a_comparison_asks_for_more_samples_where_it_may(
+def test_comparison_requests_samples_only_with_the_right_to_change(
     monkeypatch: pytest.MonkeyPatch, *, may_change: bool
 ) -> None:
     card, _ = comparison_of(monkeypatch, [ComparisonError("no samples")])

@@ -112,13 +112,13 @@ def titles(reported: dict[str, Any] | None, *alerts: Alert, vehicle_id: int = 1)
     return [alert.title for alert in with_status(alerts, reported, vehicle_id)]
 
 
-def test_node_that_was_silent_before_the_panel_was_opened() -> None:
+def test_node_without_packets_in_the_status_is_an_alert() -> None:
     [alert] = with_status([], status(silent_s=30.0), 1)
     assert (alert.title, alert.detail) == ("GPS node 2 silent", "no radio packets for 30 s")
     assert alert.level is AlertLevel.CRITICAL
 
 
-def test_node_of_another_aircraft_or_with_a_short_gap_is_none() -> None:
+def test_node_of_another_aircraft_or_with_a_short_gap_is_no_alert() -> None:
     assert titles(status(silent_s=30.0), vehicle_id=2) == []
     assert titles(status(silent_s=1.0)) == []
 
@@ -130,11 +130,11 @@ def test_status_replaces_alerts_of_status_texts() -> None:
     assert titles(None, reported, GPS_LOST) == ["GPS node 2 silent", "GPS lost"]
 
 
-def test_receiver_that_is_gone_hides_its_nodes() -> None:
+def test_lost_receiver_replaces_the_alerts_of_its_nodes() -> None:
     assert titles(status(silent_s=30.0, connected=False)) == ["Receiver lost"]
 
 
 @pytest.mark.parametrize(("state", "found"), [("blocked", ["Recording failed"]), ("idle", [])])
-def test_recording_that_cannot_go_on(state: str, found: list[str]) -> None:
+def test_blocked_recording_is_an_alert(state: str, found: list[str]) -> None:
     reported = status() | {"recorder": {"state": state, "reason": "less than 100 MB free"}}
     assert titles(reported) == found

@@ -47,7 +47,7 @@ class Memory:
         }
 
 
-def test_second_hour_takes_nothing_more() -> None:
+def test_second_hour_of_flight_needs_no_more_memory() -> None:
     memory = Memory()
     memory.fly(0, HOUR_S)
     first = memory.size
@@ -59,7 +59,7 @@ def test_second_hour_takes_nothing_more() -> None:
     assert second["frames"] == pytest.approx(SPAN_US // US_PER_S * RATE_HZ, abs=1)
 
 
-def test_aircraft_that_is_let_go_leaves_nothing() -> None:
+def test_discarded_aircraft_leaves_no_data() -> None:
     memory = Memory()
     memory.fly(0, 5)
     memory.fleet.discard(1)

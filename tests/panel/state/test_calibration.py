@@ -67,7 +67,7 @@ class Bench:
                 self.run.take(self._mav.decode(bytearray(action.frame)), self.now_us)
 
 
-def test_gyro_shows_the_bias_before_and_after() -> None:
+def test_gyro_calibration_reports_bias_before_and_after() -> None:
     bench = Bench(CalibrationStep.GYRO)
     bench.send(bench.run.start_message())
     assert bench.run.state is RunState.RUNNING
@@ -82,7 +82,7 @@ def test_gyro_shows_the_bias_before_and_after() -> None:
     assert residual.after < 0.1
 
 
-def test_motion_fails_with_the_reason() -> None:
+def test_motion_fails_gyro_calibration_with_the_reason() -> None:
     bench = Bench(CalibrationStep.GYRO)
     bench.send(bench.run.start_message())
     for n in range(40):
@@ -90,7 +90,7 @@ def test_motion_fails_with_the_reason() -> None:
     assert (bench.run.state, bench.run.trouble) == (RunState.FAILED, "it was moved")
 
 
-def test_six_sides_are_followed_one_by_one() -> None:
+def test_each_of_six_sides_is_reported_once_done() -> None:
     bench = Bench(CalibrationStep.ACCEL)
     bench.send(bench.run.start_message())
     bias = np.array((0.3, -0.2, 0.1))
@@ -143,7 +143,7 @@ def test_cancelling_and_timeout_end_a_calibration() -> None:
     assert (lonely.state, lonely.trouble) == (RunState.FAILED, "the aircraft does not answer")
 
 
-def test_a_refusal_is_reported() -> None:
+def test_denied_command_fails_the_calibration() -> None:
     run = CalibrationRun(1, CalibrationStep.GYRO, 0)
     command = mavlink.MAV_CMD_PREFLIGHT_CALIBRATION
     run.take(mavlink.MAVLink_command_ack_message(command, mavlink.MAV_RESULT_DENIED), 0)
@@ -170,7 +170,7 @@ def test_every_direction_has_its_own_cell() -> None:
 @pytest.mark.parametrize(
     "kind", [mavlink.MAVLink_scaled_imu_message, mavlink.MAVLink_raw_imu_message]
 )
-def test_other_vehicles_send_their_samples_in_thousandths(kind: Any) -> None:
+def test_scaled_and_raw_imu_are_read_in_thousandths(kind: Any) -> None:
     run = CalibrationRun(1, CalibrationStep.MAG, 0)
     run.state = RunState.RUNNING
     for mag in ((200, -30, 400), (0, 0, 0)):

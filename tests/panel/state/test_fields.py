@@ -10,7 +10,7 @@ def attitude(roll: float) -> mavlink.MAVLink_attitude_message:
     return mavlink.MAVLink_attitude_message(0, roll, 0.2, 0.3, 0.0, 0.0, 0.0)
 
 
-def test_every_numeric_field_is_kept_with_its_time_and_unit() -> None:
+def test_numeric_fields_are_stored_with_time_and_unit() -> None:
     history = FieldHistory()
     for n in range(3):
         history.take(7, attitude(0.1 * n), n * US_PER_S)
@@ -23,7 +23,7 @@ def test_every_numeric_field_is_kept_with_its_time_and_unit() -> None:
     assert history.series(7, "ATTITUDE.nonsense")[0].tolist() == []
 
 
-def test_arrays_are_kept_by_element_and_instances_apart() -> None:
+def test_array_elements_and_instances_are_separate_fields() -> None:
     history = FieldHistory()
     for instance, volt in ((0, 4000), (1, 3000)):
         cells = [volt, *[65535] * 9]
@@ -35,7 +35,7 @@ def test_arrays_are_kept_by_element_and_instances_apart() -> None:
     assert history.unit(1, "BATTERY_STATUS[0].voltages[0]") == "mV"
 
 
-def test_texts_and_files_are_no_quantities() -> None:
+def test_texts_and_file_transfers_are_not_stored() -> None:
     history = FieldHistory()
     history.take(1, mavlink.MAVLink_statustext_message(6, b"hello"), 0)
     history.take(1, mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251), 0)
@@ -43,7 +43,7 @@ def test_texts_and_files_are_no_quantities() -> None:
     assert not any("payload" in name for name in history.fields(1)["FILE_TRANSFER_PROTOCOL"])
 
 
-def test_memory_is_bounded_and_the_newest_minutes_stay() -> None:
+def test_history_is_bounded_to_the_newest_minutes() -> None:
     """Seven minutes at 100 Hz leave the last five at 50."""
     history = FieldHistory()
     for n in range(42_000):
@@ -55,7 +55,7 @@ def test_memory_is_bounded_and_the_newest_minutes_stay() -> None:
     assert np.all(np.diff(time_us) > 0)
 
 
-def test_a_span_can_be_asked_for() -> None:
+def test_series_is_limited_to_a_requested_span() -> None:
     history = FieldHistory()
     for n in range(1000):
         history.take(1, attitude(float(n)), n * 20_000)
@@ -64,7 +64,7 @@ def test_a_span_can_be_asked_for() -> None:
     assert len(time_us) == 10
 
 
-def test_seldom_message_takes_no_more_than_its_minutes() -> None:
+def test_infrequent_message_is_stored_no_longer_than_the_span() -> None:
     history = FieldHistory()
     for second in range(3600):
         history.take(1, attitude(float(second)), second * US_PER_S)
@@ -75,7 +75,7 @@ def test_seldom_message_takes_no_more_than_its_minutes() -> None:
     assert values.tolist() == list(range(3300, 3600))
 
 
-def test_message_that_comes_faster_later_keeps_its_minutes() -> None:
+def test_message_with_a_raised_rate_keeps_the_whole_span() -> None:
     history, now_us = FieldHistory(), 0
     for step in range(9000):
         now_us += US_PER_S if step < 1000 else US_PER_S // 25
@@ -85,7 +85,7 @@ def test_message_that_comes_faster_later_keeps_its_minutes() -> None:
     assert values.tolist() == list(range(1500, 9000))
 
 
-def test_fields_that_came_at_other_times_share_a_table() -> None:
+def test_csv_of_fields_with_different_times_has_blank_cells() -> None:
     series = {
         "A.x": (np.array([0, 500_000]), np.array([1.0, np.nan])),
         "B.y": (np.array([250_000]), np.array([-0.125])),
@@ -98,5 +98,5 @@ def test_fields_that_came_at_other_times_share_a_table() -> None:
     ]
 
 
-def test_nothing_chosen_is_an_empty_table() -> None:
+def test_csv_without_fields_has_only_its_header() -> None:
     assert fields_csv({}, {}, 0) == "time_unix_s\n"

@@ -23,7 +23,7 @@ def test_values_that_were_never_sent_are_unknown(vehicle: VehicleState) -> None:
     assert (now.model, now.fix, now.home, now.mark) == ("none", None, None, None)
 
 
-def test_newest_attitude_is_taken_whichever_message_brings_it(vehicle: VehicleState) -> None:
+def test_newest_attitude_of_either_message_is_used(vehicle: VehicleState) -> None:
     q_nb = from_euler(0.3, -0.1, 1.5)
     vehicle.take(decoded(mavlink.MAVLink_attitude_quaternion_message(0, *q_nb, 0.1, 0, 0)), 0)
     assert vehicle.instant(0).q_nb == pytest.approx(q_nb, abs=1e-6)
@@ -56,13 +56,13 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -
     assert [point.lat_deg for point in vehicle.fixes] == pytest.approx([47.0, 47.0001])
 
 
-def test_no_fix_is_no_place(vehicle: VehicleState) -> None:
+def test_fix_without_position_is_left_out(vehicle: VehicleState) -> None:
     vehicle.take(fix(0.0, 0.0, kind=mavlink.GPS_FIX_TYPE_NO_FIX, satellites=255), 0)
     now = vehicle.instant(0)
     assert (now.fix, now.satellites, len(vehicle.fixes)) == (None, 0, 0)
 
 
-def test_mark_is_found_from_distance_and_bearing(vehicle: VehicleState) -> None:
+def test_mark_is_computed_from_distance_and_bearing(vehicle: VehicleState) -> None:
     vehicle.take(position(0.0, 179.999), 0)
     way = mavlink.MAVLink_nav_controller_output_message(
         math.nan, math.nan, 90, 90, 1113, math.nan, 0, math.nan
@@ -90,12 +90,12 @@ def test_impossible_values_are_unknown(vehicle: VehicleState) -> None:
     ("kind", "model"),
     [(1, "plane"), (2, "copter"), (13, "copter"), (4, "heli"), (19, "plane"), (26, "none")],
 )
-def test_model_follows_the_type(vehicle: VehicleState, kind: int, model: str) -> None:
+def test_model_follows_the_vehicle_type(vehicle: VehicleState, kind: int, model: str) -> None:
     vehicle.take(heartbeat(kind), 0)
     assert vehicle.model == model
 
 
-def test_long_text_is_put_together(vehicle: VehicleState) -> None:
+def test_chunks_of_a_long_text_are_joined(vehicle: VehicleState) -> None:
     for chunk, text in enumerate(("a" * 50, "b" * 50, "c")):
         vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
     vehicle.take(decoded(mavlink.MAVLink_statustext_message(2, b"next")), 0)
@@ -109,7 +109,7 @@ def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehicleS
     assert [entry.text for entry in vehicle.texts.all] == ["a" * 50, "b"]
 
 
-def test_fleet_keeps_aircraft_apart_and_others_out() -> None:
+def test_aircraft_are_separate_and_other_components_ignored() -> None:
     fleet, heard = FleetState(), []
     leave = fleet.listen(lambda system_id, message, _: heard.append(system_id))
     fleet.take(position(*HERE, system_id=3), 0)
@@ -123,7 +123,7 @@ def test_fleet_keeps_aircraft_apart_and_others_out() -> None:
     assert fleet.vehicles[4].instant(0).lat_deg == pytest.approx(1.0)
 
 
-def test_forged_systems_do_not_fill_the_memory() -> None:
+def test_number_of_forged_systems_is_bounded() -> None:
     fleet = FleetState()
     for system_id in range(1, 200):
         fleet.take(heartbeat(system_id=system_id), 0)

@@ -62,7 +62,7 @@ def loaded(*, may_change: bool = True) -> tuple[ParameterClient, Bench]:
 
 
 @pytest.mark.parametrize("lose_every", [0, 3])
-def test_the_whole_list_comes_in_spite_of_losses(lose_every: int) -> None:
+def test_parameter_list_is_completed_despite_losses(lose_every: int) -> None:
     client = ParameterClient(1)
     bench = Bench(client, lose_every=lose_every)
     bench.run(client.load(bench.now_us), 40.0 if lose_every else 2.0)
@@ -70,7 +70,7 @@ def test_the_whole_list_comes_in_spite_of_losses(lose_every: int) -> None:
     assert len(client.entries) == client.count > 90
 
 
-def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
+def test_valid_change_is_confirmed_and_invalid_one_refused() -> None:
     client, bench = loaded()
     old = client.entries["PAPER_ALPHA_GYRO"].value
     bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
@@ -83,7 +83,7 @@ def test_a_change_is_confirmed_and_a_wrong_one_refused() -> None:
     assert client.entries["PAPER_ALPHA_GYRO"].value == 0.75
 
 
-def test_a_value_changed_again_before_the_answer_is_not_called_refused() -> None:
+def test_second_change_before_the_answer_is_not_refused() -> None:
     client, bench = loaded()
     first = client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us)
     bench.run(first + client.change("PAPER_ALPHA_GYRO", 0.5, bench.now_us), 0.02)
@@ -94,7 +94,7 @@ def test_a_value_changed_again_before_the_answer_is_not_called_refused() -> None
     assert not client.refused
 
 
-def test_a_value_that_follows_one_without_an_answer_is_sent_in_its_place() -> None:
+def test_retry_sends_the_newest_value_of_an_unanswered_change() -> None:
     client = ParameterClient(1)
     client.take(mavlink.MAVLink_param_value_message(b"P", 1.0, 9, 1, 0), 0)
     client.change("P", 2.0, 0)
@@ -107,7 +107,7 @@ def value_of(name: str, *, index: int, count: int = 2) -> Any:
     return mavlink.MAVLink_param_value_message(name.encode(), 1.0, 9, count, index)
 
 
-def test_a_value_that_nobody_asked_for_does_not_complete_the_list() -> None:
+def test_unrequested_value_does_not_complete_the_list() -> None:
     client = ParameterClient(1)
     client.load(0)
     for message in (value_of("NEW", index=65535), value_of("A", index=0)):
@@ -122,14 +122,14 @@ def test_a_value_that_nobody_asked_for_does_not_complete_the_list() -> None:
     }  # fmt: skip
 
 
-def test_a_vehicle_of_endless_parameters_fills_no_memory() -> None:
+def test_number_of_parameters_is_bounded() -> None:
     client = ParameterClient(1)
     for index in range(MAX_PARAMETERS + 3):
         client.take(value_of(f"P{index}", index=index, count=65_000), 0)
     assert len(client.entries) == MAX_PARAMETERS
 
 
-def test_a_change_without_an_answer_is_given_up() -> None:
+def test_change_without_an_answer_is_refused_after_retries() -> None:
     client = ParameterClient(1)
     client.take(value_of("P", index=0), 0)
     sent = client.change("P", 2.0, 0)
@@ -139,13 +139,13 @@ def test_a_change_without_an_answer_is_given_up() -> None:
     assert client.refused == {"P": "no answer"}
 
 
-def test_a_client_that_may_not_change_is_refused_with_the_reason() -> None:
+def test_change_by_an_untrusted_client_is_refused_with_the_reason() -> None:
     client, bench = loaded(may_change=False)
     bench.run(client.change("PAPER_ALPHA_GYRO", 0.75, bench.now_us), 0.1)
     assert "may not change" in client.refused["PAPER_ALPHA_GYRO"]
 
 
-def test_no_answer_ends() -> None:
+def test_loading_fails_without_an_answer() -> None:
     client = ParameterClient(1)
     messages = client.load(0)
     for second in range(1, 30):
@@ -154,7 +154,7 @@ def test_no_answer_ends() -> None:
     assert len(messages) < 20
 
 
-def test_nonsense_is_not_sent() -> None:
+def test_unknown_name_and_invalid_value_are_not_sent() -> None:
     client = ParameterClient(1)
     with pytest.raises(ValueError, match="no parameter NIX"):
         client.change("NIX", 1.0, 0)
@@ -166,7 +166,7 @@ def test_nonsense_is_not_sent() -> None:
     assert not client.pending
 
 
-def test_a_value_must_fit_the_type() -> None:
+def test_value_beyond_the_parameter_type_is_refused() -> None:
     client = ParameterClient(1)
     client.take(mavlink.MAVLink_heartbeat_message(1, 12, 0, 0, 4, 3), 0)
     client.take(mavlink.MAVLink_param_value_message(b"N", 0.0, 6, 1, 0), 0)
@@ -180,7 +180,7 @@ def test_a_value_must_fit_the_type() -> None:
     assert client.refused == {"N": "N cannot hold 301"}
 
 
-def test_integers_travel_as_the_vehicle_has_them() -> None:
+def test_integers_are_encoded_by_the_convention_of_the_autopilot() -> None:
     """PX4 packs their bytes into the float, ArduPilot writes the number."""
     for autopilot, on_the_wire in ((12, 7.0e-45), (3, 5.0)):
         client = ParameterClient(1)
@@ -192,7 +192,7 @@ def test_integers_travel_as_the_vehicle_has_them() -> None:
 
 
 @pytest.mark.parametrize("lose_every", [0, 5])
-def test_the_metadata_explains_every_parameter(lose_every: int) -> None:
+def test_metadata_describes_every_parameter(lose_every: int) -> None:
     (parameters, _), files = loaded(), FileClient(1)
     bench = Bench(files, lose_every=lose_every)
     bench.run(files.read("/general.json", bench.now_us), 5.0)
@@ -207,7 +207,7 @@ def test_the_metadata_explains_every_parameter(lose_every: int) -> None:
     assert not files.busy
 
 
-def test_a_file_that_is_not_there_is_refused() -> None:
+def test_missing_file_is_refused() -> None:
     files = FileClient(1)
     bench = Bench(files)
     bench.run(files.read("/nothing.json", bench.now_us), 0.2)
@@ -215,7 +215,7 @@ def test_a_file_that_is_not_there_is_refused() -> None:
     assert not files.busy
 
 
-def test_a_vehicle_without_files_does_not_hold_up() -> None:
+def test_file_request_without_an_answer_is_given_up() -> None:
     files = FileClient(1)
     files.read("/general.json", 0)
     for step in range(40):
@@ -226,12 +226,12 @@ def test_a_vehicle_without_files_does_not_hold_up() -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"{", b"[]", b'{"parameters": 3}', b'{"parameters": [{"name": 3}, 4]}']
 )
-def test_broken_metadata_explains_nothing(content: bytes) -> None:
+def test_invalid_metadata_describes_no_parameter(content: bytes) -> None:
     assert parse_parameters(content) == {}
     assert parameter_path(content) is None
 
 
-def test_metadata_may_hold_numbers_that_are_none() -> None:
+def test_limit_of_nan_in_metadata_is_unknown() -> None:
     content = b'{"parameters": [{"name": "A", "min": NaN, "max": 2, "decimalPlaces": Infinity}]}'
     meta = parse_parameters(content)["A"]
     assert math.isnan(meta.low)
