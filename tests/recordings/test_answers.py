@@ -78,14 +78,14 @@ def test_parameters_are_complete_and_renumbered(day: Day) -> None:
     assert {m.get_srcSystem() for m in found} == {8}
 
 
-def test_a_parameter_holds_from_when_it_was_sent_and_the_first_before(day: Day) -> None:
+def test_parameter_has_its_newest_value_or_the_first_before_any(day: Day) -> None:
     day.say(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
     moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
     answers = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
     assert [decode(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
 
 
-def test_a_value_keeps_its_bits_whatever_its_type(day: Day) -> None:
+def test_bits_of_a_parameter_value_are_preserved(day: Day) -> None:
     # A signalling NaN as a float: autopilots put the bits of integers there.
     bits = struct.pack("<i", -5_000_000)
     frame = bytearray(value("COUNT", 1.0).pack(day.vehicle))
@@ -95,26 +95,26 @@ def test_a_value_keeps_its_bits_whatever_its_type(day: Day) -> None:
     assert day.answers().parameters()["COUNT"][10:14] == bits
 
 
-def test_a_download_that_is_whole_is_the_mission(day: Day) -> None:
+def test_complete_download_is_the_mission(day: Day) -> None:
     day.say(day.vehicle, count_of(2), item(0), item(1))
     mission = day.answers().mission(MISSION)
     assert mission is not None
     assert [decode(frame).x for frame in mission] == [470_000_000, 470_000_001]
 
 
-def test_a_download_that_was_broken_off_is_none(day: Day) -> None:
+def test_incomplete_download_is_no_mission(day: Day) -> None:
     day.say(day.vehicle, count_of(2), item(0))
     assert day.answers().mission(MISSION) is None
 
 
-def test_an_upload_counts_when_the_vehicle_took_it(day: Day) -> None:
+def test_upload_is_the_mission_once_acknowledged(day: Day) -> None:
     day.say(day.station, count_of(1, FENCE, 3), item(0, FENCE, 3))
     assert day.answers().mission(FENCE) is None
     day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, FENCE))
     assert len(day.answers().mission(FENCE) or ()) == 1
 
 
-def test_a_refused_upload_changes_nothing(day: Day) -> None:
+def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
     day.say(day.vehicle, count_of(1), item(0))
     day.say(day.station, count_of(1, target=3), item(0, target=3))
     denied = mavlink.MAV_MISSION_DENIED
@@ -124,7 +124,7 @@ def test_a_refused_upload_changes_nothing(day: Day) -> None:
     assert decode(mission[0]).get_srcSystem() == 3
 
 
-def test_clearing_all_leaves_three_empty_lists(day: Day) -> None:
+def test_clearing_all_gives_empty_mission_fence_and_rally_points(day: Day) -> None:
     everything = mavlink.MAV_MISSION_TYPE_ALL
     day.say(day.vehicle, count_of(1), item(0))
     loaded_us = day.now_us - 1
@@ -134,7 +134,7 @@ def test_clearing_all_leaves_three_empty_lists(day: Day) -> None:
     assert len(day.answers(loaded_us).mission(MISSION) or ()) == 1
 
 
-def test_home_is_that_of_the_moment(day: Day) -> None:
+def test_home_is_that_at_the_position_of_playback(day: Day) -> None:
     for lat, since_us in ((470_000_000, 1), (470_000_000, 2), (480_000_000, 3)):
         home = mavlink.MAVLink_home_position_message(
             lat, 85_000_000, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, since_us

@@ -53,7 +53,7 @@ def test_columns_are_distinct() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_records_come_back_in_their_order(seed: int) -> None:
+def test_rows_keep_the_order_of_records(seed: int) -> None:
     records = make_flight(np.random.default_rng(seed), 50)
     flat: list[object] = []
     for row in rows_of(list(records)):
@@ -62,7 +62,7 @@ def test_records_come_back_in_their_order(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_line_holds_every_digit(seed: int) -> None:
+def test_line_keeps_every_digit(seed: int) -> None:
     records = make_flight(np.random.default_rng(seed), 20)
     for row in rows_of(list(records)):
         line = row_to_line(row)
@@ -72,7 +72,7 @@ def test_a_line_holds_every_digit(seed: int) -> None:
         assert repr(again) == repr(row)
 
 
-def test_a_row_without_counts_keeps_the_calibrated_sample(rng: np.random.Generator) -> None:
+def test_row_without_counts_keeps_the_calibrated_sample(rng: np.random.Generator) -> None:
     (row,) = RowBuilder().add(replace(make_fused(rng, 1000), imu=None))
     assert row.raw is None
     assert row.imu is not None
@@ -80,7 +80,7 @@ def test_a_row_without_counts_keeps_the_calibrated_sample(rng: np.random.Generat
     assert repr(again) == repr(row)
 
 
-def test_usual_records_share_one_row(rng: np.random.Generator) -> None:
+def test_baro_fix_and_sample_share_one_row(rng: np.random.Generator) -> None:
     baro, fix, fused = make_baro(rng, 1), make_fix(rng, 2), make_fused(rng, 3)
     rows = rows_of([baro, fix, fused])
     assert [(row.time_us, row.baro, row.gps, row.raw) for row in rows] == [
@@ -88,7 +88,7 @@ def test_usual_records_share_one_row(rng: np.random.Generator) -> None:
     ]
 
 
-def test_calibrated_samples_without_states_make_rows_too(rng: np.random.Generator) -> None:
+def test_calibrated_sample_without_a_state_gives_a_row(rng: np.random.Generator) -> None:
     (row,) = RowBuilder().add(replace(make_fused(rng, 1000), imu=None))
     assert row.imu is not None
     fix = make_fix(rng, 900)
@@ -96,7 +96,7 @@ def test_calibrated_samples_without_states_make_rows_too(rng: np.random.Generato
 
 
 @pytest.mark.parametrize(("column", "text"), [("time_us", "x"), ("gps_fix_type", "9")])
-def test_a_cell_that_cannot_be_is_refused(rng: np.random.Generator, column: str, text: str) -> None:
+def test_invalid_cell_is_a_fault(rng: np.random.Generator, column: str, text: str) -> None:
     row = TableRow(5, gps=make_fix(rng, 5))
     cells = row_to_line(row).rstrip("\n").split(",")
     cells[COLUMNS.index(column)] = text
@@ -117,7 +117,7 @@ numbers = st.one_of(
 
 
 @given(st.lists(st.tuples(numbers, st.one_of(st.just(math.nan), st.integers(-(2**53), 2**53)))))
-def test_written_as_python_writes_and_read_as_it_reads(rows: list[tuple[float, float]]) -> None:
+def test_numbers_are_written_and_read_as_by_python(rows: list[tuple[float, float]]) -> None:
     cells = np.array(rows, np.float64).reshape(-1, 2)
     text = write_lines(cells, np.array([False, True]))
     expected = [
@@ -137,12 +137,12 @@ def test_written_as_python_writes_and_read_as_it_reads(rows: list[tuple[float, f
     "text",
     [b"1,2\n3\n", b"1\n2,3\n", b"1,2,3,4\n", b"1,x\n", b"1,nan\n", b"1,-\n", b"-0,1\n", b"1,01\n"],
 )
-def test_lines_of_other_cells_are_left_to_python(text: bytes) -> None:
+def test_lines_with_unusual_cells_are_not_read_at_once(text: bytes) -> None:
     assert read_lines(b"5,6\n" + text, 2) is None
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_block_is_its_rows(seed: int) -> None:
+def test_block_equals_its_rows(seed: int) -> None:
     rows = make_rows(seed, 60)
     lines = "".join(map(row_to_line, rows)).encode()
     block = block_of(rows)
@@ -152,7 +152,7 @@ def test_a_block_is_its_rows(seed: int) -> None:
     assert again.cells.tobytes() == block.cells.tobytes()
 
 
-def test_one_bad_line_changes_no_other() -> None:
+def test_invalid_line_leaves_others_unchanged() -> None:
     """Then each line is read by itself: the numbers are the same."""
     rows = make_rows(7, 60)
     lines = [row_to_line(row).encode() for row in rows]
@@ -178,7 +178,7 @@ def test_one_bad_line_changes_no_other() -> None:
         ({"nav_flags": "inf"}, "nav_flags: inf"),
     ],
 )
-def test_numbers_that_cannot_be_are_faults(changed: dict[str, str], reason: str) -> None:
+def test_impossible_numbers_are_faults(changed: dict[str, str], reason: str) -> None:
     row = next(row for row in make_rows(1, 60) if row.gps and row.state)
     cells = dict(zip(COLUMNS, row_to_line(row).rstrip("\n").split(","), strict=True))
     text = encode_head(TableHeader()) + ",".join((cells | changed).values()) + "\n"
@@ -189,7 +189,7 @@ def test_numbers_that_cannot_be_are_faults(changed: dict[str, str], reason: str)
     assert reason in fault.reason
 
 
-def test_whole_numbers_that_another_program_wrote_as_floats_are_read() -> None:
+def test_whole_numbers_written_as_floats_are_read() -> None:
     (row,) = (row for row in make_rows(2, 60)[:1])
     text = row_to_line(row).replace(f"{row.time_us},", f"{row.time_us}.0,", 1)
     (again,) = TableReader().feed((encode_head(TableHeader(vehicle_id=3)) + text).encode())

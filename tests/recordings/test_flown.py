@@ -22,7 +22,9 @@ pytestmark = pytest.mark.io
 OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 
 
-def test_a_recording_of_two_parts(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_recording_of_two_parts_is_opened_as_one_flight(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 12))[0])
     half = len(rows) // 2
     parts = []
@@ -41,7 +43,7 @@ def test_a_recording_of_two_parts(tmp_path: Path, rng: np.random.Generator) -> N
     assert np.isfinite(flight.baro_alt_m).sum() > 10
 
 
-def test_counts_alone_are_calibrated(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_raw_counts_are_calibrated(tmp_path: Path, rng: np.random.Generator) -> None:
     header, rows = read(fly(GatewaySettings().default_aircraft, make_flight(rng, 2))[0])
     whole, bare = tmp_path / "whole.csv", tmp_path / "bare.csv"
     names = encode_head(header).splitlines()[-1].split(",")
@@ -58,7 +60,7 @@ def test_counts_alone_are_calibrated(tmp_path: Path, rng: np.random.Generator) -
     np.testing.assert_allclose(a.gyro_b_radps, b.gyro_b_radps, atol=1e-9)
 
 
-def test_an_autopilots_tlog(tmp_path: Path) -> None:
+def test_tlog_of_an_autopilot_is_opened(tmp_path: Path) -> None:
     mav = mavlink.MAVLink(None, 1, 1)
     data = b""
     for k in range(300):
@@ -81,7 +83,7 @@ def test_an_autopilots_tlog(tmp_path: Path) -> None:
     np.testing.assert_allclose(flight.gps_lat_deg[-1], 47.000029, atol=1e-7)
 
 
-def test_another_programs_csv(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_foreign_csv_is_opened(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = tmp_path / "log.csv"
     rows = [f"{k / 50},{k},0,-9.8,0,0,0,{100 + k},90,7\n" for k in range(9)]
     rows[3] = "oops" + rows[3]

@@ -53,7 +53,7 @@ def play_all(track: Track) -> list[TlogRecord]:
     return found
 
 
-def test_it_is_made_as_it_is_wanted(making: Making, tlog: FusedTlog) -> None:
+def test_frames_are_made_on_demand(making: Making, tlog: FusedTlog) -> None:
     assert making.made <= 2 * PIECE
     track = Track(tlog)
     assert (track.first_us, track.last_us, tlog.index.origins) == (START_US, END_US, {0x101})
@@ -64,14 +64,14 @@ def test_it_is_made_as_it_is_wanted(making: Making, tlog: FusedTlog) -> None:
     assert play_all(track) == RECORDS[100:]
 
 
-def test_one_can_seek_back_and_play_it_again(tlog: FusedTlog) -> None:
+def test_frames_are_played_again_after_seeking_back(tlog: FusedTlog) -> None:
     track = Track(tlog)
     assert play_all(track) == RECORDS
     track.seek(START_US + 300 * STEP_US)
     assert play_all(track) == RECORDS[300:]
 
 
-def test_preparing_goes_in_small_pieces_and_ends(making: Making, tlog: FusedTlog) -> None:
+def test_preparing_proceeds_in_small_pieces_to_the_end(making: Making, tlog: FusedTlog) -> None:
     made = making.made
     assert not tlog.prepare(START_US + 500 * STEP_US)
     assert making.made <= made + PIECE
@@ -83,7 +83,7 @@ def test_preparing_goes_in_small_pieces_and_ends(making: Making, tlog: FusedTlog
     assert making.made == len(RECORDS)
 
 
-async def test_the_old_place_plays_on_until_a_seek_is_ready(
+async def test_playback_continues_until_a_seek_is_ready(
     making: Making, tlog: FusedTlog, clock: ManualClock
 ) -> None:
     frames: list[bytes] = []
@@ -109,7 +109,7 @@ async def test_the_old_place_plays_on_until_a_seek_is_ready(
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
-def test_a_full_disk_ends_the_playback_and_nothing_else(
+def test_full_disk_ends_the_playback_with_a_warning(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: Path("/dev/full").open("w+b"))  # noqa: SIM115

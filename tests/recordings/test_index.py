@@ -35,7 +35,7 @@ def test_files_belong_to_recordings_oldest_first(folder: Path) -> None:
     assert list_recordings(folder / "none") == []
 
 
-def test_recordings_that_ended_in_one_tick_stand_by_name(tmp_path: Path) -> None:
+def test_recordings_of_equal_time_are_sorted_by_name(tmp_path: Path) -> None:
     for name in ("day-2_01.tlog", "day_01.tlog", "day-3_01.tlog"):
         (tmp_path / name).touch()
         os.utime(tmp_path / name, (1, 1))
@@ -43,7 +43,7 @@ def test_recordings_that_ended_in_one_tick_stand_by_name(tmp_path: Path) -> None
     assert find_recording(tmp_path, "last").name == "day-3"
 
 
-def test_rename_takes_all_files(folder: Path) -> None:
+def test_rename_moves_all_files(folder: Path) -> None:
     renamed = rename_recording(folder, "b", "new one")
     assert [path.name for path in renamed.files] == [
         "new one_01.tlog",
@@ -54,21 +54,21 @@ def test_rename_takes_all_files(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("name", "to_name"), [("b", "a"), ("b", "../c"), ("none", "c")])
-def test_rename_refuses_and_changes_nothing(folder: Path, name: str, to_name: str) -> None:
+def test_refused_rename_changes_nothing(folder: Path, name: str, to_name: str) -> None:
     before = sorted(folder.iterdir())
     with pytest.raises(RecordingError):
         rename_recording(folder, name, to_name)
     assert sorted(folder.iterdir()) == before
 
 
-def test_delete_takes_its_own_files_only(folder: Path) -> None:
+def test_delete_removes_only_files_of_the_recording(folder: Path) -> None:
     delete_recording(folder, "b")
     assert sorted(path.name for path in folder.iterdir()) == ["a_01.tlog", "note.txt"]
     with pytest.raises(RecordingError, match="no recording 'b'"):
         delete_recording(folder, "b")
 
 
-def test_parts_that_follow_one_another_are_together(tmp_path: Path) -> None:
+def test_consecutive_parts_are_grouped(tmp_path: Path) -> None:
     names = ["a_01.tlog", "a_01_v1.csv", "a_02.tlog", "x.tlog", "a_02_v1.csv", "a_02_v2.csv"]
     found = parts_together([tmp_path / name for name in [*names, "x.tlog", "a_02.tlog"]])
     assert [[path.name for path in parts] for parts in found] == [
@@ -81,7 +81,7 @@ def test_parts_that_follow_one_another_are_together(tmp_path: Path) -> None:
     ]
 
 
-def test_a_free_name_has_a_number_where_needed(folder: Path) -> None:
+def test_free_name_of_a_taken_one_is_numbered(folder: Path) -> None:
     assert free_name(folder, "c") == "c"
     assert free_name(folder, "a") == "a-2"
     (folder / "a-2_01.tlog").touch()

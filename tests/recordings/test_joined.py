@@ -45,7 +45,7 @@ def seconds_of(joined: RecordedTable) -> tuple[list[int], list[int]]:
 
 
 @pytest.mark.parametrize("spans", [((0, 40), (40, 80)), ((0, 40), (60, 90), (90, 99))])
-def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int], ...]) -> None:
+def test_recordings_are_ordered_by_civil_time(spans: tuple[tuple[int, int], ...]) -> None:
     joined = joined_tables([table(*span, EPOCH_US) for span in spans])
     times, _ = seconds_of(joined)
     assert times == [second for span in spans for second in range(*span)]
@@ -61,7 +61,7 @@ def test_recordings_stand_where_civil_time_puts_them(spans: tuple[tuple[int, int
         (((0, 40), (0, 40)), range(40), 39),
     ],
 )
-def test_rows_in_two_recordings_are_taken_once(
+def test_overlapping_rows_are_taken_once(
     spans: tuple[tuple[int, int], ...], kept: range, left_out: int, session: str
 ) -> None:
     joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
@@ -76,7 +76,7 @@ def test_rows_in_two_recordings_are_taken_once(
 
 @pytest.mark.parametrize("session", ["", "20260611-142530"])
 @pytest.mark.parametrize("spans", [((50, 90), (0, 40)), ((0, 40), (80, 90), (40, 80))])
-def test_an_older_recording_behind_a_newer_one_is_refused(
+def test_older_recording_behind_a_newer_one_is_refused(
     spans: tuple[tuple[int, int], ...], session: str
 ) -> None:
     joined = joined_tables([table(*span, EPOCH_US, session) for span in spans])
@@ -84,13 +84,13 @@ def test_an_older_recording_behind_a_newer_one_is_refused(
         list(joined.blocks)
 
 
-def test_recordings_without_a_civil_time_stay_on_their_clock() -> None:
+def test_recordings_without_civil_time_keep_their_clock() -> None:
     joined = joined_tables([table(0, 9, None), table(20, 29, None)])
     times = np.concatenate([block.cells[:, 0] for block in joined.blocks]) / SECOND_US
     assert times.tolist() == [*range(9), *range(9)]
 
 
-def test_parts_of_a_recording_stay_on_their_clock() -> None:
+def test_parts_of_a_recording_keep_their_clock() -> None:
     """GPS has corrected the time between them; a row that came late is in its place."""
     first, second = table(0, 10, EPOCH_US, "flight"), table(9, 20, EPOCH_US + 10**9, "flight")
     times, marks = seconds_of(joined := joined_tables([first, second]))

@@ -49,7 +49,7 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
     assert settings.estimation.reference.gps_latency_s == latency_s
 
 
-def test_the_rows_are_read_once(without_latency: Path) -> None:
+def test_rows_are_read_once_to_estimate_the_latency(without_latency: Path) -> None:
     """The first reader leaves them to the next."""
     table, again = open_rows(without_latency, OPTIONS), open_rows(without_latency, OPTIONS)
     aircraft_for([without_latency], table, OPTIONS)
@@ -57,7 +57,7 @@ def test_the_rows_are_read_once(without_latency: Path) -> None:
 
 
 @pytest.mark.parametrize("set_s", [0.16, 0.4])
-def test_a_recording_that_was_fused_with_another_latency_is_reported(
+def test_recording_fused_with_another_latency_is_reported(
     without_latency: Path, tmp_path: Path, set_s: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"

@@ -22,7 +22,7 @@ DAY_US = 86_400_000_000
         ("1970-01-02T02:00:00+02:00", Moment(time_us=DAY_US)),
     ],
 )
-def test_ways_to_write_a_moment(text: str, moment: Moment) -> None:
+def test_moment_is_parsed_in_every_notation(text: str, moment: Moment) -> None:
     assert parse_moment(text) == moment
 
 
@@ -32,6 +32,6 @@ def test_invalid_moment_is_refused(text: str) -> None:
         parse_moment(text)
 
 
-def test_place_in_a_recording() -> None:
+def test_moment_is_converted_to_the_time_of_the_recording() -> None:
     assert time_us_of(parse_moment("1:20"), 1_000) == 80_001_000
     assert time_us_of(parse_moment("1970-01-02"), 1_000) == DAY_US

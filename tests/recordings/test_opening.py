@@ -45,7 +45,7 @@ def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
     assert firsts == [START_US + n * 100 * STEP_US for n in (0, 1, 2)]
 
 
-def test_other_recordings_are_vehicles_of_their_own(tmp_path: Path) -> None:
+def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
     first = write(tmp_path, "first.tlog", RECORDS[:100])
     later = write(tmp_path, "later.tlog", RECORDS[200:])
     flights = laid_out([first, later, first], 5)
@@ -66,7 +66,7 @@ def test_parts_of_a_table_are_fused_as_one(tmp_path: Path, rng: np.random.Genera
     assert track.last_us == rows[-1].time_us
 
 
-def test_a_fused_flight_answers_with_the_settings_that_it_is_fused_by(
+def test_fused_flight_answers_with_the_settings_of_its_fusion(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     then = GatewaySettings().default_aircraft
@@ -81,7 +81,7 @@ def test_a_fused_flight_answers_with_the_settings_that_it_is_fused_by(
     assert len(answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)) == 1
 
 
-def test_settings_changed_in_flight_are_answered_from_then_on(
+def test_settings_changed_in_flight_are_answered_from_their_time(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     then = GatewaySettings().default_aircraft
@@ -106,7 +106,7 @@ def test_settings_changed_in_flight_are_answered_from_then_on(
     assert list(answered.values()) == [then.estimation.paper.accel_cutoff_hz, 3.5]
 
 
-def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:
+def test_ground_station_is_no_vehicle(tmp_path: Path) -> None:
     station = mavlink.MAVLink(None, 42, 190)
     beat = mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
     records = [*RECORDS[:9], TlogRecord(RECORDS[9].time_us, bytes(beat.pack(station)))]
@@ -114,7 +114,7 @@ def test_a_ground_station_is_no_vehicle(tmp_path: Path) -> None:
     assert flight.system_ids == {1: 1}
 
 
-def test_a_file_without_frames_is_refused(tmp_path: Path) -> None:
+def test_file_without_frames_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FlightError, match=r"empty.tlog: is no recording"):
         laid_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])
 

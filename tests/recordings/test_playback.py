@@ -30,14 +30,14 @@ def play_to_end(player: Player, now_us: int = 0) -> list[tuple[int, bytes]]:
 
 
 @pytest.mark.parametrize("speed", [0.1, 0.5, 1.0, 3.0, 100.0])
-def test_every_frame_comes_at_its_time(speed: float) -> None:
+def test_every_frame_is_played_at_its_time(speed: float) -> None:
     found = play_to_end(make_player(speed=speed, now_us=777), 777)
     assert found == [
         (777 + math.ceil(i * STEP_US / speed), frame) for i, frame in enumerate(FRAMES)
     ]
 
 
-def test_as_fast_as_possible_takes_no_time_but_keeps_to_the_limit() -> None:
+def test_infinite_speed_keeps_the_limit_of_frames_per_poll() -> None:
     player = make_player(speed=math.inf)
     assert player.poll(0, 30) == FRAMES[:30]
     assert [frame for _, frame in play_to_end(player)] == FRAMES[30:]
@@ -45,18 +45,18 @@ def test_as_fast_as_possible_takes_no_time_but_keeps_to_the_limit() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.09, 100.1, -1.0, math.nan])
-def test_speeds_out_of_range(speed: float) -> None:
+def test_speed_out_of_range_is_refused(speed: float) -> None:
     with pytest.raises(ValueError, match="speed"):
         make_player(speed=speed)
 
 
-def test_a_late_poll_brings_all_that_was_due() -> None:
+def test_late_poll_returns_all_due_frames() -> None:
     player = make_player()
     assert player.poll(10 * STEP_US, MANY) == FRAMES[:11]
     assert player.next_due_us() == 11 * STEP_US
 
 
-def test_pause_stops_time() -> None:
+def test_pause_stops_the_clock() -> None:
     player = make_player()
     player.poll(0, MANY)
     player.pause(STEP_US // 2)
@@ -66,7 +66,7 @@ def test_pause_stops_time() -> None:
     assert player.next_due_us() == 10 * STEP_US + STEP_US // 2
 
 
-def test_step_plays_so_many_and_stays() -> None:
+def test_step_plays_a_number_of_frames_and_pauses() -> None:
     player = make_player()
     assert player.step(0) == FRAMES[:1]
     assert player.step(0, 3) == FRAMES[1:4]
@@ -77,7 +77,7 @@ def test_step_plays_so_many_and_stays() -> None:
     assert player.step(60) == []
 
 
-def test_speed_changes_from_here_on() -> None:
+def test_speed_changes_from_the_present_position() -> None:
     player = make_player()
     player.poll(0, MANY)
     player.set_speed(2.0, STEP_US // 2)
@@ -95,7 +95,7 @@ def test_seek_sends_state_messages_first() -> None:
     assert player.next_due_us() == 1000 + STEP_US
 
 
-def test_seek_while_paused_shows_the_place_and_stays() -> None:
+def test_seek_while_paused_sends_the_state_and_stays_paused() -> None:
     player = make_player()
     player.pause(0)
     player.seek(START_US + 50 * STEP_US, 0)
@@ -104,7 +104,7 @@ def test_seek_while_paused_shows_the_place_and_stays() -> None:
     assert player.next_due_us() is None
 
 
-def test_seek_is_held_within_the_range() -> None:
+def test_seek_is_clamped_to_the_range() -> None:
     player = make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
     player.seek(0, 0)
     assert player.position_us == START_US + 10 * STEP_US
@@ -112,27 +112,27 @@ def test_seek_is_held_within_the_range() -> None:
     assert player.position_us == START_US + 20 * STEP_US
 
 
-def test_a_range_is_played_with_its_context() -> None:
+def test_range_begins_with_its_state_messages() -> None:
     player = make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
     frames = [frame for _, frame in play_to_end(player)]
     assert sorted(frames[:2]) == sorted([FRAMES[7], FRAMES[9]])
     assert frames[2:] == FRAMES[10:21]
 
 
-def test_a_range_that_is_wider_than_the_recording_is_no_longer_than_it() -> None:
+def test_range_is_clamped_to_the_recording() -> None:
     player = make_player(begin_us=START_US - 10**15, end_us=START_US + 10**15)
     assert (player.begin_us, player.end_us) == (START_US, START_US + SPAN_US)
     assert play_to_end(player)[-1] == (SPAN_US, FRAMES[-1])
 
 
-def test_loop_begins_again_at_once() -> None:
+def test_loop_restarts_at_once() -> None:
     player = make_player(loop=True)
     assert len(player.poll(SPAN_US, MANY)) == 100
     assert player.state is PlayState.PLAYING
     assert player.poll(SPAN_US + STEP_US, MANY)[:2] == FRAMES[:2]
 
 
-def test_resume_after_the_end_plays_again() -> None:
+def test_resume_after_the_end_restarts() -> None:
     player = make_player()
     play_to_end(player)
     assert player.state is PlayState.ENDED
@@ -147,7 +147,7 @@ def with_gap(gap_us: int) -> list[TlogRecord]:
     ]
 
 
-def test_gaps_are_kept_or_shortened_as_wished() -> None:
+def test_gaps_are_kept_or_shortened_to_a_maximum() -> None:
     gap_us = 60_000_000
     kept = play_to_end(make_player(with_gap(gap_us)))
     assert kept[-1][0] == SPAN_US + gap_us
@@ -157,7 +157,7 @@ def test_gaps_are_kept_or_shortened_as_wished() -> None:
 
 
 @pytest.mark.parametrize("jump_us", [50 * 365 * 86_400_000_000, -3_600_000_000])
-def test_a_clock_that_was_set_in_flight_is_not_waited_for(jump_us: int) -> None:
+def test_jump_of_the_recorded_clock_is_skipped(jump_us: int) -> None:
     found = play_to_end(make_player(with_gap(jump_us)))
     assert [frame for _, frame in found] == FRAMES
     assert found[-1][0] <= SPAN_US
@@ -172,11 +172,11 @@ def test_several_recordings_interleave_by_time() -> None:
     assert [time_us for time_us, _ in found] == [i * STEP_US // 2 for i in range(200)]
 
 
-def test_an_empty_recording_ends_at_once() -> None:
+def test_empty_recording_ends_at_once() -> None:
     player = make_player([])
     assert play_to_end(player) == []
     assert player.state is PlayState.ENDED
 
 
-def test_all_frames_were_made_different() -> None:
+def test_frames_of_the_recording_are_distinct() -> None:
     assert len(set(make_frames(100))) == 100

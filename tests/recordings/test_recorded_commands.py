@@ -60,14 +60,14 @@ def played(track: Track) -> list[bytes]:
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda said: said[1].get_type())
-def test_commands_stay_out(command: tuple[tuple[int, int], Any]) -> None:
+def test_commands_are_not_played_by_default(command: tuple[tuple[int, int], Any]) -> None:
     # The last heartbeat shows which system was a station all the time.
     data = tlog_of([*TELEMETRY[:2], command, *TELEMETRY[2:], COMMANDS[0]])
     assert played(make_track(data)) == frames_of(tlog_of(TELEMETRY))
 
 
 @pytest.mark.parametrize("answer", ANSWERS, ids=lambda said: said[1].get_type())
-def test_answers_stay_out_and_leave_no_gap_in_the_sequence(
+def test_answers_to_commands_are_left_out_without_a_gap_in_the_sequence(
     answer: tuple[tuple[int, int], Any],
 ) -> None:
     mav, frames = mavlink.MAVLink(None, *VEHICLE), []
@@ -94,7 +94,7 @@ def test_seek_leaves_out_recorded_commands() -> None:
     assert len(make_track(data, with_commands=True).seek(last_us)) > len(context)
 
 
-def test_a_heartbeat_that_was_cut_short_is_no_station() -> None:
+def test_truncated_heartbeat_is_no_ground_station() -> None:
     (frame,) = frames_of(tlog_of(TELEMETRY[:1]))
     short = bytearray(frame[:10]) + frame[-2:]
     short[1] = 0

@@ -123,9 +123,7 @@ def states_of(fusion: Fusion, lines: Iterable[TableEvent]) -> list[NavState]:
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
-def test_a_table_fused_again_gives_the_recorded_states_to_the_last_bit(
-    rng: np.random.Generator, estimator: str
-) -> None:
+def test_table_fused_again_gives_bit_equal_states(rng: np.random.Generator, estimator: str) -> None:
     settings = make_settings(estimator)
     table, states = fly(settings, make_flight(rng, 30))
     header, rows = read(table)
@@ -134,7 +132,7 @@ def test_a_table_fused_again_gives_the_recorded_states_to_the_last_bit(
     assert math.isfinite(states[-1].lat_deg)
 
 
-def test_settings_changed_in_flight_are_changed_again(rng: np.random.Generator) -> None:
+def test_settings_changed_in_flight_are_changed_in_replay(rng: np.random.Generator) -> None:
     settings = make_settings("paper")
     pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
     text, states = encode_head(header_for(settings, 1)), []
@@ -190,7 +188,7 @@ def fly_from_the_middle(
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
-def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
+def test_flight_resumed_from_a_state_gives_bit_equal_states(
     rng: np.random.Generator, estimator: str
 ) -> None:
     settings, state, rows = fly_from_the_middle(estimator, rng)
@@ -211,7 +209,7 @@ def test_a_flight_goes_on_from_its_middle_to_the_last_bit(
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
-def test_a_state_that_does_not_fit_is_reported_and_left_alone(
+def test_unsuitable_state_is_reported_and_not_restored(
     rng: np.random.Generator, estimator: str
 ) -> None:
     settings, state, rows = fly_from_the_middle(estimator, rng)
@@ -233,14 +231,14 @@ def test_a_state_that_does_not_fit_is_reported_and_left_alone(
         assert repr(states) == repr(fuse_again(settings_now, rows[:50]))
 
 
-def test_other_settings_give_another_flight(rng: np.random.Generator) -> None:
+def test_other_settings_give_other_states(rng: np.random.Generator) -> None:
     table, states = fly(make_settings("paper"), make_flight(rng, 10))
     again = fuse_again(make_settings("eskf"), read(table)[1])
     assert len(again) == len(states)
     assert again != states
 
 
-def test_rows_without_counts_are_fused_too(rng: np.random.Generator) -> None:
+def test_rows_without_counts_are_fused(rng: np.random.Generator) -> None:
     settings = make_settings("paper")
     table, states = fly(settings, make_flight(rng, 10))
     rows = [replace(row, raw=None) for row in read(table)[1]]
@@ -287,7 +285,7 @@ def test_marks_and_settings_of_the_flight_are_replayed_at_their_time(
         assert estimator == ("paper" if follow else "eskf")
 
 
-def test_settings_come_back_from_the_head() -> None:
+def test_settings_are_restored_from_the_head() -> None:
     settings = make_settings("paper")
     header = header_for(settings, 1)
     assert "secret" not in repr(header)
@@ -300,7 +298,7 @@ def test_settings_of_another_version_are_refused() -> None:
         settings_of(TableHeader(settings={"estimation": {"wings": 2}}))
 
 
-def test_settings_of_earlier_versions_become_present_ones() -> None:
+def test_settings_of_earlier_versions_are_migrated() -> None:
     old = {
         "sensing": {"accel_cutoff_hz": 5.0, "nominal_rate_hz": 50.0},
         "estimation": {

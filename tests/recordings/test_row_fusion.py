@@ -63,7 +63,7 @@ def at_once(lines: list[Line], settings: AircraftSettings) -> list[TableEvent]:
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
-def test_the_same_bits(estimator: str) -> None:
+def test_fusion_by_blocks_is_bit_equal_to_live_fusion(estimator: str) -> None:
     lines, settings = flown(), settings_for(estimator)
     assert any(row.raw is None for row in lines if isinstance(row, TableRow))
     assert len(lines) > 2 * BLOCK
@@ -73,7 +73,7 @@ def test_the_same_bits(estimator: str) -> None:
 
 
 @pytest.mark.parametrize("estimator", ["eskf"])
-def test_fixes_before_heights_and_repeated_or_decreasing_times_give_the_same_bits(
+def test_repeated_or_decreasing_times_are_fused_bit_equally(
     estimator: str,
 ) -> None:
     lines, settings = flown()[:900], settings_for(estimator)
@@ -95,7 +95,7 @@ def test_fixes_before_heights_and_repeated_or_decreasing_times_give_the_same_bit
     ] == expected
 
 
-def test_lines_between_rows_keep_their_place_and_settings_are_followed() -> None:
+def test_lines_between_rows_stay_there_and_settings_are_followed() -> None:
     lines, settings = flown(), settings_for("eskf")
     other = msgspec.structs.replace(settings, estimation=EstimationSettings())
     mark, header = TableMark(1, "here"), header_for(other, 1)
@@ -110,7 +110,7 @@ def test_lines_between_rows_keep_their_place_and_settings_are_followed() -> None
     assert found[501:503] == [mark, header]
 
 
-def test_a_state_of_other_settings_is_refused_and_left_out() -> None:
+def test_state_of_other_settings_is_refused_and_left_out() -> None:
     state = Aircraft(1, settings_for("eskf")).fusion_state
     fusion = Fusion(1, settings_for("paper"), follow=True)
     assert fusion.block(block_of([state])).comments == ()

@@ -28,7 +28,7 @@ def smoothed(path: Path) -> tuple[IntArray, FloatArray]:
     return RecordedFusion([path], OPTIONS, smooth=True, latency_s=0.0).states()
 
 
-def test_samples_that_came_late_are_put_into_their_place(tmp_path: Path) -> None:
+def test_late_samples_are_sorted_by_time(tmp_path: Path) -> None:
     head, rows = rows_of_golden()
     rows[500], rows[501] = rows[501], rows[500]
     path = tmp_path / "late.csv"
@@ -37,7 +37,7 @@ def test_samples_that_came_late_are_put_into_their_place(tmp_path: Path) -> None
         np.testing.assert_array_equal(found, expected)
 
 
-def test_clock_that_was_set_back_is_refused_with_advice(tmp_path: Path) -> None:
+def test_clock_set_back_is_refused_with_advice(tmp_path: Path) -> None:
     head, rows = rows_of_golden()
     path, own, out = (tmp_path / f"{name}.csv" for name in ("log", "own", "out"))
     path.write_text("\n".join([*head, *rows]))

@@ -40,7 +40,7 @@ def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
     return summary.result(len(data))
 
 
-def test_a_tlog_is_summed_up() -> None:
+def test_tlog_is_summarised() -> None:
     data = make_tlog(make_flight(101, 7))
     info = sum_up(data)
     assert (info.kind, info.size, info.records) == ("tlog", len(data), 202)
@@ -54,7 +54,7 @@ def test_a_tlog_is_summed_up() -> None:
 
 
 @pytest.mark.parametrize("chunk", [50, 100_000])
-def test_gaps_and_damage_are_found(chunk: int) -> None:
+def test_gaps_and_damage_are_reported(chunk: int) -> None:
     data = make_tlog(make_flight(20, 1, gap_at=10))
     info = sum_up(data[:300] + b"\xaa" * 40 + data[300:], chunk)
     (gap,) = info.gaps
@@ -63,7 +63,7 @@ def test_gaps_and_damage_are_found(chunk: int) -> None:
     assert info.damaged_bytes >= 40
 
 
-def test_a_last_record_that_is_being_written_is_no_damage() -> None:
+def test_incomplete_last_record_is_no_damage() -> None:
     data = make_tlog(make_flight(20, 1))
     info = sum_up(data[:300] + b"\xaa" * 40 + data[300:-4])
     assert info.damaged_bytes == sum_up(data[:300] + b"\xaa" * 40 + data[300:]).damaged_bytes
@@ -72,7 +72,7 @@ def test_a_last_record_that_is_being_written_is_no_damage() -> None:
     assert (wrong.damaged_bytes, wrong.unfinished_bytes) == (4, 0)
 
 
-def test_a_cut_record_that_others_follow_is_damage() -> None:
+def test_truncated_record_before_others_is_damage() -> None:
     """Also where the file ends before its length would be over."""
     flight = make_flight(20, 1)
     message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, [7] * 251)
@@ -86,7 +86,7 @@ def test_a_cut_record_that_others_follow_is_damage() -> None:
     ("tail", "damaged", "unfinished"),
     [(b"1000,0,", 0, 7), (b"1000," + bytes(3), 8, 0), (b"1000,0,\n", 8, 0)],
 )
-def test_a_last_line_that_is_being_written_is_no_damage(
+def test_incomplete_last_line_is_no_damage(
     rng: np.random.Generator, tail: bytes, damaged: int, unfinished: int
 ) -> None:
     rows = RowBuilder().add(make_fused(rng, 0))
@@ -99,7 +99,7 @@ def test_a_last_line_that_is_being_written_is_no_damage(
 
 @pytest.mark.parametrize("chunk", [50, 100_000])
 @pytest.mark.parametrize("years", [56, -30])
-def test_a_clock_that_leaps_by_years_makes_no_flight_of_years(years: int, chunk: int) -> None:
+def test_jump_of_the_clock_by_years_does_not_add_to_the_duration(years: int, chunk: int) -> None:
     leap_us = years * 31_556_952 * SECOND_US
     records = [
         TlogRecord(record.time_us + (leap_us if number >= 40 else 0), record.frame)
@@ -117,7 +117,7 @@ def test_vehicles_are_summarised_separately() -> None:
     assert [vehicle.system_id for vehicle in info.vehicles] == [1, 2]
 
 
-def test_a_table_is_summed_up(rng: np.random.Generator) -> None:
+def test_table_is_summarised(rng: np.random.Generator) -> None:
     builder = RowBuilder()
     text = encode_head(TableHeader(vehicle_id=3))
     for i in range(100):
@@ -137,6 +137,6 @@ def test_a_table_is_summed_up(rng: np.random.Generator) -> None:
     assert (info.damaged_runs, info.damaged_bytes) == (1, 12)
 
 
-def test_nothing_is_nothing() -> None:
+def test_empty_file_has_no_records() -> None:
     info = sum_up(b"")
     assert (info.records, info.duration_s, info.vehicles) == (0, 0.0, ())

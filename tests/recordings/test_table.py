@@ -53,7 +53,7 @@ def test_written_file_is_read_in_any_chunks(chunk: int | None) -> None:
     assert repr(events) == repr(rows)
 
 
-def test_marks_stand_between_rows() -> None:
+def test_marks_are_read_between_rows() -> None:
     rows = make_rows(2, 4)
     mark = TableMark(1234, 'over the "gate", # 2')
     data = make_table(rows[:1]) + encode_line(mark).encode() + row_to_line(rows[1]).encode()
@@ -67,7 +67,7 @@ def test_reports_of_nodes_are_read_between_rows() -> None:
     assert repr(read(make_table([]) + data.encode())[1]) == repr([rows[0], status, rows[1]])
 
 
-def test_every_prefix_opens_and_loses_at_most_the_cut_line() -> None:
+def test_truncated_table_loses_at_most_its_last_line() -> None:
     rows = make_rows(3, 4)
     data = make_table(rows)
     head = len(encode_head(HEADER))
@@ -84,7 +84,7 @@ def _line_ends(data: bytes) -> list[int]:
     return [i + 1 for i, byte in enumerate(data) if byte == ord("\n")]
 
 
-def test_a_damaged_line_costs_itself_alone() -> None:
+def test_damaged_line_loses_only_itself() -> None:
     rows = make_rows(4, 6)
     lines = make_table(rows).split(b"\n")
     lines[4] = bytes(300)
@@ -94,7 +94,7 @@ def test_a_damaged_line_costs_itself_alone() -> None:
     assert repr([e for e in events if isinstance(e, TableRow)]) == repr([rows[0], *rows[3:]])
 
 
-def test_a_damaged_line_is_counted_from_the_files_first() -> None:
+def test_damaged_line_has_its_number_in_the_file() -> None:
     reader = TableReader()
     whole = make_table(make_rows(4, 6))
     reader.feed(whole)
@@ -106,7 +106,7 @@ def test_a_damaged_line_is_counted_from_the_files_first() -> None:
 
 
 @pytest.mark.parametrize("chunk", [None, 4096])
-def test_zeros_without_an_end_do_not_fill_the_memory(chunk: int | None) -> None:
+def test_endless_zeros_are_read_within_bounded_memory(chunk: int | None) -> None:
     rows = make_rows(5, 4)
     data = make_table(rows) + bytes(3 * MAX_LINE)
     events = read(data, chunk)[1]
@@ -134,20 +134,20 @@ def test_missing_columns_are_unknown() -> None:
     assert row.raw is row.gps is row.baro is row.state is None
 
 
-def test_a_file_of_something_else_gives_faults_only() -> None:
+def test_foreign_file_gives_only_faults() -> None:
     reader, events = read(b"a,b,c\n1,2,3\n")
     assert reader.header is None
     assert all(isinstance(event, TableFault) for event in events)
 
 
-def test_column_names_are_settled() -> None:
+def test_first_and_last_columns_are_fixed() -> None:
     assert COLUMNS[0] == "time_us"
     assert COLUMNS[-1] == "nav_flags"
 
 
 @pytest.mark.parametrize("size", [1, 7, 20, 1000])
 @pytest.mark.parametrize("count", [0, 20])
-def test_pieces_of_a_block_hold_all_events_in_order(size: int, count: int) -> None:
+def test_pieces_of_a_block_contain_all_events_in_order(size: int, count: int) -> None:
     rows, mark = make_rows(1, count)[:20], TableMark(5, "here")
     events = [mark, *rows[:7], mark, mark, *rows[7:], mark]
     pieces = [*block_of(events).pieces(size)]

@@ -66,14 +66,14 @@ def test_columns_contain_sender_and_message() -> None:
     assert batch.frame(1) == make_records(3, system_id=7)[1].frame
 
 
-def test_mavlink_1_and_signed_frames_pass() -> None:
+def test_mavlink_1_and_signed_frames_are_read() -> None:
     old, signed = heartbeat(v1=True), heartbeat(signed=True)
     records = [TlogRecord(START_US + i, frame) for i, frame in enumerate([old, signed, old])]
     assert len(signed) == 12 + 9 + 13
     assert records_of(scan(make_tlog(records), strict=True)) == records
 
 
-def test_a_damaged_mavlink_1_frame_is_left_out() -> None:
+def test_damaged_mavlink_1_frame_is_left_out() -> None:
     sender = dialect_v1.MAVLink(None, 1, 1)
     message = dialect_v1.MAVLink_attitude_message(20, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
     frames = [bytes(message.pack(sender)) for _ in range(3)]
@@ -86,7 +86,7 @@ def test_a_damaged_mavlink_1_frame_is_left_out() -> None:
     assert [run for batch in batches for run in batch.damage] == [Damage(size, size)]
 
 
-def test_every_prefix_opens_and_loses_at_most_the_cut_record() -> None:
+def test_truncated_tlog_loses_at_most_its_last_record() -> None:
     records = make_records(12)
     data = make_tlog(records)
     ends = np.cumsum([8 + len(record.frame) for record in records])
@@ -99,7 +99,7 @@ def test_every_prefix_opens_and_loses_at_most_the_cut_record() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_flipped_byte_costs_at_most_its_own_record_in_a_strict_scan(seed: int) -> None:
+def test_flipped_bit_loses_at_most_its_record_in_a_strict_scan(seed: int) -> None:
     rng = np.random.default_rng(seed)
     records = make_records(30)
     data = bytearray(make_tlog(records))
@@ -119,7 +119,7 @@ def test_a_flipped_byte_costs_at_most_its_own_record_in_a_strict_scan(seed: int)
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_garbage_between_records_is_stepped_over(seed: int) -> None:
+def test_garbage_between_records_is_skipped(seed: int) -> None:
     rng = np.random.default_rng(seed)
     records = make_records(30)
     garbage = rng.bytes(int(rng.integers(1, 2000)))
@@ -130,7 +130,7 @@ def test_garbage_between_records_is_stepped_over(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_noise_alone_gives_next_to_nothing_and_never_raises(seed: int) -> None:
+def test_random_bytes_give_almost_no_records(seed: int) -> None:
     data = np.random.default_rng(seed).bytes(20_000)
     index = index_of(scan(data, chunk=777))
     assert index.size == len(data)
@@ -147,9 +147,7 @@ def test_zeros_at_the_end_as_after_a_power_cut_are_damage() -> None:
 
 @pytest.mark.parametrize("fill", [b"\0", b"\xff"])
 @pytest.mark.parametrize("torn", range(9))
-def test_a_record_that_lost_a_part_of_its_time_has_that_of_the_one_before(
-    torn: int, fill: bytes
-) -> None:
+def test_record_with_a_torn_time_gets_that_of_its_predecessor(torn: int, fill: bytes) -> None:
     records = make_records(100)
     head, data = make_tlog(records[:50]), make_tlog(records)
     cut = data[: len(head) - 20] + fill * (20 + torn) + data[len(head) + torn :]
@@ -165,7 +163,7 @@ def test_a_record_that_lost_a_part_of_its_time_has_that_of_the_one_before(
 @pytest.mark.parametrize("chunk", [None, 1, 50, 333])
 @pytest.mark.parametrize("hit", [(0,), (20,), (39,), (5, 7, 9, 30)], ids=str)
 @pytest.mark.parametrize("flip", [1 << 23, 1 << 30, 1 << 40, 1 << 50])
-def test_a_flipped_time_is_no_gap(chunk: int | None, hit: tuple[int, ...], flip: int) -> None:
+def test_flipped_time_gives_no_gap(chunk: int | None, hit: tuple[int, ...], flip: int) -> None:
     records = make_records(40)
     spoilt = list(records)
     for i in hit:
@@ -185,7 +183,7 @@ def test_a_flipped_time_is_no_gap(chunk: int | None, hit: tuple[int, ...], flip:
 
 @pytest.mark.parametrize("chunk", [None, 1, 50])
 @pytest.mark.parametrize("leap_us", [-(10**15), -5_000_000, 5_000_000, 10**15])
-def test_a_clock_that_leaps_is_left_alone(chunk: int | None, leap_us: int) -> None:
+def test_jump_of_the_clock_is_kept(chunk: int | None, leap_us: int) -> None:
     records = [
         TlogRecord(r.time_us + (leap_us if i >= 20 else 0), r.frame)
         for i, r in enumerate(make_records(40))
@@ -195,7 +193,7 @@ def test_a_clock_that_leaps_is_left_alone(chunk: int | None, leap_us: int) -> No
     assert index_of(batches).mended == 0
 
 
-def test_index_finds_each_time() -> None:
+def test_index_finds_the_offset_of_each_time() -> None:
     count = 5 * STRIDE + 3
     records = make_records(count)
     data = make_tlog(records)
@@ -221,7 +219,7 @@ def test_index_stays_in_order_where_the_clock_jumped_back() -> None:
     assert index.offset_before(max(times)) < len(data)
 
 
-def test_an_empty_file_is_an_empty_index() -> None:
+def test_index_of_an_empty_file_is_empty() -> None:
     index = index_of(scan(b""))
     assert (index.count, index.first_us, index.last_us) == (0, None, None)
     assert index.offset_before(START_US) == 0
@@ -231,7 +229,7 @@ UTC_US = 1_781_000_000_000_000
 MINUTE_US = 60_000_000
 
 
-def test_clock_of_the_machine_counts_until_gps_has_the_time() -> None:
+def test_machine_clock_is_used_until_gps_time_is_confirmed() -> None:
     clock = CivilClock()
     assert clock.offset_us is None
     clock.hear_machine(5_000_000, 1_000_000)
@@ -243,7 +241,7 @@ def test_clock_of_the_machine_counts_until_gps_has_the_time() -> None:
     assert clock.offset_us == UTC_US - 3_000_000
 
 
-def test_a_right_machine_keeps_its_finer_time() -> None:
+def test_correct_machine_clock_is_kept_over_gps_time() -> None:
     clock = CivilClock()
     clock.hear_machine(UTC_US, 0)
     for _ in range(ENOUGH):
@@ -252,7 +250,7 @@ def test_a_right_machine_keeps_its_finer_time() -> None:
 
 
 @pytest.mark.parametrize("jump_us", [-MINUTE_US, -JUMP_US - 1, JUMP_US + 1, 50 * MINUTE_US])
-def test_a_jump_asks_for_a_new_file(jump_us: int) -> None:
+def test_jump_of_civil_time_is_reported(jump_us: int) -> None:
     clock = CivilClock()
     clock.hear_machine(UTC_US, 0)
     stamper = Stamper(UTC_US)
@@ -262,7 +260,7 @@ def test_a_jump_asks_for_a_new_file(jump_us: int) -> None:
     assert stamper.has_jumped(clock)
 
 
-def test_one_aircraft_among_three_that_errs_by_an_hour_changes_nothing() -> None:
+def test_wrong_time_of_one_aircraft_in_three_is_ignored() -> None:
     clock = CivilClock()
     clock.hear_machine(UTC_US, 0)
     for n in range(30):
@@ -271,7 +269,7 @@ def test_one_aircraft_among_three_that_errs_by_an_hour_changes_nothing() -> None
         assert clock.offset_us == UTC_US
 
 
-def test_single_fixes_that_err_change_nothing() -> None:
+def test_single_wrong_fixes_are_ignored() -> None:
     clock = CivilClock()
     clock.hear_machine(UTC_US, 0)
     for n in range(60):
@@ -288,7 +286,7 @@ def sleepless(monkeypatch: pytest.MonkeyPatch) -> dict[int, int]:
 
 
 @pytest.mark.parametrize("set_by_us", [0, 3_600_000_000])
-def test_a_machine_that_slept_is_distinguished_from_one_whose_clock_was_set(
+def test_suspend_is_distinguished_from_a_set_clock(
     monkeypatch: pytest.MonkeyPatch, set_by_us: int
 ) -> None:
     clocks = sleepless(monkeypatch)
@@ -301,7 +299,7 @@ def test_a_machine_that_slept_is_distinguished_from_one_whose_clock_was_set(
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_stamps_grow_whatever_the_order_of_calls(seed: int) -> None:
+def test_timestamps_increase_for_any_order_of_calls(seed: int) -> None:
     times = np.random.default_rng(seed).integers(0, 1000, 300).tolist()
     stamper = Stamper(UTC_US)
     stamps = [stamper.stamp(time) for time in times]
@@ -309,13 +307,13 @@ def test_stamps_grow_whatever_the_order_of_calls(seed: int) -> None:
     assert all(stamp % STAMP_STEP_US == 0 for stamp in stamps)
 
 
-def test_a_stamp_is_never_later_than_its_moment() -> None:
+def test_timestamp_is_never_later_than_its_time() -> None:
     stamper = Stamper(UTC_US)
     for now_us in range(0, 100_000, 997):
         assert 0 <= now_us + UTC_US - stamper.stamp(now_us) < STAMP_STEP_US
 
 
-def test_a_clock_before_1970_gives_zero_and_grows() -> None:
+def test_timestamps_of_a_clock_before_1970_start_at_zero() -> None:
     stamper = Stamper(-1_000_000)
     assert [stamper.stamp(0), stamper.stamp(1)] == [STAMP_STEP_US, 2 * STAMP_STEP_US]
 
@@ -334,7 +332,7 @@ def heartbeat(*, v1: bool = False, signed: bool = False) -> bytes:
 
 
 @pytest.mark.parametrize("frame", [*make_frames(3), heartbeat(v1=True), heartbeat(signed=True)])
-def test_only_the_sender_changes_and_a_signature_that_cannot_hold_is_taken_off(
+def test_readdressed_frame_changes_only_its_sender_and_loses_its_signature(
     frame: bytes,
 ) -> None:
     changed = readdress(frame, 42)
@@ -345,7 +343,7 @@ def test_only_the_sender_changes_and_a_signature_that_cannot_hold_is_taken_off(
     assert len(changed) == len(frame) - 13 * is_signed(frame)
 
 
-def test_an_unknown_message_is_left_alone() -> None:
+def test_unknown_message_is_not_readdressed() -> None:
     frame = b"\xfd\x00\x00\x00\x00\x01\x01\xff\xff\xff\x00\x00"
     assert readdress(frame, 9) == frame
 
@@ -363,7 +361,7 @@ def test_an_unknown_message_is_left_alone() -> None:
         (0, -DAY_US, DAY_US + 1, False),
     ],
 )
-def test_numbers_and_arrays_are_judged_alike(
+def test_damaged_times_are_found_alike_in_numbers_and_arrays(
     before: int, time: int, after: int, is_odd: bool
 ) -> None:
     assert is_damaged(before, time, after) is is_odd

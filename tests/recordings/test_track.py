@@ -35,7 +35,7 @@ def play_all(track: Track) -> list[TlogRecord]:
     return found
 
 
-def test_a_track_yields_every_record() -> None:
+def test_track_yields_every_record() -> None:
     records = make_records(5000)
     track = make_track(make_tlog(records))
     assert (track.first_us, track.last_us) == (records[0].time_us, records[-1].time_us)
@@ -52,7 +52,7 @@ def test_seek_goes_to_the_first_record_not_before(at: int) -> None:
     assert play_all(track) == records[at:]
 
 
-def test_seek_beyond_the_ends() -> None:
+def test_seek_behind_the_end_yields_no_frame_and_to_zero_all() -> None:
     records = make_records(10)
     track = make_track(make_tlog(records))
     track.seek(START_US + 10**9)
@@ -69,7 +69,7 @@ def test_seek_sends_the_newest_state_messages() -> None:
     assert [message_id_of(frame) for frame in context] == [31, 0]
 
 
-def test_shift_and_sender() -> None:
+def test_times_are_shifted_and_senders_replaced() -> None:
     records = make_records(4)
     track = make_track(make_tlog(records), shift_us=1000, system_ids={1: 9})
     assert track.first_us == START_US + 1000
@@ -80,7 +80,7 @@ def test_shift_and_sender() -> None:
     assert track.peek_us() == START_US + 1000 + STEP_US
 
 
-def test_an_empty_recording_has_nothing() -> None:
+def test_track_of_an_empty_recording_is_empty() -> None:
     track = make_track(b"")
     assert (track.peek_us(), track.first_us, track.last_us) == (None, 0, 0)
     assert track.seek(0) == []

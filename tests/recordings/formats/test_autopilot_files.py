@@ -79,7 +79,7 @@ def test_logged_samples_are_read(folder: Path, name: str) -> None:
     np.testing.assert_allclose(baros, sent, rtol=1e-6)
 
 
-def test_a_field_that_was_not_new_is_not_read_again(tmp_path: Path) -> None:
+def test_repeated_magnetometer_field_is_read_once(tmp_path: Path) -> None:
     """PX4 of 2017 repeated the last one in every row, and marked it."""
     form = flown.FORMATS["sensor_combined"]
     form += "int32_t magnetometer_timestamp_relative;float[3] magnetometer_ga;"
@@ -163,7 +163,7 @@ def test_log_is_fused_to_the_true_attitude_and_position(
     assert rms((lat - truth.lat_deg) * 111_000) < 3.0
 
 
-def test_the_commands_take_it(folder: Path, tmp_path: Path) -> None:
+def test_info_convert_and_play_accept_autopilot_logs(folder: Path, tmp_path: Path) -> None:
     found = json.loads(run("info", folder / "new.ulg", "--json"))
     assert found["kind"] == "ULog"
     assert found["duration_s"] == pytest.approx(flown.DURATION_S, abs=1.0)
@@ -219,7 +219,7 @@ def test_log_cut_before_its_samples_is_refused(
 
 
 @pytest.mark.parametrize("end", [b"\0" * 40, b"\x10\x27\xee", b"\xff" * 40, b"\x01\x00"])
-def test_a_ulog_that_is_cut_in_its_formats_ends(tmp_path: Path, end: bytes) -> None:
+def test_ulog_cut_in_its_formats_is_refused(tmp_path: Path, end: bytes) -> None:
     head = b"".join(flown.Ulog(flown.FORMATS, {"MAV_SYS_ID": 7}).parts[:6])
     stub = flown.write(tmp_path / "cut.ulg", head + end)
     with pytest.raises(FlightError, match=r"cut.ulg: holds no sensor_combined"):
@@ -233,7 +233,7 @@ def test_a_ulog_that_is_cut_in_its_formats_ends(tmp_path: Path, end: bytes) -> N
         ["vehicle_attitude:a[3999] b;", "a:" + "b[3999] x;" * 50, "b:uint8_t x;"],
     ],
 )
-def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: list[str]) -> None:
+def test_ulog_with_endless_formats_is_refused(tmp_path: Path, formats: list[str]) -> None:
     log = flown.Ulog({}, {})
     log.parts += [flown.ulog_message(b"F", text.encode()) for text in formats]
     log.parts.append(flown.ulog_message(b"A", bytes(3) + b"vehicle_attitude"))
@@ -251,7 +251,7 @@ def test_a_ulog_whose_formats_have_no_end_is_refused(tmp_path: Path, formats: li
         (b"\xff\xffD", False),
     ],
 )
-def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(
+def test_unreadable_end_of_a_ulog_is_reported(
     folder: Path, tmp_path: Path, odd: bytes, is_read: bool
 ) -> None:
     data = (folder / "new.ulg").read_bytes()
@@ -264,7 +264,7 @@ def test_the_end_of_a_ulog_that_pyulog_gives_up_is_reported(
 
 
 @pytest.mark.parametrize("letters", [b"Q?", b"Q\xff"])
-def test_a_dataflash_log_with_an_unknown_kind_of_value_is_refused(
+def test_dataflash_log_with_an_unknown_value_type_is_refused(
     tmp_path: Path, letters: bytes
 ) -> None:
     layout = flown.packed("FMT", (200, 12, b"NEW", letters, b"TimeUS,X"))
@@ -274,9 +274,7 @@ def test_a_dataflash_log_with_an_unknown_kind_of_value_is_refused(
         rows_of(path)
 
 
-def test_odd_lines_of_a_text_log_are_counted_and_nothing_is_read_twice(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_invalid_lines_of_a_text_log_are_counted(folder: Path, tmp_path: Path) -> None:
     lines = (folder / "flight.log").read_bytes().splitlines(keepends=True)
     _, all_rows = whole(folder / "flight.log")
     places = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
@@ -292,7 +290,7 @@ def test_odd_lines_of_a_text_log_are_counted_and_nothing_is_read_twice(
 
 
 @pytest.mark.parametrize("name", ["flight.bin", "flight.log"])
-def test_a_log_that_shrinks_while_it_is_read_ends_nothing(
+def test_log_truncated_while_read_is_still_read_whole(
     folder: Path, tmp_path: Path, name: str
 ) -> None:
     log = flown.write(tmp_path / name, (folder / name).read_bytes())

@@ -25,7 +25,7 @@ def rows_of(reader: CsvReader, *lines: str) -> list[Any]:
     return [row for block in reader.blocks(lines) for row in block.events(1)]
 
 
-def test_a_full_line() -> None:
+def test_line_with_all_columns_is_read() -> None:
     _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,20,5,-40,512.5,1.45,47.1,8.5,430,1,2,3,hi")
     (row,) = rows
     assert row.time_us == 1_500_000
@@ -45,14 +45,14 @@ def test_a_full_line() -> None:
     assert row.raw is row.state is None
 
 
-def test_speed_and_course_stand_in_for_a_velocity_that_is_not_reported() -> None:
+def test_missing_velocity_is_computed_from_speed_and_course() -> None:
     _, rows = read("1.5,0,0,-9.8,0,0,0,,,,,1.45,47.1,8.5,430,,,,,5,120")
     north, east, down = rows[0].gps.vel_n_mps
     assert (north, east) == pytest.approx((-2.5, 4.330127), abs=1e-6)
     assert math.isnan(down)
 
 
-def test_blank_cells_are_nothing_new() -> None:
+def test_blank_cells_give_no_records() -> None:
     _, rows = read("1.5,0.1,0.2,-9.8,0.01,0.02,0.03,,,,,,,,,,,,")
     (row,) = rows
     assert row.imu.mag_b_ut is None
@@ -60,13 +60,13 @@ def test_blank_cells_are_nothing_new() -> None:
     assert row.baro is row.gps is None
 
 
-def test_lines_that_cannot_be_read_are_counted() -> None:
+def test_unreadable_lines_are_counted() -> None:
     reader, rows = read("x,1", ",,,", "2,0,0,0,0,0,0,,,,,,,,,,,,")
     assert len(rows) == 1
     assert reader.faults == 2
 
 
-def test_scale_and_offset() -> None:
+def test_scale_and_offset_are_applied() -> None:
     columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
     (row,) = rows_of(CsvReader(ColumnMap(columns=columns)), "t,p", "2,95000")
     assert row.time_us == 2005
@@ -74,7 +74,7 @@ def test_scale_and_offset() -> None:
     assert row.baro.pressure_pa == 95_000.0
 
 
-def test_a_file_without_the_columns_is_refused() -> None:
+def test_file_without_mapped_columns_is_refused() -> None:
     with pytest.raises(ValueError, match="no column ax, ay"):
         rows_of(CsvReader(TRACKER), "time_s,az", "1,2")
 
@@ -87,9 +87,7 @@ def test_a_file_without_the_columns_is_refused() -> None:
         ("time_s,ax,ay,az,gx,gy,gz,mx,my", "mz"),
     ],
 )
-def test_missing_columns_of_a_file_without_a_map_are_the_needed_ones(
-    names: str, missing: str
-) -> None:
+def test_only_needed_columns_are_reported_missing_without_a_map(names: str, missing: str) -> None:
     with pytest.raises(
         ValueError, match=f"no column {missing}; found, separated by commas: time_s"
     ):
@@ -104,7 +102,7 @@ def test_missing_columns_of_a_file_without_a_map_are_the_needed_ones(
         ({"time_us": "t", "mag_y_b_ut": "m"}, "mapped too: mag_x_b_ut, mag_z_b_ut"),
     ],
 )
-def test_a_wrong_map_is_refused(columns: dict[str, str], text: str) -> None:
+def test_invalid_map_is_refused(columns: dict[str, str], text: str) -> None:
     with pytest.raises(msgspec.ValidationError, match=text):
         msgspec.convert({"columns": columns}, ColumnMap)
 
@@ -118,17 +116,17 @@ SECONDS = tuple(range(10, 20))
 
 
 @pytest.mark.parametrize("odd", [86_410.0, -86_400.0, 1e9, 10.0, 30.0])
-def test_a_line_with_a_damaged_time_is_left_out(odd: float) -> None:
+def test_line_with_a_damaged_time_is_left_out(odd: float) -> None:
     assert times_of(*SECONDS[:5], odd, *SECONDS[5:]) == (1, [*SECONDS])
 
 
 @pytest.mark.parametrize("leap", [-86_400, -60, 60, 86_400 * 400])
-def test_a_clock_that_leaps_is_left_alone(leap: int) -> None:
+def test_jump_of_the_clock_is_kept(leap: int) -> None:
     times = [*SECONDS, *(t + leap for t in SECONDS)]
     assert times_of(*times) == (0, times)
 
 
 @pytest.mark.parametrize("own", ["86401", "-86400", "1e12", "1780000000"])
-def test_a_fix_of_another_time_is_as_old_as_its_line(own: str) -> None:
+def test_fix_with_a_time_of_another_clock_gets_the_time_of_its_line(own: str) -> None:
     _, (row,) = read(f"1.5,0,0,-9.8,0,0,0,,,,,{own},47.1,8.5,430,1,2,3,,,")
     assert row.gps.time_us == row.time_us

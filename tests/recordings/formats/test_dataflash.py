@@ -22,14 +22,14 @@ def records_at(*times_us: int) -> tuple[list[int], ArdupilotReader]:
 
 
 @pytest.mark.parametrize("off_us", [86_400_000_000, -31_536_000_000_000, (1 << 63) - 1])
-def test_a_damaged_stamp_costs_only_its_message(off_us: int) -> None:
+def test_damaged_time_drops_only_its_message(off_us: int) -> None:
     found, reader = records_at(*SECOND[:50], off_us, *SECOND[50:])
     assert found == SECOND
     assert (reader.dropped, reader.leaps) == (1, 0)
 
 
 @pytest.mark.parametrize("leap_us", [7_200_000_000, -5_000_000_000])
-def test_a_clock_that_leaps_is_followed(leap_us: int) -> None:
+def test_jump_of_the_clock_is_followed(leap_us: int) -> None:
     begin_us = 6_000_000_000
     found, reader = records_at(
         *(begin_us + t for t in SECOND), *(begin_us + leap_us + t for t in SECOND)

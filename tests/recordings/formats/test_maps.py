@@ -48,7 +48,7 @@ KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/e
 GPX = {"g": "http://www.topografix.com/GPX/1/1", "a": "urn:mavgate:attitude:1"}
 
 
-def test_kml_holds_every_vehicle_with_times_and_attitude() -> None:
+def test_kml_contains_every_vehicle_with_times_and_attitude() -> None:
     root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
     assert [e.text for e in root.findall(".//k:Folder/k:name", KML)] == [
         "wood & <field>", "system 7",
@@ -69,7 +69,7 @@ def test_kml_holds_every_vehicle_with_times_and_attitude() -> None:
     assert {(style or "#")[1:] for style in used} <= styles
 
 
-def test_kml_holds_home_marks_and_events() -> None:
+def test_kml_contains_home_marks_and_events() -> None:
     root = ET.fromstring("".join(to_kml("flight", VEHICLES)))
     found = [
         (p.findtext("k:description", namespaces=KML), p.findtext("k:name", namespaces=KML),
@@ -83,7 +83,7 @@ def test_kml_holds_home_marks_and_events() -> None:
     ]
 
 
-def test_gpx_holds_the_same() -> None:
+def test_gpx_contains_tracks_and_waypoints() -> None:
     root = ET.fromstring("".join(to_gpx("flight", VEHICLES)))
     # GPX wants waypoints before tracks.
     assert [e.tag.rpartition("}")[2] for e in root] == ["metadata", *["wpt"] * 3, *["trk"] * 2]
@@ -98,13 +98,13 @@ def test_gpx_holds_the_same() -> None:
     assert attitude.attrib == {"roll": "-10.0", "pitch": "5.0", "yaw": "270.0"}
 
 
-def test_no_points_is_still_a_file() -> None:
+def test_map_without_points_is_valid_xml() -> None:
     ET.fromstring("".join(to_kml("x", [])))
     ET.fromstring("".join(to_gpx("x", [])))
 
 
 @pytest.mark.parametrize("write", [to_kml, to_gpx])
-def test_texts_that_xml_cannot_hold_leave_it_readable(write: Callable[..., Iterator[str]]) -> None:
+def test_characters_not_allowed_in_xml_are_replaced(write: Callable[..., Iterator[str]]) -> None:
     odd = "".join(map(chr, range(0x20))) + "\x7f\ud800\udcff\ufffe\uffff]]>\N{HELICOPTER}"
     vehicles = [VehicleTrack(odd, POINTS, [MapMarker(MarkerKind.MARK, odd, POINTS[0])])]
     text = "".join(write(odd, vehicles))
@@ -117,7 +117,7 @@ def written(vehicles: list[VehicleTrack]) -> dict:
     return json.loads("".join(to_geojson('a "flight"', vehicles)))
 
 
-def test_it_holds_every_vehicle_with_times_home_marks_and_events() -> None:
+def test_geojson_contains_every_vehicle_with_times_and_markers() -> None:
     found = written(VEHICLES)
     assert (found["type"], found["name"]) == ("FeatureCollection", 'a "flight"')
     assert {feature["type"] for feature in found["features"]} == {"Feature"}
@@ -136,7 +136,7 @@ def test_it_holds_every_vehicle_with_times_home_marks_and_events() -> None:
     assert mark["properties"]["vehicle"] == "wood & <field>"
 
 
-def test_a_track_is_cut_at_the_antimeridian() -> None:
+def test_track_is_cut_at_the_antimeridian() -> None:
     lons = (179.0, 179.8, -179.8, -179.0, 179.9)
     points = [TrackPoint(1_000_000 * k, 10.0 + k, lon, 100.0) for k, lon in enumerate(lons)]
     (track,) = written([VehicleTrack("x", points)])["features"]
@@ -153,7 +153,7 @@ def test_a_track_is_cut_at_the_antimeridian() -> None:
 
 
 @pytest.mark.parametrize(("alt_m", "length"), [(math.nan, 2), (5.0, 3)])
-def test_one_point_is_a_point_and_an_unknown_height_is_left_out(alt_m: float, length: int) -> None:
+def test_track_of_one_point_is_a_point_without_an_unknown_height(alt_m: float, length: int) -> None:
     (track,) = written([VehicleTrack("x", [TrackPoint(0, 47.0, 8.0, alt_m)])])["features"]
     assert track["geometry"]["type"] == "Point"
     assert len(track["geometry"]["coordinates"]) == length
@@ -209,7 +209,7 @@ def markers(track: VehicleTrack) -> list[tuple[MarkerKind, str]]:
     return [(marker.kind, marker.name) for marker in track.markers]
 
 
-def test_tracks_are_those_of_the_vehicles_only() -> None:
+def test_tracks_are_only_those_of_vehicles() -> None:
     one, two = tracks_of_frames(records(), None)
     assert (one.name, two.name) == ("system 1", "system 7")
     assert [round(p.lat_deg * 1e7) for p in two.points] == [480_000_000, 480_000_001]
@@ -225,7 +225,7 @@ def test_points_have_the_attitude_of_their_time() -> None:
     assert [p.attitude_deg for p in two.points] == [None, (0.0, 0.0, 0.0)]
 
 
-def test_home_marks_and_events() -> None:
+def test_tracks_of_frames_have_home_marks_and_events() -> None:
     one, _ = tracks_of_frames(records(), None)
     assert markers(one) == [
         (MarkerKind.HOME, "Home"),

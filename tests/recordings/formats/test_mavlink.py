@@ -65,7 +65,7 @@ def read(
     return [record for record in held if record is not None]
 
 
-def test_highres_imu_is_taken_in_si() -> None:
+def test_highres_imu_is_read_in_si_units() -> None:
     (imu,) = read([(0, highres(5_000_000))])
     assert isinstance(imu, ImuCalibrated)
     assert imu.time_us == 0
@@ -76,13 +76,13 @@ def test_highres_imu_is_taken_in_si() -> None:
     assert imu.flags is ImuFlags.MAG_NEW
 
 
-def test_a_magnetometer_that_has_nothing_new_is_left_out() -> None:
+def test_magnetometer_without_a_new_sample_is_left_out() -> None:
     (imu,) = read([(0, highres(0, updated=0b111111))])
     assert isinstance(imu, ImuCalibrated)
     assert imu.mag_b_ut is None
 
 
-def test_raw_and_scaled_imu_are_in_thousandths() -> None:
+def test_raw_and_scaled_imu_are_read_in_thousandths() -> None:
     scaled = mavlink.MAVLink_scaled_imu_message(20, 10, 20, -1000, 10, 20, 30, 200, 50, -400)
     for message in (raw(20_000), scaled):
         (imu,) = read([(0, message)])
@@ -93,19 +93,19 @@ def test_raw_and_scaled_imu_are_in_thousandths() -> None:
         assert math.isnan(imu.temperature_degc)
 
 
-def test_the_best_imu_message_wins() -> None:
+def test_imu_message_of_highest_resolution_is_used() -> None:
     records = read([(0, raw(1000)), (10_000, highres(11_000)), (20_000, raw(21_000))])
     assert [r.time_us for r in records] == [0, 10_000]
 
 
-def test_pressure_in_pascal() -> None:
+def test_pressure_is_converted_to_pascal() -> None:
     pressure = mavlink.MAVLink_scaled_pressure_message(15, 950.25, 0, 2150)
     baro = read([(0, raw(10_000)), (5_000, pressure)])[1]
     assert isinstance(baro, BaroRaw)
     assert (baro.time_us, baro.pressure_pa, baro.temperature_degc) == (5_000, 95_025.0, 21.5)
 
 
-def test_a_fix_has_the_velocity_of_its_course_and_the_climb_of_the_position() -> None:
+def test_velocity_of_a_fix_is_from_its_course_and_the_climb_of_the_position() -> None:
     climb = (100_000, position(100, vz_cmps=-500))
     first, second = read([(0, raw(0)), (0, gps(1_000)), climb, (200_000, gps(201_000, 431_000))])[
         1:
@@ -121,19 +121,19 @@ def test_a_fix_has_the_velocity_of_its_course_and_the_climb_of_the_position() ->
     assert second.utc_us is None
 
 
-def test_no_fix_is_reported_as_none() -> None:
+def test_message_without_a_fix_is_not_ok() -> None:
     (fix,) = read([(0, raw(0)), (0, gps(0, fix=1))])[1:]
     assert isinstance(fix, GpsFix)
     assert not fix.fix_ok
 
 
-def test_other_systems_and_components_are_left_out() -> None:
+def test_other_systems_and_components_are_ignored() -> None:
     assert read([(0, raw(0))], component_id=191) == []
     frame = packed(raw(0))
     assert rows_of(AutopilotReader(system_id=2), [(START_US, frame)], 100) == []
 
 
-def test_the_clock_never_falls_whatever_the_messages_say() -> None:
+def test_clock_never_decreases_for_any_message_times() -> None:
     times = [5_000_000, 5_010_000, 4_000_000, 100, 5_030_000, 9_000_000_000]
     records = read([(i * 10_000, raw(t)) for i, t in enumerate(times)])
     stamps = [r.time_us for r in records]
@@ -142,7 +142,7 @@ def test_the_clock_never_falls_whatever_the_messages_say() -> None:
 
 
 @pytest.mark.parametrize("lead_us", [300_000, 900_000, 1_500_000, -300_000])
-def test_fixes_of_another_clock_leave_the_imu_its_spacing(lead_us: int) -> None:
+def test_fixes_of_another_clock_do_not_change_imu_intervals(lead_us: int) -> None:
     messages: list[tuple[int, Message]] = []
     for at_us in range(0, 4_000_000, 20_000):
         messages.append((at_us, raw(2_000_000 + at_us)))
@@ -160,7 +160,7 @@ def test_fixes_of_another_clock_leave_the_imu_its_spacing(lead_us: int) -> None:
     assert states == [*range(108_000, 4_000_000, 200_000)]
 
 
-def test_a_fix_without_a_stamp_follows_the_imu_though_the_recording_drifts() -> None:
+def test_fix_without_a_time_follows_the_imu_despite_clock_drift() -> None:
     """The recording's clock is slower by a percent; a fix comes 4 ms after each tenth sample."""
     messages: list[tuple[int, Message]] = []
     for at_us in range(0, 4_000_000, 20_000):
@@ -181,7 +181,7 @@ def test_climb_rate_is_unknown_once_it_is_outdated(age_us: int, is_known: bool) 
     assert math.isfinite(fix.vel_n_mps[2]) == is_known
 
 
-def test_a_lost_fix_makes_no_climb() -> None:
+def test_climb_rate_is_unknown_after_a_lost_fix() -> None:
     """Without a fix the height may be zero: found again, 484 m would be a climb of 968 m/s."""
     heights = [(484_000, 3), (0, 1), (484_000, 3), (484_500, 3)]
     flight: list[tuple[int, Message]] = []
@@ -196,7 +196,7 @@ def test_a_lost_fix_makes_no_climb() -> None:
     assert downs == pytest.approx([0.2, math.nan, 0.2, 0.2], nan_ok=True)
 
 
-def test_a_flat_fix_has_no_climb() -> None:
+def test_climb_rate_of_a_2d_fix_is_unknown() -> None:
     (fix,) = fixes_of([(0, position(0, -150)), (0, gps(1, fix=2))])
     assert math.isnan(fix.vel_n_mps[2])
 
@@ -205,7 +205,7 @@ def attitude(time_ms: int) -> Message:
     return mavlink.MAVLink_attitude_message(time_ms, 0.1, -0.2, 1.5, 0.01, 0.02, 0.03)
 
 
-def test_states_of_the_autopilot_are_kept() -> None:
+def test_states_of_the_autopilot_are_read() -> None:
     own = [(0, raw(0)), (0, position(0, -150)), (10_000, attitude(10)), (20_000, raw(20_000))]
     later = [(590_000, attitude(590)), (600_000, attitude(600)), (600_000, raw(600_000))]
     records = read([*own, *later])

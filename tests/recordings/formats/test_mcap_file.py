@@ -74,7 +74,7 @@ def test_every_message_has_the_fields_of_its_schema(flight: Path, shown: list[Me
         assert set(content) == set(schemas[name]["properties"])
 
 
-def test_it_is_where_it_was(shown: list[Message]) -> None:
+def test_location_fixes_match_the_true_position(shown: list[Message]) -> None:
     fixes = [(t, fix) for t, fix in of(shown, "/vehicle_7/location") if t > 30]
     truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in fixes]))
     for k, (_, fix) in enumerate(fixes):
@@ -88,7 +88,7 @@ def test_it_is_where_it_was(shown: list[Message]) -> None:
     assert {fix["position_covariance_type"] for _, fix in of(shown, "/vehicle_7/gps")} == {2}
 
 
-def test_the_frames_turn_as_the_aircraft_did(shown: list[Message]) -> None:
+def test_poses_match_the_true_attitude(shown: list[Message]) -> None:
     poses = [(t, pose) for t, pose in of(shown, "/vehicle_7/pose") if t > 30]
     assert len(poses) > 1000
     truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in poses]))
@@ -110,7 +110,7 @@ def test_the_frames_turn_as_the_aircraft_did(shown: list[Message]) -> None:
     assert transform["translation"] == last
 
 
-def test_the_state_is_in_degrees(shown: list[Message]) -> None:
+def test_state_matches_the_truth_in_degrees(shown: list[Message]) -> None:
     states = [(t, s) for t, s in of(shown, "/vehicle_7/state") if t > 30]
     truth = flown.simulated().trajectory.truth_at(np.array([t for t, _ in states]))
     speeds = np.hypot(truth.vel_n_mps[:, 0], truth.vel_n_mps[:, 1])
@@ -121,7 +121,7 @@ def test_the_state_is_in_degrees(shown: list[Message]) -> None:
     assert all(0 <= s["heading_deg"] < 360 for _, s in states)
 
 
-def test_every_message_of_a_tlog_is_in_it(tmp_path: Path) -> None:
+def test_every_message_of_a_tlog_is_written(tmp_path: Path) -> None:
     one, station = "/mavlink/3/1/", "/mavlink/255/190/"
     battery = mavlink.MAVLink_battery_status_message(0, 0, 0, 99, [4000] * 10, -1, -1, -1, 50)
     messages = [

@@ -64,7 +64,7 @@ def test_columns_have_types_and_units(table: Path, tmp_path: Path) -> None:
     assert found["gps_pdop"][0].as_py() is None
 
 
-def test_the_commands_take_it(table: Path, tmp_path: Path) -> None:
+def test_info_and_convert_accept_parquet(table: Path, tmp_path: Path) -> None:
     columns = tmp_path / "flight.parquet"
     run("convert", table, "-o", columns)
     described = [json.loads(run("info", file, "--json")) for file in (table, columns)]
@@ -75,7 +75,7 @@ def test_the_commands_take_it(table: Path, tmp_path: Path) -> None:
     assert described[0] == described[1]
 
 
-def test_one_message_is_one_typed_table(tmp_path: Path) -> None:
+def test_one_kind_of_message_is_a_typed_table(tmp_path: Path) -> None:
     path, out = tmp_path / "a.tlog", tmp_path / "a.parquet"
     path.write_bytes(make_tlog(make_records(300)))
     run("convert", path, "-o", out, "--message", "ATTITUDE_QUATERNION")
@@ -109,7 +109,7 @@ def test_invalid_options_are_refused(
     assert not (tmp_path / "a.parquet").exists()
 
 
-def test_memory_is_that_of_a_few_rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is written comes out piece by piece, long before the flight has ended."""
     monkeypatch.setattr(parquet_file, "ROWS", 50)
     path = tmp_path / "a.tlog"
@@ -123,7 +123,7 @@ def test_memory_is_that_of_a_few_rows(tmp_path: Path, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     "damage", [lambda data: data[:-100], lambda data: data[:9000] + bytes(400) + data[9400:]]
 )
-def test_a_damaged_file_is_refused(table: Path, tmp_path: Path, damage: object) -> None:
+def test_damaged_parquet_is_refused(table: Path, tmp_path: Path, damage: object) -> None:
     columns, spoilt = tmp_path / "flight.parquet", tmp_path / "spoilt.parquet"
     run("convert", table, "-o", columns)
     assert callable(damage)
@@ -131,13 +131,13 @@ def test_a_damaged_file_is_refused(table: Path, tmp_path: Path, damage: object) 
     assert "cannot be read as Parquet" in run("convert", spoilt, "-o", tmp_path / "x.csv", code=2)
 
 
-def test_another_programs_parquet_is_refused(tmp_path: Path) -> None:
+def test_foreign_parquet_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.parquet"
     pq.write_table(pa.table({"a": [1, 2]}), path)
     assert "no column time_us" in run("convert", path, "-o", tmp_path / "x.csv", code=2)
 
 
-def test_messages_of_a_table_are_those_that_the_gateway_sends(table: Path, tmp_path: Path) -> None:
+def test_messages_of_a_table_are_made_by_its_fusion(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "a.parquet"
     run("convert", table, "-o", out, "--message", "GLOBAL_POSITION_INT")
     found = pq.read_table(out)

@@ -48,7 +48,7 @@ def batch_of(frames: list[bytes]) -> Batch:
 
 @settings(max_examples=8)
 @given(st.integers(0, 1 << 32))
-def test_every_message_of_the_dialect(seed: int) -> None:
+def test_columns_of_every_message_match_pymavlink(seed: int) -> None:
     chance = random.Random(seed)
     link = mavlink.MAVLink(None)
     for message_id, kind in KINDS:
@@ -69,7 +69,7 @@ def test_every_message_of_the_dialect(seed: int) -> None:
                     )
 
 
-def test_only_those_that_are_wanted() -> None:
+def test_only_requested_frames_are_read() -> None:
     kind = mavlink.MAVLink_heartbeat_message
     frames = [frame_of(0, bytes([n, 0, 0, 0, 6]), 2) for n in range(4)]
     rows = columns_of(batch_of(frames), np.array([1, 3]), kind)
@@ -79,7 +79,7 @@ def test_only_those_that_are_wanted() -> None:
 
 
 @pytest.mark.parametrize("message_id", [0, 30, 331])
-def test_longer_than_it_is_known(message_id: int) -> None:
+def test_extra_fields_at_the_end_are_ignored(message_id: int) -> None:
     """A later dialect may have added fields at the end."""
     kind = mavlink.mavlink_map[message_id]
     payload = bytes(range(1, layout_of(kind).itemsize + 1))

@@ -229,7 +229,7 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("name", "ending"), PAIRS)
-def test_written_file_holds_the_content_of_its_source(
+def test_written_file_contains_the_content_of_its_source(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, ending: str
 ) -> None:
     monkeypatch.setattr(parquet, "ROWS", 100)

@@ -27,7 +27,7 @@ def test_documented_topics_are_read() -> None:
 
 
 @pytest.mark.parametrize("field", ["q[3]", "timestamp"])
-def test_a_topic_without_its_fields_does_not_cost_the_flight(field: str) -> None:
+def test_topic_without_its_fields_is_left_out(field: str) -> None:
     found = topics()
     del found["vehicle_attitude"][field]
     flight = Px4Log(found, 1)
@@ -35,14 +35,14 @@ def test_a_topic_without_its_fields_does_not_cost_the_flight(field: str) -> None
     assert len(list(flight.records())) == ROWS
 
 
-def test_nor_does_one_whose_times_are_no_whole_numbers() -> None:
+def test_topic_with_fractional_times_is_left_out() -> None:
     found = topics()
     found["vehicle_attitude"]["timestamp"] = np.linspace(0.0, 1.0, ROWS)
     assert Px4Log(found, 1).left_out == ["vehicle_attitude"]
 
 
 @pytest.mark.parametrize("off_us", [86_400_000_000, 31_536_000_000_000, -4_000_000, 1 << 60])
-def test_a_damaged_stamp_is_no_gap(off_us: int) -> None:
+def test_damaged_times_give_no_gap(off_us: int) -> None:
     found = topics()
     time_us = found["sensor_combined"]["timestamp"].astype(np.int64)
     time_us[[9, 30]] += off_us
@@ -57,7 +57,7 @@ def test_a_damaged_stamp_is_no_gap(off_us: int) -> None:
 @pytest.mark.parametrize(
     ("fix_type", "valid", "known"), [(3, 1, True), (3, 0, False), (1, 1, False)]
 )
-def test_a_velocity_counts_with_a_fix_and_where_it_is_valid(
+def test_velocity_is_used_with_a_fix_and_where_it_is_valid(
     fix_type: int, valid: int, known: bool
 ) -> None:
     found = topics()
