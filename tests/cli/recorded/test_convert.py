@@ -53,7 +53,7 @@ def read_table(path: Path) -> tuple[TableHeader, list[TableRow]]:
     return reader.header, [event for event in events if isinstance(event, TableRow)]
 
 
-def test_trim_a_tlog(tlog: Path, tmp_path: Path) -> None:
+def test_tlog_is_trimmed_to_a_range(tlog: Path, tmp_path: Path) -> None:
     out = tmp_path / "part.tlog"
     run("convert", tlog, "-o", out, "--from", "0:02", "--to", "4")
     assert read_tlog(out) == RECORDS[100:201]
@@ -61,7 +61,7 @@ def test_trim_a_tlog(tlog: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("ending", ["csv", "tlog", "kml", "parquet"])
 @pytest.mark.parametrize("options", [("--from", "99:00"), ("--from", "2100-01-01T00:00:00Z")])
-def test_a_stretch_that_holds_nothing_is_refused(
+def test_range_without_samples_is_refused(
     tlog: Path, table: Path, tmp_path: Path, ending: str, options: tuple[str, str]
 ) -> None:
     for source in (tlog, table) if ending in ("tlog", "kml") else (table,):
@@ -71,7 +71,7 @@ def test_a_stretch_that_holds_nothing_is_refused(
         assert not out.exists()
 
 
-def test_join_tlogs_by_time(tmp_path: Path) -> None:
+def test_tlogs_are_joined_in_order_of_time(tmp_path: Path) -> None:
     for name, records in (("a", RECORDS[::2]), ("b", RECORDS[1::2])):
         (tmp_path / f"{name}.tlog").write_bytes(make_tlog(records))
     out = tmp_path / "all.tlog"
@@ -79,7 +79,7 @@ def test_join_tlogs_by_time(tmp_path: Path) -> None:
     assert read_tlog(out) == RECORDS
 
 
-def test_nothing_is_overwritten_unless_forced(tlog: Path, tmp_path: Path) -> None:
+def test_existing_output_is_overwritten_only_with_force(tlog: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.tlog"
     out.write_text("dear")
     assert "--force" in run("convert", tlog, "-o", out, code=2)
@@ -88,13 +88,13 @@ def test_nothing_is_overwritten_unless_forced(tlog: Path, tmp_path: Path) -> Non
     assert read_tlog(out) == RECORDS
 
 
-def test_a_table_fused_again_is_the_same_table(table: Path, tmp_path: Path) -> None:
+def test_table_fused_again_is_identical(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.csv"
     run("convert", table, "-o", out, "--fuse")
     assert out.read_bytes() == table.read_bytes()
 
 
-def test_a_table_fused_with_other_settings_is_another(table: Path, tmp_path: Path) -> None:
+def test_table_fused_with_other_settings_has_other_states(table: Path, tmp_path: Path) -> None:
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     out = tmp_path / "again.csv"
@@ -104,7 +104,7 @@ def test_a_table_fused_with_other_settings_is_another(table: Path, tmp_path: Pat
     assert after[-1].state != before[-1].state
 
 
-def test_positions_on_straight_lines(table: Path, tmp_path: Path) -> None:
+def test_interpolated_positions_lie_on_lines_between_fixes(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.csv"
     run("convert", table, "-o", out, "--fuse", "--position", "interpolated")
     _, rows = read_table(out)
@@ -142,13 +142,13 @@ def test_tables_of_two_aircraft_become_one_tlog(table: Path, tmp_path: Path) -> 
     assert stamps == sorted(set(stamps))
 
 
-def test_a_flight_without_a_position_gives_no_map(tlog: Path, tmp_path: Path) -> None:
+def test_map_of_a_flight_without_position_is_refused(tlog: Path, tmp_path: Path) -> None:
     text = run("convert", tlog, "-o", tmp_path / "out.kml", code=2)
     assert f"{tlog}: nothing to draw, since the flight has no position" in text
     assert not (tmp_path / "out.kml").exists()
 
 
-def test_an_autopilots_tlog_becomes_a_table_that_is_fused(tmp_path: Path) -> None:
+def test_tlog_of_an_autopilot_is_converted_to_a_fused_table(tmp_path: Path) -> None:
     mav = mavlink.MAVLink(None, 4, 1)
     records = []
     for i in range(1000):
@@ -172,7 +172,7 @@ def test_an_autopilots_tlog_becomes_a_table_that_is_fused(tmp_path: Path) -> Non
     assert again.read_bytes() == out.read_bytes()
 
 
-def test_another_programs_csv_by_its_column_map(tmp_path: Path) -> None:
+def test_foreign_csv_is_converted_by_its_column_map(tmp_path: Path) -> None:
     lines = ["time_s,ax,ay,az,gx,gy,gz,mx,my,mz,baro_alt_m,gps_time_s,gps_lat,gps_lon,gps_alt_m,"]
     lines[0] += "gps_vn,gps_ve,gps_vd"
     for i in range(500):
@@ -210,13 +210,13 @@ def test_invalid_options_are_refused(tlog: Path, args: tuple[str, ...], text: st
     assert text in run("convert", tlog, *args, code=2)
 
 
-def test_a_beginning_behind_the_end_is_refused(tlog: Path) -> None:
+def test_play_from_behind_the_end_is_refused(tlog: Path) -> None:
     text = run("play", tlog, "--from", "1:30", "--endpoint", "udp:127.0.0.1:1", code=2)
     assert "it ends after 10.0 s, before --from" in text
 
 
 @pytest.mark.parametrize("range_", [("--to", "2010-01-01"), ("--from", "9", "--to", "2010-01-01")])
-def test_an_end_before_the_beginning_is_refused(tlog: Path, range_: tuple[str, ...]) -> None:
+def test_play_to_before_the_begin_is_refused(tlog: Path, range_: tuple[str, ...]) -> None:
     text = run("play", tlog, *range_, "--endpoint", "udp:127.0.0.1:1", code=2)
     assert "nothing between that begin and end" in text
 
@@ -233,7 +233,7 @@ def test_part_given_twice_is_taken_once_and_reported(table: Path, tmp_path: Path
     assert times == [*recorded, recorded[-1]]
 
 
-def test_info_for_programs(tlog: Path, table: Path) -> None:
+def test_info_as_json(tlog: Path, table: Path) -> None:
     info = json.loads(run("info", tlog, "--json"))
     assert (info["kind"], info["records"]) == ("tlog", 500)
     assert info["duration_s"] == pytest.approx(9.98)
@@ -242,7 +242,7 @@ def test_info_for_programs(tlog: Path, table: Path) -> None:
     assert info["header"]["vehicle_id"] == 1
 
 
-def test_info_for_people(tlog: Path) -> None:
+def test_info_as_text_reports_incomplete_and_damaged_records(tlog: Path) -> None:
     text = run("info", tlog)
     assert "500 records" in text
     assert "HEARTBEAT" in text
@@ -266,7 +266,7 @@ def test_file_that_is_no_recording_is_refused(tmp_path: Path, content: bytes) ->
     assert "No such file" in run("info", tmp_path / "none.tlog", code=2)
 
 
-def test_recover_a_tlog(tlog: Path, tmp_path: Path) -> None:
+def test_recover_keeps_intact_records_of_a_tlog(tlog: Path, tmp_path: Path) -> None:
     data = tlog.read_bytes()
     tlog.write_bytes(data[:1000] + b"\xaa" * 77 + data[1000:-5] + bytes(4096))
     text = run("recover", tlog)
@@ -277,7 +277,7 @@ def test_recover_a_tlog(tlog: Path, tmp_path: Path) -> None:
     assert tlog.read_bytes()[1000:1077] == b"\xaa" * 77
 
 
-def test_recover_a_table(table: Path, tmp_path: Path) -> None:
+def test_recover_keeps_intact_rows_of_a_table(table: Path, tmp_path: Path) -> None:
     whole = table.read_bytes()
     lines = whole.split(b"\n")
     lines[10] = b"\0" * 50
@@ -288,7 +288,7 @@ def test_recover_a_table(table: Path, tmp_path: Path) -> None:
     assert len(rows) == len(lines) - 4 - 2
 
 
-def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
+def test_recover_keeps_rows_of_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
     whole = table.read_bytes()
     table.write_bytes(whole.replace(b"# header: {", b"# header: }", 1))
     text = run("recover", table)
@@ -299,7 +299,7 @@ def test_recover_a_table_without_its_head(table: Path, tmp_path: Path) -> None:
     run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
 
 
-def test_recover_does_not_convert(tlog: Path, table: Path, tmp_path: Path) -> None:
+def test_recover_to_another_format_is_refused(tlog: Path, table: Path, tmp_path: Path) -> None:
     for file, out, kept in (
         (table, tmp_path / "x.tlog", ".csv"),
         (tlog, tmp_path / "x.csv", ".tlog"),
@@ -309,7 +309,7 @@ def test_recover_does_not_convert(tlog: Path, table: Path, tmp_path: Path) -> No
         assert not out.exists()
 
 
-def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> None:
+def test_trimmed_flight_is_fused_from_its_begin(table: Path, tmp_path: Path) -> None:
     plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
     run("convert", table, "-o", plain, "--from", "5", "--to", "10")
     run("convert", table, "-o", fused, "--from", "5", "--to", "10", "--fuse")
@@ -321,7 +321,7 @@ def test_a_flight_is_cut_out_after_it_is_fused(table: Path, tmp_path: Path) -> N
     assert [row.time_us for row in rows] == within
 
 
-def test_head_of_a_table_has_the_settings_of_its_fusion(table: Path, tmp_path: Path) -> None:
+def test_head_of_a_fused_table_has_the_settings_of_its_fusion(table: Path, tmp_path: Path) -> None:
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
@@ -337,12 +337,12 @@ def test_tables_of_two_aircraft_are_not_joined(table: Path, tmp_path: Path) -> N
     assert "aircraft 1 and 2" in text
 
 
-def test_recover_reports_a_sound_file(tlog: Path, tmp_path: Path) -> None:
+def test_recover_copies_an_undamaged_file(tlog: Path, tmp_path: Path) -> None:
     assert "nothing was damaged" in run("recover", tlog)
     assert (tmp_path / "flight.recovered.tlog").read_bytes() == tlog.read_bytes()
 
 
-def test_record_without_a_gateway(tmp_path: Path) -> None:
+def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     config = tmp_path / "x.toml"
     config.write_text(f'[recording]\nfolder = "{tmp_path}/rec"\n')
     folder = tmp_path / "rec"
@@ -359,7 +359,7 @@ def test_record_without_a_gateway(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("options", [[], ["--fuse"]])
-def test_remarks_stay_in_their_place(table: Path, tmp_path: Path, options: list[str]) -> None:
+def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, options: list[str]) -> None:
     mark = '# mark: {"time_us":123456,"text":"over the wood"}'
     lines = table.read_text().splitlines()
     lines.insert(len(lines) // 2, mark)

@@ -128,7 +128,7 @@ def test_capture_without_any_time_is_spaced_by_the_size_of_its_frames(tmp_path: 
     assert "57600 baud" in str(found["remarks"])
 
 
-def test_tlog_with_eight_zero_bytes_more_in_each_record_keeps_its_times(tmp_path: Path) -> None:
+def test_tlog_with_padded_records_keeps_its_times(tmp_path: Path) -> None:
     plain, padded = tlog(tmp_path / "plain.tlog"), tlog(tmp_path / "padded.tlog", pad=bytes(8))
     run("convert", padded, "-o", tmp_path / "out.tlog")
     assert (tmp_path / "out.tlog").read_bytes() == plain.read_bytes()
@@ -198,14 +198,16 @@ def rates(path: Path, *words: object) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("title", [[], ["", "ArduCopter V3.1.2 (abc)", "Free RAM: 990", ""]])
-def test_dataflash_of_old_firmware_counts_milliseconds(tmp_path: Path, title: list[str]) -> None:
+def test_dataflash_of_old_firmware_is_read_in_milliseconds(
+    tmp_path: Path, title: list[str]
+) -> None:
     path = dataflash(tmp_path / "old.log", *title, *old_log())
     assert rates(path) == {"imu": 600, "gps": 60}
     assert info(path)["duration_s"] == pytest.approx(11.98)
     assert "2013-12-11" in run("info", path)
 
 
-def test_dataflash_with_only_a_second_sensor_uses_it(tmp_path: Path) -> None:
+def test_second_sensor_of_a_dataflash_is_used_without_a_first(tmp_path: Path) -> None:
     path = dataflash(tmp_path / "second.log", *RECENT, *recent_log(gps=1, imu=2))
     assert rates(path) == {"imu": 600, "gps": 60}
     printed = run("info", path)

@@ -42,7 +42,7 @@ def run(log: Path, *arguments: str) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("estimator", ["paper", "eskf"])
-def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: str) -> None:
+def test_one_row_per_sample_with_position_and_true_heading(log: Path, estimator: str) -> None:
     rows = run(log, "--estimator", estimator)
     assert len(rows) == 500
     last = rows[-1]
@@ -55,7 +55,7 @@ def test_one_row_per_sample_with_place_and_true_heading(log: Path, estimator: st
     assert known == (estimator != "paper")
 
 
-def test_a_recording_gives_its_own_states_also_from_its_middle(
+def test_recording_cut_in_its_middle_is_fused_to_its_recorded_states(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
     settings, state, rows = fly_from_the_middle("eskf", rng)
@@ -68,7 +68,7 @@ def test_a_recording_gives_its_own_states_also_from_its_middle(
     assert [row["nav_lat_deg"] for row in again] == [repr(known.lat_deg) for known in recorded]
 
 
-def test_written_file_is_a_table(log: Path) -> None:
+def test_output_is_a_readable_table(log: Path) -> None:
     run(log)
     reader = TableReader()
     events = reader.feed(log.with_name("out.csv").read_bytes(), final=True)
@@ -77,13 +77,13 @@ def test_written_file_is_a_table(log: Path) -> None:
     assert all(event.state is not None for event in events if isinstance(event, TableRow))
 
 
-def test_blank_before_anything_is_known(log: Path) -> None:
+def test_unknown_states_are_blank(log: Path) -> None:
     first = run(log, "--estimator", "eskf")[0]
     assert first["nav_lat_deg"] == ""
     assert first["nav_q_w"] != ""
 
 
-def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
+def test_settings_file_overrides_facts_of_the_log(log: Path) -> None:
     config = log.with_name("c.toml")
     config.write_text('[estimation.reference]\ndeclination = "fixed"\ndeclination_deg = -20.0\n')
     last = run(log, "--estimator", "eskf", "--config", str(config))[-1]
@@ -91,7 +91,7 @@ def test_settings_file_comes_before_the_files_own_words(log: Path) -> None:
     assert math.degrees(yaw) == pytest.approx(-20.0, abs=0.5)
 
 
-def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
+def test_file_without_needed_columns_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "other.csv"
     path.write_text("a,b\n1,2\n")
     invoke("fuse", path, "-o", tmp_path / "out.csv", code=2)
@@ -99,14 +99,14 @@ def test_a_file_without_the_needed_columns_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("force", [[], ["--force"]])
-def test_recording_is_not_overwritten_by_its_own_states(log: Path, force: list[str]) -> None:
+def test_input_as_output_is_refused(log: Path, force: list[str]) -> None:
     before = log.read_bytes()
     result = invoke("fuse", log, "-o", log, *force, code=2)
     assert "is what the output is made of" in result.output
     assert log.read_bytes() == before
 
 
-def test_an_output_that_is_there_is_replaced_on_demand_only(log: Path) -> None:
+def test_existing_output_needs_force(log: Path) -> None:
     out = log.with_name("out.csv")
     out.write_text("precious")
     result = invoke("fuse", log, "-o", out, code=2)

@@ -34,7 +34,7 @@ def recording(path: Path, samples: int) -> Path:
     return path
 
 
-def test_a_recording_comes_with_its_own_settings(tmp_path: Path) -> None:
+def test_recording_is_loaded_with_its_recorded_settings(tmp_path: Path) -> None:
     flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
     assert flight.fusion.estimation == RECORDED.estimation
     assert flight.story == STORIES[TABLE]
@@ -50,6 +50,6 @@ def test_latency_contradicted_by_the_motion_is_reported(
     assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
 
 
-def test_too_short_a_recording_is_refused(tmp_path: Path) -> None:
+def test_recording_of_one_sample_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FlightError, match=r"flight\.csv: 1 IMU samples are no flight"):
         load_flight(recording(tmp_path / "flight.csv", 1), TODAY, read_options(TODAY))

@@ -64,7 +64,7 @@ def test_list_contains_length_vehicles_size_and_path(config: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["alps", "last"])
-def test_every_command_takes_the_name(config: Path, tmp_path: Path, name: str) -> None:
+def test_info_fuse_and_convert_accept_a_name(config: Path, tmp_path: Path, name: str) -> None:
     for file in (config.parent / "recordings").glob("lake*"):
         file.unlink()
     found = run("info", name, "--config", config)
@@ -80,7 +80,7 @@ def test_every_command_takes_the_name(config: Path, tmp_path: Path, name: str) -
     assert joined.stat().st_size == len(make_tlog(make_records(COUNT)))
 
 
-def test_play_takes_the_name(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_play_accepts_a_name(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     played: list[str] = []
 
     async def serve(daemon_of: Callable[[], PlayerDaemon], *, attached: bool) -> None:
@@ -97,7 +97,7 @@ def test_play_takes_the_name(config: Path, tmp_path: Path, monkeypatch: pytest.M
     assert len(played) == 2
 
 
-def test_report_takes_the_name(
+def test_report_accepts_a_name(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fusing it in every way and drawing it is tested elsewhere, and takes long."""
@@ -119,7 +119,7 @@ def test_report_takes_the_name(
     assert flight.duration_s == pytest.approx(12, abs=0.1)
 
 
-def test_sweep_takes_the_name(config: Path, tmp_path: Path) -> None:
+def test_sweep_accepts_a_name(config: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
     words = ("--beta", "0.5", "--jobs", "1", "--metric", "interpolated", "-o", best)
     run("sweep", "alps", *words, "--config", config)
@@ -132,13 +132,13 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
     assert next(frames).data
 
 
-def test_a_name_that_is_none_is_refused(config: Path) -> None:
+def test_unknown_name_is_refused(config: Path) -> None:
     result = invoke("info", "sea", "--config", config)
     assert result.exit_code == 2
     assert "record list" in result.output
 
 
-def test_a_path_stays_a_path(tmp_path: Path) -> None:
+def test_existing_path_takes_precedence_over_a_name(tmp_path: Path) -> None:
     there = tmp_path / "a.tlog"
     there.touch()
     missing = tmp_path / "gone.tlog"
@@ -147,7 +147,7 @@ def test_a_path_stays_a_path(tmp_path: Path) -> None:
         files_of([Path("gone.tlog")], tmp_path, "tables")
 
 
-def test_info_takes_another_programs_csv(tmp_path: Path) -> None:
+def test_info_accepts_a_foreign_csv(tmp_path: Path) -> None:
     lines = ["time_s,ax,ay,az,gx,gy,gz"]
     lines += [f"{k / 100:.2f},0.0,0.0,-9.8,0.0,0.0,0.0" for k in range(501)]
     path = tmp_path / "log.csv.gz"

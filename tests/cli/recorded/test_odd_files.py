@@ -55,7 +55,7 @@ def table(path: Path, **head: object) -> Path:
     ],
     ids=lambda odd: next(iter(odd)) + next(iter(odd.values()))[:5],
 )
-def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
+def test_lines_with_impossible_values_are_left_out(tmp_path: Path, odd: dict[str, str]) -> None:
     out = tmp_path / "out.csv"
     printed = run("fuse", log(tmp_path / "log.csv", **odd), "-o", out)
     assert "fused by eskf" in printed
@@ -64,7 +64,7 @@ def test_lines_that_cannot_be_are_left_out(tmp_path: Path, odd: dict[str, str]) 
 
 
 @pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])
-def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
+def test_height_beyond_the_atmosphere_gives_no_barometer_sample(
     tmp_path: Path, height: str
 ) -> None:
     printed = run("fuse", log(tmp_path / "log.csv", baro_alt_m=height), "-o", tmp_path / "out.csv")
@@ -80,7 +80,9 @@ def test_a_height_that_has_no_pressure_is_no_sample_of_the_barometer(
         (b"\xef\xbb\xbf", "fused by eskf"),
     ],
 )
-def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
+def test_comments_before_a_log_are_read_or_refused_with_their_line(
+    tmp_path: Path, text: bytes, words: str
+) -> None:
     path = log(tmp_path / "log.csv")
     path.write_bytes(text + path.read_bytes())
     printed = run("fuse", path, "-o", tmp_path / "out.csv", code=0 if "fused" in words else 2)
@@ -89,7 +91,7 @@ def test_the_head_of_a_log(tmp_path: Path, text: bytes, words: str) -> None:
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover", "play"])
 @pytest.mark.parametrize("kind", ["pipe", "zeros", "link"])
-def test_pipe_without_an_end_is_not_read(tmp_path: Path, command: str, kind: str) -> None:
+def test_pipe_or_device_is_refused(tmp_path: Path, command: str, kind: str) -> None:
     path = Path("/dev/zero") if kind == "zeros" else tmp_path / "log.csv"
     if kind == "pipe":
         os.mkfifo(path)
@@ -103,7 +105,7 @@ def test_pipe_without_an_end_is_not_read(tmp_path: Path, command: str, kind: str
 
 @pytest.mark.parametrize("command", ["info", "fuse", "recover"])
 @pytest.mark.parametrize("how", ["cut", "checksum"])
-def test_a_gzip_file_that_is_none(tmp_path: Path, command: str, how: str) -> None:
+def test_damaged_gzip_file_is_refused(tmp_path: Path, command: str, how: str) -> None:
     whole = gzip.compress(log(tmp_path / "log.csv").read_bytes())
     path = tmp_path / "log.csv.gz"
     damaged = {"cut": whole[:-100], "checksum": whole[:-8] + bytes(8)}
@@ -125,7 +127,7 @@ def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(
     assert "100 records in 0:00.990" in run("info", path)
 
 
-def test_a_line_that_never_ends_fills_no_memory(tmp_path: Path) -> None:
+def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
     path = tmp_path / "log.csv.gz"
     with gzip.open(path, "wb") as file:
         file.write(NAMES.encode() + b"\n")
@@ -173,20 +175,22 @@ def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memor
 
 @pytest.mark.parametrize("end", [".kml", ".gpx"])
 @pytest.mark.parametrize("zero_us", [0, -(10**17), 10**18, 2**62])
-def test_times_beyond_the_calendar(tmp_path: Path, end: str, zero_us: int) -> None:
+def test_times_beyond_the_calendar_are_written_and_reported(
+    tmp_path: Path, end: str, zero_us: int
+) -> None:
     path = table(tmp_path / "table.csv", unix_us_at_zero=zero_us)
     run("convert", path, "-o", tmp_path / f"out{end}")
     printed = run("info", path)
     assert ("no day of the calendar" in printed) == (zero_us != 0)
 
 
-def test_a_tlog_of_the_far_future(tmp_path: Path) -> None:
+def test_tlog_of_the_far_future_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "future.tlog"
     path.write_bytes(b"".join(struct.pack(">Q", 10**18) + frame for frame in make_frames(20)))
     assert "is no recording" in run("info", path, code=2)
 
 
-def test_a_table_of_a_newer_version_is_not_read_as_if_it_were_known(tmp_path: Path) -> None:
+def test_table_of_a_newer_version_is_refused(tmp_path: Path) -> None:
     path = table(tmp_path / "table.csv")
     path.write_text(path.read_text().replace(FORMAT_LINE, "# mavgate table 2"))
     printed = run("fuse", path, "-o", tmp_path / "out.csv", code=2)
@@ -194,14 +198,14 @@ def test_a_table_of_a_newer_version_is_not_read_as_if_it_were_known(tmp_path: Pa
 
 
 @pytest.mark.parametrize("vehicle_id", [-5, 0, 300])
-def test_a_table_of_no_vehicle(tmp_path: Path, vehicle_id: int) -> None:
+def test_table_with_an_invalid_vehicle_id_is_refused(tmp_path: Path, vehicle_id: int) -> None:
     path = table(tmp_path / "table.csv", vehicle_id=vehicle_id)
     printed = run("convert", path, "-o", tmp_path / "out.tlog", code=2)
     assert "table.csv: line 2: Expected `int`" in printed
     assert "mavgate recover" in printed
 
 
-def test_a_table_with_a_byte_order_mark_is_a_table(tmp_path: Path) -> None:
+def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     path = table(tmp_path / "table.csv")
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert "vehicle 1" in run("info", path)
@@ -216,7 +220,7 @@ def test_a_table_with_a_byte_order_mark_is_a_table(tmp_path: Path) -> None:
         (b"[columns", "map.toml: is no column map"),
     ],
 )
-def test_a_column_map_that_is_none(tmp_path: Path, content: bytes, words: str) -> None:
+def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
     columns = tmp_path / "map.toml"
     columns.write_bytes(content)
     path = log(tmp_path / "log.csv")
@@ -224,14 +228,14 @@ def test_a_column_map_that_is_none(tmp_path: Path, content: bytes, words: str) -
 
 
 @pytest.mark.parametrize("moment", ["9" * 400, "inf", "nan", "1e400", "9999-99-99T00:00:00Z", ""])
-def test_a_moment_that_is_none(tmp_path: Path, moment: str) -> None:
+def test_invalid_moment_is_refused(tmp_path: Path, moment: str) -> None:
     path = table(tmp_path / "table.csv")
     printed = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
     assert "write 80, 1:20" in printed
 
 
 @pytest.mark.parametrize("words", [("nan", "nan"), ("inf", "0"), ("47", "8", "--alt", "nan")])
-def test_a_mark_that_is_nowhere_does_not_clear_the_one_there_is(words: tuple[str, ...]) -> None:
+def test_mark_at_invalid_coordinates_is_refused(words: tuple[str, ...]) -> None:
     assert "write a number" in run("mark", *words, code=2)
 
 
@@ -247,19 +251,19 @@ def test_a_mark_that_is_nowhere_does_not_clear_the_one_there_is(words: tuple[str
         ('[recording]\nmode = "sometimes"', "allowed: manual, in_flight, always"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(tmp_path: Path, text: str, words: str) -> None:
+def test_unusable_settings_are_refused(tmp_path: Path, text: str, words: str) -> None:
     file = tmp_path / "gateway.toml"
     file.write_text(text + "\n")
     assert words in run("check-config", file, code=2)
 
 
-def test_settings_with_a_byte_order_mark_are_settings(tmp_path: Path) -> None:
+def test_settings_with_a_byte_order_mark_are_read(tmp_path: Path) -> None:
     file = tmp_path / "gateway.toml"
     file.write_bytes(b"\xef\xbb\xbf[recording]\nmode = 'always'\n")
     assert "all settings are right" in run("check-config", file)
 
 
-def test_times_run_on_when_the_clock_of_a_log_begins_again(tmp_path: Path) -> None:
+def test_times_increase_across_a_restart_of_the_logs_clock(tmp_path: Path) -> None:
     path = log(tmp_path / "log.csv")
     head, *rows = path.read_text().splitlines()
     path.write_text("\n".join([head, *rows, *rows[:50], *rows, ""]))

@@ -9,7 +9,7 @@ from tests.kit.cli import invoke
 pytestmark = pytest.mark.io
 
 
-def test_without_a_yes_no_command_leaves_this_machine(tmp_path: Path) -> None:
+def test_playing_commands_beyond_this_machine_needs_a_confirmation(tmp_path: Path) -> None:
     file = str(tmp_path / "missing.tlog")
     away = ("--endpoint", "udp:tablet.example:14550")
     asked = invoke("play", file, "--with-commands", *away, answers="n\n")
@@ -25,7 +25,7 @@ def test_without_a_yes_no_command_leaves_this_machine(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("speed", ["0", "nan", "101", "fast", ""])
 @pytest.mark.parametrize("words", [["play", "x.tlog", "--speed"], ["player", "speed"]])
-def test_a_speed_out_of_range_is_refused(words: list[str], speed: str) -> None:
+def test_speed_out_of_range_is_refused(words: list[str], speed: str) -> None:
     done = invoke(*words, speed)
     assert done.exit_code == 2
     assert f"speed {speed!r}: write 0.1 to 100, or max" in done.output

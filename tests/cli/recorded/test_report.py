@@ -35,7 +35,7 @@ def test_recording_is_compared_with_other_settings(
     assert (folder / "timing.csv").exists()
 
 
-def test_a_file_without_a_flight_is_reported(tmp_path: Path) -> None:
+def test_file_without_rows_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.csv"
     empty.write_text(encode_head(TableHeader()))
     result = invoke("report", empty, "-o", tmp_path / "out")
@@ -55,7 +55,7 @@ def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "-m pip install 'mavgate[plot]'\n" in result.output
 
 
-def test_a_folder_that_cannot_be_written_is_reported(
+def test_full_disk_is_reported_with_its_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
@@ -71,7 +71,7 @@ def test_a_folder_that_cannot_be_written_is_reported(
     assert f"{tmp_path / 'page'}: No space left" in result.output
 
 
-def test_a_folder_that_holds_something_is_not_written_into_unasked(tmp_path: Path) -> None:
+def test_folder_that_is_not_empty_needs_force(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("mine")
     result = invoke("report", "-o", tmp_path)
     assert result.exit_code == 2

@@ -21,7 +21,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_best_settings_become_a_settings_file(recording: Path, tmp_path: Path) -> None:
+def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path: Path) -> None:
     best, table = tmp_path / "best.toml", tmp_path / "trials.csv"
     arguments = [
         "--alpha",
@@ -45,7 +45,7 @@ def test_the_best_settings_become_a_settings_file(recording: Path, tmp_path: Pat
     assert "beta_velocity" in tomllib.loads(best.read_text())["estimation"]["paper"]
 
 
-def test_a_search_writes_its_best_too(recording: Path, tmp_path: Path) -> None:
+def test_search_writes_its_best_settings(recording: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
     arguments = ["--beta", "0:1", "--optimise", "2", "-o", str(best), "--jobs", "1"]
     result = invoke("sweep", recording, *arguments)
@@ -66,7 +66,7 @@ def test_texts_and_numbers_are_varied_together(recording: Path, tmp_path: Path) 
     assert estimation.reference.gps_latency_s == winner["estimation.reference.gps_latency_s"]
 
 
-def test_a_setting_that_changes_nothing_is_reported(recording: Path, tmp_path: Path) -> None:
+def test_setting_without_effect_is_reported(recording: Path, tmp_path: Path) -> None:
     idle = ["--vary", "dead_reckoning_s=30.0,60.0"]
     base = ["sweep", str(recording), "-o", str(tmp_path / "best.toml"), "--jobs", "1", "--force"]
     result = invoke(*base, "--vary", "baro_noise_m=0.1,5.0", *idle)
@@ -94,13 +94,13 @@ def test_impossible_sweep_is_reported(recording: Path, arguments: list[str], tex
     assert text in result.output
 
 
-def test_a_file_that_is_not_there_is_reported(tmp_path: Path) -> None:
+def test_missing_file_is_reported(tmp_path: Path) -> None:
     result = invoke("sweep", tmp_path / "no.csv", "--alpha", "0.1,0.2")
     assert result.exit_code == 2
     assert "no.csv" in result.output
 
 
-def test_settings_that_are_there_are_not_replaced_unasked(recording: Path, tmp_path: Path) -> None:
+def test_existing_settings_need_force(recording: Path, tmp_path: Path) -> None:
     best = tmp_path / "best.toml"
     best.write_text("# mine")
     arguments = ["--beta", "0.1,0.9", "-o", str(best), "--jobs", "1"]
