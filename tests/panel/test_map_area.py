@@ -7,6 +7,7 @@ import pytest
 from pmtiles.tile import Compression, TileType, zxy_to_tileid
 from pmtiles.writer import Writer
 
+from gateway.panel import map_area
 from gateway.panel.map_area import (
     MapAreaError,
     box_around,
@@ -93,6 +94,15 @@ async def test_extracted_area_is_a_map_style(world: Path, tmp_path: Path) -> Non
 def test_forbidden_or_unreadable_source_is_refused(source: str, text: str, tmp_path: Path) -> None:
     with pytest.raises(MapAreaError, match=text):
         extract_area(open_source(source), tmp_path / "x", (0, 0, 1, 1), 3)
+
+
+def test_area_of_too_many_tiles_is_refused(
+    world: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(map_area, "MAX_TILES", 20)
+    with pytest.raises(MapAreaError, match="21 tiles are too many"):
+        extract_area(open_source(str(world)), tmp_path / "x", (-80, -179, 80, 179), 2)
+    assert not (tmp_path / "x").exists()
 
 
 def test_server_without_ranges_and_vector_tiles_are_refused(world: Path, tmp_path: Path) -> None:

@@ -41,19 +41,19 @@ def picture(shade: int = 0) -> bytes:
     )
 
 
-def write_mbtiles(file: Path, data: bytes, places: Iterable[tuple[int, int, int]]) -> None:
-    """Write a file that has the same picture at some places: zoom, column, row from the south."""
+def write_mbtiles(file: Path, data: bytes, tiles: Iterable[tuple[int, int, int]]) -> None:
+    """Write a file with the same picture in some tiles: zoom, column, row from the south."""
     with sqlite3.connect(file) as database:
-        database.execute("create table places (zoom_level, tile_column, tile_row)")
-        database.executemany("insert into places values (?, ?, ?)", places)
+        database.execute("create table addresses (zoom_level, tile_column, tile_row)")
+        database.executemany("insert into addresses values (?, ?, ?)", tiles)
         database.execute("create table picture (tile_data)")
         database.execute("insert into picture values (?)", (data,))
-        database.execute("create view tiles as select * from places, picture")
+        database.execute("create view tiles as select * from addresses, picture")
     database.close()
 
 
 def tiles_around(lat_deg: float, lon_deg: float) -> Iterator[tuple[int, int, int]]:
-    """Return the places of the tiles around a position, in every zoom, as MBTiles counts them."""
+    """Yield the tiles around a position, in every zoom, as MBTiles counts them."""
     north = math.asinh(math.tan(math.radians(lat_deg))) / math.pi
     for zoom in range(19):
         size = 1 << zoom
@@ -116,17 +116,30 @@ async def test_invalid_tile_is_not_cached(tmp_path: Path, owner: tuple[str, type
     assert not list(tmp_path.rglob("*.*"))
 
 
-async def test_old_tile_is_shown_while_there_is_no_network(tmp_path: Path) -> None:
+async def test_unreachable_server_gives_no_tile(tmp_path: Path) -> None:
     tiles = tiles_of(tmp_path, "http://127.0.0.1:9/{z}/{x}/{y}")
     assert await tiles.tile(0, 2, 1, 1) is None
 
 
-@pytest.mark.parametrize("place", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
-async def test_tiles_beyond_the_world_are_not_requested(
-    tmp_path: Path, owner: tuple[str, type[_Owner]], place: tuple[int, int, int]
+async def test_outdated_tile_is_shown_while_the_server_has_none(
+    tmp_path: Path, owner: tuple[str, type[_Owner]]
 ) -> None:
     url, asked = owner
-    assert await tiles_of(tmp_path, url).tile(0, *place) is None
+    asked.answers["/3/1/2.png"] = picture()
+    assert await tiles_of(tmp_path, url).tile(0, 3, 1, 2) == picture()
+    (cached,) = (file for file in tmp_path.rglob("*") if file.is_file())
+    os.utime(cached, (0, 0))
+    asked.answers.clear()
+    assert await tiles_of(tmp_path, url).tile(0, 3, 1, 2) == picture()
+    assert asked.asked == ["/3/1/2.png"] * 2
+
+
+@pytest.mark.parametrize("tile", [(0, 0, 1), (0, -1, 0), (3, 8, 0), (25, 0, 0), (-1, 0, 0)])
+async def test_tiles_beyond_the_world_are_not_requested(
+    tmp_path: Path, owner: tuple[str, type[_Owner]], tile: tuple[int, int, int]
+) -> None:
+    url, asked = owner
+    assert await tiles_of(tmp_path, url).tile(0, *tile) is None
     assert await tiles_of(tmp_path, url).tile(1, 0, 0, 0) is None
     assert asked.asked == []
 
