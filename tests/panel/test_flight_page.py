@@ -137,6 +137,6 @@ def check_instruments(page: Page) -> None:
         const data = new Uint32Array(pen.getImageData(0, 0, 64, 64).data.buffer);
         return new Set(data).size > 3;
     }"""
-    for place in (".flight-display canvas", ".plot canvas >> nth=0"):
-        assert page.locator(place).evaluate(many)
+    for selector in (".flight-display canvas", ".plot canvas >> nth=0"):
+        assert page.locator(selector).evaluate(many)
     assert int(page.locator(".scene").get_attribute("data-frames") or 0) > 1

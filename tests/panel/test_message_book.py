@@ -68,11 +68,11 @@ def test_array_element_is_found_by_its_index(book: MessageBook) -> None:
     link = mavlink.MAVLink(None, 1, 1)
     message = mavlink.MAVLink_param_value_message(b"SPEED", 1.5, 9, 1, 0)
     book.take(link.decode(bytearray(message.pack(link))))
-    place = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
-    assert book.look_up(f"{place}/1") == "P"
+    path = "vehicles/1/components/1/messages/PARAM_VALUE/message/param_id"
+    assert book.look_up(f"{path}/1") == "P"
     for element in ("16", "-1", "01", "+1"):
         with pytest.raises(KeyError):
-            book.look_up(f"{place}/{element}")
+            book.look_up(f"{path}/{element}")
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,8 @@ def test_number_of_forged_ids_is_bounded(
 def test_sent_message_is_listed_but_not_counted_as_received(book: MessageBook) -> None:
     assert book.has_heard(1, 1)
     book.take(attitude(3, 255, 0), is_sent=True)
-    place = "vehicles/255/components/0/messages/ATTITUDE/message/roll"
-    assert book.look_up(place) == 3
+    path = "vehicles/255/components/0/messages/ATTITUDE/message/roll"
+    assert book.look_up(path) == 3
     assert not book.has_heard(255, 0)
     book.take(attitude(4, 255, 0))
     assert book.has_heard(255, 0)

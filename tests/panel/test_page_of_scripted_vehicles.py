@@ -41,17 +41,17 @@ CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
 """
 """Notes the words and figures that the flight display draws, the newest last."""
 LOOKS = """
-([places, expected]) => {
+([points, expected]) => {
   const canvas = document.querySelector(".flight-display canvas");
   const pen = canvas.getContext("2d");
-  const colours = places.map(([right, down]) => {
+  const colours = points.map(([right, down]) => {
     const [red, , blue] = pen.getImageData(right * canvas.width, down * canvas.height, 1, 1).data;
     return blue > red ? "sky" : "ground";
   });
   return String(colours) === String(expected);
 }
 """
-"""Whether sky or ground is drawn as expected, at places that are shares of the flight display."""
+"""Whether sky or ground is drawn as expected, at points that are shares of the flight display."""
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def display_of(page: Page) -> Locator:
 
 
 def test_row_horizon(page: Page, vehicle: ScriptedVehicle) -> None:
-    places = [(0.25, 0.5), (0.72, 0.5), (0.25, 0.62)]
+    points = [(0.25, 0.5), (0.72, 0.5), (0.25, 0.62)]
     for roll, pitch, expected in (
         (30, 0, ("sky", "ground", "sky")),
         (-30, 0, ("ground", "sky", "ground")),
@@ -117,7 +117,7 @@ def test_row_horizon(page: Page, vehicle: ScriptedVehicle) -> None:
         vehicle.roll_deg, vehicle.pitch_deg = roll, pitch
         spoken = re.compile(f"^Roll {roll}.0°, pitch {pitch}.0°,")
         expect(display_of(page)).to_have_attribute("aria-label", spoken)
-        page.wait_for_function(LOOKS, arg=[places, expected])
+        page.wait_for_function(LOOKS, arg=[points, expected])
     vehicle.roll_deg = vehicle.pitch_deg = 0.0
 
 

@@ -193,8 +193,8 @@ class TestWriting:
         assert (command.command, command.param1) == (400, 1.0)
         assert (command.get_srcSystem(), command.get_srcComponent()) == (255, 0)
         world.send(mavlink.MAVLink_command_ack_message(400, 0, 0, 0, 255, 0))
-        place = "/v1/mavlink/vehicles/1/components/1/messages/COMMAND_ACK/message/result/type"
-        await world.until_json(place, "MAV_RESULT_ACCEPTED")
+        path = "/v1/mavlink/vehicles/1/components/1/messages/COMMAND_ACK/message/result/type"
+        await world.until_json(path, "MAV_RESULT_ACCEPTED")
         sent = "/v1/mavlink/vehicles/255/components/0/messages/COMMAND_LONG"
         found = (await world.client.get(sent)).json()
         assert found["message"] == COMMAND["message"]

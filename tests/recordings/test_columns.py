@@ -1,4 +1,4 @@
-"""Rows keep every record, its digits and its place."""
+"""Rows keep every record, its digits and its order."""
 
 import math
 import re

@@ -1,4 +1,4 @@
-"""Recordings behind one another: in their place by civil time, and nothing twice."""
+"""Recordings joined in order of civil time, without repeated rows."""
 
 import numpy as np
 import pytest
@@ -91,7 +91,7 @@ def test_recordings_without_civil_time_keep_their_clock() -> None:
 
 
 def test_parts_of_a_recording_keep_their_clock() -> None:
-    """GPS has corrected the time between them; a row that came late is in its place."""
+    """GPS has corrected the time between them; a late row is sorted by its time."""
     first, second = table(0, 10, EPOCH_US, "flight"), table(9, 20, EPOCH_US + 10**9, "flight")
     times, marks = seconds_of(joined := joined_tables([first, second]))
     assert times == [*range(10), *range(9, 20)]

@@ -32,8 +32,8 @@ def frames(*, v1: bool = False, timed: bool = True) -> Iterator[tuple[int, bytes
             imu = (10 * tick, 20, -1000, 1, 2, 3, 200, 10, 400)
             messages.append(mavlink.MAVLink_scaled_imu_message(ms + 5000, *imu))
             if tick % 10 == 1:
-                place = (471_000_000 + 100 * tick, 82_000_000, 500_000, 0, 100, 0, 0, 0)
-                messages.append(mavlink.MAVLink_global_position_int_message(ms + 5000, *place))
+                position = (471_000_000 + 100 * tick, 82_000_000, 500_000, 0, 100, 0, 0, 0)
+                messages.append(mavlink.MAVLink_global_position_int_message(ms + 5000, *position))
                 messages.append(mavlink.MAVLink_system_time_message(BEGIN_US + 1000 * ms, ms))
         else:
             messages.append(mavlink.MAVLink_statustext_message(6, b"tick %d" % tick))

@@ -28,11 +28,11 @@ class Memory:
         imu = decoded(mavlink.MAVLink_highres_imu_message(0, *[0.0] * 13, 63))
         text = decoded(mavlink.MAVLink_statustext_message(6, b"all is well"))
         attitude = decoded(mavlink.MAVLink_attitude_message(0, *[0.1] * 6))
-        place = position(47.0, 8.0)
+        here = position(47.0, 8.0)
         for step in range(begin_s * RATE_HZ, end_s * RATE_HZ):
             now_us = step * US_PER_S // RATE_HZ
             slow: list[Any] = [heartbeat(), text] if step % RATE_HZ == 0 else []
-            for message in (imu, attitude, place, *slow):
+            for message in (imu, attitude, here, *slow):
                 self.fleet.take(message, now_us)
 
     @property

@@ -148,7 +148,7 @@ class Ulog:
 
 
 def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
-    """Write the flight as PX4 of today, or of 2018: places as integers, pressures in hPa."""
+    """Write the flight as PX4 of today, or of 2018: positions as integers, pressures in hPa."""
     formats = dict(FORMATS)
     formats["vehicle_gps_position"] = OLD_GPS if old else NEW_GPS
     formats.pop("vehicle_air_data" if old else "sensor_baro")
@@ -168,15 +168,15 @@ def make_ulog(*, old: bool = False, seconds: float = DURATION_S) -> bytes:
                 else:
                     log.add("vehicle_air_data", t, r.pressure_pa, r.temperature_degc)
             case GpsFix():
-                place = (r.lat_dege7 * 1e-7, r.lon_dege7 * 1e-7, r.alt_amsl_m, r.alt_ellipsoid_m)
+                position = (r.lat_dege7 * 1e-7, r.lon_dege7 * 1e-7, r.alt_amsl_m, r.alt_ellipsoid_m)
                 if old:
                     mm = (round(r.alt_amsl_m * 1e3), round(r.alt_ellipsoid_m * 1e3))
-                    place = (r.lat_dege7, r.lon_dege7, *mm)
+                    position = (r.lat_dege7, r.lon_dege7, *mm)
                 vel = (float(np.hypot(*r.vel_n_mps[:2])), *r.vel_n_mps)
                 acc = (r.speed_acc_mps, np.radians(r.course_acc_deg), r.h_acc_m, r.v_acc_m)
                 end = (0, int(r.fix_type), r.fix_ok, r.satellites)
                 log.add(
-                    "vehicle_gps_position", t, r.utc_us or 0, *place, *acc, 0.8, 1.1, *vel, *end
+                    "vehicle_gps_position", t, r.utc_us or 0, *position, *acc, 0.8, 1.1, *vel, *end
                 )
             case Estimated():
                 log.add("vehicle_local_position", t, *r.vel_n_mps)
@@ -235,11 +235,11 @@ def dataflash_rows(seconds: float = DURATION_S) -> list[Row]:
                     week, ms = divmod(since_ms, WEEK_S * 1000)
                 north, east, down = r.vel_n_mps
                 course = float(np.degrees(np.arctan2(east, north)) % 360)
-                place = (r.lat_dege7 / 1e7, r.lon_dege7 / 1e7, r.alt_amsl_m)
+                position = (r.lat_dege7 / 1e7, r.lon_dege7 / 1e7, r.alt_amsl_m)
                 motion = (float(np.hypot(north, east)), course, down, 0.0)
                 status = 3 if r.fix_ok else 1
                 rows.append(
-                    ("GPS", (t, 0, status, ms, week, r.satellites, 0.8, *place, *motion, 1))
+                    ("GPS", (t, 0, status, ms, week, r.satellites, 0.8, *position, *motion, 1))
                 )
                 acc = (r.h_acc_m, r.v_acc_m, r.speed_acc_mps)
                 rows.append(("GPA", (t, 0, 1.1, *acc, 0.0, 1, 0, 200)))

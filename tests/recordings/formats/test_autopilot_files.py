@@ -277,8 +277,8 @@ def test_dataflash_log_with_an_unknown_value_type_is_refused(
 def test_invalid_lines_of_a_text_log_are_counted(folder: Path, tmp_path: Path) -> None:
     lines = (folder / "flight.log").read_bytes().splitlines(keepends=True)
     _, all_rows = whole(folder / "flight.log")
-    places = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
-    short, wrong, nameless = places[50], places[70], places[90]
+    numbers = [k for k, line in enumerate(lines) if line.startswith(b"IMU, ")]
+    short, wrong, nameless = numbers[50], numbers[70], numbers[90]
     lines[short] = lines[short][:20] + b"\n"
     lines[wrong] = lines[wrong].replace(b".", b"x")
     lines[nameless] = lines[nameless].replace(b"IMU", b"I%U")

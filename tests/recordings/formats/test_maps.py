@@ -54,13 +54,13 @@ def test_kml_contains_every_vehicle_with_times_and_attitude() -> None:
         "wood & <field>", "system 7",
     ]  # fmt: skip
     first, second = root.findall(".//gx:Track", KML)
-    places = [e.text for e in first.findall("gx:coord", KML)]
-    assert places[1] == "-8.5000000 47.1000010 430.25"
+    positions = [e.text for e in first.findall("gx:coord", KML)]
+    assert positions[1] == "-8.5000000 47.1000010 430.25"
     times = [e.text for e in first.findall("k:when", KML)]
     assert times[0] == "2025-10-09T08:53:20.123Z"
     angles = [e.text for e in first.findall("gx:angles", KML)]
     assert angles == [None] * 5 + ["270.0 5.0 -10.0"]
-    assert len(times) == len(places) == len(angles) == 6
+    assert len(times) == len(positions) == len(angles) == 6
     assert len(second.findall("gx:coord", KML)) == 2
     assert second.findall("gx:angles", KML) == []
     styles = {e.get("id") for e in root.findall(".//k:Style", KML)}

@@ -256,8 +256,8 @@ def test_damaged_source_is_read_in_part_or_refused(
 ) -> None:
     rng = np.random.default_rng(seed)
     data = bytearray(content(name)[:60_000])
-    for place in rng.integers(0 if seed % 2 else 2000, len(data), 40).tolist():
-        data[place] = int(rng.integers(256))
+    for offset in rng.integers(0 if seed % 2 else 2000, len(data), 40).tolist():
+        data[offset] = int(rng.integers(256))
     path = tmp_path / name
     path.write_bytes(bytes(data[: int(rng.integers(3000, len(data)))]))
     try:
