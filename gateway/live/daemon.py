@@ -102,20 +102,13 @@ class Daemon:
             settings.hub,
             self._on_frame,
             self.now_us,
-            on_foreign=lambda frame: self._record(frame),
+            on_foreign=self._record,
             on_gone=self._on_gone,
             on_alert=self._announce,
             signer=self._pipeline.signer,
             recordings=Path(settings.recording.folder).expanduser(),
         )
-        self._recorder = Recorder(
-            settings.recording,
-            self.now_us,
-            unix_time_us,
-            self._table_head,
-            self._announce,
-            *(lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state, self._introduction),
-        )
+        self._recorder = self._make_recorder()
         self._budget = RecordingBudget()
         heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *heard, self.now_us)
@@ -134,6 +127,17 @@ class Daemon:
         at_zero_us = unix_time_us() - self.now_us()
         default = self._settings.default_aircraft
         return Pipeline(PipelineSettings(default, aircraft, at_zero_us, plans=plans, stamps=stamps))
+
+    def _make_recorder(self) -> Recorder:
+        return Recorder(
+            self._settings.recording,
+            self.now_us,
+            unix_time_us,
+            self._table_head,
+            self._announce,
+            lambda vehicle_id: self._pipeline.find(vehicle_id).fusion_state,
+            self._introduction,
+        )
 
     def _make_control(self) -> ControlServer:
         self._imu = ImuTap(
