@@ -18,8 +18,8 @@ machine meets them alike; all are sent to from the same port. Such load only eve
 round counts for the maximum and its CPU time, the median round for latencies.
 
 "WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients take
-several frames in one datagram. `--systems` shows another thing: the source is a link with so many
-vehicles behind it, and the first client sends each of them a command.
+several frames in one datagram. With `--systems` the source is a link with so many vehicles behind
+it, and the first client sends each of them a command.
 """
 
 import argparse
@@ -36,6 +36,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,7 @@ CLIENTS = (1, 4, 16, 64)
 RATE_HZ = 1000
 SOURCE_SYSTEM = 42
 FRAMES = 20_000
-"""Distinct frames, so that the hub's memory of duplicates works as it does in life."""
+"""Distinct frames, so that the hub's memory of duplicates works as in operation."""
 WINDOWS = (128, 32, 8)
 """Frames under way; a forwarder that loses some of the first window is given a smaller one."""
 STALL_S = 0.5
@@ -72,46 +73,23 @@ while True:
 """
 
 HUB = """
-import asyncio, sys
-OPTIONS = "%s"
+import asyncio, importlib, sys
 from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 
-async def main():
-    clients = tuple(f"udp:127.0.0.1:{port}{OPTIONS}" for port in sys.argv[2:])
-    endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", *clients)
-    hub = Hub(HubSettings(endpoints=endpoints, max_clients=500), lambda incoming: None,
+async def main(endpoints):
+    hub = Hub(HubSettings(endpoints=tuple(endpoints), max_clients=500), lambda incoming: None,
               GatewayClock())
     hub.start()
     await asyncio.Event().wait()
 
-asyncio.run(main())
+event_loop, *endpoints = sys.argv[1:]
+with asyncio.Runner(loop_factory=importlib.import_module(event_loop).new_event_loop) as runner:
+    runner.run(main(endpoints))
 """
-
 UVLOOP = "uvloop"
 """The hub again, on the event loop of that name."""
-UVLOOP_HUB = HUB.replace(
-    "asyncio.run(main())",
-    "import uvloop\nwith asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:\n"
-    "    runner.run(main())",
-)
-
-WEB_HUB = """
-import asyncio, sys
-from gateway.clock import GatewayClock
-from gateway.hub.hub import Hub
-from gateway.hub.settings import HubSettings
-
-async def main():
-    endpoints = (f"udp-listen:127.0.0.1:{sys.argv[1]}", f"ws-listen:127.0.0.1:{sys.argv[2]}")
-    hub = Hub(HubSettings(endpoints=endpoints, max_clients=500), lambda incoming: None,
-              GatewayClock())
-    hub.start()
-    await asyncio.Event().wait()
-
-asyncio.run(main())
-"""
 
 HANDSHAKE = (
     b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -143,9 +121,9 @@ class Latency:
     """The longest time in which a client received nothing."""
 
 
-def python(code: str) -> Command:
-    """Make the command line of a forwarder written above."""
-    return lambda port, clients: [sys.executable, "-c", code, str(port), *map(str, clients)]
+def plain(port: int, clients: list[int]) -> list[str]:
+    """Make the command line of the plain forwarder."""
+    return [sys.executable, "-c", PLAIN, str(port), *map(str, clients)]
 
 
 def mavlink_router(command: str) -> Command:
@@ -169,9 +147,19 @@ def mavproxy(command: str) -> Command:
     return build
 
 
-def hub(options: str = "") -> Command:
+def hub(options: str = "", event_loop: str = "asyncio") -> Command:
     """Make the command line of our hub, its clients with some options of an endpoint."""
-    return python(HUB % options)
+
+    def build(port: int, clients: list[int]) -> list[str]:
+        urls = (f"udp:127.0.0.1:{client}{options}" for client in clients)
+        return hub_command(f"udp-listen:127.0.0.1:{port}", *urls, event_loop=event_loop)
+
+    return build
+
+
+def hub_command(*endpoints: str, event_loop: str = "asyncio") -> list[str]:
+    """Make the command line of our hub with some endpoints."""
+    return [sys.executable, "-c", HUB, event_loop, *endpoints]
 
 
 def source_frames(systems: int = 1) -> list[bytes]:
@@ -374,7 +362,7 @@ class Bench:
             self._source.send(frame)
 
     def _settle(self) -> None:
-        """Wait until nothing comes any more."""
+        """Read until nothing arrives for 0.1 s."""
         while self._drain(100):
             pass
 
@@ -419,7 +407,8 @@ class WebBench(Bench):
         super().__init__(self._command, clients, frames)
 
     def _command(self, port: int, clients: list[int]) -> list[str]:  # noqa: ARG002
-        return [sys.executable, "-c", WEB_HUB, str(port), str(self._web_port)]
+        web = f"ws-listen:127.0.0.1:{self._web_port}"
+        return hub_command(f"udp-listen:127.0.0.1:{port}", web)
 
     def _wait_until_up(self) -> None:
         """Replace the UDP sockets by WebSockets."""
@@ -479,6 +468,10 @@ class WebBench(Bench):
         return count
 
 
+Start = Callable[[int, list[bytes]], Bench]
+"""Starts a forwarder for so many clients and with these frames."""
+
+
 def lossless(bench: Bench, seconds: float) -> Throughput:
     """Return the fastest run without loss, or the last."""
     for window in WINDOWS:
@@ -502,7 +495,7 @@ def summed_up(results: list[dict[str, float]]) -> dict[str, float]:
 
 
 def measure(
-    forwarders: dict[str, Command], clients: int, rounds: int, seconds: float
+    forwarders: dict[str, Start], clients: int, rounds: int, seconds: float
 ) -> dict[str, dict[str, dict[str, float]]]:
     """Run all forwarders with so many clients, in turns."""
     frames = source_frames()
@@ -510,8 +503,8 @@ def measure(
         name: ([], []) for name in forwarders
     }
     for _ in range(rounds):
-        for name, command in forwarders.items():
-            bench = WebBench(clients, frames) if name == WEB else Bench(command, clients, frames)
+        for name, start in forwarders.items():
+            bench = start(clients, frames)
             try:
                 found[name][0].append(asdict(lossless(bench, seconds)))
                 found[name][1].append(asdict(bench.latency(seconds, RATE_HZ)))
@@ -552,19 +545,19 @@ def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
 
 
 def measure_systems(
-    forwarders: dict[str, Command], systems: int, clients: int, seconds: float
+    forwarders: dict[str, Start], systems: int, clients: int, seconds: float
 ) -> dict[str, dict[str, float]]:
     """Reach so many vehicles behind one link, and see what each of their frames costs."""
     found: dict[str, dict[str, float]] = {}
     table = Table(title=f"{systems} vehicles behind one link", box=box.SIMPLE_HEAD)
     for column in ("forwarder", "commanded", "CPU µs/msg", "of one vehicle"):
         table.add_column(column, justify="right")
-    for name, command in forwarders.items():
+    for name, start in forwarders.items():
         if name in (WEB, "plain"):
             continue
         costs: dict[int, float] = {}
         for behind in (1, systems):
-            bench = Bench(command, clients, source_frames(behind))
+            bench = start(clients, source_frames(behind))
             try:
                 runs = [bench.throughput(seconds, WINDOWS[-1]) for _ in range(3)]
                 costs[behind] = min(run.cpu_us_per_message for run in runs)
@@ -611,15 +604,18 @@ def main() -> None:
     )
     options = parser.parse_args()
     report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
-    forwarders = {
-        "plain": python(PLAIN), "mavgate": hub(), PACKED: hub("?pack=1100"), WEB: python(WEB_HUB)
-    }  # fmt: skip
+    forwarders: dict[str, Start] = {
+        "plain": partial(Bench, plain),
+        "mavgate": partial(Bench, hub()),
+        PACKED: partial(Bench, hub("?pack=1100")),
+        WEB: WebBench,
+    }
     if options.uvloop:
-        forwarders[UVLOOP] = python(UVLOOP_HUB % "")
+        forwarders[UVLOOP] = partial(Bench, hub(event_loop=UVLOOP))
     if options.mavlink_router:
-        forwarders["mavlink-router"] = mavlink_router(options.mavlink_router)
+        forwarders["mavlink-router"] = partial(Bench, mavlink_router(options.mavlink_router))
     if options.mavproxy:
-        forwarders["mavproxy"] = mavproxy(options.mavproxy)
+        forwarders["mavproxy"] = partial(Bench, mavproxy(options.mavproxy))
     if options.memory:
         report["memory"] = watch_memory(options.memory)
     elif options.systems:

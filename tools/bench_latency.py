@@ -2,13 +2,13 @@
 
     python tools/bench_latency.py
 
-Several aircraft send all that their nodes say: IMU samples, the barometer's, fixes with their
+Several aircraft send all that their nodes send: IMU and barometer samples, fixes with their
 quality, the nodes' and the receiver's own reports. A frame with an IMU sample is written to a
 pseudo-terminal and the ATTITUDE_QUATERNION that it becomes is awaited on a UDP port, at several
 rates. Programs take turns in short rounds, so that other load on the machine meets them alike: the
 median round counts. The baseline is a program that reads the same line and sends a datagram of the
 same size for every frame, without decoding, fusing or encoding anything; `--forwarder` names
-another such, written in whatever language. The greatest latency at the highest rate is the longest
+another such program, in any language. The greatest latency at the highest rate is the longest
 pause, the machine's own included: the baseline has those too.
 """
 
@@ -73,7 +73,7 @@ event_loop = "{event_loop}"
 
 
 class Moment(NamedTuple):
-    """What is on the line at once."""
+    """The frames that are written to the line together."""
 
     system: int
     """Whose IMU sample it is."""
@@ -89,7 +89,7 @@ class Nodes:
         self._frames = itertools.count()
 
     def moments(self, rate_hz: int, vehicles: int) -> Iterator[Moment]:
-        """Make an endless row, with so many IMU samples a second of all aircraft together."""
+        """Yield without end, at so many IMU samples a second of all aircraft together."""
         for number in itertools.count():
             system, tick = 1 + number % vehicles, number // vehicles
             node_us = round(number * 1e6 / rate_hz)
@@ -140,19 +140,19 @@ def imu_payload(number: int) -> payloads.ImuPayload:
 
 
 def fix_payload(itow_ms: int) -> payloads.GpsFixPayload:
-    """Make a fix that stands still."""
-    place = (-77_656_000, 1_103_728_000, 110_000)
-    return payloads.GpsFixPayload(itow_ms, *place, (0, 0, 0), GpsFixType.FIX_3D, True, 12)
+    """Make a fix of a stationary aircraft."""
+    position = (-77_656_000, 1_103_728_000, 110_000)
+    return payloads.GpsFixPayload(itow_ms, *position, (0, 0, 0), GpsFixType.FIX_3D, True, 12)
 
 
 def quality_payload(itow_ms: int) -> payloads.GpsQualityPayload:
-    """Make what belongs to it."""
+    """Make the accuracies and the time of that fix."""
     utc = datetime(2026, 1, 1, tzinfo=UTC)
     return payloads.GpsQualityPayload(itow_ms, 150, 220, 30, 900, 140, 2500, utc)
 
 
 def frames(rate_hz: int) -> Iterator[bytes]:
-    """Make an endless row of the IMU frames of one aircraft."""
+    """Yield the IMU frames of one aircraft without end."""
     return (moment.sample for moment in Nodes().moments(rate_hz, 1))
 
 
@@ -163,22 +163,22 @@ def cpu_seconds(pid: int) -> float:
 
 
 class Line:
-    """A pseudo-terminal with a program at its other end, and what the program answers by UDP."""
+    """A pseudo-terminal with a program at its other end, and the UDP port of its answers."""
 
     def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
         self._is_gateway = name in (GATEWAY, WITH_UVLOOP)
         self._moments = moments
         self._waiting: dict[int, deque[float | None]] = {}
-        """When what is not answered yet was sent; None for what does not count."""
+        """Times of the frames not answered yet, by system; None for those that are not measured."""
         self._latencies_us: list[float] = []
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._sock.bind(("127.0.0.1", 0))
         self._sock.setblocking(False)
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
-        places = {"line": os.ttyname(self._slave), "port": self._sock.getsockname()[1]}
+        values = {"line": os.ttyname(self._slave), "port": self._sock.getsockname()[1]}
         self.process = subprocess.Popen(
-            [word.format(**places) for word in command],
+            [word.format(**values) for word in command],
             stderr=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
         )
@@ -277,7 +277,7 @@ def measure(
 
 
 def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
-    """Give the command lines, with places for the line and the port, of all that is measured."""
+    """Return the command line of each program, with placeholders for the line and the port."""
     loops = {GATEWAY: "asyncio"} | ({WITH_UVLOOP: "uvloop"} if options.uvloop else {})
     commands = {"plain forwarder": [sys.executable, "-c", BASELINE, "{line}", "{port}"]}
     for name, event_loop in loops.items():

@@ -34,7 +34,7 @@ PACKS = 20_000
 LONGEST_WAIT_US = 100_000
 """As the daemon: it polls at the latest so long after the last time."""
 SLEEP_S = 0.0007
-"""What is left of a millisecond after a sample, about."""
+"""About the rest of a millisecond after a sample."""
 SLEEPING_SECONDS = 3
 """Of the runs with sleeps."""
 
@@ -62,7 +62,7 @@ def run_pipeline(rate_hz: int, seconds: int, sleep_s: float = 0.0) -> tuple[floa
     slept_s = began_s = 0.0
     for number, frame in enumerate(line):
         if number == rate_hz:
-            # The first second loads machine code and sends what is sent at the start.
+            # The first second loads machine code and sends the messages of the start.
             sent, slept_s, began_s = 0, 0.0, time.process_time()
         if sleep_s:
             before_s = time.process_time()
