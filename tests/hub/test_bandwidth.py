@@ -63,7 +63,7 @@ def rates(frames: list[bytes], seconds: float) -> dict[int, float]:
 
 
 @pytest.mark.parametrize("budget", [5760, 3000, 1500, 800])
-def test_no_message_starves_and_all_of_it_fits(budget: int) -> None:
+def test_no_message_starves_and_all_fit_the_bandwidth(budget: int) -> None:
     flight = Flight(f"udp:h:1?budget={budget}", "udp:h:2")
     flight.run(10)
     begin_us = flight.run(20)
@@ -90,7 +90,7 @@ def test_position_and_health_are_thinned_less_than_raw_values() -> None:
     assert parts[33] == pytest.approx(parts[24], rel=0.3)
 
 
-def test_telemetry_comes_back_soon_after_many_answers() -> None:
+def test_telemetry_resumes_soon_after_many_answers() -> None:
     """All parameters within two seconds, as they are sent: four times what the link takes."""
     flight = Flight("udp:h:1?budget=960")
     flight.run(10)
@@ -112,20 +112,20 @@ def test_thinning_leaves_no_gap_in_the_numbers() -> None:
     assert {(b - a) % 256 for a, b in itertools.pairwise(numbers)} == {1}
 
 
-def test_a_serial_line_is_as_wide_as_its_baud_rate() -> None:
+def test_serial_line_has_the_bandwidth_of_its_baud_rate() -> None:
     assert parse_endpoint("serial:/dev/ttyUSB0:57600").budget == 5760
     assert parse_endpoint("serial:/dev/ttyUSB0:57600?budget=2000").budget == 2000
     assert parse_endpoint("udp:h:1").budget == 0
 
 
-def test_a_wide_link_gets_everything_without_delay() -> None:
+def test_wide_link_gets_everything_without_delay() -> None:
     flight = Flight("udp:h:1?budget=50000", "udp:h:2")
     flight.run(20)
     assert flight.sinks[0].sent == flight.sinks[1].sent
 
 
 @pytest.mark.parametrize("budget", [10, 54, 99])
-def test_a_link_of_a_few_bytes_gets_one_message_alone(budget: int) -> None:
+def test_satellite_link_gets_one_message_only(budget: int) -> None:
     flight = Flight(f"udp:h:1?budget={budget}")
     flight.run(60)
     kinds = {message_id_of(frame) for frame in flight.sinks[0].frames}
@@ -143,7 +143,7 @@ def test_message_of_a_foreign_satellite_link_goes_to_all() -> None:
     assert [len(sink.frames) for sink in flight.sinks] == [1, 1, 1]
 
 
-def test_a_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
+def test_radio_whose_buffer_fills_is_sent_less_and_then_more_again() -> None:
     flight = Flight("serial:/dev/ttyUSB0:57600")
     flows = []
     for free_percent in (100, 10, 100):
@@ -170,7 +170,7 @@ def test_plan_of_a_link_lasts_until_its_bandwidth_changes(budget: int, is_kept: 
 
 
 @pytest.mark.parametrize("how", ["answer", "deliver"])
-def test_answers_come_first(how: str) -> None:
+def test_answers_reduce_the_bandwidth_for_telemetry(how: str) -> None:
     """Our own answers, and frames that others address to who is behind the link."""
     flight = Flight("udp:h:1?budget=3000")
     flight.run(10)

@@ -92,7 +92,7 @@ def test_same_location_in_two_spellings_is_refused() -> None:
         HubSettings(endpoints=("udp-listen:0.0.0.0:14550", "udpin://:14550"))
 
 
-def test_options() -> None:
+def test_common_options_are_parsed() -> None:
     endpoint = parse_endpoint(
         "udp:10.0.0.7:14550?name=tablet&deny=RAW_IMU,105&rate=attitude:5,VFR_HUD:0"
         "&pack=1100&trusted=no"
@@ -104,14 +104,14 @@ def test_options() -> None:
     assert endpoint.trusted is False
 
 
-def test_options_of_a_websocket() -> None:
+def test_websocket_options_are_parsed() -> None:
     listening = parse_endpoint("ws-listen:127.0.0.1:1?origins=https://Example.org:8443,null")
     assert listening.origins == {"https://example.org:8443", "null"}
     assert parse_endpoint("ws:127.0.0.1:1?path=/v1/raw").path == "/v1/raw"
     assert parse_endpoint("wss:127.0.0.1:1").path == "/"
 
 
-def test_a_site_of_a_fleet() -> None:
+def test_site_of_a_fleet_is_parsed() -> None:
     endpoint = parse_endpoint("zenoh:tcp/[::1]:7447?site=field-1&config=/etc/zenoh.json5&rate=30:5")
     assert (endpoint.host, endpoint.site, endpoint.keys) == ("tcp/[::1]:7447", "field-1", "site")
     assert endpoint.address == "tcp/[::1]:7447"
@@ -122,7 +122,7 @@ def test_a_site_of_a_fleet() -> None:
     assert places == {"zenoh:tcp/h:7447?site=a", "zenoh:tcp/h:7447?site=b"}
 
 
-def test_lists() -> None:
+def test_deny_applies_within_the_allowed_messages() -> None:
     allowing = parse_endpoint("udp:h:1?allow=HEARTBEAT,ATTITUDE&deny=ATTITUDE")
     assert [allowing.passes(message_id) for message_id in (0, 30, 33)] == [True, False, False]
     assert parse_endpoint("udp:h:1").passes(33)
@@ -179,12 +179,12 @@ def test_refusals_name_the_endpoint_and_what_is_allowed(url: str, words: str) ->
     assert repr(url) in str(error.value)
 
 
-def test_settings_refuse_an_endpoint_that_is_there_twice() -> None:
+def test_settings_refuse_duplicate_endpoints() -> None:
     with pytest.raises(ValueError, match="twice"):
         HubSettings(endpoints=("udp:h:1", "udp:h:1?name=same"))
 
 
-def test_settings_refuse_a_wrong_endpoint_when_read() -> None:
+def test_settings_refuse_a_malformed_endpoint() -> None:
     with pytest.raises(msgspec.ValidationError, match="carrier-pigeon"):
         msgspec.convert({"endpoints": ["carrier-pigeon:home:1"]}, HubSettings)
 
@@ -216,7 +216,7 @@ URLS = st.one_of(
 
 
 @given(URLS)
-def test_any_text_is_an_endpoint_that_can_be_used_or_is_refused_by_name(url: str) -> None:
+def test_any_text_is_a_usable_endpoint_or_is_refused_by_name(url: str) -> None:
     endpoint = None
     with contextlib.suppress(ValueError):
         endpoint = parse_endpoint(url)
@@ -234,7 +234,7 @@ def test_any_text_is_an_endpoint_that_can_be_used_or_is_refused_by_name(url: str
     assert (again.kind, again.host, again.port) == (endpoint.kind, endpoint.host, endpoint.port)
 
 
-def test_a_caller_keeps_the_name_of_its_port() -> None:
+def test_client_name_begins_with_the_name_of_its_port() -> None:
     named = parse_endpoint("udp-listen:0.0.0.0:14551?name=tablets")
     assert named.name_of("10.0.0.7:3000") == "tablets 10.0.0.7:3000"
     assert parse_endpoint("udp-listen:0.0.0.0:14551").name_of("10.0.0.7:3000") == "10.0.0.7:3000"

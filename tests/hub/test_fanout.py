@@ -95,7 +95,7 @@ def test_clients_with_the_same_number_share_one_signed_copy(vehicle: Sender) -> 
     assert peers[0].sent[0][1].signed
 
 
-def test_a_client_may_leave_while_a_frame_is_sent_to_it(fanout: Fanout, vehicle: Sender) -> None:
+def test_client_may_leave_while_a_frame_is_sent_to_it(fanout: Fanout, vehicle: Sender) -> None:
     class Leaving(Peer):
         def transmit(self, frame: MavFrame) -> None:
             super().transmit(frame)
@@ -120,9 +120,7 @@ def test_denied_messages_leave_no_gap_in_the_sequence(fanout: Fanout, vehicle: S
     assert plain.sequences() == [n & 255 for n in range(600)]
 
 
-def test_an_answer_is_sent_to_one_client_and_leaves_no_gap_at_others(
-    fanout: Fanout, vehicle: Sender
-) -> None:
+def test_answer_to_one_client_leaves_no_gap_at_others(fanout: Fanout, vehicle: Sender) -> None:
     asker, other = Peer(fanout, 1, "?deny=HEARTBEAT"), Peer(fanout, 2)
     publish(fanout, vehicle.attitude(), 0)
     answer(fanout, vehicle.heartbeat(), [1])
@@ -142,7 +140,7 @@ def test_systems_are_numbered_separately(fanout: Fanout) -> None:
 
 
 class TestRates:
-    def test_a_limit_halves_the_stream_and_jitter_does_not(
+    def test_rate_limit_halves_a_stream_and_ignores_jitter(
         self, fanout: Fanout, vehicle: Sender
     ) -> None:
         peer = Peer(fanout, 1, "?rate=ATTITUDE:25")
@@ -151,20 +149,20 @@ class TestRates:
         assert len(peer.frames) == 50
         assert peer.sequences() == list(range(50))
 
-    def test_a_limit_at_the_stream_rate_passes_all(self, fanout: Fanout, vehicle: Sender) -> None:
+    def test_rate_limit_equal_to_the_rate_passes_all(self, fanout: Fanout, vehicle: Sender) -> None:
         peer = Peer(fanout, 1, "?rate=ATTITUDE:50")
         for n in range(100):
             publish(fanout, vehicle.attitude(), n * 20_000 + (n % 3) * 2_000)
         assert len(peer.frames) == 100
 
-    def test_after_a_pause_no_burst_makes_up(self, fanout: Fanout, vehicle: Sender) -> None:
+    def test_pause_is_not_followed_by_a_burst(self, fanout: Fanout, vehicle: Sender) -> None:
         peer = Peer(fanout, 1, "?rate=ATTITUDE:10")
         publish(fanout, vehicle.attitude(), 0)
         for n in range(10):
             publish(fanout, vehicle.attitude(), 60_000_000 + n)
         assert len(peer.frames) == 2
 
-    def test_a_requested_interval_slows_and_stops(self, fanout: Fanout, vehicle: Sender) -> None:
+    def test_requested_interval_slows_and_stops(self, fanout: Fanout, vehicle: Sender) -> None:
         asker, other = Peer(fanout, 1), Peer(fanout, 2)
 
         def sent_in_a_second(interval_us: int) -> int:
@@ -186,19 +184,19 @@ class TestRates:
             publish(fanout, vehicle.attitude(), n * 20_000)
         assert (len(denied.frames), len(limited.frames)) == (0, 1)
 
-    def test_a_requested_interval_applies_to_one_system(self, fanout: Fanout) -> None:
+    def test_requested_interval_applies_to_one_system(self, fanout: Fanout) -> None:
         peer = Peer(fanout, 1)
         fanout.set_interval(ClientInterval(1, 1, ATTITUDE_ID, -1))
         publish(fanout, Sender(1).attitude(), 0)
         publish(fanout, Sender(2).attitude(), 0)
         assert [frame[5] for frame in peer.frames] == [2]
 
-    def test_a_request_of_an_unknown_client_is_ignored(self, fanout: Fanout) -> None:
+    def test_request_of_an_unknown_client_is_ignored(self, fanout: Fanout) -> None:
         fanout.set_interval(ClientInterval(5, 1, ATTITUDE_ID, -1))
 
 
 class TestForeignFrames:
-    def test_forwarded_to_all_but_the_source_and_never_renumbered(self, fanout: Fanout) -> None:
+    def test_foreign_frames_reach_all_but_their_source_unchanged(self, fanout: Fanout) -> None:
         source, plain = Peer(fanout, 1), Peer(fanout, 2)
         picky = Peer(fanout, 3, "?deny=HEARTBEAT&rate=ATTITUDE:1")
         foreign = Sender(9)
@@ -217,7 +215,7 @@ class TestForeignFrames:
         assert [len(peer.frames) for peer in peers] == [1, 0, 1]
 
 
-def test_a_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender) -> None:
+def test_monitor_gets_every_frame_without_a_gap(fanout: Fanout, vehicle: Sender) -> None:
     monitor, other = Peer(fanout, 1, "?monitor=yes&deny=ATTITUDE"), Peer(fanout, 2)
     publish(fanout, vehicle.attitude())
     answer(fanout, vehicle.heartbeat(), [2])

@@ -33,7 +33,7 @@ def send(sock: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-async def test_one_wake_up_takes_a_little_of_a_flood(rig: Any, kind: str) -> None:
+async def test_one_wake_up_reads_a_bounded_part_of_a_flood(rig: Any, kind: str) -> None:
     hub = rig.hub(f"{kind}:127.0.0.1:0")
     sock = await caller(rig, kind, hub.listening_ports()[0])
     await rig.until(lambda: bool(rig.incoming))

@@ -41,7 +41,7 @@ async def receive(sock: socket.socket) -> tuple[bytes, tuple[str, int]]:
     return await asyncio.wait_for(asyncio.get_running_loop().sock_recvfrom(sock, 4096), LIMIT_S)
 
 
-async def test_multicast_both_ways_and_nothing_comes_back(rig: Any) -> None:
+async def test_multicast_is_sent_and_received_without_own_frames(rig: Any) -> None:
     listener = member(rig)
     port = listener.getsockname()[1]
     hub = await rig.open(f"udp-multicast:{GROUP}:{port}")

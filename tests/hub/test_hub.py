@@ -47,7 +47,7 @@ async def test_telemetry_of_an_autopilot_goes_to_all_byte_for_byte(world: Any) -
         assert world.foreign[-1] == frame
 
 
-async def test_a_request_goes_to_the_system_it_addresses(world: Any) -> None:
+async def test_request_goes_to_the_system_that_it_addresses(world: Any) -> None:
     count = len(world.incoming)
     request = world.first.sender.command(42, 1)
     world.first.send(request)
@@ -128,7 +128,7 @@ async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
     assert world.first.is_silent()
 
 
-async def test_nothing_runs_round_a_ring(rig: Any) -> None:
+async def test_no_frame_circulates_between_hubs_joined_twice(rig: Any) -> None:
     """Two hubs joined by two cables; a vehicle of its own behind each, and both ask for trips."""
     first = rig.hub("udp-listen:127.0.0.1:0", "udp-listen:127.0.0.2:0", ping_interval_s=1.0)
     here, there = first.listening_ports()
@@ -195,7 +195,7 @@ async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
     assert rig.foreign == []
 
 
-async def test_a_monitor_gets_all_traffic_and_what_it_sends_is_ignored(world: Any) -> None:
+async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: Any) -> None:
     hub = world.world
     monitor = world.station()
     hub.add(f"udp:127.0.0.1:{monitor.port}?monitor=yes&allow=HEARTBEAT")
@@ -249,7 +249,7 @@ async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -
     assert [frame[4] for frame in got] == list(range(got[0][4], got[0][4] + 9))
 
 
-async def test_a_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> None:
+async def test_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> None:
     """Frames that the first link has lost arrive three seconds late by the second one."""
     hub = world.world
     slow = world.station(hub.listening_ports()[0])
@@ -277,7 +277,7 @@ async def test_a_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> 
     assert counters.duplicates > 80
 
 
-async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
+async def test_round_trip_is_measured_by_ping_and_by_timesync(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", ping_interval_s=5.0)
     hub.send(rig.out(rig.vehicle.heartbeat()))
     station = await rig.call(hub)
@@ -309,7 +309,7 @@ async def test_round_trips_by_ping_and_by_timesync(rig: Any) -> None:
 
 
 class TestChangesAtRunTime:
-    async def test_add_and_remove(self, rig: Any) -> None:
+    async def test_added_endpoint_gets_frames_until_it_is_removed(self, rig: Any) -> None:
         hub, station = rig.hub(), rig.station()
         hub.add(f"udp:127.0.0.1:{station.port}?name=tablet")
         await rig.until_open(hub)
@@ -323,7 +323,7 @@ class TestChangesAtRunTime:
         with pytest.raises(ValueError, match="tablet"):
             hub.remove("tablet")
 
-    async def test_reload_drops_nobody_who_stays(self, rig: Any) -> None:
+    async def test_reload_keeps_the_clients_of_endpoints_that_remain(self, rig: Any) -> None:
         stays, goes, comes = (rig.station() for _ in range(3))
         hub = rig.hub(
             "udp-listen:127.0.0.1:0",
@@ -386,7 +386,9 @@ class TestCachedRoutes:
         assert by_remote[f"127.0.0.1:{world.autopilot.port}"].received == 51
         assert world.foreign[-50:] == frames
 
-    async def test_a_refusal_on_the_way_is_counted_and_hurts_nobody(self, world: Any) -> None:
+    async def test_refusal_on_a_cached_route_is_counted_without_loss_at_others(
+        self, world: Any
+    ) -> None:
         hub = world.world
         world.autopilot.send(world.autopilot.sender.attitude())
         assert [(await s.receive())[7] for s in (world.first, world.second)] == [30, 30]
@@ -437,7 +439,7 @@ class TestCachedRoutes:
 
 class TestListeningPorts:
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_a_taken_port_is_shown_and_opens_when_it_is_free(
+    async def test_taken_port_is_reported_and_opens_when_it_is_free(
         self, rig: Any, kind: str, caplog: pytest.LogCaptureFixture
     ) -> None:
         taken = rig.station(kind=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)

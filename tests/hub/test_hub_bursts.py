@@ -31,7 +31,7 @@ def burst(rig: Any, count: int) -> list[bytes]:
     return [rig.vehicle.attitude() for _ in range(count)]
 
 
-async def test_a_burst_is_sent_in_order_a_few_frames_a_turn(crowd: Any) -> None:
+async def test_burst_is_sent_in_order_a_few_frames_a_turn(crowd: Any) -> None:
     hub, frames = crowd.world, burst(crowd, 3 * FRAMES_A_TURN + 1)
     sent = []
     hub.send_all(map(crowd.out, frames))
@@ -59,13 +59,13 @@ async def test_telemetry_after_a_burst_does_not_overtake_it(crowd: Any) -> None:
         assert [await station.receive() for _ in frames] == frames
 
 
-async def test_more_than_the_bound_is_sent_at_once(crowd: Any) -> None:
+async def test_frames_beyond_the_bound_are_sent_at_once(crowd: Any) -> None:
     hub = crowd.world
     hub.send_all(map(crowd.out, burst(crowd, 2 * MAX_WAITING)))
     assert hub.counters().published == MAX_WAITING
 
 
-async def test_a_burst_ends_before_the_hub_closes(crowd: Any) -> None:
+async def test_burst_is_sent_before_the_hub_closes(crowd: Any) -> None:
     hub, frames = crowd.world, burst(crowd, 2 * FRAMES_A_TURN)
     hub.send_all(map(crowd.out, frames))
     hub.close()
@@ -73,7 +73,7 @@ async def test_a_burst_ends_before_the_hub_closes(crowd: Any) -> None:
         assert [await station.receive() for _ in frames] == frames
 
 
-async def test_a_burst_is_charged_to_the_client_that_caused_it(
+async def test_burst_is_charged_to_the_client_that_caused_it(
     crowd: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where its frames are for all and are sent long after its request was served."""
@@ -113,7 +113,7 @@ async def test_simultaneous_clients_are_admitted_one_a_turn(rig: Any, kind: str)
 
 @pytest.mark.parametrize(("stations", "most"), [(1, READ_BYTES), (15, 768), (80, LEAST_READ_BYTES)])
 @pytest.mark.parametrize("kind", ["udp", "tcp"])
-async def test_a_flood_is_forwarded_over_many_turns(
+async def test_flood_is_forwarded_over_many_turns(
     rig: Any, kind: str, stations: int, most: int
 ) -> None:
     takers = [rig.station() for _ in range(stations)]
@@ -143,7 +143,7 @@ TURN_US = 40_000
 """A turn of the loop at a load of 40."""
 
 
-async def test_a_slow_loop_answers_within_0_3_s_and_sheds_telemetry(crowd: Any) -> None:
+async def test_slow_loop_answers_within_0_3_s_and_sheds_telemetry(crowd: Any) -> None:
     """A client uploads a mission item by item while each turn of the loop takes 40 ms."""
     hub, station = crowd.world, crowd.stations[0]
     station.target = ("127.0.0.1", hub._clients[1]._port)

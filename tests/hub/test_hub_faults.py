@@ -72,7 +72,7 @@ def _sequences(sock: socket.socket) -> list[int]:
 
 
 @pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
-async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
+async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: bytes) -> None:
     flight = Healthy(rig, "tcp-listen:127.0.0.1:0")
     await flight.start()
     with socket.create_connection(("127.0.0.1", flight.hub.listening_ports()[1])) as rude:
@@ -97,7 +97,7 @@ async def test_a_tcp_client_pours_garbage(rig: Any, garbage: bytes) -> None:
 
 
 @pytest.mark.parametrize("room", [16, 100])
-async def test_hundreds_of_clients_appear_and_vanish(rig: Any, room: int) -> None:
+async def test_hundreds_of_short_visits_cost_others_no_frame(rig: Any, room: int) -> None:
     flight = Healthy(rig, max_clients=room, ping_interval_s=0.0)
     await flight.start()
     target = ("127.0.0.1", flight.hub.listening_ports()[0])
@@ -119,7 +119,7 @@ async def test_hundreds_of_clients_appear_and_vanish(rig: Any, room: int) -> Non
     reason="only root can make network namespaces, with iproute2 and util-linux",
 )
 @pytest.mark.slow
-async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
+async def test_interface_that_goes_down_and_up_costs_others_no_frame(tmp_path: Any) -> None:
     """Run in a network namespace of its own: see `interface_world.py`."""
     program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
     run = await asyncio.to_thread(
@@ -141,7 +141,7 @@ async def test_an_interface_goes_down_and_up(tmp_path: Any) -> None:
     assert seen["far end heard"] >= seen["sent after"] - 5
 
 
-class TestALinkThatRaises:
+class TestLinkThatRaises:
     """An error that nobody foresaw costs its own link a second, and nobody else anything."""
 
     async def test_link_that_raises_is_reported_and_retried_while_others_go_on(
@@ -176,7 +176,7 @@ class TestALinkThatRaises:
         assert hub.clients()[0].state == "open"
 
     @pytest.mark.parametrize("kind", ["udp", "tcp"])
-    async def test_a_listening_port_is_bound_again(
+    async def test_listening_port_that_raises_is_bound_again(
         self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         hub = rig.hub(f"{kind}-listen:127.0.0.1:0")

@@ -123,7 +123,7 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     assert [frame for frame in got if frame in said] == said
 
 
-async def test_another_key_applies_from_the_next_frame_on(rig: Any) -> None:
+async def test_changed_key_applies_from_the_next_frame_on(rig: Any) -> None:
     keys = signer()
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=keys)
     hub.send(rig.out(rig.vehicle.heartbeat()))

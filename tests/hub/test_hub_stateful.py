@@ -338,7 +338,7 @@ def received(station: Station) -> list[bytes]:
     return frames
 
 
-def test_no_order_of_events_harms_the_good_client() -> None:
+def test_trusted_client_loses_nothing_in_any_order_of_events() -> None:
     bounded = settings(
         max_examples=EXAMPLES,
         stateful_step_count=STEPS,

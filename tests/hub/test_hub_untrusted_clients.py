@@ -83,7 +83,7 @@ class Gateway(FlyingHub):
                 self.attitudes_heard += frame[7:10] == b"\x1f\0\0"
 
 
-async def test_thousands_of_unknown_addresses(
+async def test_thousands_of_unknown_addresses_cost_no_frame_and_no_memory(
     rig: Any, rng: np.random.Generator, caplog: pytest.LogCaptureFixture
 ) -> None:
     # The lines that pytest keeps would be counted.

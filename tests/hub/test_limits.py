@@ -23,7 +23,7 @@ def asked(client_id: int, number: int = 0, *, trusted: bool = True) -> Incoming:
     return Incoming(client_id, bytes((number,)), trusted)
 
 
-def test_in_turns_and_each_in_its_order() -> None:
+def test_clients_are_served_in_turns_and_each_in_its_order() -> None:
     queue = RequestQueue()
     for number in range(3):
         queue.offer(asked(1, number), 0)
@@ -45,7 +45,7 @@ def test_flooding_client_delays_only_itself() -> None:
     assert queue.take(0) == asked(2)
 
 
-def test_next_request_waits_until_the_answers_are_paid() -> None:
+def test_next_request_waits_until_the_bucket_has_refilled() -> None:
     queue = RequestQueue()
     queue.offer(asked(1), 0)
     queue.offer(asked(1), 0)
@@ -93,7 +93,7 @@ def test_untrusted_clients_cause_a_bounded_number_of_bytes_in_a_minute() -> None
     assert answered <= (UNTRUSTED_BURST + 60 * UNTRUSTED_RATE) / (REQUEST_COST + 300) + 1
 
 
-def test_a_client_no_longer_trusted_uses_the_shared_bucket() -> None:
+def test_client_no_longer_trusted_uses_the_shared_bucket() -> None:
     queue = RequestQueue()
     queue.offer(asked(9, trusted=False), 0)
     queue.charge(9, 2 * UNTRUSTED_BURST)

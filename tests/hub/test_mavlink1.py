@@ -27,7 +27,7 @@ async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
             return frame
 
 
-async def test_endpoint_of_version_1_gets_what_this_version_can_carry(rig: Any) -> None:
+async def test_endpoint_of_version_1_gets_only_messages_of_this_version(rig: Any) -> None:
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}?mavlink=1")
     odometry = dialect.MAVLink_odometry_message(

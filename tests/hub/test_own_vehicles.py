@@ -12,7 +12,7 @@ def home(system: int, sequence: int) -> MavFrame:
     return numbered(system, sequence, message)
 
 
-def test_a_system_is_ours_until_its_heartbeat_stops() -> None:
+def test_system_is_own_until_its_heartbeat_stops() -> None:
     vehicles = OwnVehicles()
     vehicles.register(numbered(1, 0), 0)
     assert vehicles.is_own((1, 1), OWN_FRESH_US)
@@ -22,7 +22,7 @@ def test_a_system_is_ours_until_its_heartbeat_stops() -> None:
     assert vehicles.systems(OWN_FRESH_US + 1) == []
 
 
-def test_a_waiting_client_gets_heartbeat_and_home_of_each_vehicle() -> None:
+def test_waiting_client_gets_heartbeat_and_home_of_each_vehicle() -> None:
     vehicles = OwnVehicles()
     frames = [home(1, 50), numbered(1, 60), numbered(2, 9)]
     for frame in frames:
@@ -36,7 +36,7 @@ def test_a_waiting_client_gets_heartbeat_and_home_of_each_vehicle() -> None:
     assert not vehicles.waiting
 
 
-def test_a_removed_client_is_not_greeted() -> None:
+def test_removed_client_is_not_greeted() -> None:
     vehicles = OwnVehicles()
     vehicles.register(numbered(1, 0), 0)
     vehicles.await_greeting(7)
@@ -48,7 +48,7 @@ def test_a_removed_client_is_not_greeted() -> None:
     assert not vehicles.waiting
 
 
-def test_a_system_that_returns_greets_without_its_old_home() -> None:
+def test_returning_system_greets_without_its_old_home() -> None:
     vehicles = OwnVehicles()
     vehicles.register(numbered(1, 0), 0)
     vehicles.register(home(1, 1), 0)
@@ -58,7 +58,7 @@ def test_a_system_that_returns_greets_without_its_old_home() -> None:
     assert [frame.message_id for frame in vehicles.greet((1, 1))[1]] == [0]
 
 
-def test_without_a_vehicle_no_client_waits() -> None:
+def test_no_client_waits_without_a_vehicle() -> None:
     vehicles = OwnVehicles()
     vehicles.await_greeting(7)
     assert not vehicles.waiting

@@ -46,19 +46,19 @@ def table() -> RoutingTable:
         ((99, 1), 9, []),
     ],
 )
-def test_clients_to_a_target(
+def test_target_selects_the_clients_that_lead_to_it(
     table: RoutingTable, target: tuple[int, int], source: int, clients: list[int]
 ) -> None:
     assert table.clients_to(target, source, 0) == clients
 
 
-def test_a_fresh_path_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
+def test_fresh_path_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
     table.register(4, (20, 1), ROUTE_FRESH_US + 1)
     assert table.clients_to((20, 1), 9, ROUTE_FRESH_US + 1) == [4]
     assert table.clients_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]
 
 
-def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None:
+def test_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None:
     table.register(4, (20, 1), 0)
     assert table.is_shared((20, 1), ROUTE_FRESH_US)
     table.register(4, (20, 1), ROUTE_FRESH_US + 1)
@@ -66,7 +66,7 @@ def test_a_system_is_shared_by_paths_that_are_alive(table: RoutingTable) -> None
     assert not table.is_shared((10, 1), 0)
 
 
-def test_a_removed_client_has_no_paths(table: RoutingTable) -> None:
+def test_removed_client_has_no_paths(table: RoutingTable) -> None:
     table.remove(1)
     table.remove(1)
     assert table.clients_to((10, 1), 9, 0) == [2]
@@ -83,7 +83,7 @@ def test_stations_are_distinguished_from_vehicles(table: RoutingTable) -> None:
     assert table.clients_with_vehicles(1) == [2, 3, 4]
 
 
-def test_a_path_begins_again_after_a_timeout(table: RoutingTable) -> None:
+def test_path_begins_again_after_a_timeout(table: RoutingTable) -> None:
     later_us = ROUTE_FRESH_US
     table.register(8, (10, 1), 0)
     assert table.register(1, (10, 1), later_us).since_us == 0
@@ -97,7 +97,7 @@ class TestBounds:
             assert table.register(1, (system, 1), system)
         assert all(table.clients_to((system, 1), 9, 255) == [1] for system in range(1, 256))
 
-    def test_the_stalest_origin_is_replaced(self) -> None:
+    def test_stalest_origin_is_replaced(self) -> None:
         table = RoutingTable(max_origins=3)
         for system, us in ((1, 5), (2, 0), (3, 9)):
             table.register(1, (system, 1), us)
@@ -105,7 +105,7 @@ class TestBounds:
         assert table.origins(1) == ((1, 1), (3, 1), (4, 1))
         assert table.clients_to((2, 1), 9, 0) == []
 
-    def test_with_all_origins_fresh_a_new_one_is_ignored(self) -> None:
+    def test_new_origin_is_ignored_while_all_are_fresh(self) -> None:
         changes: list[int] = []
         table = RoutingTable(lambda: changes.append(1), max_origins=3)
         for system in range(1, 4):
@@ -160,13 +160,13 @@ def links() -> Links:
 
 
 class TestDuplicates:
-    def test_a_copy_is_dropped_on_every_path(self, links: Links) -> None:
+    def test_copy_is_dropped_on_every_path(self, links: Links) -> None:
         assert links.check(FAST, 1, 0) == NEW
         assert links.check(SLOW, 1, 10) == FAST
         assert links.check(FAST, 1, 20) == FAST
         assert links.check(SLOW, 2, 20) == NEW
 
-    def test_a_frame_from_before_its_path_existed_passes(self, links: Links) -> None:
+    def test_frame_from_before_its_path_existed_passes(self, links: Links) -> None:
         links.check(FAST, 1, 10)
         links.paths[FAST].since_us = 11
         assert links.check(FAST, 1, 11) == NEW
@@ -208,14 +208,14 @@ class TestLateFrames:
                 assert number >= newest - rate_hz
                 newest = max(newest, number)
 
-    def test_a_frame_within_the_limit_fills_a_gap(self, links: Links) -> None:
+    def test_frame_within_the_limit_fills_a_gap(self, links: Links) -> None:
         for number in range(100):
             if number % 10:
                 assert links.check(FAST, number, number * 20_000) == NEW
             if number >= 20 and (number - 20) % 10 == 0:
                 assert links.check(SLOW, number - 20, number * 20_000 + 1) == NEW
 
-    def test_the_slow_link_takes_over_when_the_fast_one_fails(self, links: Links) -> None:
+    def test_slow_link_takes_over_when_the_fast_one_fails(self, links: Links) -> None:
         for number in range(500):
             now_us = number * 20_000
             if number < 250:
@@ -224,7 +224,7 @@ class TestLateFrames:
                 verdict = links.check(SLOW, number - 150, now_us + 1)
                 assert (verdict == NEW) == (number - 150 >= 250)
 
-    def test_a_restarted_vehicle_loses_nothing_on_the_leading_link(self, links: Links) -> None:
+    def test_restarted_vehicle_loses_nothing_on_the_leading_link(self, links: Links) -> None:
         for number in range(200):
             links.check(FAST, number, number * 20_000)
             links.check(SLOW, number, number * 20_000 + 5000)
@@ -247,7 +247,7 @@ class TestLateFrames:
         assert all(found[0] == NEW and LATE not in found for found in verdicts.values())
 
 
-def test_a_copy_joins_two_links() -> None:
+def test_copy_joins_two_links() -> None:
     links = RedundantLinks()
     assert links.group(1) == (1,)
     assert links.register(2, 1, 0)
@@ -262,7 +262,7 @@ def test_pairs_that_share_a_client_are_one_group() -> None:
     assert {links.group(n) for n in range(1, 5)} == {(1, 2, 3, 4)}
 
 
-def test_without_copies_links_are_separated() -> None:
+def test_links_without_copies_are_separated() -> None:
     links = RedundantLinks()
     links.register(1, 2, 0)
     links.register(3, 4, 10)
@@ -273,7 +273,7 @@ def test_without_copies_links_are_separated() -> None:
     assert links.group(3) == (3, 4)
 
 
-def test_a_removed_client_is_in_no_group() -> None:
+def test_removed_client_is_in_no_group() -> None:
     links = RedundantLinks()
     links.register(1, 2, 0)
     links.register(2, 3, 0)

@@ -27,7 +27,7 @@ def drain(queue: SendQueue) -> list[bytes]:
 
 
 class TestSendQueue:
-    def test_urgent_first_yet_bulk_ends(self) -> None:
+    def test_urgent_frames_leave_first_without_starving_bulk(self) -> None:
         queue = queue_of(10_000)
         for n in range(8):
             queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
@@ -40,14 +40,14 @@ class TestSendQueue:
         assert [f for f in order if f[:1] == b"b"] == [b"b%d" % n for n in range(8)]
         assert queue.size == 0
 
-    def test_bulk_and_usual_take_turns(self) -> None:
+    def test_bulk_and_usual_frames_take_turns(self) -> None:
         queue = queue_of(10_000)
         for n in range(3):
             queue.push(raw_frame(RAW_IMU, b"u%d" % n), 0)
             queue.push(raw_frame(PARAM_VALUE, b"b%d" % n), 0)
         assert drain(queue) == [b"b0", b"u0", b"b1", b"u1", b"b2", b"u2"]
 
-    def test_oldest_telemetry_goes_first_and_answers_last(self) -> None:
+    def test_full_queue_drops_oldest_telemetry_first_and_answers_last(self) -> None:
         queue = queue_of(30)
         queue.push(raw_frame(COMMAND_ACK, b"c" * 10), 0)
         queue.push(raw_frame(ATTITUDE, b"a" * 10), 0)
@@ -57,7 +57,7 @@ class TestSendQueue:
         assert queue.push(raw_frame(COMMAND_ACK, b"C" * 10), 0) == 1
         assert drain(queue) == [b"c" * 10, b"C" * 10, b"A" * 10]
 
-    def test_an_answer_overtakes_the_attitude(self) -> None:
+    def test_answer_overtakes_attitudes(self) -> None:
         queue = queue_of(1000)
         for message_id in (ATTITUDE, RAW_IMU, PARAM_VALUE, COMMAND_ACK, HEARTBEAT):
             queue.push(raw_frame(message_id, bytes([message_id])), 0)
@@ -92,7 +92,7 @@ class TestSendQueue:
         assert queue.size == 0
 
     @pytest.mark.parametrize("message_id", [ATTITUDE, RAW_IMU, COMMAND_ACK])
-    def test_the_newest_is_always_taken(self, message_id: int) -> None:
+    def test_newest_frame_is_always_accepted(self, message_id: int) -> None:
         queue = queue_of(30)
         for n in range(3):
             queue.push(raw_frame((ATTITUDE, RAW_IMU, COMMAND_ACK)[n], bytes((n,)) * 10), 0)
@@ -126,7 +126,7 @@ class TestNumbers:
     def queue(self) -> SendQueue:
         return queue_of(10_000, (1, 1))
 
-    def test_without_drops_every_frame_is_sent_unchanged(self, queue: SendQueue) -> None:
+    def test_frames_are_unchanged_without_drops(self, queue: SendQueue) -> None:
         for sequence in (254, 255, 0, 9, 9, 3):
             frame = numbered(1, sequence)
             assert queue.encode(frame, 0) is frame.data
@@ -140,7 +140,7 @@ class TestNumbers:
         assert [frame_of(data).sequence for data in left] == [251, 252, 253]
         assert all(frames_in(data) == [data] for data in left)
 
-    def test_an_overtaking_frame_gets_the_next_number(self, queue: SendQueue) -> None:
+    def test_overtaking_frame_gets_the_next_number(self, queue: SendQueue) -> None:
         queue.encode(numbered(1, 7), 0)
         messages = (raw_imu(), raw_imu(), dialect.MAVLink_command_ack_message(512, 0))
         for sequence, message in enumerate(messages, start=8):

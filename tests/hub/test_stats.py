@@ -70,7 +70,7 @@ AWAY = client(state="unreachable")
         ),
     ],
 )  # fmt: skip
-def test_problems_that_last_are_reported_once_and_so_is_their_end(
+def test_lasting_problem_and_its_end_are_reported_once(
     looks: list[tuple[int, tuple[ClientStats, ...]]], texts: list[str]
 ) -> None:
     watch = ClientAlerts()
@@ -78,7 +78,7 @@ def test_problems_that_last_are_reported_once_and_so_is_their_end(
     assert SLOW_FOR_US < 40 * S
 
 
-def test_a_port_that_cannot_be_bound_is_reported_until_it_can() -> None:
+def test_closed_port_is_reported_until_it_is_open() -> None:
     watch, taken = ClientAlerts(), "Address already in use"
     closed = ListenerStats("here", "udp-listen:0.0.0.0:14550", "closed", taken, 0, 0, 0)
     news = [each for n in range(20) for each in watch.update((), (closed,), n * S)]
@@ -129,7 +129,7 @@ def test_lines_beyond_the_limit_are_counted() -> None:
     assert limiter.add("f", 3 * WINDOW_US) == ["f"]
 
 
-def test_the_sum_comes_before_the_next_line() -> None:
+def test_number_of_suppressed_lines_precedes_the_next_line() -> None:
     limiter = LogRateLimiter(1, "more came")
     for line in "abc":
         limiter.add(line, 0)

@@ -50,7 +50,7 @@ async def read_frames(client: socket.socket, count: int) -> list[bytes]:
 
 
 class TestTcpListen:
-    async def test_a_stalled_client_loses_its_own_oldest_telemetry(self, rig: Any) -> None:
+    async def test_stalled_client_loses_only_its_own_oldest_telemetry(self, rig: Any) -> None:
         hub = rig.hub("tcp-listen:127.0.0.1:0", queue_bytes=4096)
         hub.send(rig.out(rig.vehicle.heartbeat()))
         port = hub.listening_ports()[0]
@@ -87,7 +87,7 @@ class TestTcpListen:
         await rig.until(lambda: len(hub.clients()) == 1)
         return client
 
-    async def test_frames_wait_in_our_queue_and_not_in_the_kernels(self, rig: Any) -> None:
+    async def test_frames_wait_in_the_queue_and_not_in_the_kernel(self, rig: Any) -> None:
         hub = rig.hub("tcp-listen:127.0.0.1:0")
         await self.narrow_client(rig, hub)
         for _ in range(5000):
@@ -107,7 +107,7 @@ class TestTcpListen:
         unsent = fcntl.ioctl(client._socket, SIOCOUTQNSD, bytes(4))
         assert int.from_bytes(unsent, sys.byteorder) < 2 * UNSENT_BYTES
 
-    async def test_a_slow_client_gets_what_is_fresh_and_answers_first(self, rig: Any) -> None:
+    async def test_slow_client_gets_fresh_telemetry_and_answers_first(self, rig: Any) -> None:
         """It takes 2 kB a second of 10."""
         hub = rig.hub("tcp-listen:127.0.0.1:0")
         slow = await self.narrow_client(rig, hub)
@@ -155,7 +155,7 @@ class TestTcpOut:
         await rig.until(lambda: hub.clients()[0].state in ("refused", "open"))
         assert hub.clients()[0].state == "refused"
 
-    async def test_connects_when_the_server_comes_and_again_when_it_comes_back(
+    async def test_client_connects_when_the_server_starts_and_when_it_restarts(
         self, rig: Any
     ) -> None:
         port = free_port()
@@ -215,7 +215,7 @@ class TestSerial:
             await rig.until(lambda count=count: hub.clients()[0].received == count)
             assert width.share == (1.0 if free == 100 else 0.7)
 
-    async def test_the_attitude_overtakes_and_numbers_stay_in_order(
+    async def test_attitude_overtakes_and_sequence_numbers_stay_in_order(
         self, rig: Any, line: tuple[int, str]
     ) -> None:
         near, device = line

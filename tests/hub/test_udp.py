@@ -67,7 +67,7 @@ async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     assert [f"127.0.0.1:{station.port}" for station in receivers] == [answered.remote]
 
 
-async def test_odd_sizes_from_a_client_are_counted(rig: Any) -> None:
+async def test_datagrams_of_unusual_sizes_are_counted(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = rig.station(hub.listening_ports()[0])
     for data in (station.sender.heartbeat(), b"", b"\xfd" * 65507, station.sender.heartbeat()):
@@ -126,7 +126,7 @@ async def test_refusing_client_gets_nothing_until_it_sends_again(rig: Any) -> No
     assert len(hub.clients()) == 1
 
 
-async def test_back_on_another_port_replaces_itself(rig: Any) -> None:
+async def test_client_that_returns_on_another_port_replaces_its_old_entry(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", idle_timeout_s=1000.0)
     before, after = (rig.station(hub.listening_ports()[0]) for _ in range(2))
     before.send(before.sender.heartbeat())
@@ -138,7 +138,7 @@ async def test_back_on_another_port_replaces_itself(rig: Any) -> None:
     assert hub.clients()[0].remote == f"127.0.0.1:{after.port}"
 
 
-async def test_a_refused_port_is_counted_and_hurts_nobody(rig: Any) -> None:
+async def test_refused_port_is_counted_without_loss_at_others(rig: Any) -> None:
     gone, station = rig.station(), rig.station()
     gone.socket.close()
     hub = await rig.open(f"udp:127.0.0.1:{gone.port}", f"udp:127.0.0.1:{station.port}")
@@ -151,7 +151,7 @@ async def test_a_refused_port_is_counted_and_hurts_nobody(rig: Any) -> None:
     assert (fine.sent, fine.dropped) == (10, 0)
 
 
-async def test_a_station_that_starts_late_loses_nothing_after_its_start(rig: Any) -> None:
+async def test_station_that_starts_late_loses_nothing_after_its_start(rig: Any) -> None:
     late = rig.station()
     late.socket.close()
     hub = await rig.open(f"udp:127.0.0.1:{late.port}")
@@ -165,7 +165,9 @@ async def test_a_station_that_starts_late_loses_nothing_after_its_start(rig: Any
         assert await asyncio.get_running_loop().sock_recv(started, 100) == frame
 
 
-async def test_a_name_resolves_only_later(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_name_that_resolves_later_is_used_then(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     station = rig.station()
     known: list[str] = []
 
@@ -208,7 +210,9 @@ async def test_second_address_of_a_name_is_used_when_the_first_refuses(
         assert (await station.receive())[7] == 30
 
 
-async def test_a_name_moves_to_another_address(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_changed_address_of_a_name_is_followed(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     old, new = rig.station(), rig.station()
     ports = [old.port]
 
@@ -258,7 +262,7 @@ class Waiting:
         return self.datagrams.pop(0)
 
 
-async def test_datagrams_one_by_one_cost_one_read_each_and_a_burst_is_read_at_once(
+async def test_single_datagrams_cost_one_read_and_a_burst_is_read_at_once(
     rig: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     station = rig.station()
@@ -294,7 +298,7 @@ async def test_packed_frames_share_a_datagram(rig: Any) -> None:
     assert hub.clients()[0].sent == 5
 
 
-async def test_packing_waits_for_nothing_but_what_comes_at_once(
+async def test_packing_without_a_wait_joins_only_frames_of_one_wake_up(
     rig: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two datagrams that are read at one wake-up go on as one, without a timer."""
@@ -314,7 +318,9 @@ async def test_packing_waits_for_nothing_but_what_comes_at_once(
     assert hub._gathering == {}
 
 
-async def test_packing_may_wait(rig: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_packing_with_a_wait_joins_later_frames(
+    rig: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}?pack=1100&wait=20")
     loop = asyncio.get_running_loop()
@@ -330,7 +336,7 @@ async def test_packing_may_wait(rig: Any, monkeypatch: pytest.MonkeyPatch) -> No
     assert await station.receive() == b"".join(frames)
 
 
-async def test_a_packing_client_that_goes_before_the_flush(rig: Any) -> None:
+async def test_client_removed_before_its_flush_causes_no_error(rig: Any) -> None:
     errors: list[Any] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: errors.append(context))
     station = rig.station()
@@ -341,7 +347,7 @@ async def test_a_packing_client_that_goes_before_the_flush(rig: Any) -> None:
     assert errors == []
 
 
-async def test_a_full_socket_buffer_drops_the_oldest(rig: Any) -> None:
+async def test_full_socket_buffer_drops_the_oldest_frames(rig: Any) -> None:
     station = rig.station()
     hub = await rig.open(f"udp:127.0.0.1:{station.port}")
     link = hub._clients[hub.clients()[0].client_id]
@@ -367,7 +373,7 @@ async def test_a_full_socket_buffer_drops_the_oldest(rig: Any) -> None:
     assert await station.receive() == newest
 
 
-async def test_ipv6_on_both_kinds(rig: Any) -> None:
+async def test_ipv6_works_at_configured_and_listening_endpoints(rig: Any) -> None:
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as station:
         station.setblocking(False)
         station.bind(("::1", 0))
@@ -380,7 +386,7 @@ async def test_ipv6_on_both_kinds(rig: Any) -> None:
     assert all(client.trusted for client in hub.clients())
 
 
-async def test_a_second_gateway_on_the_same_port_waits(rig: Any) -> None:
+async def test_second_gateway_on_a_port_waits_until_it_is_free(rig: Any) -> None:
     first = rig.hub("udp-listen:127.0.0.1:0")
     port = first.listening_ports()[0]
     second = rig.hub(f"udp-listen:127.0.0.1:{port}")

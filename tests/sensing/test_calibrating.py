@@ -61,7 +61,7 @@ def test_six_sides_give_bias_and_scale(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_many_poses_give_the_skew_too(seed: int) -> None:
+def test_many_poses_give_the_misalignment_too(seed: int) -> None:
     rng = np.random.default_rng(seed)
     skew = rng.normal(0, 0.01, (3, 3))
     matrix = np.eye(3) + 0.5 * (skew + skew.T)
@@ -79,7 +79,7 @@ def test_missing_sides_are_refused(poses: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_magnetometer_ellipsoid(seed: int) -> None:
+def test_magnetometer_ellipsoid_gives_hard_and_soft_iron(seed: int) -> None:
     rng = np.random.default_rng(seed)
     spread = 0.1 * rng.normal(size=(3, 3))
     soft = np.eye(3) + 0.5 * (spread + spread.T)
@@ -112,7 +112,7 @@ def test_magnetometer_that_was_only_turned_flat_is_refused() -> None:
 
 @pytest.mark.parametrize("pitch_deg", [20.0, 45.0, 90.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_mounting_from_level_and_nose_up(seed: int, pitch_deg: float) -> None:
+def test_level_and_nose_up_poses_give_the_mounting(seed: int, pitch_deg: float) -> None:
     mounting = Rotation.random(random_state=seed).as_matrix()
     pitch = np.radians(pitch_deg)
     level_s = mounting.T @ np.array([0.0, 0.0, -G])
@@ -191,18 +191,18 @@ def joined(*parts: NodeSamples) -> NodeSamples:
     )
 
 
-def test_gyro_bias_at_rest() -> None:
+def test_mean_rate_at_rest_is_the_gyro_bias() -> None:
     after = calibrate_gyro(pose(SIDES[4], rate=0.05), NodeCalibration())
     assert after.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
     assert 0.001 < after.gyro_residual_radps < 0.003
 
 
-def test_gyro_that_is_moved_is_refused() -> None:
+def test_moved_gyro_is_refused() -> None:
     with pytest.raises(CalibrationError, match="still"):
         calibrate_gyro(pose(SIDES[4], shaking=3.0), NodeCalibration())
 
 
-def test_six_poses_one_by_one() -> None:
+def test_six_poses_one_by_one_give_the_accelerometer_bias() -> None:
     held = [pose(side, k) for k, side in enumerate(SIDES)]
     assert sides_of([]) == set()
     assert sides_of([held[0], held[0]]) == {0}
@@ -213,18 +213,18 @@ def test_six_poses_one_by_one() -> None:
     assert after.accel_residual_mps2 < 0.01
 
 
-def test_six_poses_in_one_log() -> None:
+def test_six_poses_in_one_log_give_the_accelerometer_bias() -> None:
     whole = joined(*(pose(side, k) for k, side in enumerate(SIDES)))
     after = calibrate_accelerometer([whole], NodeCalibration())
     assert after.accel_bias_mps2 == pytest.approx(tuple(BIAS), abs=0.01)
 
 
-def test_a_tilted_pose_is_no_side() -> None:
+def test_tilted_pose_is_no_side() -> None:
     half = np.sin(np.pi / 4)
     assert sides_of([pose(G * np.array([half, half, 0.0]))]) == set()
 
 
-def test_a_pose_that_moved_does_not_count() -> None:
+def test_pose_in_motion_does_not_count() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
     assert not still_windows(shaken)
     assert sides_of([shaken, pose(SIDES[1])]) == {1}
@@ -243,7 +243,7 @@ def test_mounting_turns_the_magnetometer_along() -> None:
 
 
 @pytest.mark.parametrize("tilt_deg", [(3.0, -2.0), (-5.0, 4.0), (0.0, 0.0)])
-def test_level_takes_a_small_tilt_out(tilt_deg: tuple[float, float]) -> None:
+def test_level_calibration_removes_a_small_tilt(tilt_deg: tuple[float, float]) -> None:
     before = NodeCalibration(accel_bias_mps2=tuple(BIAS))
     tilt = Rotation.from_euler("xy", tilt_deg, degrees=True).as_matrix()
     force_s = np.linalg.solve(np.array(before.mounting), tilt.T @ [0, 0, -G])
@@ -252,7 +252,7 @@ def test_level_takes_a_small_tilt_out(tilt_deg: tuple[float, float]) -> None:
     assert level.apply(tuple(force_s + BIAS)) == pytest.approx((0, 0, -G), abs=0.02)
 
 
-def test_magnetometer_from_raw_records() -> None:
+def test_magnetometer_is_calibrated_from_raw_records() -> None:
     rng = np.random.default_rng(4)
     points = rng.normal(size=(400, 3))
     counts = np.rint(500 * points / np.linalg.norm(points, axis=1)[:, None] + [80, -40, 20])
@@ -314,27 +314,27 @@ def lying(
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("mag_hz", [0.0, 15.0, 75.0])
-def test_the_bias_of_a_rest(seed: int, mag_hz: float) -> None:
+def test_rest_gives_the_gyro_bias(seed: int, mag_hz: float) -> None:
     gyro = gyro_at_rest(lying(10.0, mag_hz=mag_hz, seed=seed))
     assert gyro.mean(axis=0) == pytest.approx(BIAS, abs=2e-4)
 
 
 @pytest.mark.parametrize("turn_degps", [-2.8, 2.8, 1.0])
-def test_a_steady_turn_is_no_rest(turn_degps: float) -> None:
+def test_steady_turn_is_no_rest(turn_degps: float) -> None:
     turn = lying(20.0, turn_degps)
     assert len(still_windows(turn)) >= 19, "as quiet as on a table"
     with pytest.raises(CalibrationError, match="3 s of rest"):
         gyro_at_rest(turn)
 
 
-def test_the_rest_of_a_log_is_found_among_its_turns() -> None:
+def test_rest_is_found_among_the_turns_of_a_log() -> None:
     log = joined(lying(20.0, 2.8), lying(8.0, seed=1), lying(30.0, -2.8))
     after = calibrate_gyro(log, NodeCalibration())
     assert after.gyro_bias_radps == pytest.approx(tuple(BIAS), abs=5e-4)
     assert after.gyro_residual_radps < 0.003
 
 
-def test_without_a_magnetometer_contradicting_rests_are_refused() -> None:
+def test_contradicting_rests_are_refused_without_a_magnetometer() -> None:
     log = joined(lying(8.0, mag_hz=0.0), lying(8.0, 2.8, mag_hz=0.0))
     with pytest.raises(CalibrationError, match=r"2.8 deg/s: .*turned steadily"):
         gyro_at_rest(log)
@@ -358,18 +358,18 @@ def test_samples_in_motion_by_gps_are_no_rest() -> None:
         ({"bias": np.array([1.05 * MAX_GYRO_BIAS_RADPS, 0, 0])}, False),
     ],
 )
-def test_the_limits_of_stillness(shape: dict[str, float], is_still: bool) -> None:
+def test_noise_and_bias_limit_stillness(shape: dict[str, float], is_still: bool) -> None:
     assert bool(still_windows(lying(5.0, **shape))) == is_still
 
 
 @pytest.mark.parametrize(("scale", "is_still"), [(1.0, True), (1.14, True), (1.17, False)])
-def test_a_banked_turn_weighs_too_much(scale: float, is_still: bool) -> None:
+def test_specific_force_of_a_banked_turn_is_not_still(scale: float, is_still: bool) -> None:
     turn = lying(5.0, mag_hz=0.0)
     turn.accel[:] *= scale
     assert bool(still_windows(turn)) == is_still
 
 
-def test_a_rest_takes_three_seconds() -> None:
+def test_rest_lasts_at_least_three_seconds() -> None:
     assert rest_spans(lying(2.9)) == []
     assert rest_spans(lying(3.5)) != []
 
@@ -447,7 +447,7 @@ def test_correction_of_one_sensor_leaves_the_others_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0, 215.0])
-def test_hard_iron_by_a_known_heading(yaw_deg: float) -> None:
+def test_known_heading_gives_the_hard_iron(yaw_deg: float) -> None:
     field = MagneticField(math.radians(3.0), math.radians(64.0), 48.0)
     q_nb = from_euler(0.1, -0.2, math.radians(yaw_deg))
     north = 48.0 * math.cos(math.radians(64.0)) * np.array([math.cos(0.05236), math.sin(0.05236)])

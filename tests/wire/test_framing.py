@@ -23,7 +23,7 @@ def test_crc_check_value() -> None:
     assert crc16(b"123456789") == 0x29B1
 
 
-def test_frame_by_hand() -> None:
+def test_frame_equals_one_worked_out_by_hand() -> None:
     """Content 11 00 is stuffed as 02 11, then 03 and the CRC: worked out with pencil and paper."""
     crc = crc16(b"\x11\x00").to_bytes(2, "little")
     assert 0 not in crc
@@ -57,12 +57,12 @@ def test_round_trip(size: int, seed: int) -> None:
     assert FrameDecoder().feed(encoded) == [content]
 
 
-def test_content_that_no_receiver_takes_is_refused() -> None:
+def test_content_above_the_limit_is_refused() -> None:
     with pytest.raises(ValueError, match="73 bytes"):
         encode_frame(bytes(MAX_CONTENT + 1))
 
 
-def test_empty_frames_mean_nothing() -> None:
+def test_empty_frames_are_ignored() -> None:
     assert FrameDecoder().feed(b"\x00\x00\x00") == []
 
 
@@ -75,7 +75,7 @@ def test_empty_frames_mean_nothing() -> None:
         (b"\x01" * 200 + b"\x00", FaultKind.TOO_LONG),
     ],
 )
-def test_one_fault_then_in_step_again(line: bytes, kind: FaultKind) -> None:
+def test_damaged_frame_is_one_fault_and_the_next_is_read(line: bytes, kind: FaultKind) -> None:
     good = encode_frame(b"good")
     for cut in range(len(line)):
         decoder = FrameDecoder()

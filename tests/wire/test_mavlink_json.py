@@ -95,7 +95,7 @@ def test_every_template_can_be_sent() -> None:
     assert {getattr(message, name) for name in ("time_boot_ms", "q1", "yawspeed")} == {0}
 
 
-def test_a_heartbeat_as_mavlink2rest_shows_it() -> None:
+def test_heartbeat_has_the_json_of_mavlink2rest() -> None:
     heartbeat = mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_FIXED_WING, mavlink.MAV_AUTOPILOT_GENERIC, 81, 7, 4, 3
     )
@@ -120,7 +120,7 @@ COMMAND = {
 }
 
 
-def test_a_command_as_its_readme_sends_it() -> None:
+def test_command_of_the_mavlink2rest_readme_is_read() -> None:
     message = from_json({**COMMAND, "param1": 1})
     assert (message.command, message.param1, message.target_system) == (400, 1.0, 1)
 
@@ -137,13 +137,13 @@ def test_a_command_as_its_readme_sends_it() -> None:
         ("custom_mode", 7.0, 7),
     ],
 )
-def test_other_ways_to_write_a_value(field: str, value: Any, number: int) -> None:
+def test_other_notations_of_a_value_are_read(field: str, value: Any, number: int) -> None:
     message = from_json({**template("HEARTBEAT"), field: value})
     assert getattr(message, field.removeprefix("mav")) == number
 
 
 @pytest.mark.parametrize("text", ["SPEED", list("SPEED"), list("SPEED") + ["\0"] * 11])
-def test_ways_to_write_a_text(text: Any) -> None:
+def test_notations_of_a_text_are_read(text: Any) -> None:
     message = from_json({**template("PARAM_SET"), "param_id": text})
     link = mavlink.MAVLink(None, 1, 1)
     assert link.decode(bytearray(message.pack(link))).param_id == "SPEED"

@@ -68,7 +68,7 @@ async def until_colour(page: Page, place: tuple[int, int], wanted: list[int]) ->
             await asyncio.sleep(0.01)
 
 
-async def test_the_horizon_is_drawn(rig: Rig, page: Page) -> None:
+async def test_documented_page_draws_the_horizon(rig: Rig, page: Page) -> None:
     hub = rig.hub("ws-listen:127.0.0.1:0")
     server = await serve(documented_page(hub.listening_ports()[0]), "127.0.0.1")
     async with server:

@@ -95,7 +95,7 @@ class TestPages:
         assert max(map(len, page.messages)) <= 200
         assert hub.clients()[0].sent == 9
 
-    async def test_the_end_of_a_page_is_the_end_of_the_client(self, rig: Rig, visit: Visit) -> None:
+    async def test_client_is_removed_when_its_page_closes(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN)
         page, other = [await visit(hub.listening_ports()[0]) for _ in range(2)]
         page.writer.write(page.web.send(CloseConnection(code=1001)))
@@ -113,7 +113,7 @@ class TestPages:
 
 
 class TestTrouble:
-    async def test_a_stalled_page_loses_its_own_oldest_telemetry(
+    async def test_stalled_page_loses_only_its_own_oldest_telemetry(
         self, rig: Rig, visit: Visit
     ) -> None:
         hub = rig.hub(LISTEN, queue_bytes=4096)
@@ -149,7 +149,7 @@ class TestTrouble:
                     break
         await rig.until(lambda: not hub.clients())
 
-    async def test_a_page_that_no_longer_answers_is_dropped(self, rig: Rig, visit: Visit) -> None:
+    async def test_page_that_stops_answering_pings_is_dropped(self, rig: Rig, visit: Visit) -> None:
         """Half-open: its machine is gone, and no packet reports it."""
         hub = rig.hub(LISTEN, idle_timeout_s=9)
         page, mute = [await visit(hub.listening_ports()[0]) for _ in range(2)]
@@ -181,7 +181,7 @@ class TestTrouble:
         assert await hung_up(sock)
         assert not listener._handshakes  # type: ignore[union-attr]
 
-    async def test_connections_without_handshake_keep_no_page_out(
+    async def test_connections_without_handshake_do_not_keep_pages_out(
         self, rig: Rig, plug: Visit, visit: Visit
     ) -> None:
         hub = rig.hub(LISTEN, max_clients=3)
@@ -209,7 +209,7 @@ class TestTrouble:
         hub.send(rig.out(rig.vehicle.attitude()))
         assert len(await page.frames(1)) == 1
 
-    async def test_two_hundred_connections(self, rig: Rig, visit: Visit) -> None:
+    async def test_two_hundred_pages_get_every_frame(self, rig: Rig, visit: Visit) -> None:
         hub = rig.hub(LISTEN, max_clients=200, ping_interval_s=0)
         port = hub.listening_ports()[0]
         pages = []
@@ -241,7 +241,7 @@ class TestTrouble:
 
 
 class TestCalling:
-    async def test_a_server_that_refuses_is_named(self, rig: Rig) -> None:
+    async def test_server_that_refuses_is_reported(self, rig: Rig) -> None:
         async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             await reader.readuntil(b"\r\n\r\n")
             writer.write(b"HTTP/1.1 403 Forbidden\r\nContent-Length: 0\r\n\r\n")
@@ -255,7 +255,7 @@ class TestCalling:
         server.close()
         await rig.quiet()
 
-    async def test_a_server_that_never_answers_is_given_up(self, rig: Rig) -> None:
+    async def test_server_that_never_answers_is_given_up(self, rig: Rig) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             hub = rig.hub(f"ws:127.0.0.1:{server.getsockname()[1]}")
             await rig.until(lambda: hub._clients[1]._socket is not None)
@@ -267,7 +267,9 @@ class TestCalling:
 
 
 class TestTls:
-    async def test_both_ends(self, rig: Rig, visit: Visit, certificate: Path) -> None:
+    async def test_frames_pass_over_tls_to_a_hub_and_to_a_page(
+        self, rig: Rig, visit: Visit, certificate: Path
+    ) -> None:
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         port = server.listening_ports()[0]
         hub = await rig.open(f"wss:127.0.0.1:{port}", tls_authority=str(certificate))
@@ -280,7 +282,7 @@ class TestTls:
         await rig.until(lambda: hub.clients()[0].received == 500)
         assert len(await page.frames(501)) == 501
 
-    async def test_a_stalled_page_within_tls(
+    async def test_page_stalled_over_tls_resumes_without_a_gap(
         self, rig: Rig, visit: Visit, certificate: Path
     ) -> None:
         hub = rig.hub(
@@ -349,7 +351,7 @@ class TestTls:
         shutil.copy(certificate, file)
         assert (await visit(port, tls=tls)).is_open
 
-    async def test_a_missing_certificate_is_reported_and_waited_for(
+    async def test_missing_certificate_is_reported_until_it_exists(
         self, rig: Rig, visit: Visit, certificate: Path, tmp_path: Path
     ) -> None:
         file = tmp_path / "mine.pem"

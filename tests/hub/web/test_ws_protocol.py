@@ -73,14 +73,14 @@ def in_pieces(server: WsServer, data: bytes, sizes: list[int]) -> WsInput:
 
 class TestHandshake:
     @pytest.mark.parametrize("step", [1, 7, 10_000])
-    def test_of_the_standard(self, step: int) -> None:
+    def test_request_of_the_standard_opens_the_connection(self, step: int) -> None:
         """The sample of RFC 6455 section 1.3."""
         found = in_pieces(WsServer(lambda origin: False), REQUEST + b"\r\n", [step] * 1000)
         assert found.opened
         assert found.reply.startswith(b"HTTP/1.1 101 ")
         assert b"s3pPLMBiTxaQ9kYGzzhZRbK+xOo=" in found.reply
 
-    def test_a_page_is_judged_by_its_origin(self) -> None:
+    def test_page_of_a_refused_origin_gets_status_403(self) -> None:
         asked: list[str] = []
         server = WsServer(lambda origin: bool(asked.append(origin)))
         found = server.feed(REQUEST + b"Origin: https://example.org\r\n\r\n")
@@ -91,7 +91,7 @@ class TestHandshake:
         assert "example.org" in found.ended
         assert server.feed(masked(2, b"\xfd")) == WsInput()
 
-    def test_two_origins_are_no_origin(self) -> None:
+    def test_request_with_two_origins_is_refused(self) -> None:
         server = WsServer(lambda origin: origin == "http://localhost")
         twice = b"Origin: http://localhost\r\nOrigin: https://example.org\r\n\r\n"
         assert server.feed(REQUEST + twice).ended
@@ -113,7 +113,7 @@ class TestHandshake:
             (REQUEST.replace(b"127.0.0.1:56781", b"xn--\xff") + b"\r\n", b"400"),
         ],
     )
-    def test_no_websocket(self, data: bytes, status: bytes) -> None:
+    def test_invalid_upgrade_request_is_refused(self, data: bytes, status: bytes) -> None:
         found = WsServer(lambda origin: True).feed(data)
         assert found.ended
         assert found.reply.startswith(b"HTTP/1.1 " + status)
@@ -126,7 +126,7 @@ class TestMessages:
     )  # fmt: skip
 
     @pytest.mark.parametrize("seed", range(5))
-    def test_fragments_and_chunks(self, seed: int) -> None:
+    def test_fragments_are_joined_whatever_the_chunks(self, seed: int) -> None:
         chance = random.Random(seed)
         sizes = [chance.randint(1, 3 + 40 * seed) for _ in range(1000)]
         found = in_pieces(opened(), self.FRAMES, sizes)
@@ -134,7 +134,7 @@ class TestMessages:
         assert found.reply == b"\x8a\x06there?"
         assert not found.ended
 
-    def test_text_is_no_mavlink(self) -> None:
+    def test_text_is_counted_and_is_not_payload(self) -> None:
         found = opened().feed(masked(1, "€".encode()) + masked(2, b"\xfd"))
         assert (found.text_size, found.payload, found.ended) == (3, b"\xfd", "")
 
@@ -188,7 +188,7 @@ class TestMessages:
         assert close_code(found.reply) == CloseReason.GOING_AWAY
         assert found.ended == "closed: 1001 going away"
 
-    def test_compression_is_not_agreed_to(self) -> None:
+    def test_compression_is_not_accepted(self) -> None:
         offer = b"Sec-WebSocket-Extensions: permessage-deflate\r\n\r\n"
         reply = WsServer(lambda origin: False).feed(REQUEST + offer).reply
         assert reply.startswith(b"HTTP/1.1 101 ")
