@@ -1,6 +1,7 @@
 """A hub on the manual clock, its clients on loopback sockets, and some frames."""
 
 import asyncio
+import contextlib
 import select
 import socket
 from collections.abc import AsyncIterator, Callable, Iterable
@@ -24,7 +25,7 @@ from tests.kit.records import sample_at, state_at
 from tests.ports import free_port
 
 LIMIT_S = 60.0
-"""Until a test is given up: what it waits for takes a moment, on a busy machine some seconds."""
+"""Time limit of a test: its events take a moment, on a busy machine some seconds."""
 
 
 class Clock:
@@ -54,12 +55,13 @@ class Station:
         """Return whether there is nothing to read, without reading it."""
         return not select.select([self.socket], (), (), 0)[0]
 
-    def is_silent(self) -> bool:
-        try:
-            self.socket.recv(65535)
-        except BlockingIOError:
-            return True
-        return False
+    def received(self) -> list[bytes]:
+        """Read all datagrams that have arrived."""
+        frames = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                frames.append(self.socket.recv(65535))
+        return frames
 
     def send(self, data: bytes) -> None:
         assert self.target
@@ -129,7 +131,7 @@ class FlyingHub:
 
 
 class Rig:
-    """A hub, what came in, its vehicle, and the stations; all closed at the end."""
+    """A hub, the frames it received, its vehicle, and the stations; all closed at the end."""
 
     def __init__(self) -> None:
         self.clock = Clock()
@@ -186,7 +188,7 @@ class Rig:
         return outgoing(frame, client_id)
 
     def tick(self, hub: Hub) -> None:
-        """Let the hub do what it does a few times a second, now."""
+        """Run the hub's periodic tasks now."""
         assert hub._timer
         hub._timer.cancel()
         hub._tick()
@@ -197,7 +199,7 @@ class Rig:
                 await asyncio.sleep(0)
 
     async def quiet(self) -> None:
-        """Let everything go where it goes: on loopback each step takes one turn of the loop."""
+        """Let all frames arrive: on loopback each step takes one turn of the loop."""
         for _ in range(200):
             await asyncio.sleep(0)
 

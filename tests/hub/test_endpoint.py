@@ -37,7 +37,7 @@ def test_kind_host_and_port_are_parsed(url: str, kind: EndpointKind, host: str, 
 
 
 @pytest.mark.parametrize(
-    ("written", "place"),
+    ("written", "location"),
     [
         ("udpin:0.0.0.0:14550", "udp-listen:0.0.0.0:14550"),
         ("udpin://:14540", "udp-listen:0.0.0.0:14540"),
@@ -64,10 +64,10 @@ def test_kind_host_and_port_are_parsed(url: str, kind: EndpointKind, host: str, 
         ("/dev/ttyUSB0", "serial:/dev/ttyUSB0"),
     ],
 )
-def test_spellings_of_other_programs_are_understood(written: str, place: str) -> None:
+def test_spellings_of_other_programs_are_understood(written: str, location: str) -> None:
     endpoint = parse_endpoint(written)
-    assert endpoint.location == place
-    assert parse_endpoint(place).kind is endpoint.kind
+    assert endpoint.location == location
+    assert parse_endpoint(location).kind is endpoint.kind
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,11 @@ def test_site_of_a_fleet_is_parsed() -> None:
     assert endpoint.config == "/etc/zenoh.json5"
     assert endpoint.interval_us == {30: 200_000}
     assert parse_endpoint("zenoh:tls/h:7447?keys=mavlink_raw").keys == "mavlink_raw"
-    places = {parse_endpoint(f"zenoh:tcp/h:7447?site={site}&rate=30:5").location for site in "ab"}
-    assert places == {"zenoh:tcp/h:7447?site=a", "zenoh:tcp/h:7447?site=b"}
+    sites = [parse_endpoint(f"zenoh:tcp/h:7447?site={site}&rate=30:5") for site in "ab"]
+    assert {site.location for site in sites} == {
+        "zenoh:tcp/h:7447?site=a",
+        "zenoh:tcp/h:7447?site=b",
+    }
 
 
 def test_deny_applies_within_the_allowed_messages() -> None:
@@ -192,7 +195,7 @@ def test_settings_refuse_a_malformed_endpoint() -> None:
 WORDS = st.sampled_from(
     [*EndpointKind, "udpin", "udpout", "tcpin", "mcast", "serial", "", "/dev/tty", "[::1]", "a.b"]
 )
-PLACES = st.sampled_from(["://", ":", ":127.0.0.1:", ":[::1]:", ",", ":h:", "::"])
+HOSTS = st.sampled_from(["://", ":", ":127.0.0.1:", ":[::1]:", ",", ":h:", "::"])
 OPTIONS = st.lists(
     st.one_of(
         st.tuples(
@@ -209,7 +212,7 @@ OPTIONS = st.lists(
 ).map("&".join)
 URLS = st.one_of(
     st.text(max_size=40),
-    st.tuples(WORDS, PLACES, st.one_of(st.integers().map(str), st.text(max_size=8)), OPTIONS).map(
+    st.tuples(WORDS, HOSTS, st.one_of(st.integers().map(str), st.text(max_size=8)), OPTIONS).map(
         lambda parts: f"{parts[0]}{parts[1]}{parts[2]}?{parts[3]}"
     ),
 )

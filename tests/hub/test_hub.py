@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.transports import base
-from gateway.hub.transports import stream as accepting
+from gateway.hub.transports import base, stream
 from gateway.wire.mavlink_splitter import frame_of
 
 pytestmark = pytest.mark.io
@@ -35,7 +34,7 @@ async def world(rig: Any) -> Any:
         await rig.until(lambda count=before: len(rig.incoming) > count)
     for station in (rig.first, rig.second):
         assert (await station.receive())[5] == 42
-    assert rig.autopilot.is_silent()
+    assert rig.autopilot.is_empty()
     return rig
 
 
@@ -55,7 +54,7 @@ async def test_request_goes_to_the_system_that_it_addresses(world: Any) -> None:
     answer = world.autopilot.sender.command(255, 190)
     world.autopilot.send(answer)
     assert await world.first.receive() == answer
-    assert world.second.is_silent()
+    assert world.second.is_empty()
     assert len(world.incoming) == count
 
 
@@ -63,20 +62,20 @@ async def test_request_to_our_vehicle_is_not_forwarded(world: Any) -> None:
     request = world.first.sender.command(1, 1)
     world.first.send(request)
     await world.until(lambda: world.incoming[-1].frame == request)
-    assert world.autopilot.is_silent()
+    assert world.autopilot.is_empty()
 
 
 async def test_request_to_an_unknown_system_is_unroutable(world: Any) -> None:
     world.first.send(world.first.sender.command(99, 1))
     await world.until(lambda: world.world.counters().unroutable == 1)
-    assert world.autopilot.is_silent()
+    assert world.autopilot.is_empty()
 
 
 async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
     said = world.first.sender.heartbeat()
     world.first.send(said)
     assert await world.autopilot.receive() == said
-    assert world.second.is_silent()
+    assert world.second.is_empty()
 
 
 async def test_copies_and_echoes_are_dropped(world: Any) -> None:
@@ -89,11 +88,11 @@ async def test_copies_and_echoes_are_dropped(world: Any) -> None:
     assert [await world.first.receive(), await world.second.receive()] == [frame, frame]
     world.second.send(frame)
     await world.until(lambda: hub.counters().duplicates == 1)
-    assert world.first.is_silent()
+    assert world.first.is_empty()
     ours = world.vehicle.attitude()
     world.first.send(ours)
     await world.until(lambda: hub.counters().looped == 1)
-    assert world.second.is_silent()
+    assert world.second.is_empty()
     assert world.incoming[-1].frame != ours
 
 
@@ -110,7 +109,7 @@ async def test_first_frame_of_a_restarted_program_is_accepted(world: Any) -> Non
 
 
 async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
-    """Whoever echoes from the start is heard as a second way; then its echoes end here."""
+    """A client that echoes from the start is a second path, whose copies are then dropped."""
     port = world.world.listening_ports()[0]
     echo = world.station(port)
     said = [world.autopilot.sender.attitude() for _ in range(5)]
@@ -125,7 +124,7 @@ async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
         assert [await world.first.receive(), await echo.receive()] == [frame, frame]
         echo.send(frame)
         await world.until(lambda count=count: world.world.counters().duplicates == count)
-    assert world.first.is_silent()
+    assert world.first.is_empty()
 
 
 async def test_no_frame_circulates_between_hubs_joined_twice(rig: Any) -> None:
@@ -175,7 +174,7 @@ async def test_first_own_frame_that_returns_is_dropped(rig: Any) -> None:
     assert [await echo.receive(), await other.receive()] == [frame, frame]
     echo.socket.sendto(frame, ("127.0.0.1", hub._clients[1]._port))
     await rig.until(lambda: hub.counters().looped == 1)
-    assert other.is_silent()
+    assert other.is_empty()
 
 
 async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
@@ -191,7 +190,7 @@ async def test_untrusted_clients_reach_our_vehicles_only(rig: Any) -> None:
         assert not rig.incoming[-1].trusted
     outsider.send(outsider.sender.command(255, 190))
     await rig.until(lambda: hub.counters().unroutable == 1)
-    assert trusted.is_silent()
+    assert trusted.is_empty()
     assert rig.foreign == []
 
 
@@ -224,9 +223,7 @@ async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: An
     await world.until(lambda: client.counters.received == 3)
     assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
     await world.quiet()
-    heard = []
-    while not world.first.is_empty():
-        heard.append(frame_of(await world.first.receive()))
+    heard = [frame_of(data) for data in world.first.received()]
     assert telemetry in [frame.data for frame in heard]
     assert 77 not in {frame.origin[0] for frame in heard}
 
@@ -242,9 +239,7 @@ async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -
         hub.send(rig.out(rig.vehicle.attitude()))
         rig.tick(hub)
     await rig.quiet()
-    got = []
-    while not station.is_empty():
-        got.append(await station.receive())
+    got = station.received()
     assert [frame[7] for frame in got] == [0] * 9
     assert [frame[4] for frame in got] == list(range(got[0][4], got[0][4] + 9))
 
@@ -265,8 +260,7 @@ async def test_slow_second_link_does_not_move_an_aircraft_back(world: Any) -> No
         if number >= 150:
             slow.send(delayed[number - 150])
         await world.quiet_some()
-        while not world.first.is_empty():
-            got = frame_of(await world.first.receive())
+        for got in map(frame_of, world.first.received()):
             if got.message_id == 30:
                 time_ms = int.from_bytes(got.payload[:4], "little")
                 assert time_ms > newest
@@ -319,7 +313,7 @@ class TestChangesAtRunTime:
         hub.remove("tablet")
         hub.send(rig.out(rig.vehicle.attitude()))
         assert hub.clients() == ()
-        assert station.is_silent()
+        assert station.is_empty()
         with pytest.raises(ValueError, match="tablet"):
             hub.remove("tablet")
 
@@ -360,7 +354,7 @@ class TestChangesAtRunTime:
             while message_id := (await station.receive())[7]:
                 heard[name].append(message_id)
         assert heard == {"stays": [27], "comes": [27, 30], "caller": [30]}
-        assert goes.is_silent()
+        assert goes.is_empty()
         assert "laptop" in {client.name for client in hub.clients()}
 
     async def test_endpoint_added_at_run_time_survives_a_reload(self, rig: Any) -> None:
@@ -419,7 +413,7 @@ class TestCachedRoutes:
         hub.remove(f"udp:127.0.0.1:{late.port}")
         world.autopilot.send(world.autopilot.sender.attitude())
         assert (await world.first.receive())[7] == 30
-        assert late.is_silent()
+        assert late.is_empty()
 
     async def test_second_path_ends_the_cached_route(self, world: Any) -> None:
         hub = world.world
@@ -434,7 +428,7 @@ class TestCachedRoutes:
             assert await world.first.receive() == frame
             other.send(frame)
         await world.until(lambda: hub.counters().duplicates == 5)
-        assert world.first.is_silent()
+        assert world.first.is_empty()
 
 
 class TestListeningPorts:
@@ -483,10 +477,10 @@ class TestListeningPorts:
     async def test_clients_are_admitted_once_descriptors_are_free_again(
         self, rig: Any, kind: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(accepting, "ACCEPT_AGAIN_S", 0.001)
+        monkeypatch.setattr(stream, "ACCEPT_AGAIN_S", 0.001)
         hub = rig.hub(f"{kind}-listen:127.0.0.1:0")
-        (place,) = hub.listening_ports()
-        caller = rig.station(place, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
+        (port,) = hub.listening_ports()
+        caller = rig.station(port, socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
         resource.setrlimit(resource.RLIMIT_NOFILE, (min(os.dup(0), soft), hard))
         try:

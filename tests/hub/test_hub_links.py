@@ -50,11 +50,7 @@ class Joined:
             self.listen()
 
     def listen(self) -> None:
-        while True:
-            try:
-                frame = self.station.socket.recv(4096)
-            except BlockingIOError:
-                return
+        for frame in self.station.received():
             if frame[5] in self.heard and frame[6] == 1:
                 self.heard[frame[5]].append(frame)
 
@@ -98,11 +94,7 @@ async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
             twin.send(twin.sender.command(1, 1))
         await rig.quiet()
         for number, twin in enumerate(twins):
-            while True:
-                try:
-                    frame = twin.socket.recv(4096)
-                except BlockingIOError:
-                    break
-                answers[number] += message_id_of(frame) == dialect.MAVLINK_MSG_ID_COMMAND_ACK
+            ids = [message_id_of(frame) for frame in twin.received()]
+            answers[number] += ids.count(dialect.MAVLINK_MSG_ID_COMMAND_ACK)
     assert answers[0] >= 10
     assert answers[1] >= 10

@@ -9,7 +9,6 @@ Hypothesis draws the order and shrinks what fails to the fewest steps. After eac
 """
 
 import asyncio
-import contextlib
 import itertools
 import os
 import socket
@@ -47,7 +46,7 @@ NAMES = st.sampled_from([OURS, AUTOPILOT, GOOD, (42, 190), (7, 7), (1, 240), (20
 
 
 def lies(sender: Any, guessed: bytes) -> dict[str, bytes]:
-    """Return what a liar may say under a name; `guessed` is what the good client will say next."""
+    """Return forged frames of a name; `guessed` is the next frame of the good client."""
     pack = sender.pack
 
     def command(target: tuple[int, int]) -> bytes:
@@ -82,9 +81,9 @@ class HubMachine(RuleBasedStateMachine):
         self.rig = Rig()
         self.numbers = bytearray()
         self.telemetry: list[bytes] = []
-        """What the autopilot sent and the good client has still to get."""
+        """Frames of the autopilot that the good client has not received yet."""
         self.requests: list[bytes] = []
-        """What the good client sent and the autopilot has still to get."""
+        """Frames of the good client that the autopilot has not received yet."""
         self.answers = 0
         self.lies: set[bytes] = set()
         self.said: set[bytes] = set()
@@ -116,7 +115,7 @@ class HubMachine(RuleBasedStateMachine):
         await self._second()
 
     async def _second(self) -> None:
-        """Let a second pass in which everybody good is alive."""
+        """Let a second pass in which vehicle, autopilot and good client send."""
         self.rig.clock.us += 1_000_000
         self.gateway.fly()
         beat = self.autopilot.sender.heartbeat()
@@ -143,19 +142,19 @@ class HubMachine(RuleBasedStateMachine):
         self._listen()
 
     def _listen(self) -> None:
-        for frame in received(self.good):
+        for frame in self.good.received():
             assert frame not in self.lies
             if origin_of(frame) == OURS:
                 self.numbers.append(frame[4])
                 self.answers += message_id_of(frame) == COMMAND_ACK
             elif origin_of(frame) == AUTOPILOT:
                 assert frame == self.telemetry.pop(0)
-        for frame in received(self.autopilot):
+        for frame in self.autopilot.received():
             assert frame not in self.lies
             if origin_of(frame) == GOOD:
                 assert frame == self.requests.pop(0)
         for outsider in self.outsiders:
-            for frame in received(outsider):
+            for frame in outsider.received():
                 assert frame not in self.said, (
                     "what the good client says is not for untrusted clients"
                 )
@@ -328,14 +327,6 @@ class HubMachine(RuleBasedStateMachine):
 
         self.run(end())
         self.runner.close()
-
-
-def received(station: Station) -> list[bytes]:
-    frames = []
-    with contextlib.suppress(BlockingIOError, ConnectionRefusedError):
-        while True:
-            frames.append(station.socket.recv(65535))
-    return frames
 
 
 def test_trusted_client_loses_nothing_in_any_order_of_events() -> None:

@@ -23,7 +23,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 CLIENTS = 4000
 MAX_CLIENTS = 16
 GROWTH_LIMIT_BLOCKS = CLIENTS // 4
-"""Half a block of memory for each of the second half: whoever is remembered takes one or more."""
+"""Half a block of memory for each of the second half: a client that is kept takes one or more."""
 FLIGHT_EVERY = 5
 STEP_US = 1_000_000
 
@@ -47,7 +47,7 @@ def hostile_datagrams(rng: np.random.Generator) -> list[bytes]:
             mav
         ),
         mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3).pack(mav, force_mavlink1=True),
-        # Somebody who claims to be the vehicle itself.
+        # A client that claims to be the vehicle itself.
         mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 0, 3).pack(mavlink.MAVLink(None, 1, 1)),
     ]
     bad = bytearray(frames[0])
@@ -73,11 +73,7 @@ class Gateway(FlyingHub):
         return found
 
     def listen(self) -> None:
-        while True:
-            try:
-                frame = self.steady.socket.recv(4096)
-            except BlockingIOError:
-                return
+        for frame in self.steady.received():
             if frame[5:7] == b"\x01\x01":
                 self.sequence.append(frame[4])
                 self.attitudes_heard += frame[7:10] == b"\x1f\0\0"

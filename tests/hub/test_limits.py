@@ -76,7 +76,7 @@ def test_untrusted_clients_share_one_bucket_that_a_new_client_does_not_refill() 
     for client_id in (2, 3):
         queue.offer(asked(client_id, trusted=False), 0)
     queue.offer(asked(4), 0)
-    assert queue.take(0) == asked(4), "who is trusted is served all the same"
+    assert queue.take(0) == asked(4), "a trusted client is served all the same"
     assert queue.take(0) is None
     assert queue.take(US_PER_S) == asked(2, trusted=False)
 
@@ -159,9 +159,9 @@ def test_host_with_all_of_a_port_makes_room_down_to_its_share() -> None:
     hosts, admitted = ["a"] * 32, 0
     for number in range(30):
         assert removed(hosts, "a") is None
-        if (place := removed(hosts, f"b{number}")) is not None:
-            assert place > 0, "the first client stays"
-            hosts[place:] = [*hosts[place + 1 :], f"b{number}"]
+        if (index := removed(hosts, f"b{number}")) is not None:
+            assert index > 0, "the first client stays"
+            hosts[index:] = [*hosts[index + 1 :], f"b{number}"]
             admitted += 1
     assert admitted == 24
 

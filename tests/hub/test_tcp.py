@@ -1,4 +1,4 @@
-"""TCP both ways and serial ports: broken and stalled peers, and what overtakes what."""
+"""TCP both ways and serial ports: broken and stalled peers, and the order of frames."""
 
 import asyncio
 import contextlib
@@ -82,8 +82,8 @@ class TestTcpListen:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
         client.setblocking(False)
-        place = ("127.0.0.1", hub.listening_ports()[0])
-        await asyncio.get_running_loop().sock_connect(client, place)
+        address = ("127.0.0.1", hub.listening_ports()[0])
+        await asyncio.get_running_loop().sock_connect(client, address)
         await rig.until(lambda: len(hub.clients()) == 1)
         return client
 

@@ -1,4 +1,4 @@
-"""UDP clients, configured and calling: what they get, what they may say, how they go."""
+"""UDP clients, configured or of a port: frames in both directions, timeouts, packing."""
 
 import asyncio
 import socket
@@ -48,8 +48,8 @@ async def test_new_client_of_a_port_is_greeted_without_a_gap(rig: Any) -> None:
 async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     stations = [rig.station(hub.listening_ports()[0]) for _ in range(5)]
-    for place, station in enumerate(stations):
-        station.sender.link.srcSystem = 200 + place
+    for number, station in enumerate(stations):
+        station.sender.link.srcSystem = 200 + number
         station.send(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 5)
     for _ in range(3):
@@ -58,12 +58,12 @@ async def test_clients_of_one_port_are_distinguished(rig: Any) -> None:
     await rig.until(lambda: len(rig.incoming) == 20)
     assert [client.received for client in hub.clients()] == [4] * 5
     assert {client.systems for client in hub.clients()} == {
-        ((200 + place, 190),) for place in range(5)
+        ((200 + number, 190),) for number in range(5)
     }
     answered = hub.clients()[2]
     frame = rig.vehicle.attitude()
     hub.send(rig.out(frame, answered.client_id))
-    receivers = [station for station in stations if not station.is_silent()]
+    receivers = [station for station in stations if not station.is_empty()]
     assert [f"127.0.0.1:{station.port}" for station in receivers] == [answered.remote]
 
 
@@ -244,8 +244,8 @@ async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> Non
     hub.set_interval(ClientInterval(one.client_id, 1, 30, -1))
     hub.send(rig.out(rig.vehicle.attitude()))
     assert (await second.receive())[4] == 0
-    assert first.is_silent()
-    assert second.is_silent()
+    assert first.is_empty()
+    assert second.is_empty()
 
 
 class Waiting:
@@ -331,7 +331,7 @@ async def test_packing_with_a_wait_joins_later_frames(
         hub.send(rig.out(frame))
         now_s[0] += 0.006
         await asyncio.sleep(0)
-        assert station.is_silent()
+        assert station.is_empty()
     now_s[0] += 0.003
     assert await station.receive() == b"".join(frames)
 

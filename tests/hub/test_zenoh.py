@@ -54,16 +54,16 @@ PATIENT = """{
 
 
 class Router:
-    """A router as a process that can be killed, stopped and started again at the same place."""
+    """A router as a process that can be killed, stopped and started again at the same locator."""
 
     def __init__(self) -> None:
-        self.place = f"tcp/127.0.0.1:{free_port()}"
+        self.locator = f"tcp/127.0.0.1:{free_port()}"
         self.process: subprocess.Popen[str] | None = None
         self.start()
 
     def start(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, "-c", ROUTER, self.place],
+            [sys.executable, "-c", ROUTER, self.locator],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -90,12 +90,12 @@ def router() -> Iterator[Router]:
 
 
 class Far:
-    """Somebody else at the router, who notes what comes."""
+    """Another session at the router, which keeps the messages it receives."""
 
-    def __init__(self, place: str, *keys: str) -> None:
+    def __init__(self, locator: str, *keys: str) -> None:
         config = zenoh.Config()
         config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([place]))
+        config.insert_json5("connect/endpoints", json.dumps([locator]))
         config.insert_json5("scouting/multicast/enabled", "false")
         self.session = zenoh.open(config)
         self.got: list[tuple[str, bytes]] = []
@@ -117,7 +117,7 @@ def visit(router: Router) -> Iterator[Callable[..., Far]]:
     clients: list[Far] = []
 
     def make(*keys: str) -> Far:
-        clients.append(Far(router.place, *keys))
+        clients.append(Far(router.locator, *keys))
         return clients[-1]
 
     yield make
@@ -143,7 +143,7 @@ async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
 
 
 async def open_site(rig: Rig, router: Router, options: str = "site=field") -> Any:
-    hub = rig.hub(f"zenoh:{router.place}?{options}")
+    hub = rig.hub(f"zenoh:{router.locator}?{options}")
     hub.send(rig.out(rig.vehicle.heartbeat()))
     await until(rig, hub, lambda: hub.clients()[0].state == "open")
     return hub
@@ -317,10 +317,10 @@ class TestTrouble:
         assert ("trusted=yes without TLS" in caplog.text) == warns
 
     async def test_missing_router_is_reported(self, rig: Rig) -> None:
-        place = f"tcp/127.0.0.1:{free_port()}"
-        hub = rig.hub(f"zenoh:{place}?site=field")
+        locator = f"tcp/127.0.0.1:{free_port()}"
+        hub = rig.hub(f"zenoh:{locator}?site=field")
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
-        assert hub.clients()[0].reason.startswith(f"no router answers at {place}")
+        assert hub.clients()[0].reason.startswith(f"no router answers at {locator}")
 
     def test_error_of_a_tls_router_mentions_certificates(self) -> None:
         error = zenoh.ZError("Unable to connect to any of [Single(tls/h:1)]!  at /x/y.rs:4.")
@@ -344,8 +344,7 @@ class TestTrouble:
         station.send(station.sender.heartbeat())
         await rig.until(lambda: len(hub.clients()) == 2)
         hub.send(rig.out(rig.vehicle.attitude()))
-        while not station.is_silent():
-            pass
+        station.received()
         # Blocking reads: the loop does nothing meanwhile.
         station.socket.settimeout(LIMIT_S)
         router.signal(signal.SIGSTOP)
@@ -541,7 +540,7 @@ def test_process_ends_soon_after_its_session_is_closed(
     router: Router, patient: Path, *, stalls: bool
 ) -> None:
     """Zenoh may wait for a stalled link, Python for threads and for what is still declared."""
-    words = [sys.executable, "-c", SITE, router.place, f"site=field&config={patient}"]
+    words = [sys.executable, "-c", SITE, router.locator, f"site=field&config={patient}"]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as site:
         assert site.stdin is not None
         assert site.stdout is not None

@@ -62,9 +62,9 @@ async def colour(page: Page, x: int, y: int) -> list[int]:
     return found
 
 
-async def until_colour(page: Page, place: tuple[int, int], wanted: list[int]) -> None:
+async def until_colour(page: Page, pixel: tuple[int, int], wanted: list[int]) -> None:
     async with asyncio.timeout(LIMIT_S):
-        while await colour(page, *place) != wanted:
+        while await colour(page, *pixel) != wanted:
             await asyncio.sleep(0.01)
 
 

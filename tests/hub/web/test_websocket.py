@@ -1,4 +1,4 @@
-"""The hub's WebSockets: pages and programs, slow and gone, and what they may."""
+"""The hub's WebSockets: pages and programs, stalled and closed, and their rights."""
 
 import asyncio
 import re
@@ -320,7 +320,7 @@ class TestTls:
     async def test_certificate_for_another_name_is_reported(
         self, rig: Rig, certificate: Path
     ) -> None:
-        """What is wrong with it is not the same for who has to mend it: name, date, authority."""
+        """The reason shows whether its name, its date or its authority is to be mended."""
         server = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
         port = server.listening_ports()[0]
         hub = rig.hub(f"wss:localhost:{port}", tls_authority=str(certificate))
