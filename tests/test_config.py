@@ -137,7 +137,7 @@ def test_error_of_a_choice_lists_the_allowed_values(tmp_path: Path) -> None:
     assert "quadrotor" in vehicle
 
 
-def test_missing_and_unreadable_files(tmp_path: Path) -> None:
+def test_missing_or_undecodable_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load(tmp_path / "missing.toml")
     file = tmp_path / "latin.toml"

@@ -99,7 +99,7 @@ def test_unusable_block_is_refused_with_the_reason(image: bytes, message: str) -
         find_block(image)
 
 
-def test_the_magic_word_elsewhere_does_not_hide_the_block() -> None:
+def test_magic_word_elsewhere_does_not_hide_the_block() -> None:
     image = b"see mavgate.example " + image_with(with_crc(BLOCK))
     assert find_block(image).settings == SETTINGS
 

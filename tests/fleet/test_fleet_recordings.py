@@ -188,7 +188,7 @@ class TestAnswers:
     @pytest.mark.parametrize(
         "file", ["../secret_01.tlog", "notes.txt", "link_01.tlog", "/etc/passwd", "a\0_01.tlog"]
     )
-    def test_names_that_leave_the_folder(self, folder: Path, file: str) -> None:
+    def test_file_outside_the_folder_is_refused(self, folder: Path, file: str) -> None:
         asked = json.dumps({"file": file, "size": 10}).encode()
         with pytest.raises(RefusedQueryError):
             RecordingAnswers(folder)(asked)
@@ -316,7 +316,7 @@ class TestFetch:
             self.fetch(tmp_path, lambda *_: {"data": None})
 
     @pytest.mark.parametrize("name", ["../flight_01.tlog", "flight.txt", "x/flight_01.tlog"])
-    def test_names_that_leave_the_folder(self, tmp_path: Path, name: str) -> None:
+    def test_file_outside_the_folder_is_refused(self, tmp_path: Path, name: str) -> None:
         one = RecordingFetch("site", tmp_path, lambda *_: {}, wait=lambda _: None)
         with pytest.raises(FetchError, match="not a file of a recording"):
             one.fetch(name, 10, lambda _: None)
