@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.routing_table import Origin
 from gateway.records import EVERYBODY
-from gateway.units import US_PER_S
+from gateway.units import NS_PER_US, US_PER_S
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 
@@ -23,7 +23,6 @@ MAX_ASKED: Final = 64
 """Rounds whose answers are recognized: a minute of them, one a second."""
 LONGEST_US: Final = 60 * US_PER_S
 """An answer to an older request is ignored."""
-NS_PER_US: Final = 1000
 NOBODY: Final = 0
 MEASURING: Final = frozenset({dialect.MAVLINK_MSG_ID_PING, dialect.MAVLINK_MSG_ID_TIMESYNC})
 

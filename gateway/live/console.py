@@ -25,7 +25,7 @@ from gateway.live.log_limit import UNKNOWN, figure_of
 from gateway.printable import PrintableFormatter
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
-from gateway.units import US_PER_S, counted
+from gateway.units import MV_PER_V, US_PER_S, counted
 
 OUTAGE_US: Final = 2 * US_PER_S
 LOG_LINES: Final = 5
@@ -41,7 +41,6 @@ KEYS: Final = "q quit   r record or stop   space pause the view"
 FIX_NAMES: Final = ("none", "dead reckoning", "2D", "3D", "3D", "time only")
 MB: Final = 1e6
 GB: Final = 1e9
-MV_PER_V: Final = 1e3
 
 FLAG_WORDS: Final = (
     (NavFlags.ATTITUDE_VALID, "attitude", "green"),

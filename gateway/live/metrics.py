@@ -16,7 +16,7 @@ from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
 from gateway.records import NavFlags, NodeId
 from gateway.status import Snapshot
-from gateway.units import RAD_PER_DEG, US_PER_S
+from gateway.units import MV_PER_V, RAD_PER_DEG, US_PER_S
 
 Labels = tuple[str, ...]
 Samples = Iterable[tuple[Labels, float | None]]
@@ -106,7 +106,7 @@ VALUES: Final[dict[str, Callable[[Any], float | None]]] = {
     "requests_refused": attrgetter("refused"),
     "requests_forged": attrgetter("forged"),
     "clock_skew_ratio": lambda link: link.clock_skew_ppm * 1e-6,
-    "supply_volts": lambda board: board.supply_mv / 1e3,
+    "supply_volts": lambda board: board.supply_mv / MV_PER_V,
     "loop_max_seconds": lambda board: board.loop_max_us / US_PER_S,
     "latitude_degrees": attrgetter("lat_deg"),
     "longitude_degrees": attrgetter("lon_deg"),

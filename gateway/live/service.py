@@ -19,11 +19,9 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Final
 
-from gateway.units import US_PER_S
+from gateway.units import NS_PER_US, US_PER_S
 
 log = logging.getLogger(__name__)
-
-NS_PER_US: Final = 1_000
 
 
 class ServiceNotifier:

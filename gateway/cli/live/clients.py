@@ -22,10 +22,9 @@ from gateway.cli.support.terminal import (
 )
 from gateway.printable import receiver_state
 from gateway.records import RadioState
-from gateway.units import US_PER_S, counted
+from gateway.units import MV_PER_V, US_PER_S, counted
 
 US_PER_MS: Final = 1000
-MV_PER_V: Final = 1000
 
 Record = Mapping[str, Any]
 """A dataclass, as decoded from the control socket."""

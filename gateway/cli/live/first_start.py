@@ -28,6 +28,7 @@ from gateway.simulator.node import nodes_of
 from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import Workbench
+from gateway.units import MV_PER_V
 from gateway.wire.payloads import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
 
 LOOK_S: Final = 5.0
@@ -188,7 +189,7 @@ def _check_nodes(
             continue
         failed = _sensors(status.sensors_failed)
         version = "{}.{}".format(*status.firmware_version)
-        volts = f"{status.supply_mv / 1000:.2f}" if status.supply_mv else ""
+        volts = f"{status.supply_mv / MV_PER_V:.2f}" if status.supply_mv else ""
         present = _sensors(status.sensors_present & ~status.sensors_failed)
         found = ", ".join(status.chips) or present
         table.add_row(

@@ -22,7 +22,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
-from gateway.units import US_PER_S
+from gateway.units import NS_PER_US, US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
 from gateway.vehicle.plan import DEGE7, GLOBAL_FRAMES
 from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request, Service
@@ -123,7 +123,7 @@ MIN_TIMED_INTERVAL_US: Final = 20_000
 """Of messages that no sample carries: faster they would only repeat themselves."""
 MAX_REQUESTED: Final = 1024
 """Clients come and go; the oldest requested intervals are discarded first."""
-KEEPS_CLIENTS_US: Final = 1_000_000
+KEEPS_CLIENTS_US: Final = US_PER_S
 """A client that gets fewer heartbeats loses the vehicle."""
 
 DEFAULT: Final = 0
@@ -178,7 +178,7 @@ class IntervalService(Service):
         ids = DATA_STREAMS.get(message.req_stream_id, ())
         wanted_us = NONE
         if message.start_stop and message.req_message_rate:
-            wanted_us = 1_000_000 // message.req_message_rate
+            wanted_us = US_PER_S // message.req_message_rate
         answers: list[Answer] = []
         for message_id in ids:
             common_us = self._telemetry.streams[message_id].interval_us
@@ -415,8 +415,6 @@ class RecordingService(Service):
         self._due_us = None
         return acks
 
-
-NS_PER_US: Final = 1000
 
 SIGNING_SETUP: Final = (
     "Signing is not set up by MAVLink: set vehicle.signing_passphrase in the settings file "
