@@ -23,7 +23,7 @@ from gateway.config import (
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, client_verbs, mark_verbs
-from gateway.live.kept_files import PlanFiles, StampFile, begin_worker
+from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
 from gateway.live.pty_port import PtyPort
@@ -95,7 +95,7 @@ class Daemon:
         self._settings = settings
         self._read = read
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
-        self._stamps = StampFile(aircraft_folder(settings))
+        self._stamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(

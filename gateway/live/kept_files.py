@@ -160,26 +160,26 @@ def _broken(file: Path) -> str:
     return f"{file.name} is broken: repair or remove it"
 
 
-STAMPS_NAME: Final = "signing-stamps.json"
+TIMESTAMPS_NAME: Final = "signing-stamps.json"
 
 _Stream = Annotated[str, msgspec.Meta(pattern=r"^\d{1,3}\.\d{1,3}\.\d{1,3}$")]
-_Stamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
+_Timestamp = Annotated[int, msgspec.Meta(ge=0, lt=1 << 49)]
 Kept = Mapping[int, dict[str, dict[str, int]]]
 """By vehicle id; see `SigningTimestamps`."""
 
 
-class StampFile:
+class TimestampFile:
     """The file of all aircraft."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = folder / STAMPS_NAME
-        self._worker = begin_worker("stamps")
+        self._file = folder / TIMESTAMPS_NAME
+        self._worker = begin_worker("timestamps")
         self._waiting: Kept | None = None
         self._is_reported = False
 
     def load(self) -> Kept:
         """Read the file; nothing if there is none, or it cannot be read."""
-        kind = dict[int, dict[str, dict[_Stream, _Stamp]]]
+        kind = dict[int, dict[str, dict[_Stream, _Timestamp]]]
         try:
             return msgspec.json.decode(self._file.read_bytes(), type=kind, strict=False)
         except FileNotFoundError:
@@ -193,23 +193,23 @@ class StampFile:
             )
             return {}
 
-    def save(self, stamps: Kept) -> None:
+    def save(self, timestamps: Kept) -> None:
         """Store these; returns at once, only the newest is written."""
-        is_busy, self._waiting = self._waiting is not None, stamps
+        is_busy, self._waiting = self._waiting is not None, timestamps
         if not is_busy:
             self._worker.submit(self._write)
 
-    def close(self, stamps: Kept) -> None:
+    def close(self, timestamps: Kept) -> None:
         """Write these last if there are any, and end."""
-        if stamps:
-            self.save(stamps)
+        if timestamps:
+            self.save(timestamps)
         self._worker.shutdown(wait=True)
 
     def _write(self) -> None:
-        stamps, self._waiting = self._waiting, None
+        timestamps, self._waiting = self._waiting, None
         try:
             self._file.parent.mkdir(parents=True, exist_ok=True)
-            text = msgspec.json.encode({str(key): kept for key, kept in (stamps or {}).items()})
+            text = msgspec.json.encode({str(key): kept for key, kept in (timestamps or {}).items()})
             write_new(self._file, [text], overwrite=True, rights=PRIVATE)
         except OSError as error:
             if not self._is_reported:

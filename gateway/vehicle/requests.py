@@ -290,17 +290,17 @@ class SigningClock:
 
 
 class Verifier:
-    """Check the signatures of frames that clients send; add each accepted timestamp to the book."""
+    """Check the signatures of frames that clients send, and keep their timestamps."""
 
     def __init__(
-        self, key: bytes, clock: SigningClock, book: SigningTimestamps | None = None
+        self, key: bytes, clock: SigningClock, timestamps: SigningTimestamps | None = None
     ) -> None:
         if len(key) != KEY_BYTES:
             raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
         self._key = key
         self._key_id = key_id_of(key)
         self._clock = clock
-        self._book = SigningTimestamps() if book is None else book
+        self._timestamps = SigningTimestamps() if timestamps is None else timestamps
 
     def accepts(self, frame: bytes, now_us: int) -> bool:
         """Return whether a whole frame is signed by a holder of the key, and not a replay."""
@@ -311,7 +311,7 @@ class Verifier:
         stream = f"{frame[-SIGNATURE_BYTES]}.{frame[5]}.{frame[6]}"
         timestamp = int.from_bytes(frame[-12:-6], "little")
         oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
-        return self._book.accept(self._key_id, stream, timestamp, oldest)
+        return self._timestamps.accept(self._key_id, stream, timestamp, oldest)
 
 
 V2_START: Final = 0xFD

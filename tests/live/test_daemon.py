@@ -52,7 +52,7 @@ def daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Daemon:
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_signed_frame_is_not_accepted_again_after_a_restart(tmp_path: Path, orderly: bool) -> None:
-    # First, since it may compile for more than the minute in which a stamp is new.
+    # First, since it may compile for more than the minute in which a timestamp is new.
     first = make_daemon(tmp_path, "correct horse")
     mav = mavlink.MAVLink(None, 255, 190)
     mav.signing.secret_key = key_from_passphrase("correct horse")

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.live import kept_files
-from gateway.live.kept_files import STAMPS_NAME, PlanFiles, StampFile
+from gateway.live.kept_files import TIMESTAMPS_NAME, PlanFiles, TimestampFile
 from gateway.vehicle.plan import Location, StoredPlan
 
 pytestmark = pytest.mark.io
@@ -163,38 +163,38 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return calls
 
 
-STAMPS = {1: {"0123456789abcdef": {"0.255.190": 36_000_000_000_000}}, 31: {"ff": {"1.2.3": 7}}}
+TIMESTAMPS = {1: {"0123456789abcdef": {"0.255.190": 36_000_000_000_000}}, 31: {"ff": {"1.2.3": 7}}}
 
 
 def test_saved_timestamps_are_loaded(tmp_path: Path) -> None:
-    file = StampFile(tmp_path / "new")
+    file = TimestampFile(tmp_path / "new")
     assert file.load() == {}
     file.save({1: {}})
-    file.close(STAMPS)
-    assert StampFile(tmp_path / "new").load() == STAMPS
-    assert stat.S_IMODE((tmp_path / "new" / STAMPS_NAME).stat().st_mode) == 0o600
+    file.close(TIMESTAMPS)
+    assert TimestampFile(tmp_path / "new").load() == TIMESTAMPS
+    assert stat.S_IMODE((tmp_path / "new" / TIMESTAMPS_NAME).stat().st_mode) == 0o600
 
 
 def test_closing_without_timestamps_leaves_the_file_unchanged(tmp_path: Path) -> None:
-    StampFile(tmp_path).close(STAMPS)
-    StampFile(tmp_path).close({})
-    assert StampFile(tmp_path).load() == STAMPS
+    TimestampFile(tmp_path).close(TIMESTAMPS)
+    TimestampFile(tmp_path).close({})
+    assert TimestampFile(tmp_path).load() == TIMESTAMPS
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"1":{"k":{"0.1":3}}}', '{"1":{"k":{"0.1.1":-3}}}'])
 def test_broken_file_of_timestamps_is_reported(
     tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / STAMPS_NAME).write_text(text)
-    assert StampFile(tmp_path).load() == {}
+    (tmp_path / TIMESTAMPS_NAME).write_text(text)
+    assert TimestampFile(tmp_path).load() == {}
     assert "cannot be read" in caplog.text
 
 
 def test_unwritable_timestamps_are_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / STAMPS_NAME).mkdir()
-    file = StampFile(tmp_path)
+    (tmp_path / TIMESTAMPS_NAME).mkdir()
+    file = TimestampFile(tmp_path)
     file._write()
     file._write()
     file.close({})

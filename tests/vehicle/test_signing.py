@@ -153,14 +153,14 @@ def ping(at_us: int = NOW_UNIX_US, sender: tuple[int, int] = (255, 190)) -> byte
 
 @pytest.mark.parametrize("orderly", [True, False])
 def test_frame_is_not_accepted_again_after_a_restart(orderly: bool) -> None:
-    clock, book = SigningClock(NOW_UNIX_US), SigningTimestamps()
-    verifier, kept = Verifier(KEY, clock, book), book.to_keep()
+    clock, timestamps = SigningClock(NOW_UNIX_US), SigningTimestamps()
+    verifier, kept = Verifier(KEY, clock, timestamps), timestamps.to_keep()
     taken = [ping(NOW_UNIX_US + n * 100_000) for n in range(100)]
     for frame in taken:
         assert verifier.accepts(frame, 0)
-        if book.is_due:
-            kept = book.to_keep()
-    again = SigningTimestamps(book.exact() if orderly else kept)
+        if timestamps.is_due:
+            kept = timestamps.to_keep()
+    again = SigningTimestamps(timestamps.exact() if orderly else kept)
     verifier = Verifier(KEY, SigningClock(NOW_UNIX_US - 86_400_000_000), again)
     assert not any(verifier.accepts(frame, 0) for frame in taken)
     reserve_us = 0 if orderly else RESERVE_TICKS * 10
@@ -168,13 +168,13 @@ def test_frame_is_not_accepted_again_after_a_restart(orderly: bool) -> None:
 
 
 def test_timestamps_of_a_busy_stream_are_written_every_few_seconds() -> None:
-    book = SigningTimestamps()
-    verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), book), 0
+    timestamps = SigningTimestamps()
+    verifier, written = Verifier(KEY, SigningClock(NOW_UNIX_US), timestamps), 0
     for n in range(600):
         assert verifier.accepts(ping(NOW_UNIX_US + n * 100_000), 0)
-        if book.is_due:
+        if timestamps.is_due:
             written += 1
-            book.to_keep()
+            timestamps.to_keep()
     assert 12 <= written <= 13, "a minute"
 
 
@@ -200,10 +200,10 @@ def test_old_recording_is_rejected_once_gps_time_is_known() -> None:
 
 
 def test_oldest_key_is_discarded_beyond_the_limit() -> None:
-    book = SigningTimestamps()
+    timestamps = SigningTimestamps()
     for n in range(2 * MAX_KEYS):
-        assert book.accept(f"{n}", "0.1.1", n, oldest=0)
-    assert list(book.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
-    again, newest = SigningTimestamps(book.to_keep()), MAX_KEYS + RESERVE_TICKS
+        assert timestamps.accept(f"{n}", "0.1.1", n, oldest=0)
+    assert list(timestamps.exact()) == [f"{n}" for n in range(MAX_KEYS, 2 * MAX_KEYS)]
+    again, newest = SigningTimestamps(timestamps.to_keep()), MAX_KEYS + RESERVE_TICKS
     assert not again.accept(f"{MAX_KEYS}", "0.1.1", newest, oldest=0)
     assert again.accept(f"{MAX_KEYS}", "0.1.1", newest + 1, oldest=0)
