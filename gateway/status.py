@@ -36,7 +36,7 @@ class Way:
 
 @dataclass(frozen=True, slots=True)
 class AircraftStatus:
-    """Status of one aircraft besides its navigation state."""
+    """Status of one aircraft, without its navigation state."""
 
     vehicle_id: int
     fix: GpsFix | None

@@ -48,7 +48,7 @@ MAX_ANSWER: Final = 256 << 10
 MAX_ANSWERS: Final = 16 << 20
 """Bytes of the answers of all sites to one query."""
 ANSWER_OVERHEAD: Final = 64
-"""Bytes counted for an answer besides its payload, so that empty ones are bounded too."""
+"""Bytes counted for an answer in addition to its payload, so that empty ones are bounded too."""
 VERIFIED: Final = ("tls", "quic")
 """Protocols whose clients can be verified by their certificates."""
 LOCAL: Final = "unixsock-stream"

@@ -5,11 +5,11 @@ Recording on command is acknowledged when the recorder has started, not when it 
 | command       | recorder                        | answer                                   |
 | ------------- | ------------------------------- | ---------------------------------------- |
 | LOGGING_START | records already                 | ACCEPTED                                 |
-| LOGGING_START | idle                            | IN_PROGRESS; then, as below              |
-| LOGGING_STOP  | any                             | ACCEPTED; FAILED to all who wait         |
+| LOGGING_START | idle                            | IN_PROGRESS, then one of the next three  |
 |               | has opened its files            | ACCEPTED to all who wait                 |
 |               | cannot open them                | FAILED to all who wait, and why as text  |
 |               | has not reported for 10 s       | FAILED to all who wait                   |
+| LOGGING_STOP  | any                             | ACCEPTED; FAILED to all who wait         |
 
 A start that failed stays pending: the recorder retries by itself, and announces when it succeeds.
 """

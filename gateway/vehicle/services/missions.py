@@ -7,27 +7,27 @@ An upload, seen from here:
 | idle   | MISSION_COUNT, 0                | clear, ACK accepted               | idle   |
 | idle   | MISSION_COUNT, too many         | ACK no space                      | idle   |
 | idle   | MISSION_COUNT                   | REQUEST_INT 0                     | upload |
-| upload | the item asked for, well        | REQUEST_INT of the next           | upload |
-| upload | the last item, well             | store all, ACK accepted           | idle   |
-| upload | the item asked for, bad         | ACK with what is bad              | idle   |
-| upload | one that it had before          |                                   | upload |
-| upload | one further on                  | REQUEST_INT of the one asked for  | upload |
+| upload | the requested item, valid       | REQUEST_INT of the next           | upload |
+| upload | the last item, valid            | store all, ACK accepted           | idle   |
+| upload | the requested item, invalid     | ACK with the reason               | idle   |
+| upload | an item that was received       |                                   | upload |
+| upload | a later item                    | REQUEST_INT of the requested one  | upload |
 | upload | the same count before any item  |                                   | upload |
-| upload | any other count of its own      | start again                       | upload |
+| upload | another count, same client      | start again                       | upload |
 | upload | MISSION_COUNT, another client   | ACK denied                        | upload |
 | upload | MISSION_ACK, not accepted       |                                   | idle   |
 | upload | 400 ms without the item         | REQUEST_INT again                 | upload |
-| upload | 5 s without one that is missing | ACK cancelled                     | idle   |
+| upload | 5 s without a missing item      | ACK cancelled                     | idle   |
 | idle   | 400 ms after an upload in which | REQUEST_INT of the last item,     | idle   |
 |        | a request had to be repeated    | three times: the ACK may be lost  |        |
 | idle   | the last item once more         | ACK accepted again                | idle   |
 
-MAVSDK repeats no item by itself. It gives up when the half seconds it waited since it sent the
-newest item, and the times it was asked for older ones, add up to five: so a request is repeated a
-little sooner than in half a second, however slow the link is. Items that come twice for that are
-not answered twice, or so would be all that follow, and a second ACK would end the next upload.
-Where a request comes late, MAVSDK goes back to its item and then ignores requests beyond the next:
-what is asked for again is the item after the one that came last.
+MAVSDK repeats no item by itself. It counts the half seconds since it sent the newest item and the
+requests for older ones, and gives up at five: so a request is repeated a little sooner than after
+half a second, however slow the link is. An item that therefore comes twice is answered once:
+otherwise every later item would be sent twice too, and a second ACK would end the next upload.
+After a late request MAVSDK goes back to its item and ignores requests beyond the next one: so the
+item after the newest received one is requested again.
 
 What is stored changes only when an upload is complete. A download has no state: each request is
 answered from the store.
@@ -61,11 +61,11 @@ REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S
 """Timeout of an upload without progress; longer than the round trip of a slow link."""
 OLD_FORM_EVERY: Final = 3
-"""Of so many requests to a client of unknown form, one is in the older form."""
+"""One in so many requests to a client of unknown form is in the older form."""
 MAX_CLIENTS: Final = 512
 """Clients whose form is stored."""
 CHECKS: Final = 3
-"""The last item is asked for so many times more where the ACK may have been lost."""
+"""Further requests for the last item where the ACK may have been lost."""
 ALL: Final = mavlink.MAV_MISSION_TYPE_ALL
 CHANGING: Final = frozenset(
     {
@@ -91,16 +91,16 @@ class _Upload:
     count: int
     due_us: int
     progress_us: int
-    """When the first item that is missing was asked for first."""
+    """When the first missing item was requested first."""
     items: list[Item] = field(default_factory=list)
     wanted: int = 0
-    """What is asked for: the first that is missing, or before it what the client goes on with."""
+    """The requested item: the first missing one, or an earlier one where the client resumes."""
     repeats: int = 0
-    """How often a request was repeated since: so many copies of that item may still come."""
+    """Number of repeated requests for it: so many copies of that item may still come."""
     loses: bool = False
     """Whether any request had to be repeated."""
     checks: int = 0
-    """How often the last item is still to be asked for, once all came."""
+    """Number of requests for the last item that are left, once all have been received."""
 
     @property
     def is_complete(self) -> bool:
