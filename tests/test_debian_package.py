@@ -95,7 +95,7 @@ def test_program_starts_from_its_own_packages(unpacked: Path) -> None:
     assert f'MADE_FOR = "{major}.{minor}"' in script
 
 
-def test_what_the_program_starts_runs_from_its_packages_too(unpacked: Path) -> None:
+def test_child_processes_use_the_installed_packages(unpacked: Path) -> None:
     program = str(unpacked / "usr/bin/mavgate")
     code = f"""
 import atexit, runpy, subprocess, sys
@@ -146,7 +146,7 @@ def test_systemd_understands_the_unit(unpacked: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
-def test_systemd_finds_little_that_the_unit_may_do(unpacked: Path) -> None:
+def test_systemd_security_score_of_unit_is_low(unpacked: Path) -> None:
     """Of 10, as `systemd-analyze security` counts; a service without any restriction has 9.6."""
     words = ("security", "--offline=true", "--threshold=20", str(unpacked / UNIT))
     done = subprocess.run(["systemd-analyze", *words], capture_output=True, text=True, check=False)

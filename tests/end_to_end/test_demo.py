@@ -43,7 +43,7 @@ def test_every_message_arrives_and_stopping_is_clean(
     assert "Traceback" not in gateway.log.read_text()
 
 
-def test_whoever_speaks_to_the_listening_port_is_served(
+def test_client_that_sends_to_listening_port_is_served(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client]
 ) -> None:
     gateway = start_gateway("demo")

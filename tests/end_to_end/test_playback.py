@@ -162,7 +162,7 @@ def test_recorded_vehicle_answers_a_ground_station(
     assert seen["COMMAND_ACK"].result == mavlink.MAV_RESULT_ACCEPTED
 
 
-def test_mavlogdump_reads_a_live_recording_and_it_fuses_to_the_last_bit(
+def test_live_recording_is_read_by_mavlogdump_and_fused_bit_for_bit(
     start_gateway: Callable[..., Gateway], connect: Callable[..., Client], tmp_path: Path
 ) -> None:
     config = """

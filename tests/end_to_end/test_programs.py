@@ -134,7 +134,7 @@ def hear(stream: Any, ear: Ear) -> dict[str, list[dict[str, Any]]]:
     return received
 
 
-def test_json_is_what_pymavlink_reads(apis: Apis) -> None:
+def test_json_equals_messages_of_pymavlink(apis: Apis) -> None:
     ear = Ear(apis.station)
     ear.read(0)
     with follow(f"ws://{apis.panel}/v1/ws/mavlink") as stream:

@@ -118,7 +118,7 @@ def test_reload_changes_clients_and_leaves_no_gap(
     assert systemd.notified() == b"STOPPING=1"
 
 
-def test_terminal_that_goes_ends_all_processes_of_the_demo(
+def test_closed_terminal_ends_all_processes_of_demo(
     start_gateway: Callable[..., Gateway], tmp_path: Path
 ) -> None:
     master, terminal = os.openpty()

@@ -20,7 +20,7 @@ class Renamed:
     gain: float
 
 
-def test_record_comes_back_to_the_last_bit_and_can_be_changed() -> None:
+def test_unpacked_record_is_equal_bit_for_bit_and_writable() -> None:
     values = {"time_us": (1 << 62) + 1, "bias": [1 / 3, np.nan, -0.0], "weight": np.inf}
     record = filled_record(State, values)
     again = unpack_record(State, pack_record(record))

@@ -7,7 +7,7 @@ from gateway.estimation.select import EstimationSettings, make_estimator, migrat
 from tests.estimation.samples import imu, times
 
 
-def test_default_estimator_is_the_kalman_filter() -> None:
+def test_default_estimator_is_kalman_filter() -> None:
     assert EstimationSettings().estimator == "eskf"
 
 

@@ -139,7 +139,7 @@ def test_estimator_is_not_changed_by_smoothing(flight: Flight) -> None:
 
 
 @pytest.mark.slow
-def test_position_that_is_not_estimated_stays_that_of_the_fixes(flight: Flight) -> None:
+def test_position_without_heading_is_that_of_filter(flight: Flight) -> None:
     """Without a heading, on the ground without a compass, later fixes correct no position."""
     blind = no_mag(flight).flight
     live, smoothed = run_eskf(blind), run_smoothed(blind)
@@ -150,7 +150,7 @@ def test_position_that_is_not_estimated_stays_that_of_the_fixes(flight: Flight) 
 
 
 @pytest.mark.slow
-def test_real_fixed_wing(data_dir) -> None:
+def test_smoothed_real_fixed_wing_flight_has_small_errors(data_dir) -> None:
     flight = read_flight(data_dir / "arduplane_testlog2.csv.gz")
     assert attitude_scores(flight, run_smoothed(flight)[:, :4])["yaw"] < 1.0
     assert outage_score(flight, run_smoothed, 10.0) < 1.5
@@ -158,7 +158,7 @@ def test_real_fixed_wing(data_dir) -> None:
 
 
 @pytest.mark.slow
-def test_real_car(data_dir) -> None:
+def test_smoothing_reduces_errors_of_real_car(data_dir) -> None:
     """Long parked without a heading; then GPS velocities 0.12 s behind the positions."""
     flight = read_flight(data_dir / "car_rtk_drive0708_first_half.csv.gz")
     live, smoothed = (

@@ -144,7 +144,7 @@ def test_message_that_was_cut_off_leaves_the_next_alone(bench: MakeBench, left: 
     assert all(abs(f.header.node_time_us % 200_000 - 150_000) < 1000 for f in fixes)
 
 
-def test_without_a_receiver_the_node_says_so_and_goes_on_asking(bench: MakeBench) -> None:
+def test_missing_receiver_is_reported_and_searched_for(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()
     node.gps.absent = True

@@ -139,7 +139,7 @@ def test_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
     assert rig.last(ImuPayload).mag == (218, -4096, 436)
 
 
-def test_failed_self_test_is_reported_and_flying_goes_on(bench: MakeBench) -> None:
+def test_failed_self_test_is_reported_and_samples_continue(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node().imu.self_test_works = False
     rig.run(START_S + 0.3)
@@ -171,7 +171,7 @@ def test_absent_sensor_is_reported_and_found_when_it_comes(
     assert rig.last(NodeStatusPayload).sensors_present == 7
 
 
-def test_without_the_imu_barometer_and_status_still_come(bench: MakeBench) -> None:
+def test_missing_imu_leaves_barometer_and_status(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     node.imu.absent = True
@@ -273,7 +273,7 @@ def test_hung_slave_is_clocked_free(bench: MakeBench, clocks: int) -> None:
     assert len(rig.payloads(ImuPayload, since_s=0.8)) > 120
 
 
-def test_bus_held_for_good_stops_the_samples_but_not_the_node(bench: MakeBench) -> None:
+def test_permanently_held_bus_stops_samples_but_not_node(bench: MakeBench) -> None:
     rig = bench()
     node = rig.imu_node()
     rig.run(0.8)

@@ -56,7 +56,7 @@ def test_half_of_the_samples_reach_the_line_within_5_ms(bench: MakeBench) -> Non
     assert 0.002 < np.median(late_s) < 0.005
 
 
-def test_receiver_counts_what_went_by(bench: MakeBench) -> None:
+def test_receiver_counts_received_and_lost_packets(bench: MakeBench) -> None:
     rig = bench()
     rig.imu_node()
     rig.run(1.2)

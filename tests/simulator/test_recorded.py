@@ -180,7 +180,7 @@ class TestRefusals:
 
 
 @pytest.mark.io
-def test_real_flight_comes_through(data_dir) -> None:  # type: ignore[no-untyped-def]
+def test_real_flight_passes_the_link_without_loss(data_dir) -> None:  # type: ignore[no-untyped-def]
     options = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
     flight = open_flown([data_dir / "arduplane_testlog2.csv.gz"], options)
     assert flight.gps_latency_s == 0.28
@@ -197,7 +197,7 @@ def test_real_flight_comes_through(data_dir) -> None:  # type: ignore[no-untyped
     assert report.nodes[0].lost == 0
 
 
-def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
+def test_recording_repeats_without_landing(flight: RecordedFlight) -> None:
     link = Link()
     found: list[RawRecord] = []
     rounds: list[tuple[int, int]] = []
@@ -223,7 +223,7 @@ def test_it_goes_round_as_if_nobody_had_landed(flight: RecordedFlight) -> None:
     assert [node.lost for node in report.nodes] == [0, 0]
 
 
-def test_flight_without_barometer_and_gps_goes_round_too() -> None:
+def test_recording_without_barometer_and_gps_repeats() -> None:
     bare = RecordedFlight.from_columns(columns(baro_alt_m=None, gps_lat=None))
     frames = replay(QUIET, bare, endless=True).frames()
     assert sum(1 for _, frame in zip(range(3 * ROWS), frames, strict=False)) == 3 * ROWS

@@ -37,7 +37,7 @@ from tools.flights import Flight, north_east_m, simulated_flight
 from tools.score_estimators import attitude_scores, run_eskf
 
 FASTEST_MPS = 1000.0
-Nonsense = Callable[[SampleLog, np.random.Generator], None]
+Change = Callable[[SampleLog, np.random.Generator], None]
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +103,10 @@ def fixes_off_africa(log: SampleLog, rng: np.random.Generator) -> None:
     log.gps[rng.random(len(log.gps)) < 0.05, GPS_LAT : GPS_LON + 1] = 0.0
 
 
-def fixes_with_holes(log: SampleLog, rng: np.random.Generator) -> None:
-    holes = rng.random(log.gps.shape) < 0.1
-    holes[:, 0] = False
-    log.gps[holes] = np.nan
+def fixes_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
+    missing = rng.random(log.gps.shape) < 0.1
+    missing[:, 0] = False
+    log.gps[missing] = np.nan
 
 
 def fixes_without_velocity(log: SampleLog, rng: np.random.Generator) -> None:
@@ -118,7 +118,7 @@ def wild_fixes(log: SampleLog, rng: np.random.Generator) -> None:
     log.gps[wild, 1:GPS_COLUMNS] *= rng.normal(1.0, 1.0, (wild.sum(), GPS_COLUMNS - 1))
 
 
-def samples_with_holes(log: SampleLog, rng: np.random.Generator) -> None:
+def samples_with_gaps(log: SampleLog, rng: np.random.Generator) -> None:
     log.imu[rng.random(log.imu.shape) < 0.02] = np.nan
 
 
@@ -136,23 +136,23 @@ def wild_heights(log: SampleLog, rng: np.random.Generator) -> None:
     log.baro_alt_m[wild] = rng.normal(0.0, 1e6, wild.sum())
 
 
-NONSENSE: tuple[Nonsense, ...] = (
+KINDS: tuple[Change, ...] = (
     noisy_field,
     upright_field,
     swapped_field,
     fixes_off_africa,
-    fixes_with_holes,
+    fixes_with_gaps,
     fixes_without_velocity,
     wild_fixes,
-    samples_with_holes,
+    samples_with_gaps,
     shaken,
     swapped_rates,
     wild_heights,
 )
 
 
-@pytest.mark.parametrize("how", NONSENSE, ids=lambda how: how.__name__)
-def test_one_kind_of_invalid_data_leaves_states_finite(flight: Flight, how: Nonsense) -> None:
+@pytest.mark.parametrize("how", KINDS, ids=lambda how: how.__name__)
+def test_one_kind_of_invalid_data_leaves_states_finite(flight: Flight, how: Change) -> None:
     log = part(flight, 0.0, 60.0)
     how(log, np.random.default_rng(1))
     check_sane(flight, log)
@@ -163,8 +163,8 @@ def test_several_kinds_of_invalid_data_leave_states_finite(flight: Flight, seed:
     """The parts begin on the ground or in flight."""
     rng = np.random.default_rng(seed)
     log = part(flight, rng.uniform(0.0, 150.0), 40.0)
-    for k in rng.permutation(len(NONSENSE))[: rng.integers(1, 5)]:
-        NONSENSE[k](log, rng)
+    for k in rng.permutation(len(KINDS))[: rng.integers(1, 5)]:
+        KINDS[k](log, rng)
     check_sane(flight, log)
 
 
