@@ -180,8 +180,8 @@ class Station:
         return True
 
 
-def free_place() -> str:
-    """Find a place for a router."""
+def free_locator() -> str:
+    """Return a Zenoh locator of a free local TCP port."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{free.getsockname()[1]}"
@@ -200,9 +200,9 @@ def start(*words: str, home: Path | None = None) -> "subprocess.Popen[str]":
     )
 
 
-def start_router(place: str) -> "subprocess.Popen[str]":
+def start_router(locator: str) -> "subprocess.Popen[str]":
     """Start a Zenoh router, and wait until it is open."""
-    router = start("-c", ROUTER, place)
+    router = start("-c", ROUTER, locator)
     assert router.stdout is not None
     router.stdout.readline()
     return router
@@ -218,33 +218,33 @@ def wait_for(file: Path) -> None:
 
 
 def generators(
-    place: str, names: list[str], rate_hz: int, seconds: float
+    locator: str, names: list[str], rate_hz: int, seconds: float
 ) -> list["subprocess.Popen[str]"]:
     """Start the load, the sites shared out to a few processes."""
     shares = [names[n::GENERATORS] for n in range(min(GENERATORS, len(names)))]
     return [
-        start("-c", GENERATOR, place, ",".join(share), str(rate_hz), str(seconds))
+        start("-c", GENERATOR, locator, ",".join(share), str(rate_hz), str(seconds))
         for share in shares
     ]
 
 
 def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float) -> FleetRun:
     """Measure one number of sites."""
-    place, station = free_place(), Station(ATTITUDE, time.time_ns)
+    locator, station = free_locator(), Station(ATTITUDE, time.time_ns)
     with tempfile.TemporaryDirectory() as folder:
-        watched, sockets = [start_router(place)], []
+        watched, sockets = [start_router(locator)], []
         for number in range(fleets):
             home = Path(folder) / str(number)
             home.mkdir()
-            end = f"udp:127.0.0.1:{station.port}"
-            words = ("fleet", "--connect", place, "--site", f"{number}-*", "--endpoint", end)
+            url = f"udp:127.0.0.1:{station.port}"
+            words = ("fleet", "--connect", locator, "--site", f"{number}-*", "--endpoint", url)
             watched.append(start("-m", "gateway.cli", *words, home=home))
             sockets.append(home / "mavgate" / "fleet.sock")
             wait_for(sockets[-1])
         time.sleep(SETTLE_S)
         names = [f"{number % fleets}-{number}" for number in range(sites)]
         others = [f"other-{number}" for number in range(unsubscribed)]
-        loads = generators(place, names + others, rate_hz, seconds)
+        loads = generators(locator, names + others, rate_hz, seconds)
         processes = Processes(watched, loads, sockets)
         way = "Zenoh" if fleets == 1 else f"Zenoh, {fleets} fleets"
         try:

@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from tools.bench_fleet import SETTLE_S, Station, end, free_place, start, start_router, wait_for
+from tools.bench_fleet import SETTLE_S, Station, end, free_locator, start, start_router, wait_for
 from tools.bench_hub import resident_kib
 from tools.bench_latency import frames
 
@@ -51,7 +51,7 @@ PIECES = ".bench_01.tlog.part"
 CONFIG = """
 [hub]
 endpoints = [
-    "udp:127.0.0.1:{udp}", "tcp-listen:127.0.0.1:{tcp}", "zenoh:{place}?site=field&trusted=yes",
+    "udp:127.0.0.1:{udp}", "tcp-listen:127.0.0.1:{tcp}", "zenoh:{locator}?site=field&trusted=yes",
 ]
 
 [recording]
@@ -81,16 +81,16 @@ class Field:
     """The site, its line, its three ground stations, the router and the fleet."""
 
     def __init__(self, folder: Path, rate_hz: int, stack: contextlib.ExitStack) -> None:
-        self.home, self.place, self._rate_hz = folder, free_place(), rate_hz
+        self.home, self.locator, self._rate_hz = folder, free_locator(), rate_hz
         self._frames = frames(rate_hz)
         self._line, slave = os.openpty()
         tty.setraw(slave)
         os.set_blocking(self._line, False)
-        self.router = start_router(self.place)
+        self.router = start_router(self.locator)
         stack.callback(lambda: end(self.router))
         direct, far = (Station(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION) for _ in range(2))
         self.fleet = start(
-            *("-m", "gateway.cli", "fleet", "--connect", self.place, "--site", "field"),
+            *("-m", "gateway.cli", "fleet", "--connect", self.locator, "--site", "field"),
             *("--endpoint", f"udp:127.0.0.1:{far.port}"),
             home=folder,
         )
@@ -100,10 +100,10 @@ class Field:
         recordings.mkdir()
         with (recordings / "bench_01.tlog").open("wb") as file:
             file.truncate(RECORDING_BYTES)
-        tcp = int(free_place().rpartition(":")[2])
+        tcp = int(free_locator().rpartition(":")[2])
         config = folder / "bench.toml"
         config.write_text(
-            CONFIG.format(udp=direct.port, tcp=tcp, place=self.place, recordings=recordings)
+            CONFIG.format(udp=direct.port, tcp=tcp, locator=self.locator, recordings=recordings)
         )
         words = ("run", "--plain", "--config", str(config), "--port", os.ttyname(slave))
         self.site = start("-m", "gateway.cli", *words)
@@ -205,7 +205,7 @@ def through_an_outage(site: Field, outage_s: float) -> tuple[list[WayFigures], l
 
     def restart() -> None:
         end(site.router)
-        site.router = start_router(site.place)
+        site.router = start_router(site.locator)
         returned.append(time.monotonic_ns())
 
     whole_s = BEFORE_S + outage_s + AFTER_S

@@ -162,7 +162,7 @@ static void twi_end_after(board_t *board, int bits, uint8_t status)
     avr_cycle_timer_register(avr, bits * cycles_a_bit, twi_done, board);
 }
 
-static uint8_t twi_tell(board_t *board, uint8_t event, uint8_t byte)
+static uint8_t twi_notify(board_t *board, uint8_t event, uint8_t byte)
 {
     return board->on_twi ? board->on_twi(event, byte) : 0;
 }
@@ -179,7 +179,7 @@ static void twi_stop(board_t *board)
     avr_t *avr = board->avr;
     avr->data[board->twi->r_twcr] &= ~(1 << TWCR_TWSTO);
     if (board->twi_busy)
-        twi_tell(board, BUS_STOP, board->twi_left);
+        twi_notify(board, BUS_STOP, board->twi_left);
     board->twi_left = 0;
     board->twi_busy = board->twi_addressed = 0;
 }
@@ -190,15 +190,15 @@ static void twi_byte(board_t *board, int acknowledge)
     uint8_t byte = avr->data[board->twi->r_twdr];
     if (!board->twi_addressed) {
         board->twi_left = 0;
-        uint8_t ack = twi_tell(board, BUS_ADDRESS, byte);
+        uint8_t ack = twi_notify(board, BUS_ADDRESS, byte);
         board->twi_addressed = 1 + (byte & 1);
         twi_end_after(board, 9, byte & 1 ? (ack ? 0x40 : 0x48) : (ack ? 0x18 : 0x20));
     } else if (board->twi_addressed == 1) {
-        twi_end_after(board, 9, twi_tell(board, BUS_WRITE, byte) ? 0x28 : 0x30);
+        twi_end_after(board, 9, twi_notify(board, BUS_WRITE, byte) ? 0x28 : 0x30);
     } else {
         avr->data[board->twi->r_twdr] = board->twi_left
                                             ? board->twi_answer[TWI_SIZE - board->twi_left--]
-                                            : twi_tell(board, BUS_READ, acknowledge);
+                                            : twi_notify(board, BUS_READ, acknowledge);
         twi_end_after(board, 9, acknowledge ? 0x50 : 0x58);
     }
 }
