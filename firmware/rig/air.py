@@ -1,4 +1,4 @@
-"""The air between the radios: who hears what, and what is lost.
+"""The air between the radios: reception, collisions and losses.
 
 Two packets that overlap on one channel destroy each other at every listener. Beyond that each
 packet, data or acknowledgement, is lost to a listener with the probability `loss`.
@@ -18,7 +18,7 @@ _KEPT_PS: Final = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """What is on the air."""
+    """A transmission on the air."""
 
     channel: int
     kbps: int
@@ -27,7 +27,7 @@ class Packet:
     identity: int
     is_ack: bool
     no_ack: bool = False
-    """The sender wants no acknowledgement."""
+    """The sender requests no acknowledgement."""
 
     @property
     def duration_ps(self) -> int:
@@ -78,7 +78,7 @@ class Air:
     _packets: list[_OnAir] = field(default_factory=list)
 
     def send(self, packet: Packet, sender: Listener, done: Callable[[], None]) -> None:
-        """Put a packet on the air now; `done` is called at its end, before anybody hears it."""
+        """Put a packet on the air now; `done` is called at its end, before it is received."""
         now_ps = self.bench.now_ps
         new = _OnAir(packet, now_ps, now_ps + packet.duration_ps, collided=False)
         self._packets = [p for p in self._packets if p.end_ps > now_ps - _KEPT_PS]
@@ -95,7 +95,7 @@ class Air:
         self.bench.at(new.end_ps, end)
 
     def carrier(self, channel: int, now_ps: int) -> bool:
-        """Whether a carrier stands on the channel."""
+        """Whether there is a carrier on the channel."""
         busy = any(
             p.packet.channel == channel and p.start_ps <= now_ps < p.end_ps for p in self._packets
         )

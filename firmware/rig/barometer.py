@@ -65,7 +65,7 @@ class Bmp180(RegisterDevice):
         """When the conversion ends, and what it gives."""
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds."""
+        """Return the value of a register."""
         if self._running and self._clock() >= self._running[0]:
             for i, byte in enumerate(self._running[1]):
                 self._registers[_RESULT + i] = byte
@@ -152,7 +152,7 @@ class Bmp280(RegisterDevice):
         """End of the measurement, and its raw pressure and temperature."""
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds."""
+        """Return the value of a register."""
         if self._running and self._clock() >= self._running[0]:
             self._set_result(*self._running[1:])
             self._registers[self._CONTROL] &= ~3

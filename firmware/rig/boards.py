@@ -1,4 +1,4 @@
-"""The three boards: a chip, its program, and what is soldered to it."""
+"""The three boards: a chip, its program, and the modules soldered to it."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ class Parts:
 
 @dataclass
 class Setup:
-    """What the boards share.
+    """Set-up that the boards share.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class Receiver(Board):
         setup.bench.after_step.append(self._take)
 
     def take_bytes(self) -> list[tuple[int, int]]:
-        """Return what it sent since the last call: the end of each byte in ps, and the byte."""
+        """Return the bytes sent since the last call: the end of each byte in ps, and the byte."""
         sent, self._sent = self._sent, []
         return sent
 

@@ -10,7 +10,7 @@ from typing import Final
 from firmware.rig.mcu import FIRMWARE
 
 PACKAGES: Final = "make g++ gcc-avr binutils-avr avr-libc libsimavr-dev"
-"""What the programs, the shim and the bench need of a Debian system."""
+"""Debian packages that the programs, the shim and the bench need."""
 
 PROGRAMS: Final = ("imu_node", "gps_node", "receiver")
 
@@ -66,7 +66,7 @@ def build(
 
 
 def make(*arguments: str) -> str:
-    """Run make in the firmware's folder and return what it said.
+    """Run make in the firmware's folder and return its output.
 
     Raises
     ------

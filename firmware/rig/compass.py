@@ -18,7 +18,7 @@ _OVERFLOW: Final = 0x02
 
 
 class Compass(RegisterDevice):
-    """What the chips have in common."""
+    """Common part of the chips."""
 
     def __init__(self, world: World, clock: Clock, behind: Imu) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class Compass(RegisterDevice):
         raise NotImplementedError
 
     def reachable(self) -> bool:
-        """Whether it hears the bus: only through the bypass."""
+        """Whether the device is connected to the bus: only through the bypass."""
         return not self.absent and self._behind.bypass
 
     def write_register(self, register: int, value: int) -> None:
@@ -45,7 +45,7 @@ class Compass(RegisterDevice):
 
 
 class Hmc5883l(Compass):
-    """HMC5883L, and what differs in its relatives.
+    """HMC5883L, and the differences of its relatives.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Hmc5883l(Compass):
         self._registers = {0: 0x10, 1: 0x20, 2: 0x03} | identification
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds; the first data byte takes the newest measurement."""
+        """Return the value of a register; the first data byte takes the newest measurement."""
         if register == self._STATUS:
             return int(self._status_ready)
         if register == self._DATA and self._registers[2] & 3 == self._CONTINUOUS:
@@ -93,7 +93,7 @@ class Hmc5883l(Compass):
 
 
 class _Qmc(Compass):
-    """What the two QMC chips have in common: they differ in where the registers are."""
+    """Common part of the two QMC chips, which differ in the addresses of the registers."""
 
     _RATES_HZ: Final = (10.0, 50.0, 100.0, 200.0)
     _DATA: int
@@ -112,7 +112,7 @@ class _Qmc(Compass):
         return field
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds; the first data byte takes the newest measurement."""
+        """Return the value of a register; the first data byte takes the newest measurement."""
         if register == self._DATA and self._running():
             self._measure()
         value = self._registers.get(register, 0)

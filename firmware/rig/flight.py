@@ -59,7 +59,7 @@ class FlightWorld:
         self._pressure_pa, self._solutions = 0.0, dict[int, Solution]()
 
     def moment(self, time_s: float) -> Moment:
-        """Return what the sensors sense at a time of the bench; never much before the last."""
+        """Return the measured quantities at a time of the bench, which may only go back a bit."""
         flight_s = time_s + self.start_s
         while flight_s >= self._taken_s - 1.5 / SAMPLE_HZ:
             self._take(self._taken_s + PIECE_S)

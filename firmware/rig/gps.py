@@ -48,7 +48,7 @@ _MPS_PER_KNOT: Final = 0.514444
 
 @dataclass(frozen=True, slots=True)
 class GpsModule:
-    """What a module is made of."""
+    """Properties of a GPS module."""
 
     hardware: str = ""
     """hwVersion of its UBX-MON-VER; empty if it does not answer that."""
@@ -59,7 +59,7 @@ class GpsModule:
     valset: bool = False
     """Takes UBX-CFG-VALSET."""
     pvt: bool = True
-    """Knows UBX-NAV-PVT; a u-blox 6 does not."""
+    """Supports UBX-NAV-PVT; a u-blox 6 does not."""
     acknowledges: bool = True
     talkers: tuple[str, ...] = ("GN",)
     """Of the NMEA sentences; every one of them sends GSA, the first one the rest."""
@@ -278,7 +278,7 @@ class Gps:
             self._to_module.send(start_ps, byte, baud)
 
     def sample(self) -> None:
-        """Sample what has passed on both lines by now."""
+        """Sample both lines up to the present time."""
         now_ps = self._bench.now_ps
         self._to_board.receive(now_ps, self._board_baud())
         self._to_module.receive(now_ps, self.baud)

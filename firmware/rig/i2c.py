@@ -1,4 +1,4 @@
-"""The I2C bus of the IMU node, and what every sensor on it has in common."""
+"""The I2C bus of the IMU node, and the common part of the sensors on it."""
 
 from collections.abc import Callable, Sequence
 from typing import Final
@@ -20,11 +20,11 @@ class RegisterDevice:
         self.pointer = 0
 
     def reachable(self) -> bool:
-        """Whether it hears the bus."""
+        """Whether the device is connected to the bus."""
         return not self.absent
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds."""
+        """Return the value of a register."""
         raise NotImplementedError
 
     def burst(self) -> bytes:

@@ -145,7 +145,7 @@ class Imu(RegisterDevice):
         return bool(self._registers.get(INT_PIN_CFG, 0) & 2) and not self.absent
 
     def read_register(self, register: int) -> int:
-        """Return what a register holds."""
+        """Return the value of a register."""
         return self._registers.get(register, 0)
 
     def burst(self) -> bytes:

@@ -153,7 +153,7 @@ class Mcu:
             self.board = None
 
     def reset(self, cause: int = POWER_ON, through_bootloader: bool = False) -> None:
-        """Restart the program; `cause` is what it finds in MCUSR, behind optiboot in r2."""
+        """Restart the program; `cause` is the value of MCUSR, behind optiboot that of r2."""
         self._lib.board_reset(self.board, 0 if through_bootloader else cause)
         if through_bootloader:
             self._lib.board_poke(self.board, _R2, cause)
@@ -212,7 +212,7 @@ class Mcu:
         self._lib.board_watch_line(self.board)
 
     def hold_sda(self, held: bool) -> None:
-        """Let somebody hold the I2C data line low, or let it go."""
+        """Hold the I2C data line low, or release it."""
         self._lib.board_hold_sda(self.board, held)
         self.set_pin("C", 4, not held)
 
@@ -227,7 +227,7 @@ class Mcu:
         return 10 * self.frequency_hz / cycles if cycles else 0.0
 
     def uart_take(self) -> list[tuple[int, int]]:
-        """Return what was sent since the last call: the end of each stop bit in ps, the byte."""
+        """Return the bytes sent since the last call: the end of each stop bit in ps, the byte."""
         count = self._lib.board_uart_take(self.board, self._bytes, self._ends_ps)
         if not count:
             return []

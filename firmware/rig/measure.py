@@ -51,7 +51,7 @@ class Load:
 
 @dataclass
 class Run:
-    """What one flight at one loss gave."""
+    """Results of one flight at one loss."""
 
     loss: float
     received: dict[int, int] = field(default_factory=dict)
@@ -69,7 +69,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Programs:
-    """What to measure."""
+    """Build of the programs that is measured."""
 
     settings: str = ""
     mhz: int = 16
@@ -182,7 +182,7 @@ def program_table(programs: Programs, run: Run) -> list[str]:
 
 
 def loss_table(runs: list[Run]) -> list[str]:
-    """Build the table of what arrived, and how late."""
+    """Build the table of received samples and their latency."""
     rows = [
         "| loss | IMU node: payloads, lost | GPS node: the same | latency p50 | p99 | worst |",
         "| ---: | ---: | ---: | ---: | ---: | ---: |",

@@ -121,7 +121,7 @@ class Nrf24:
             self._begin_job()
 
     def begin(self, command: int) -> tuple[int, bytes]:
-        """Take a command; return what is sent with it and with the bytes behind it."""
+        """Handle a command; return the answers to it and to the bytes behind it."""
         if self.absent:
             return 0xFF, b"\xff" * 32
         self._command = command

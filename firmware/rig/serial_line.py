@@ -46,7 +46,7 @@ class LineSampler:
                 self._lows.append((begin, end))
 
     def receive(self, now_ps: int, baud: float) -> None:
-        """Sample what has passed by now at the receiver's speed."""
+        """Sample the line up to the present time at the receiver's speed."""
         if baud != self._baud:
             self._baud, self._ready_ps = baud, now_ps
         if not baud:

@@ -1,4 +1,4 @@
-"""What the sensors sense: physical values as a function of time."""
+"""The quantities that the sensors measure, as a function of time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ class Moment:
     """The world at one time, in the axes printed on the sensor board (FRD or not: as mounted)."""
 
     accel_mps2: Vec3 = (0.0, 0.0, 9.80665)
-    """Specific force as the MPU6050 sees it: +1 g on z where it lies flat, face up."""
+    """Specific force on the axes of the MPU6050: +1 g on z where it lies flat, face up."""
     gyro_radps: Vec3 = (0.0, 0.0, 0.0)
     mag_ut: Vec3 = EARTH_FIELD_UT
     temperature_degc: float = 25.0
@@ -24,7 +24,7 @@ class Moment:
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """What a GPS receiver would compute."""
+    """Solution of a GPS receiver."""
 
     lat_deg: float = -7.7123456
     lon_deg: float = 110.3654321

@@ -1,4 +1,4 @@
-"""A flight in figures for pilots: when, how far, how high, how fast, and what was lost."""
+"""Key figures of a flight for pilots: times, distance, height, speed and outages."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -60,7 +60,7 @@ def _do(numbered: tuple[int, Any]) -> tuple[int, Any]:
 
 
 def begin_copy(work: Callable[[Any, Connection], None], argument: Any) -> Connection:
-    """Call a function in a background process, which sends what it makes."""
+    """Call a function in a background process, which sends its results."""
     receiver, sender = multiprocessing.Pipe(duplex=False)
     process = multiprocessing.Process(
         target=_begin, args=(_send, work, argument, sender, receiver), daemon=True
@@ -86,7 +86,7 @@ def _send(
 
 
 def _end_without_receiver(sender: Connection) -> None:
-    """End this process when nobody can receive any more; it may be long before it sends."""
+    """End this process when the pipe has no receiver, even if nothing is being sent."""
     hang_up = select.poll()
     hang_up.register(sender, 0)  # no event but that one
     hang_up.poll()
@@ -99,7 +99,7 @@ def _begin(work: Callable[..., None], *arguments: Any) -> None:
 
 
 def keep_inherited() -> None:
-    """Never collect what the parent process has left; for the beginning of a forked process.
+    """Exclude objects of the parent process from garbage collection, in a forked process.
 
     Destructors may wait for the parent's threads, as that of a Zenoh session does, and a forked
     process has none of them.

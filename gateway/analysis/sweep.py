@@ -72,7 +72,7 @@ def parse_axis(name: str, text: str) -> Axis:
         values: Values
         if len(parts) == 3:
             steps = np.linspace(float(parts[0]), float(parts[1]), int(parts[2]))
-            # Rounded to the digits that a person would write.
+            # Rounded to remove the error of binary fractions.
             values = tuple(float(f"{step:.12g}") for step in steps)
         elif len(parts) == 2:
             values = (float(parts[0]), float(parts[1]))
@@ -179,7 +179,7 @@ def make_contest(
     fusion = with_estimator_of(fusion, keys)
     keep = np.ones(len(flight.fixes), np.bool_)
     if interval_s:
-        # Not both: applied after one another they leave gaps, or nothing.
+        # Not both: thinning and withholding together would leave gaps, or no fixes.
         keep = thin(flight, interval_s)
     elif hold_out:
         keep = withhold(flight, hold_out)
@@ -190,7 +190,7 @@ def score_of(contest: Contest, fusion: FusionSettings) -> Scores:
     """Fuse the flight with any settings, and score it by the fixes of the contest."""
     judge = contest.judge
     if fusion.estimation.reference != judge.fused.fusion.estimation.reference:
-        # Judged by its own latency: judged by the recording's, that would win.
+        # Scored with the latency of the trial: that of the recording would favour itself.
         judge = judge_of(*(replace(f, fusion=fusion) for f in (judge.fused, judge.held_flight)))
     return score(fuse_track(judge.fused, fusion), judge)
 

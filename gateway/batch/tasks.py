@@ -219,7 +219,7 @@ def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[F
         try:
             worked = task.do(files, name)
         except SweepError:
-            # It is the question that is wrong, not the recording.
+            # The settings of the sweep are wrong, not the recording.
             raise
         except (FlightError, ValueError) as error:
             text = str(error) or type(error).__name__
@@ -422,7 +422,7 @@ def _stamps(
 
 
 def _names(items: Sequence[BatchItem], stamps: Sequence[str | WorkFailed]) -> list[str]:
-    """Name what is written; where two recordings have one name, with a part of their stamps."""
+    """Return names for the results; equal names of recordings get a part of their stamps."""
     names = [name_of(item) for item in items]
     often = Counter(names)
     return [

@@ -3,7 +3,7 @@
 A function marked by `compiled` is in numba's nopython subset. `tools/build_kernels.py` compiles the
 entry points (see `entry_point`) and all functions that they call into one library. Compiled code is
 strict IEEE 754 and gives the same bits everywhere; Python gives the same except for some units in
-the last place, because its powers and `hypot` are rounded differently.
+the last digit, because its powers and `hypot` are rounded differently.
 """
 
 import ctypes

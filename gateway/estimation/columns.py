@@ -166,7 +166,7 @@ FRESH_GPS_S: Final = 1.5
 def gps_flags(since_fix_s: float, since_reject_s: float, hold_s: float) -> int:
     """Return the bits of `NavFlags` that follow from the age of the last fix and rejected one.
 
-    Dead reckoning for longer than `hold_s` is no position any more.
+    A position is valid for `hold_s` after the last fix.
     """
     flags: int = FLAG.POSITION_VALID | FLAG.VELOCITY_VALID if since_fix_s < hold_s else 0
     flags |= FLAG.USING_GPS if since_fix_s < FRESH_GPS_S else FLAG.DEAD_RECKONING | FLAG.DEGRADED

@@ -133,7 +133,7 @@ class KernelEstimator:
         return used_s, self._reference.gps_latency_s
 
     def latency_of(self, log: SampleLog) -> float:
-        """Return the GPS latency of a whole log: the set one, or what its manoeuvres show, s."""
+        """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
         other = KernelEstimator(self._gains, self._reference)
         other.state = self._state
         other.run(log)
@@ -215,7 +215,7 @@ class KernelEstimator:
         return gps_row(fix, self._reference, self._earth)
 
     def run(self, log: SampleLog) -> FloatArray:
-        """Advance over a whole log; bit for bit what its samples give one at a time.
+        """Advance over a whole log, with the same bits as sample by sample.
 
         Parameters
         ----------
@@ -254,7 +254,7 @@ class KernelEstimator:
         aiding: Sequence[Aiding],
         on_fix: Callable[[], None] | None = None,
     ) -> FloatArray:
-        """Advance over samples and what arrived between them, in the order of arrival.
+        """Advance over samples, and heights and fixes between them, in the order of arrival.
 
         Parameters
         ----------

@@ -59,7 +59,7 @@ GAP_S: Final = 2.5
 GAIN_INTERVAL_S: Final = 0.01
 """The attitude weights hold for this interval; other intervals take the matching power."""
 POSITION_HOLD_S: Final = 30.0
-"""Dead reckoning for longer is no position any more."""
+"""A position is not valid after a longer time of dead reckoning."""
 MOST_GAINS: Final = 2000
 """Samples of the longest latency at 1000 a second."""
 STALE_MAG_S: Final = 2.0
@@ -247,7 +247,7 @@ class PaperEstimator:
         self._blend_fix()
 
     def _gained_since(self, time_us: int) -> Vec3:
-        """Return the change of velocity since a time, and discard what is older."""
+        """Return the change of velocity since a time, and discard older values."""
         gains = self._s.gains
         while len(gains) > 1 and gains[1][0] <= time_us:
             del gains[0]

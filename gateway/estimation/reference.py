@@ -1,4 +1,4 @@
-"""What ties an estimate to the Earth: usable GPS fixes, their latency, and true north."""
+"""Reference of an estimate to the Earth: usable GPS fixes, their latency, and true north."""
 
 import math
 from typing import Annotated, Final, Literal

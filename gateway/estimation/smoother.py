@@ -187,9 +187,9 @@ def share_raised(s: State, copy: State) -> None:
 
 @compiled
 def write_row(s: State, copy: State, p: Gains, reset: bool, row: FloatArray) -> None:
-    """Write the prediction, and of its standard deviations what the covariance does not contain.
+    """Write the prediction, and the part of its standard deviations beyond the covariance.
 
-    Where the filter was reset, its own output stands.
+    Where the filter was reset, its own output is written.
     """
     chosen = s if reset else copy
     write_output(chosen, p, row)

@@ -1,4 +1,4 @@
-"""Rotation matrices, and the three angles by which people describe them."""
+"""Rotation matrices, and their Euler angles."""
 
 import math
 

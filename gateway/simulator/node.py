@@ -39,7 +39,7 @@ STARTING_US: Final = 600_000
 """From reset to the first payload: self-test and settling of the sensors."""
 
 SAMPLES_AT_ONCE: Final = 20
-"""Few at once cost nearly as much as many, but many at once would hold up an event loop."""
+"""A few samples at once cost nearly as much as many, but many would block an event loop."""
 FIXES_AT_ONCE: Final = 10
 PHASES: Final = 4
 

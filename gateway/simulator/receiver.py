@@ -182,7 +182,7 @@ class SimulatedReceiver:
         yield from self._write(time_s, encode_receiver_status(status), LINE_BUFFER_BYTES)
 
     def _write(self, time_s: float, content: bytes, room: int) -> Iterator[TimedFrame]:
-        # A dropped frame uses up its number, so that the gateway sees the gap.
+        # A dropped frame uses up its number, so that the gateway detects the gap.
         self._frame_seq = (self._frame_seq + 1) % UINT8
         data = encode_frame(content)
         byte_s = BITS_PER_BYTE / self._settings.baud

@@ -345,11 +345,11 @@ class DeviceClock:
     """A node's or receiver's own clock against true time."""
 
     boot_us: int
-    """What it shows at the start of the simulation."""
+    """Time of the clock at the start of the simulation."""
     skew_ppm: float
 
     def at(self, time_s: float) -> int:
-        """Return what the clock shows at a true time, in whole µs, not wrapped."""
+        """Return the time of the clock at a true time, in whole µs, not wrapped."""
         return self.boot_us + math.floor(time_s * 1e6 * (1.0 + self.skew_ppm * 1e-6))
 
     def true_s(self, clock_us: IntArray) -> FloatArray:

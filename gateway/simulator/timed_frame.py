@@ -11,4 +11,4 @@ class TimedFrame:
     """True time since the start at which its last bit leaves the receiver; never goes back."""
     data: bytes
     damaged: int = 0
-    """How many of its bytes are not what the receiver sent."""
+    """Number of bytes that differ from those that the receiver sent."""

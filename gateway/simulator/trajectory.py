@@ -123,15 +123,15 @@ class Truth:
     q_nb: FloatArray
     """Shape (N, 4), scalar first, unit norm, continuous within one flight."""
     rate_b_radps: FloatArray
-    """Shape (N, 3), body relative to NED, in body FRD: what an ideal gyroscope reads."""
+    """Shape (N, 3), body relative to NED, in body FRD: the reading of an ideal gyroscope."""
     accel_b_mps2: FloatArray
-    """Shape (N, 3), specific force in body FRD: what an ideal accelerometer reads."""
+    """Shape (N, 3), specific force in body FRD: the reading of an ideal accelerometer."""
     airspeed_mps: FloatArray
     """Shape (N,), mean motion through the air, gusts left out."""
 
 
 class SensorMotion(Protocol):
-    """What moves the simulated sensors."""
+    """Motion of the simulated sensors."""
 
     def truth_at(self, time_s: FloatArray) -> Truth:
         """Return the true state at any times."""
@@ -239,7 +239,7 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class _Commands:
-    """What the plan asks for at each time of the grid; arrays of shape (N,)."""
+    """Planned values at each time of the grid; arrays of shape (N,)."""
 
     heading_rad: FloatArray
     turn_radps: FloatArray

@@ -1,7 +1,7 @@
 """The filter sample by sample, and its entry points for compiled code.
 
-One IMU sample passes: clock, gap and fault checks, prediction, rest, the measurements that stand in
-for GPS, and the compass. Barometer samples and fixes arrive between IMU samples.
+One IMU sample passes: clock, gap and fault checks, prediction, rest, the measurements that replace
+GPS, and the compass. Barometer samples and fixes arrive between IMU samples.
 """
 
 import math
@@ -222,7 +222,7 @@ def advance(
     if is_sound_field(s, mag, dt):
         take_mag(s, p, mag)
     elif s.mag_misplaced > misplaced:
-        # The heading so far, and what it has shown of the sensors, came from wrong axes.
+        # The heading, and the sensor errors estimated with it, came from wrong axes.
         discard_calibration(s, p)
         lose_attitude(s, p)
 
@@ -253,7 +253,7 @@ def restart_clock(s: State, time_us: int) -> None:
 
 @compiled
 def note_calibration(s: State, p: Gains, row: FloatArray) -> None:
-    """Discard what was estimated of a sensor whose calibration has changed."""
+    """Discard the estimated errors of a sensor whose calibration has changed."""
     bits = 1 if row[GYRO_UNCALIBRATED] != 0.0 else 0
     bits |= 2 if row[ACCEL_UNCALIBRATED] != 0.0 else 0
     bits |= 4 if row[MAG_UNCALIBRATED] != 0.0 else 0

@@ -48,7 +48,7 @@ from gateway.geometry.quaternion import from_rotation_vector, multiply, normalis
 from gateway.units import STANDARD_GRAVITY_MPS2
 
 LOST_LEVEL_VAR: Final = 0.5**2
-"""Of an unknown level, rad2: about what a linear filter can still correct."""
+"""Of an unknown level, rad2: about the largest that a linear filter can still correct."""
 LOST_LEVEL_RAD: Final = 0.35
 """An attitude with a larger standard deviation is lost."""
 FOUND_LEVEL_RAD: Final = 0.08
@@ -72,7 +72,7 @@ def lose_attitude(s: State, p: Gains) -> None:
     s.heading_known = 0
     clear_pairs(s)
     begin_attitude(s, p, LOST_LEVEL_VAR, NO_HEADING_VAR)
-    # What the low-pass contains was rotated by an attitude that is discarded, or by none.
+    # The low-pass contains forces rotated by the discarded attitude, or by none.
     s.force_lp_s = 0.0
 
 

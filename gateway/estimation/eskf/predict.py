@@ -153,7 +153,7 @@ def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> Non
 
 @compiled
 def follow_gravity(s: State, p: Gains, force_i: Vec3, dt: float) -> None:
-    """Low-pass the force in the gyroscope frame, where gravity stands still [3]_.
+    """Low-pass the force in the gyroscope frame, where gravity is constant [3]_.
 
     A plain mean at first, so that the first sample does not count for a whole time constant.
     """

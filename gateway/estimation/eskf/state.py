@@ -1,4 +1,4 @@
-"""State of the filter: the nominal state, the covariance of its errors, and what each part keeps.
+"""State of the filter: the nominal state, the error covariance, and the memory of each part.
 
 The error state, in the order of the covariance's rows:
 

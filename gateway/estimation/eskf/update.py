@@ -50,7 +50,7 @@ NO_GATE_SQ: Final = 1e12
 GRAVITY_TOLERANCE: Final = 0.02
 """A mean force beyond gravity by more than this share, an MPU6050's scale error, accelerates."""
 LEVEL_INTERVAL_S: Final = 0.1
-"""Interval of the measurements that stand in for GPS."""
+"""Interval of the measurements that replace GPS."""
 REST_VELOCITY_VAR: Final = 0.2**2
 """Of a vehicle that idles, m2/s2."""
 REST_RATE_VAR: Final = 0.002**2
