@@ -93,7 +93,7 @@ class Aircraft:
         Of all stages.
     clock : SigningClock, optional
         Civil time.
-    stamps : SigningTimestamps, optional
+    timestamps : SigningTimestamps, optional
         The signing timestamps accepted before.
     stored : StoredPlan, optional
         Missions, mark and home kept from an earlier run.
@@ -107,7 +107,7 @@ class Aircraft:
         settings: AircraftSettings,
         *,
         clock: SigningClock | None = None,
-        stamps: SigningTimestamps | None = None,
+        timestamps: SigningTimestamps | None = None,
         stored: StoredPlan | None = None,
         fused: "FusedStates | None" = None,
     ) -> None:
@@ -122,7 +122,7 @@ class Aircraft:
             vehicle_id,
             sections=sections,
             clock=clock,
-            stamps=stamps,
+            timestamps=timestamps,
             stored=stored,
         )
         self.chain, self.estimator = make_fusion(settings)

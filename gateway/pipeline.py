@@ -56,7 +56,7 @@ class PipelineSettings:
     """The states of a recording, in place of an estimator."""
     plans: Mapping[int, StoredPlan] = field(default_factory=dict)
     """Missions, marks and homes kept from an earlier run, by vehicle id."""
-    stamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
+    timestamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
     """Signing timestamps kept from an earlier run, by vehicle id; see `SigningTimestamps`."""
 
 
@@ -75,7 +75,9 @@ class Pipeline:
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
         """Signs the frames of every aircraft with a passphrase where they are sent."""
-        self._stamps = {key: SigningTimestamps(kept) for key, kept in settings.stamps.items()}
+        self._timestamps = {
+            key: SigningTimestamps(kept) for key, kept in settings.timestamps.items()
+        }
         self._gps_time = GpsTime()
         self._connected = False
         self._port = ""
@@ -126,7 +128,7 @@ class Pipeline:
             vehicle_id,
             known.aircraft.get(vehicle_id, known.default),
             clock=self._signing_clock,
-            stamps=self._stamps.setdefault(vehicle_id, SigningTimestamps()),
+            timestamps=self._timestamps.setdefault(vehicle_id, SigningTimestamps()),
             stored=known.plans.get(vehicle_id),
             fused=known.fused,
         )
@@ -189,15 +191,15 @@ class Pipeline:
             self._set_key(each)
         return out
 
-    def stamps_to_keep(self) -> dict[int, KeptTimestamps] | None:
+    def timestamps_to_keep(self) -> dict[int, KeptTimestamps] | None:
         """Return the signing timestamps of all aircraft if they must be written now."""
-        if not any(book.is_due for book in self._stamps.values()):
+        if not any(book.is_due for book in self._timestamps.values()):
             return None
-        return {key: book.to_keep() for key, book in self._stamps.items()}
+        return {key: book.to_keep() for key, book in self._timestamps.items()}
 
-    def newest_stamps(self) -> dict[int, KeptTimestamps]:
+    def newest_timestamps(self) -> dict[int, KeptTimestamps]:
         """Return the signing timestamps of all aircraft, for a clean shutdown."""
-        return {key: found for key, book in self._stamps.items() if (found := book.exact())}
+        return {key: found for key, book in self._timestamps.items() if (found := book.exact())}
 
     def connect(self, port: str) -> None:
         """Note that the source was opened; partly received data is dropped."""

@@ -95,7 +95,7 @@ class Daemon:
         self._settings = settings
         self._read = read
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
-        self._stamps = TimestampFile(aircraft_folder(settings))
+        self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
         self._pipeline.disconnect(serial.port)
         self._hub = Hub(
@@ -122,11 +122,13 @@ class Daemon:
         self._lag = LoopLag()
 
     def _make_pipeline(self, aircraft: Mapping[int, AircraftSettings]) -> Pipeline:
-        plans, stamps = self._plans.load(), self._stamps.load()
+        plans, timestamps = self._plans.load(), self._timestamps.load()
         self._broken_plans = dict(self._plans.broken)
         at_zero_us = unix_time_us() - self.now_us()
         default = self._settings.default_aircraft
-        return Pipeline(PipelineSettings(default, aircraft, at_zero_us, plans=plans, stamps=stamps))
+        return Pipeline(
+            PipelineSettings(default, aircraft, at_zero_us, plans=plans, timestamps=timestamps)
+        )
 
     def _make_recorder(self) -> Recorder:
         return Recorder(
@@ -218,7 +220,7 @@ class Daemon:
         self._files.shutdown()
         self._recorder.close()
         self._plans.close()
-        self._stamps.close(self._pipeline.newest_stamps())
+        self._timestamps.close(self._pipeline.newest_timestamps())
         self._metrics.close()
         self._hub.close()
 
@@ -303,8 +305,8 @@ class Daemon:
         frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()
         self._budget.note(client_id, now_us, trusted=incoming.trusted)
         out = self._pipeline.handle(incoming, now_us)
-        if (stamps := self._pipeline.stamps_to_keep()) is not None:
-            self._stamps.save(stamps)
+        if (timestamps := self._pipeline.timestamps_to_keep()) is not None:
+            self._timestamps.save(timestamps)
         # A ground station's broadcast is both handled and forwarded: it is recorded once. Frames of
         # untrusted clients are recorded only if they had an effect.
         kept = incoming.trusted or bool(out.frames or out.records or out.orders)

@@ -84,7 +84,7 @@ class Vehicle:
         *,
         sections: Mapping[str, Settings] | None = None,
         clock: SigningClock | None = None,
-        stamps: SigningTimestamps | None = None,
+        timestamps: SigningTimestamps | None = None,
         stored: StoredPlan | None = None,
     ) -> None:
         """Start without any data.
@@ -97,7 +97,7 @@ class Vehicle:
         sections : mapping of str to Settings, optional
             Other settings of this aircraft that ground stations may change as parameters, by the
             key under which the change comes back.
-        clock, stamps : optional
+        clock, timestamps : optional
             Civil time and the timestamps accepted before; needed for signing only.
         stored : StoredPlan, optional
             The plan of an earlier run.
@@ -109,7 +109,7 @@ class Vehicle:
         self.health = Health(system_id, settings.node_silent_s, settings.supply_low_v)
         self.telemetry = Telemetry(settings, self.health)
         self._clock = clock or SigningClock(0)
-        self._stamps = stamps or SigningTimestamps()
+        self._timestamps = timestamps or SigningTimestamps()
         self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
         self.signing_key: bytes | None = None
@@ -359,7 +359,7 @@ class Vehicle:
         if key == self.signing_key:
             return
         self.signing_key = key
-        self._reader.verifier = Verifier(key, self._clock, self._stamps) if key else None
+        self._reader.verifier = Verifier(key, self._clock, self._timestamps) if key else None
 
     def _replies(self, messages: Iterable[Any]) -> list[Answer]:
         return [Reply(message) for message in messages]

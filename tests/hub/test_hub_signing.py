@@ -17,7 +17,7 @@ from tests.kit.mavlink import frames_of
 pytestmark = pytest.mark.io
 
 OLD, NEW = bytes(32), bytes(range(32))
-STAMP = 30_000_000_000_000
+TIMESTAMP = 30_000_000_000_000
 
 
 class Strict:
@@ -25,7 +25,7 @@ class Strict:
 
     def __init__(self, key: bytes = OLD) -> None:
         self.mav: Any = mavlink.MAVLink(None)
-        self.mav.signing.timestamp = STAMP
+        self.mav.signing.timestamp = TIMESTAMP
         self.mav.signing.secret_key = key
 
     def read(self, frame: bytes) -> tuple[str, int, int]:
@@ -36,7 +36,7 @@ class Strict:
 
 class Clock:
     def timestamp(self, now_us: int) -> int:
-        return STAMP
+        return TIMESTAMP
 
 
 def signer() -> FrameSigner:

@@ -60,7 +60,7 @@ def test_signed_frame_is_not_accepted_again_after_a_restart(tmp_path: Path, orde
     mav.signing.timestamp = (unix_time_us() - EPOCH_2015_US) // 10
     signed = Incoming(5, bytes(PING.pack(mav)), True)
     first._on_frame(signed)
-    first._stamps.close(first._pipeline.newest_stamps() if orderly else {})
+    first._timestamps.close(first._pipeline.newest_timestamps() if orderly else {})
     assert first._pipeline.forged == 0
     second = make_daemon(tmp_path, "correct horse")
     second._on_frame(signed)

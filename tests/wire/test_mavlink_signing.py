@@ -10,7 +10,7 @@ from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import packed
 
 KEY = bytes(range(32))
-STAMP = 30_000_000_000_000
+TIMESTAMP = 30_000_000_000_000
 
 
 def attitude(sequence: int, *, version: int = 2) -> bytes:
@@ -20,14 +20,14 @@ def attitude(sequence: int, *, version: int = 2) -> bytes:
 
 def strict() -> Any:
     receiver = mavlink.MAVLink(None)
-    receiver.signing.secret_key, receiver.signing.timestamp = KEY, STAMP
+    receiver.signing.secret_key, receiver.signing.timestamp = KEY, TIMESTAMP
     return receiver
 
 
 class Clock:
     """The time in signing ticks, whatever the gateway's clock says."""
 
-    ticks = STAMP
+    ticks = TIMESTAMP
 
     def timestamp(self, now_us: int) -> int:
         return self.ticks
@@ -67,15 +67,15 @@ def test_an_overtaken_frame_is_signed_again_when_it_is_sent() -> None:
 def test_timestamps_follow_the_clock_and_always_increase() -> None:
     clock = Clock()
     ours, found = signer(clock), []
-    for clock.ticks in (STAMP, STAMP, STAMP - 5, STAMP + 100):
+    for clock.ticks in (TIMESTAMP, TIMESTAMP, TIMESTAMP - 5, TIMESTAMP + 100):
         found.append(int.from_bytes(signed_by(ours, attitude(0), 0)[-12:-6], "little"))
-    assert found == [STAMP, STAMP + 1, STAMP + 2, STAMP + 100]
+    assert found == [TIMESTAMP, TIMESTAMP + 1, TIMESTAMP + 2, TIMESTAMP + 100]
 
 
 def test_frames_that_cannot_be_signed_are_unchanged() -> None:
     old, unknown = attitude(3, version=1), bytes.fromhex("fd000000000101fffe0a1234")
-    assert sign(old, 9, KEY, STAMP) == old
-    assert sign(unknown, 9, KEY, STAMP) == unknown
+    assert sign(old, 9, KEY, TIMESTAMP) == old
+    assert sign(unknown, 9, KEY, TIMESTAMP) == unknown
 
 
 def test_a_system_without_a_key_is_numbered_and_not_signed() -> None:
