@@ -7,8 +7,8 @@
 
 Pure: time is an argument, and results are returned as `Outputs`. An aircraft is created with its
 first record. One that sends nothing for `GONE_US` disappears, and returns with its state when a
-record of it is received again. Live, demo and playback differ only in who calls `feed` (bytes) or
-`take` (raw records of a recording).
+record of it is received again. Live, demo and playback differ only in the caller of `feed` (bytes)
+or `take` (raw records of a recording).
 """
 
 from collections.abc import Mapping

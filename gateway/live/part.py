@@ -1,10 +1,11 @@
 """One part of a recording: the data buffered for it, its limits, and its files on the disk.
 
 Everything about files may block and runs in the recorder's threads. Files are only ever appended
-to, so a power cut at any moment leaves what was written before. Only a record that was written
-partly is removed again. Finished files get their true times once GPS has provided them: a part may
-be larger than the memory and the disk slow, so a file is copied in small steps, between which the
-present recording is synced. The copy replaces the file in one step: a power cut leaves either.
+to, so a power cut at any moment leaves the data that was written before. Only a record that was
+written partly is removed again. Finished files get their true times once GPS has provided them: a
+part may be larger than the memory and the disk slow, so a file is copied in small steps, between
+which the present recording is synced. The copy replaces the file in one step: a power cut leaves
+either.
 """
 
 import contextlib

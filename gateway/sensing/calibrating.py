@@ -55,7 +55,7 @@ MIN_MAG_SAMPLES: Final = 100
 
 # No intact sensor of this kind has larger errors: the poses were wrong.
 MAX_ACCEL_BIAS_MPS2: Final = 2.0
-"""Twice what the MPU6050's data sheet allows, for what soldering adds."""
+"""Twice the limit of the MPU6050's data sheet, since soldering adds to it."""
 MAX_ACCEL_SCALE_OFF: Final = 0.15
 MAX_ACCEL_RESIDUAL_MPS2: Final = 0.5
 FIELD_UT: Final = (15.0, 100.0)

@@ -140,7 +140,7 @@ class SensorChain:
             the node could not read them.
         temperature_degc : ndarray, shape (n,)
         flags : ndarray of int, shape (n,)
-            Those given, and what the calibration adds.
+            Those given, and those that the calibration adds.
         """
         accel = vectors_from_counts(accel_scale, counts[:, 0:3], counts[:, 10])
         gyro = vectors_from_counts(gyro_scale, counts[:, 3:6], counts[:, 11])

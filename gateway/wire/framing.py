@@ -26,7 +26,7 @@ MAX_ENCODED: Final = MAX_CONTENT + CRC_SIZE + 1
 
 
 class FaultKind(StrEnum):
-    """What can be wrong with bytes from the line."""
+    """Reasons for which bytes of the line are dropped."""
 
     COBS = "cobs"
     CRC = "crc"

@@ -1,4 +1,4 @@
-"""Bytes of the receiver to raw records on the gateway clock, and the account of what was lost.
+"""Bytes of the receiver to raw records on the gateway clock, and the counts of all losses.
 
 One `Link` handles one serial line. It joins the frame decoder, the payload codec, one clock
 tracker for the receiver and one for each node, and counts everything that is lost.

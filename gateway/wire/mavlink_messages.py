@@ -1,6 +1,6 @@
-"""What a router must know of each MAVLink message: checksum seed, target, name.
+"""Properties of each MAVLink message that a router needs: checksum seed, target, name.
 
-The widest dialect serves here, since frames of any vehicle pass through; what is not in it is
+The widest dialect serves here, since frames of any vehicle pass through; messages that it lacks are
 forwarded unchecked.
 """
 

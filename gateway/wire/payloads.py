@@ -58,7 +58,7 @@ _GPS_NAMES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Chips:
-    """What a node has found, as it sends it; 0 where there is nothing."""
+    """The chips that a node has found, as it sends them; 0 for none."""
 
     imu: int = 0
     """WHO_AM_I."""
@@ -168,7 +168,7 @@ _RESET_MASK: Final = 0x0F
 
 
 class Header(msgspec.Struct, frozen=True, gc=False):
-    """What every radio payload starts with."""
+    """The first bytes of every radio payload."""
 
     node: NodeId
     seq: int

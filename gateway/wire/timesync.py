@@ -45,7 +45,7 @@ MAX_SKEW: Final = 0.01
 MAX_RC_SKEW: Final = 0.1
 """A processor that runs on its internal RC oscillator, since its fuses are wrong."""
 LONGEST_QUEUE_US: Final = 500_000
-"""What a clock has moved beyond this is no queue."""
+"""A greater change of the offset is not due to a queue."""
 RESTART_JUMP_US: Final = 1_500_000
 """More than any queue holds, less than a microcontroller's restart with its sensors' start-up."""
 MAX_STALL_US: Final = 60_000_000

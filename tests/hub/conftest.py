@@ -204,7 +204,7 @@ class Rig:
             await asyncio.sleep(0)
 
     async def quiet_some(self) -> None:
-        """Let the hub read and send what is waiting."""
+        """Let the hub read and send waiting frames."""
         for _ in range(6):
             await asyncio.sleep(0)
 

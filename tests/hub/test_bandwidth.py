@@ -91,7 +91,7 @@ def test_position_and_health_are_thinned_less_than_raw_values() -> None:
 
 
 def test_telemetry_resumes_soon_after_many_answers() -> None:
-    """All parameters within two seconds, as they are sent: four times what the link takes."""
+    """All parameters within two seconds, as they are sent: four times the bandwidth of the link."""
     flight = Flight("udp:h:1?budget=960")
     flight.run(10)
     usual = rates(flight.sinks[0].since(flight.run(10)), 10)
@@ -171,7 +171,7 @@ def test_plan_of_a_link_lasts_until_its_bandwidth_changes(budget: int, is_kept: 
 
 @pytest.mark.parametrize("how", ["answer", "deliver"])
 def test_answers_reduce_the_bandwidth_for_telemetry(how: str) -> None:
-    """Our own answers, and frames that others address to who is behind the link."""
+    """Our own answers, and frames that others address to a system behind the link."""
     flight = Flight("udp:h:1?budget=3000")
     flight.run(10)
     answer = frame_of(b"\xfd\xc8\0\0\0\1\1\x16\0\0" + bytes(202))

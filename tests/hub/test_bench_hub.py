@@ -1,4 +1,4 @@
-"""The command lines of what the hub is measured against, as their manuals have it."""
+"""Command lines of the forwarders that the hub is compared with, as in their manuals."""
 
 from tools.bench_hub import mavlink_router, mavproxy
 

@@ -1,4 +1,4 @@
-"""Endpoint URLs: what they mean, and what is refused with which words."""
+"""Endpoint URLs: their meaning, and the errors of malformed ones."""
 
 import contextlib
 import re

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.io
 
 
 class Healthy:
-    """Clients to which nothing happens: two configured, one that called."""
+    """Clients without a fault: two configured, and one of a listening port."""
 
     def __init__(self, rig: Any, *endpoints: str, **settings: object) -> None:
         self.rig = rig

@@ -1,4 +1,4 @@
-"""Gateways joined twice, stations that share an id: everybody gets everything once, in order."""
+"""Gateways joined twice, stations that share an id: every frame arrives once, in order."""
 
 import asyncio
 import itertools

@@ -71,7 +71,7 @@ def lies(sender: Any, guessed: bytes) -> dict[str, bytes]:
 
 
 class HubMachine(RuleBasedStateMachine):
-    """One hub with one good client, an autopilot, and everybody else."""
+    """One hub with one good client, an autopilot, and untrusted clients."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ class HubMachine(RuleBasedStateMachine):
         for outsider in self.outsiders:
             for frame in outsider.received():
                 assert frame not in self.said, (
-                    "what the good client says is not for untrusted clients"
+                    "an untrusted client received a frame of the good client"
                 )
 
     @rule(seconds=st.integers(1, 7))

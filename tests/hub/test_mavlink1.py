@@ -1,4 +1,4 @@
-"""Clients that know only MAVLink 1, by their options or by what they send."""
+"""Clients that know only MAVLink 1, by their options or by the frames they send."""
 
 from typing import Any
 
@@ -19,7 +19,7 @@ def heartbeat(sequence: int) -> bytes:
 
 
 async def next_attitude(rig: Any, hub: Any, station: Any) -> bytes:
-    """Publish telemetry, and return what the station gets of it."""
+    """Publish an attitude, and return the frame that the station receives."""
     hub.send(rig.out(rig.vehicle.attitude()))
     while True:
         frame = await station.receive()

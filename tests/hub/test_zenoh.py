@@ -50,7 +50,7 @@ PATIENT = """{
   scouting: {multicast: {enabled: false}, gossip: {enabled: false}},
   transport: {link: {tx: {queue: {congestion_control: {block: {wait_before_close: 3600000000}}}}}},
 }"""
-"""Lets Zenoh wait an hour for a stalled link: whoever waits for it exceeds any limit of a test."""
+"""Lets Zenoh wait an hour for a stalled link: a caller that waits for it exceeds any time limit."""
 
 
 class Router:
@@ -100,7 +100,7 @@ class Far:
         self.session = zenoh.open(config)
         self.got: list[tuple[str, bytes]] = []
         self.marks: dict[str, set[bytes | None]] = defaultdict(set)
-        """What was attached, by key."""
+        """Attachments of messages, by key."""
         self._subscribers = [self.session.declare_subscriber(key, self._note) for key in keys]
 
     def _note(self, sample: zenoh.Sample) -> None:

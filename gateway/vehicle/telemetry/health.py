@@ -82,7 +82,7 @@ class _Radio:
     """Failed sends of the last seconds, of which some are no trouble."""
 
     failed: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=MAX_REPORTS))
-    """Time of each report and what it added."""
+    """Time of each report and the number of failed sends that it added."""
     is_bad: bool = False
 
     def update(self, time_us: int, failed: int, rate_hz: int) -> int:
@@ -169,9 +169,9 @@ class Health:
         return major << 24 | minor << 16
 
     def on_state(self, state: NavState, sample: ImuSample) -> None:
-        """Note an IMU sample and what the estimator made of it."""
+        """Note an IMU sample and its estimate."""
         seen, seen_us = self._seen_us, sample.time_us
-        # Samples that waited in the kernel during a stall are older than what the stall excuses.
+        # Samples that waited in the kernel during a stall are older than the time it excuses.
         if seen.get(GYRO, 0) > seen_us:
             seen_us = seen[GYRO]
         seen[GYRO] = seen[ACCEL] = seen_us

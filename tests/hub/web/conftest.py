@@ -107,7 +107,7 @@ class Page:
 
 @pytest.fixture
 async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
-    """Return what opens a WebSocket to a hub's port."""
+    """Return a function that opens a WebSocket to a hub's port."""
     pages: list[Page] = []
 
     async def open_page(port: int, origin: str = "", tls: ssl.SSLContext | None = None) -> Page:
@@ -122,7 +122,7 @@ async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
 
 @pytest.fixture
 def plug(rig: Rig) -> Callable[..., Any]:
-    """Return what opens a bare connection to a hub's port."""
+    """Return a function that opens a bare connection to a hub's port."""
 
     async def open_socket(port: int, *, room_bytes: int = 0) -> socket.socket:
         sock = socket.socket()

@@ -43,7 +43,7 @@ async def page() -> AsyncIterator[Page]:
 
 
 async def serve(html: str, host: str) -> asyncio.Server:
-    """Serve one page to whoever asks for anything."""
+    """Serve one page at every path."""
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.readuntil(b"\r\n\r\n")

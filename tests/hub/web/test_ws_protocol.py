@@ -1,4 +1,4 @@
-"""One WebSocket connection, without a socket: what comes, whole and in pieces, and the answers."""
+"""One WebSocket connection, without a socket: bytes, whole and in pieces, and the answers."""
 
 import random
 import struct
@@ -55,7 +55,7 @@ def close_code(reply: bytes) -> int:
 
 
 def in_pieces(server: WsServer, data: bytes, sizes: list[int]) -> WsInput:
-    """Feed data in chunks and join what comes of them."""
+    """Feed data in chunks and join the results."""
     total = WsInput()
     at = 0
     while at < len(data):
@@ -141,7 +141,7 @@ class TestMessages:
         assert (found.text_size, found.payload, found.ended) == (3, b"\xfd", "")
 
     def test_last_of_several_pings_is_answered(self) -> None:
-        """So that one who asks without end and never reads cannot fill our memory."""
+        """A peer that sends pings without end and never reads cannot fill our memory."""
         found = opened().feed(b"".join(masked(9, b"%d" % n) for n in range(1000)))
         assert found.reply == b"\x8a\x03999"
 
