@@ -27,7 +27,7 @@ def check_output(
 ) -> None:
     """Check that a file may be written here, before the work for it.
 
-    Raises OSError fileExistsError if it exists and may not be replaced; otherwise the reason.
+    Raises FileExistsError if it exists and may not be replaced, OSError for any other reason.
     """
     try:
         there = path.lstat()
@@ -46,9 +46,7 @@ def check_output(
 
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
-    there = next(
-        folder for folder in (path, *path.parents) if folder.exists() or folder.is_symlink()
-    )
+    there = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not there.is_dir():
         raise OSError(errno.ENOTDIR, "is no folder", str(there))
     if there == path and not overwrite and any(path.iterdir()):

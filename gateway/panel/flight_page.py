@@ -83,7 +83,7 @@ LEAFLET_CSS: Final = "elements/leaflet/dist/leaflet/leaflet.css"
 
 @dataclass(slots=True)
 class PageFlight:
-    """What a page shows of a flight."""
+    """Data of a flight that a page shows."""
 
     name: str
     begin_us: int = 0

@@ -66,7 +66,7 @@ def tiles_in(box: Box, zoom: int) -> list[tuple[int, int]]:
 
 
 def open_source(source: str, client: httpx.Client | None = None) -> GetBytes:
-    """Return what reads a range of bytes of a PMTiles file on a web server or a disk.
+    """Return a function that reads ranges of bytes of a PMTiles file on a web server or a disk.
 
     Raises MapAreaError if the source is a tile server.
     """

@@ -206,8 +206,8 @@ MAG: Final = span_of("mag_x_b_ut", "mag_y_b_ut", "mag_z_b_ut")
 
 
 LARGEST_WHOLE: Final = 1 << 53
-"""Up to here every whole number is a float. As a time it is three centuries; a clock that says more
-is broken, and other programs round such a number."""
+"""Up to here every whole number is a float. As a time in us it is three centuries; a greater one is
+invalid, and other programs round such a number."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -334,7 +334,7 @@ class TlogIndex:
         self.origins: set[int] = set()
         """All that sent: system << 8 | component."""
         self.stations: set[int] = set()
-        """Those among them whose heartbeats say that they are ground stations."""
+        """Those among them with heartbeats of a ground station."""
         self.damage: list[Damage] = []
         """The first `MAX_DAMAGE_RUNS` runs."""
         self.damaged_bytes = 0

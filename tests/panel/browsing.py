@@ -18,7 +18,7 @@ ARGUMENTS = [
 ]
 START_LIMIT_MS = 60_000
 WAIT_MS = 60_000
-"""What is on the page by then, or not: a busy machine is slow, and nothing here sleeps."""
+"""Longest wait for a state of the page, ms: a busy machine is slow, and no test sleeps."""
 DESKTOP = {"width": 1080, "height": 680}
 """Small: the processor draws every pixel."""
 FEW_FRAMES = """

@@ -1,4 +1,4 @@
-"""Who may reach the page: tested on the guard alone, before an application that grants all."""
+"""Access control of the page, in front of an application that accepts every request."""
 
 import asyncio
 import contextlib
@@ -68,7 +68,7 @@ async def locked() -> AsyncIterator[httpx.AsyncClient]:
 
 
 async def websocket_answer(guard: AccessControl, path: str, **headers: str) -> str:
-    """Ask for the telemetry as a page would; what the guard says first."""
+    """Ask for the telemetry as a page would; return the type of the first answer."""
     said: list[str] = []
 
     async def receive() -> dict[str, str]:

@@ -64,7 +64,7 @@ def vehicle() -> Iterator[ScriptedVehicle]:
 
 @pytest.fixture(scope="module")
 def troubles() -> list[str]:
-    """Errors of the page, and whatever a script of others would say."""
+    """Errors of the page, and messages of dialogs that a foreign script opens."""
     return []
 
 

@@ -142,7 +142,7 @@ LISTEN_TO_WORDS = """
   new MutationObserver(note).observe(element, kinds);
 }
 """
-"""Notes what an element says from now on: what is there for a moment is not missed."""
+"""Records every text of an element from now on, also one that is shown for a moment."""
 
 
 def test_row_latitude_and_longitude_to_copy(page: Page) -> None:
@@ -277,7 +277,7 @@ def _move_in_time(page: Page, row: object) -> None:
 
 
 def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
-    """What is flown while the browser draws no view is drawn when the view is shown again."""
+    """Points that came while the map was hidden are drawn when it is shown again."""
     show(page, "flight")
     show(page, "plots")
     begin = page.evaluate("mavgate.track(mavgate.selected).points.length")

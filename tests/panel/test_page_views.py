@@ -105,7 +105,7 @@ class Desk:
 
     @property
     def kept(self) -> str:
-        """What is stored of the aircraft's settings."""
+        """Stored settings of all aircraft."""
         files = sorted((self.folder / "aircraft").glob("*.toml"))
         return "".join(file.read_text() for file in files)
 

@@ -1,4 +1,4 @@
-"""What is known of a recording before it is played."""
+"""Aircraft of a recording, as found before it is played."""
 
 from pathlib import Path
 

@@ -26,7 +26,7 @@ LIMIT_S = 60.0
 
 
 class Browser:
-    """What a page is to the feed."""
+    """The WebSocket of a page."""
 
     def __init__(self) -> None:
         self.frames: list[dict[str, Any]] = []

@@ -1,4 +1,4 @@
-"""MAVLink frames and tlogs for the tests of this room."""
+"""MAVLink frames and tlogs for the tests of recordings."""
 
 from pymavlink.dialects.v20 import common as mavlink
 

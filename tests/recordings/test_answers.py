@@ -26,9 +26,9 @@ class Day:
         self.data = b""
         self.count = 0
 
-    def say(self, who: Any, *messages: Any) -> None:
+    def send(self, sender: Any, *messages: Any) -> None:
         for message in messages:
-            self.data += encode_record(self.now_us, bytes(message.pack(who)))
+            self.data += encode_record(self.now_us, bytes(message.pack(sender)))
             self.count += 1
 
     @property
@@ -68,9 +68,9 @@ def decode(frame: bytes) -> Any:
 
 
 def test_parameters_are_complete_and_renumbered(day: Day) -> None:
-    day.say(day.vehicle, value("BETA", 2.0, 7, 900), value("ALPHA", 1.0, 3, 900))
-    day.say(day.vehicle, value("GAMMA", 5.0, 65535, 900))
-    day.say(day.gimbal, value("GIMBAL", 9.0))
+    day.send(day.vehicle, value("BETA", 2.0, 7, 900), value("ALPHA", 1.0, 3, 900))
+    day.send(day.vehicle, value("GAMMA", 5.0, 65535, 900))
+    day.send(day.gimbal, value("GIMBAL", 9.0))
     found = [decode(frame) for frame in day.answers(played_as=8).parameters().values()]
     assert [(m.param_id, m.param_index, m.param_count) for m in found] == [
         ("ALPHA", 0, 3), ("BETA", 1, 3), ("GAMMA", 2, 3),
@@ -79,7 +79,7 @@ def test_parameters_are_complete_and_renumbered(day: Day) -> None:
 
 
 def test_parameter_has_its_newest_value_or_the_first_before_any(day: Day) -> None:
-    day.say(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
+    day.send(day.vehicle, value("ALPHA", 1.0), value("ALPHA", 1.0), value("ALPHA", 2.0))
     moments = (START_US - 1, START_US + SECOND_US, START_US + 2 * SECOND_US)
     answers = [day.answers(at_us).parameters()["ALPHA"] for at_us in moments]
     assert [decode(frame).param_value for frame in answers] == [1.0, 1.0, 2.0]
@@ -96,29 +96,29 @@ def test_bits_of_a_parameter_value_are_preserved(day: Day) -> None:
 
 
 def test_complete_download_is_the_mission(day: Day) -> None:
-    day.say(day.vehicle, count_of(2), item(0), item(1))
+    day.send(day.vehicle, count_of(2), item(0), item(1))
     mission = day.answers().mission(MISSION)
     assert mission is not None
     assert [decode(frame).x for frame in mission] == [470_000_000, 470_000_001]
 
 
 def test_incomplete_download_is_no_mission(day: Day) -> None:
-    day.say(day.vehicle, count_of(2), item(0))
+    day.send(day.vehicle, count_of(2), item(0))
     assert day.answers().mission(MISSION) is None
 
 
 def test_upload_is_the_mission_once_acknowledged(day: Day) -> None:
-    day.say(day.station, count_of(1, FENCE, 3), item(0, FENCE, 3))
+    day.send(day.station, count_of(1, FENCE, 3), item(0, FENCE, 3))
     assert day.answers().mission(FENCE) is None
-    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, FENCE))
+    day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, FENCE))
     assert len(day.answers().mission(FENCE) or ()) == 1
 
 
 def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
-    day.say(day.vehicle, count_of(1), item(0))
-    day.say(day.station, count_of(1, target=3), item(0, target=3))
+    day.send(day.vehicle, count_of(1), item(0))
+    day.send(day.station, count_of(1, target=3), item(0, target=3))
     denied = mavlink.MAV_MISSION_DENIED
-    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, denied, MISSION))
+    day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, denied, MISSION))
     mission = day.answers().mission(MISSION)
     assert mission is not None
     assert decode(mission[0]).get_srcSystem() == 3
@@ -126,10 +126,10 @@ def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
 
 def test_clearing_all_gives_empty_mission_fence_and_rally_points(day: Day) -> None:
     everything = mavlink.MAV_MISSION_TYPE_ALL
-    day.say(day.vehicle, count_of(1), item(0))
+    day.send(day.vehicle, count_of(1), item(0))
     loaded_us = day.now_us - 1
-    day.say(day.station, mavlink.MAVLink_mission_clear_all_message(3, 1, everything))
-    day.say(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, everything))
+    day.send(day.station, mavlink.MAVLink_mission_clear_all_message(3, 1, everything))
+    day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, everything))
     assert [day.answers().mission(kind) for kind in (0, 1, 2)] == [(), (), ()]
     assert len(day.answers(loaded_us).mission(MISSION) or ()) == 1
 
@@ -139,7 +139,7 @@ def test_home_is_that_at_the_position_of_playback(day: Day) -> None:
         home = mavlink.MAVLink_home_position_message(
             lat, 85_000_000, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, since_us
         )
-        day.say(day.vehicle, home)
+        day.send(day.vehicle, home)
     latitudes = []
     for second in (0, 1, 2):
         (frame,) = day.answers(START_US + second * SECOND_US).frames(242)
@@ -148,7 +148,7 @@ def test_home_is_that_at_the_position_of_playback(day: Day) -> None:
 
 
 def test_values_never_sent_are_unknown(day: Day) -> None:
-    day.say(day.station, value("ALPHA", 1.0))
+    day.send(day.station, value("ALPHA", 1.0))
     answers = day.answers()
     assert answers.parameters() == {}
     assert answers.frames(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == []

@@ -1,4 +1,4 @@
-"""What the player makes of its files before it begins."""
+"""Recordings opened and laid out for the player."""
 
 from contextlib import ExitStack
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What asks something of a vehicle stays out of a playback."""
+"""Recorded commands to vehicles are left out of a playback."""
 
 from typing import Any
 

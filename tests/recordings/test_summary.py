@@ -1,4 +1,4 @@
-"""What a recording is said to hold is what was put in."""
+"""Summaries of recordings match their content."""
 
 import numpy as np
 import pytest

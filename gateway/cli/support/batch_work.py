@@ -54,7 +54,7 @@ SHOWN_FAILURES: Final = 12
 
 @dataclass(frozen=True, slots=True)
 class SeasonWork:
-    """Which recordings, and who works on them."""
+    """Recordings, and the processes or the cluster that work on them."""
 
     names: Sequence[str]
     config: Path | None

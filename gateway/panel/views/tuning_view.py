@@ -31,7 +31,7 @@ class ParameterRow:
         self._shown: object = None
         value = dialogue.parameters.entries[meta.name].value
         self._settled: float | None = value
-        """What the field holds while nothing else is typed."""
+        """Value of the field while nothing else is typed."""
         with ui.element("div").classes("parameter") as self._row:
             self._row.props["data-name"] = meta.name
             with ui.element("div"):

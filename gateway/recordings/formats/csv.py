@@ -45,7 +45,7 @@ class Column(Settings, frozen=True):
 
 
 class ColumnMap(Settings, frozen=True):
-    """Which columns of another program's file correspond to which of ours."""
+    """Columns of another program's file by the names of ours."""
 
     columns: Annotated[
         dict[str, Column | str],

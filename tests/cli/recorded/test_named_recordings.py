@@ -1,4 +1,4 @@
-"""What `record list` shows is taken by every command on recordings."""
+"""Every command on recordings accepts the names that `record list` shows."""
 
 import gzip
 import json

@@ -1,4 +1,4 @@
-"""What `mavgate play` and `player` ask and refuse before they do anything."""
+"""Confirmations and errors of `mavgate play` and `player` before they play."""
 
 from pathlib import Path
 

@@ -18,7 +18,7 @@ from tools.simulated_flight import SimulatedFlight, fly
 DURATION_S = 75.0
 """Rest, take-off and the first turns."""
 BOOT_US = 5_000_000
-"""What the autopilot's clock showed at the first sample."""
+"""Time of the autopilot's clock at the first sample."""
 LEAP_S, GPS_EPOCH_S, WEEK_S = 18, 315_964_800, 604_800
 
 Record = ImuCalibrated | BaroRaw | GpsFix

@@ -223,7 +223,7 @@ def test_states_of_the_autopilot_are_read() -> None:
 
 
 def recorded(seed: int) -> list[tuple[int, bytes]]:
-    """Make what an autopilot, a second one and a station say in any order, stamps that fall too."""
+    """Make messages of two autopilots and a station in any order, with decreasing times too."""
     chance, records, at_us = random.Random(seed), [], 0
     links = [mavlink.MAVLink(None, *sender) for sender in ((1, 1), (1, 1), (1, 1), (2, 1), (1, 5))]
     for _ in range(600):

@@ -110,7 +110,7 @@ def test_invalid_options_are_refused(
 
 
 def test_parquet_is_written_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is written comes out piece by piece, long before the flight has ended."""
+    """So memory is bounded by a few rows."""
     monkeypatch.setattr(parquet_file, "ROWS", 50)
     path = tmp_path / "a.tlog"
     path.write_bytes(make_tlog(make_records(3000)))
