@@ -12,11 +12,9 @@ from typing import Literal
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from tests.kit.process import Process
+from tests.panel.browsing import Process, launch
 
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = ["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
 START_S = 180.0
 AIRBORNE_M = 60.0
 CONFIG = """
@@ -61,7 +59,7 @@ def draw_flight_page() -> None:
         flight = PICTURES.parents[1] / "tests" / "golden" / "take_off.csv.gz"
         command = [sys.executable, "-m", "gateway.cli", "page", str(flight), "-o", str(page_file)]
         subprocess.run(command, check=True)
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        browser = launch(playwright)
         page = browser.new_page(viewport=SIZE, color_scheme="dark")
         page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
         page.goto(page_file.as_uri())
@@ -77,19 +75,19 @@ def draw_flight_page() -> None:
 def main() -> None:
     """Start the demo, draw, end it."""
     draw_flight_page()
-    with tempfile.TemporaryDirectory() as folder:
-        config = CONFIG.format(folder=folder)
-        with Process(Path(folder), "demo", "--plain", config=config) as demo:
-            link = demo.link()
-            with sync_playwright() as playwright:
-                browser = playwright.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-                for view, scheme in SHOTS:
-                    page = browser.new_page(viewport=SIZE, color_scheme=scheme)
-                    page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
-                    page.goto(link)
-                    draw(page, view)
-                    page.close()
-                browser.close()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        Process(Path(folder), "demo", "--plain", config=CONFIG) as demo,
+        sync_playwright() as playwright,
+    ):
+        link, browser = demo.link(), launch(playwright)
+        for view, scheme in SHOTS:
+            page = browser.new_page(viewport=SIZE, color_scheme=scheme)
+            page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
+            page.goto(link)
+            draw(page, view)
+            page.close()
+        browser.close()
 
 
 if __name__ == "__main__":
