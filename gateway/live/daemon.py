@@ -408,8 +408,8 @@ class Daemon:
     def _save(self, save: SaveSettings) -> None:
         """Write an aircraft's settings to its file, and report the outcome."""
         aircraft, loop = self._pipeline.find(save.vehicle_id), asyncio.get_running_loop()
-        job = (save_aircraft, self._settings, save.vehicle_id, aircraft.settings)
-        saving = loop.run_in_executor(self._files, *job)
+        write = partial(save_aircraft, self._settings, save.vehicle_id, aircraft.settings)
+        saving = loop.run_in_executor(self._files, write)
         saving.add_done_callback(partial(self._on_saved, aircraft, save.request))
 
     def _on_saved(self, aircraft: Aircraft, request: Request, saving: asyncio.Future[Path]) -> None:

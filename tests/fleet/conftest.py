@@ -23,10 +23,10 @@ __all__ = ["rig"]
 class World:
     """A fleet that is a router, sites of one aircraft 1 each, and one ground station."""
 
-    def __init__(self, rig: Rig, fleet: FleetServer, place: str, station: Station) -> None:
+    def __init__(self, rig: Rig, fleet: FleetServer, locator: str, station: Station) -> None:
         self.rig = rig
         self.fleet = fleet
-        self.place = place
+        self.locator = locator
         self.station = station
         self.sites: dict[str, Any] = {}
         self.heard: dict[str, list[Any]] = {}
@@ -36,7 +36,7 @@ class World:
     def open_site(
         self, name: str, options: str = "", recordings: Path | None = None, extra: str = ""
     ) -> Any:
-        url = f"zenoh:{self.place}?site={name}{options}"
+        url = f"zenoh:{self.locator}?site={name}{options}"
         return self.add_site(name, url, extra=extra, recordings=recordings)
 
     def add_site(
@@ -111,7 +111,7 @@ def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FleetSettings:
 
 @asynccontextmanager
 async def opened_world(
-    rig: Rig, settings: FleetSettings, hub: HubSettings | None = None, place: str = ""
+    rig: Rig, settings: FleetSettings, hub: HubSettings | None = None, locator: str = ""
 ) -> AsyncIterator[World]:
     """Run a fleet with one ground station; sites reach it at its router, or at another address."""
     hub = msgspec.structs.replace(hub or HubSettings(), endpoints=("udp-listen:127.0.0.1:0",))
@@ -121,7 +121,7 @@ async def opened_world(
     async with asyncio.timeout(LIMIT_S):
         while not fleet._session.is_open:
             await asyncio.sleep(0.01)
-    yield World(rig, fleet, place or settings.listen, station)
+    yield World(rig, fleet, locator or settings.listen, station)
     fleet.close()
     for close in rig.closing:
         close()

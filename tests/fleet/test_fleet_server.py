@@ -162,7 +162,7 @@ async def test_garbage_and_invalid_site_names_are_counted(world: World) -> None:
 
     config = zenoh.Config()
     config.insert_json5("mode", '"client"')
-    config.insert_json5("connect/endpoints", json.dumps([world.place]))
+    config.insert_json5("connect/endpoints", json.dumps([world.locator]))
     config.insert_json5("scouting/multicast/enabled", "false")
     with zenoh.open(config) as client:
         client.put("mavlink/field-x/1/out", b"no MAVLink at all")
@@ -241,8 +241,8 @@ def test_fleet_ends_on_sigterm(tmp_path: Path, settings: FleetSettings) -> None:
 def test_fleet_ends_on_sigterm_while_its_router_does_not_answer(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:
         mute.settimeout(LIMIT_S)
-        place = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
-        with command(tmp_path, "--connect", place) as fleet, mute.accept()[0]:
+        locator = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
+        with command(tmp_path, "--connect", locator) as fleet, mute.accept()[0]:
             assert fleet.end() == 0
 
 

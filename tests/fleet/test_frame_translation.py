@@ -166,10 +166,10 @@ class TestSigned:
         assert found is not None
         assert read(found[1], KEY).target_system == 1
 
-    @pytest.mark.parametrize("place", [-1, -10, 15])
-    def test_forged_frame_is_dropped_and_counted(self, place: int) -> None:
+    @pytest.mark.parametrize("offset", [-1, -10, 15])
+    def test_forged_frame_is_dropped_and_counted(self, offset: int) -> None:
         frame = bytearray(packed(attitude(), 1, key=KEY))
-        frame[place] ^= 1
+        frame[offset] ^= 1
         there = translation(KEY)
         assert from_site(there, bytes(frame)) is None
         assert there.counters["forged"] == 1

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.io
 @pytest.fixture
 def settings(settings: FleetSettings, router: Router) -> FleetSettings:
     """Both ends at one router."""
-    return msgspec.structs.replace(settings, listen=router.place, router=router.place)
+    return msgspec.structs.replace(settings, listen=router.locator, router=router.locator)
 
 
 async def test_router_outage_loses_old_frames_and_recovers(world: World, router: Router) -> None:
