@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,7 @@ def test_list_of_licences_is_current() -> None:
 
 def test_licence_texts_of_all_installed_packages_are_found(tmp_path: Path) -> None:
     names = third_party.locked_in(ROOT / "requirements.lock")
-    packages = [third_party.distribution(name) for name in names]
+    packages = [distribution(name) for name in names]
     text = third_party.copyright_of(packages)
     assert text.count("=" * 78) >= len(names)
     assert "Chris Liechti" in text

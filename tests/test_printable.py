@@ -58,7 +58,7 @@ def test_json_output_is_escaped_and_decodes_to_the_same_value() -> None:
 def test_console_escapes_text_of_any_renderable(make: object) -> None:
     console = console_of()
     console.file = io.StringIO()
-    console.print(make(f"Site {RIGHT_TO_LEFT}\x9b2J"))  # type: ignore[operator]
+    console.print(make(f"Site {RIGHT_TO_LEFT}\x9b2J"))
     assert r"Site \u202e\x9b2J" in console.file.getvalue()
     assert not {RIGHT_TO_LEFT, "\x9b"} & set(console.file.getvalue())
 

@@ -19,7 +19,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Generator, Sequence
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
@@ -105,7 +105,7 @@ async def answer_upload(
     return PlainTextResponse(stored.name, HTTPStatus.CREATED)
 
 
-def zip_stream(files: Sequence[Path]) -> Iterator[bytes]:
+def zip_stream(files: Sequence[Path]) -> Generator[bytes]:
     """Pack files into a ZIP archive, piece by piece; links and devices are left out."""
     sink = _Sink()
     with ZipFile(sink, "w", ZIP_DEFLATED) as packed:  # type: ignore[call-overload]

@@ -10,13 +10,13 @@ from gateway.analysis.case import (
     changed_settings,
     make_case,
     summarise,
-    with_estimator,
     withheld_error_m,
 )
 from gateway.analysis.flight import FlightTrack, LocalFrame, local_frame
 from gateway.analysis.pilot_figures import pilot_figures
 from gateway.analysis.reporting.estimators import comparison
 from gateway.analysis.simulated import simulated_flight
+from gateway.recordings.fuse import with_estimator
 from gateway.simulator.simulator_settings import SimulatorSettings
 from tests.analysis.flights import DURATION_S, short_case, short_flight, with_imu
 

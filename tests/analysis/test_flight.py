@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.analysis.case import ESTIMATORS, make_case, with_estimator
+from gateway.analysis.case import ESTIMATORS, make_case
 from gateway.analysis.flight import (
     FlightTrack,
     LocalFrame,
@@ -25,7 +25,7 @@ from gateway.analysis.simulated import ideal_calibration
 from gateway.estimation.select import make_estimator
 from gateway.geometry.geodesy import displacement_m
 from gateway.recordings.columns import TableRow
-from gateway.recordings.fuse import FusionSettings
+from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.recordings.table import block_of
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated, ImuFlags, ImuRaw, NodeId
 from gateway.sensing.calibration import NodeCalibration

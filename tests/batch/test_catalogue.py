@@ -42,7 +42,7 @@ class InThisProcess(ThisProcess):
     """Remembers on what it works."""
 
     def __init__(self) -> None:
-        self.seen: list[object] = []
+        self.seen: list[tuple[str, object]] = []
 
     def run(self, work, items):
         self.seen += items

@@ -72,7 +72,7 @@ def test_every_python_child_is_started_with_a_safe_module_path() -> None:
                 continue
             option = words[1].value if isinstance(words[1], ast.Constant) else None
             if option not in ("-P", "-I"):
-                unsafe.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+                unsafe.append(f"{path.relative_to(ROOT)}:{first.lineno}")
     assert unsafe == []
 
 

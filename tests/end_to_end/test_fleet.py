@@ -94,7 +94,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory, wrong_clock: Path | None) ->
             running[site] = start_site(folder / site, place, site, wrong_clock)
         yield Fleet(ports, running)
     finally:
-        for each in (process, *(gateway.process for gateway in running.values())):
+        for each in [process] + [gateway.process for gateway in running.values()]:
             each.kill()
             each.wait(START_LIMIT_S)
 

@@ -81,7 +81,7 @@ async def folder(tmp_path: Path, clock: ManualClock) -> Path:
                 if is_kept and sent.message_id not in UNRECORDED:
                     recorder.frame(sent.frame)
             for record in out.records:
-                recorder.flight(record)  # type: ignore[arg-type]
+                recorder.flight(record)
             await recording.turn()
     return tmp_path
 

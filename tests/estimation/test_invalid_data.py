@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -275,6 +276,7 @@ def test_fix_repeated_in_flight_is_handled_as_outage(flight: Flight) -> None:
 def test_repeated_fixes_at_rest_are_accepted(speed_mps: float) -> None:
     """Some receivers hold their position at rest."""
     log = at_rest(20.0, speed_mps)
-    out = make_estimator(EstimationSettings()).run(log)
+    estimator: Any = make_estimator(EstimationSettings())
+    out = estimator.run(log)
     assert (out[-1000:, NAV_FLAGS].astype(int) & NavFlags.POSITION_VALID != 0).all()
     assert (out[-1000:, NAV_POS_STD] < 10.0).all()

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,7 +170,8 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
     imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
     imu[:, GYRO : GYRO + 3] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
     imu[:, MAG : MAG + 3] = math.nan
-    out = make_estimator(EstimationSettings()).run(log_of(imu, rate_hz))
+    estimator: Any = make_estimator(EstimationSettings())
+    out = estimator.run(log_of(imu, rate_hz))
     late = out[3 * count // 4 :]
     w, x, y, z = late[:, :4].T
     roll = np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
@@ -184,7 +186,7 @@ def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
     imu[:, GYRO : GYRO + 3] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
     imu[:, MAG : MAG + 3] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))
     imu[:, [GYRO_UNCALIBRATED, ACCEL_UNCALIBRATED]] = 1.0
-    estimator = make_estimator(EstimationSettings())
+    estimator: Any = make_estimator(EstimationSettings())
     estimator.run(log_of(imu, 100))
     found = np.degrees(estimator.state.gyro_bias_b)
     np.testing.assert_allclose(found, (14.0, -9.0, 4.0), atol=0.1)

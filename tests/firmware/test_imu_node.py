@@ -294,7 +294,7 @@ def test_other_calibration_words_give_the_same_pressure(
 ) -> None:
     rig = bench(world=still(pressure_pa=pressure_pa, temperature_degc=-8.0))
     node = rig.imu_node()
-    node.barometer.__init__(  # type: ignore[misc]
+    node.barometer.__init__(
         rig.setup.world,
         lambda: node.mcu.now_ps,
         Words(7911, -1022, -14429, 33996, 25204, 16739, 5498, 57, -32768, -11786, 2723),

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -336,7 +337,7 @@ class TestFetch:
     ) -> None:  # fmt: skip
         site, waits = Site(), list[float]()
         site.took_s = took_s
-        monkeypatch.setattr(fleet_command.time, "monotonic", lambda: site.now_s)
+        monkeypatch.setattr(time, "monotonic", lambda: site.now_s)
         one = RecordingFetch("site", tmp_path, site, wait=waits.append)
         one.piece_size = kib[0] << 10
         assert one.fetch(NAME, sum(kib) << 10, lambda _: None)

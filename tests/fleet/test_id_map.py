@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway import output
 from gateway.fleet import id_map
 from gateway.fleet.id_map import FIRST_ID, LAST_ID, MAX_WAITING, Handover, IdMap, IdsFile
 
@@ -196,7 +197,7 @@ async def test_ids_are_saved_for_the_next_start(kept: IdsFile) -> None:
 
 
 async def test_keep_waits_for_the_disk(kept: IdsFile, monkeypatch: pytest.MonkeyPatch) -> None:
-    may_write, begun, write_new = threading.Event(), asyncio.Event(), id_map.write_new
+    may_write, begun, write_new = threading.Event(), asyncio.Event(), output.write_new
     loop = asyncio.get_running_loop()
 
     def slow(path: Path, pieces: list[bytes], *, overwrite: bool) -> int:

@@ -6,7 +6,7 @@ from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import IdMap
 from gateway.fleet.loop_detection import MAX_CHANCE, MAX_FRAMES, SPAN_US, LoopDetection
 from gateway.wire.mavlink_splitter import frame_of, origin_of
-from tests.hub.conftest import Sender
+from tests.kit.mavlink import Sender
 
 STEP_US = 20_000
 

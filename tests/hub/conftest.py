@@ -147,7 +147,7 @@ class Rig:
         recordings: Path | None = None,
         **settings: object,
     ) -> Hub:
-        wanted = HubSettings(endpoints=endpoints, **settings)  # type: ignore[arg-type]
+        wanted = HubSettings(endpoints=endpoints, **settings)
         taps = (self.incoming.append, self.clock, self.foreign.append)
         hub = Hub(wanted, *taps, signer=signer, recordings=recordings)
         self.closing.append(hub.close)

@@ -65,7 +65,7 @@ async def test_a_connection_waits_for_a_descriptor_and_both_ends_are_reported_on
     def counted(wait_s: float, *work: object) -> asyncio.TimerHandle:
         if wait_s == accepting.ACCEPT_AGAIN_S:
             tries.append(wait_s)
-        return call_later(wait_s, *work)  # type: ignore[arg-type]
+        return call_later(wait_s, *work)
 
     monkeypatch.setattr(loop, "call_later", counted)
     accept_each(

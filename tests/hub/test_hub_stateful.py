@@ -109,7 +109,8 @@ class HubMachine(RuleBasedStateMachine):
         self.hub, self.vehicle = self.gateway.hub, self.gateway.vehicle
         await self.rig.until_open(self.hub)
         self.trusted, self.untrusted, self.tcp = self.hub.listening_ports()
-        self.good.target = ("127.0.0.1", self.hub._clients[1]._port)
+        trusted: Any = self.hub._clients[1]
+        self.good.target = ("127.0.0.1", trusted._port)
         self.autopilot = self.rig.station(self.trusted)
         self.autopilot.sender = self.rig.sender(*AUTOPILOT)
         await self._second()

@@ -432,7 +432,7 @@ class TestFlood:
     @pytest.mark.parametrize("trusted", ["yes", "no"])
     async def test_message_above_the_limit_is_dropped_unread(self, rig: Rig, trusted: str) -> None:
         hub = rig.hub(f"zenoh:tcp/127.0.0.1:1?site=field&trusted={trusted}")
-        client = hub._clients[1]
+        client: Any = hub._clients[1]
         beat = rig.sender(255, 190).heartbeat()
         sample = MagicMock(payload=zenoh.ZBytes(beat * 1000))
         before = hub.untrusted_reads.level

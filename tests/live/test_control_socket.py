@@ -136,7 +136,7 @@ async def test_connection_accepted_just_before_the_end_is_closed(tmp_path: Path)
         await ended.wait()
         await serve(connection)
 
-    server._serve = serve_late  # type: ignore[method-assign]
+    server._serve = serve_late
     await server.start()
     reader, writer = await asyncio.open_unix_connection(str(server.path))
     await accepted.wait()
@@ -194,8 +194,8 @@ async def test_only_owner_root_and_group_of_a_service_are_answered(
     await server.start()
     assert stat.S_IMODE(server.path.stat().st_mode) == (0o660 if in_service else 0o600)
     monkeypatch.setattr(control_socket, "peer_of", lambda _: (user, groups))
-    monkeypatch.setattr(control_socket.os, "getuid", lambda: 1)
-    monkeypatch.setattr(control_socket.os, "getgid", lambda: 7)
+    monkeypatch.setattr(os, "getuid", lambda: 1)
+    monkeypatch.setattr(os, "getgid", lambda: 7)
     reader, writer = await asyncio.open_unix_connection(str(server.path))
     writer.write(b'{"verb":"verbs"}\n')
     try:
@@ -263,7 +263,7 @@ async def test_command_finds_the_gateway_of_its_user_before_the_service(folders:
 async def test_error_without_access_to_a_service_names_its_group(
     folders: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(control_socket.os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "access", lambda *_: False)
     service = ControlServer(folders / "run.sock")
     await service.start()
     with pytest.raises(ControlError, match="usermod -aG mavgate"):

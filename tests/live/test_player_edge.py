@@ -37,7 +37,7 @@ class Played:
         self.file = TlogFile(path)
         self.frames: list[bytes] = []
         self.ended = asyncio.Event()
-        player = Player([Track(self.file)], clock(), **options)  # type: ignore[arg-type]
+        player = Player([Track(self.file)], clock(), **options)
         self.edge = PlayerEdge(player, self._emit, clock, files=[path.name], on_end=self.ended.set)
 
     def _emit(self, frames: Iterable[bytes]) -> None:

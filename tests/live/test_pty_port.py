@@ -59,7 +59,7 @@ class Reader:
 
 
 @pytest.fixture
-async def play() -> Iterator[Callable[..., PtyPort]]:  # type: ignore[misc]
+async def play() -> Iterator[Callable[..., PtyPort]]:
     ports: list[PtyPort] = []
 
     def make(source: Iterator[TimedFrame]) -> PtyPort:

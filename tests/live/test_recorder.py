@@ -39,7 +39,7 @@ class Bench:
         self.announced: list[tuple[bool, str]] = []
         options = {"folder": str(folder), "mode": "always", "free_floor_mb": 0.0, **settings}
         self.recorder = Recorder(
-            RecordingSettings(**options),  # type: ignore[arg-type]
+            RecordingSettings(**options),
             clock,
             lambda: self.unix_at_zero_us + clock(),
             lambda vehicle_id: HEADER,

@@ -66,7 +66,7 @@ def test_unsafe_name_is_refused(name: str) -> None:
     ],
 )
 def test_mode_decides_without_a_command(mode: str, in_flight: bool, expected: bool) -> None:
-    session = Session(RecordingSettings(mode=mode))  # type: ignore[arg-type]
+    session = Session(RecordingSettings(mode=mode))
     session.set_in_flight(in_flight)
     assert session.wanted is expected
     assert bool(poll(session)) is expected

@@ -184,7 +184,7 @@ def test_key_sequences_are_named(text: str, names: list[str]) -> None:
 def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, int]]:
     """Both ends of a terminal, of which this process is taken for the one in front."""
     ours, theirs = pty.openpty()
-    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp())
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp())
     yield ours, theirs
     os.close(ours)
     os.close(theirs)
@@ -229,7 +229,7 @@ async def test_keyboard_leaves_a_pipe_unchanged(tmp_path: object) -> None:
 async def test_background_job_does_not_change_the_terminal(
     terminal: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terminal_module.os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
+    monkeypatch.setattr(os, "tcgetpgrp", lambda _: os.getpgrp() + 1)
     before = termios.tcgetattr(terminal[1])
     board = Keyboard(lambda _: None, terminal[1])
     board.start()

@@ -81,7 +81,7 @@ class Process(process.Process):
 
 def open_page(browser: Browser, link: str, view: str = "flight", script: str = "") -> Page:
     """Open the page, wait for an aircraft, and show a view; a script runs before those of it."""
-    page = browser.new_page(viewport=DESKTOP)  # type: ignore[arg-type]
+    page = browser.new_page(viewport=DESKTOP)
     page.set_default_timeout(WAIT_MS)
     page.add_init_script(FEW_FRAMES + script)
     page.goto(link)

@@ -405,7 +405,7 @@ def viewers_page(browser: Browser, desk: Desk) -> Iterator[Page]:
     desk.page.close()
     write_certificate(desk.folder / "panel.pem", desk.folder / "panel.key")
     panel = Process(desk.folder, "panel", config=LOCKED)
-    opened = browser.new_page(viewport=DESKTOP, ignore_https_errors=True)  # type: ignore[arg-type]
+    opened = browser.new_page(viewport=DESKTOP, ignore_https_errors=True)
     opened.set_default_timeout(WAIT_MS)
     opened.add_init_script(FEW_FRAMES)
     opened.goto(panel.link())

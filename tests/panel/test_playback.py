@@ -50,8 +50,8 @@ def player() -> Player:
 
 @pytest.fixture
 def playback(player: Player) -> Playback:
-    made = Playback(None, FleetState(), "page")  # type: ignore[arg-type]
-    made._control = player  # type: ignore[assignment]
+    made = Playback(None, FleetState(), "page")
+    made._control = player
     made.status = {"state": "playing", "position_s": 0.0}
     return made
 
@@ -118,7 +118,7 @@ async def test_opening_waits_for_a_player_that_refuses_at_first(
     class Uplink:
         playback_port = 1
 
-    playback = Playback(Uplink(), FleetState(), "page")  # type: ignore[arg-type]
+    playback = Playback(Uplink(), FleetState(), "page")
     await playback.open(tmp_path, "day", fused_again=False)
     assert playback.status == {"state": "playing", "position_s": 0.0}
     playback.close()
@@ -127,14 +127,14 @@ async def test_opening_waits_for_a_player_that_refuses_at_first(
 
 async def test_recording_is_visible_only_on_the_page_that_opened_it() -> None:
     fleet = FleetState()
-    playback = Playback(None, fleet, "mine")  # type: ignore[arg-type]
+    playback = Playback(None, fleet, "mine")
     recorded = RecordedAircraft(1, RECORDED, Profile())
     (first,) = playback._number([[recorded]])
     fleet.take(heartbeat(), 0)
     fleet.take(heartbeat(system_id=first), 0)
     assert set(fleet.visible("mine")) == {1, first}
     assert set(fleet.visible("another")) == set(fleet.visible("")) == {1}
-    other = Playback(None, fleet, "another")  # type: ignore[arg-type]
+    other = Playback(None, fleet, "another")
     assert other._number([[recorded]]) != [first]
     playback.close()
     assert set(fleet.visible("mine")) == {1}
@@ -145,6 +145,4 @@ async def test_number_of_players_is_limited(tmp_path: Path) -> None:
     for n in range(MAX_PLAYERS):
         fleet.origins[100 + n] = Origin(RECORDED, 1, f"page {n}")
     with pytest.raises(PlaybackError, match="close one of them first"):
-        await Playback(None, fleet, "one more").open(  # type: ignore[arg-type]
-            tmp_path, "day", fused_again=False
-        )
+        await Playback(None, fleet, "one more").open(tmp_path, "day", fused_again=False)

@@ -162,7 +162,7 @@ class Gateway:
 
 async def test_late_status_does_not_replace_a_later_one() -> None:
     gateway = Gateway()
-    watch = GatewayWatch(gateway, FleetState())  # type: ignore[arg-type]
+    watch = GatewayWatch(gateway, FleetState())
     early = asyncio.create_task(watch.refresh())
     while not gateway.asked:
         await asyncio.sleep(0)

@@ -37,7 +37,7 @@ def test_button_of_a_row_acts_only_while_the_row_is_shown() -> None:
         {"key": "d", "cells": [["2", "bad", "error"]]},
     ]
     for key in ("d", "gone"):
-        asyncio.run(table._on_act(SimpleNamespace(args=[0, key])))  # type: ignore[arg-type]
+        asyncio.run(table._on_act(SimpleNamespace(args=[0, key])))
     assert pressed == ["d"]
 
 

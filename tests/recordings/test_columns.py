@@ -39,7 +39,7 @@ from tools.document_columns import PAGE, with_table
 
 def rows_of(records: list[object]) -> list[TableRow]:
     builder = RowBuilder()
-    rows = [row for record in records for row in builder.add(record)]  # type: ignore[arg-type]
+    rows = [row for record in records for row in builder.add(record)]
     return rows + builder.flush()
 
 

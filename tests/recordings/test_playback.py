@@ -17,7 +17,7 @@ SPAN_US = 99 * STEP_US
 
 
 def make_player(records: list[TlogRecord] = RECORDS, now_us: int = 0, **options: object) -> Player:
-    return Player([make_track(make_tlog(records))], now_us, **options)  # type: ignore[arg-type]
+    return Player([make_track(make_tlog(records))], now_us, **options)
 
 
 def play_to_end(player: Player, now_us: int = 0) -> list[tuple[int, bytes]]:

@@ -25,7 +25,7 @@ class Source:
 def make_track(data: bytes, **options: object) -> Track:
     index = TlogIndex()
     index.add(TlogScanner().feed(data, final=True))
-    return Track(Source(data, index), **options)  # type: ignore[arg-type]
+    return Track(Source(data, index), **options)
 
 
 def play_all(track: Track) -> list[TlogRecord]:

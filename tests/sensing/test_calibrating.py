@@ -420,7 +420,7 @@ def test_joined_calibrations_equal_one_after_the_other(seed: int) -> None:
 
     def near_identity() -> Matrix3:
         rows = (np.eye(3) + 0.05 * rng.normal(size=(3, 3))).tolist()
-        return tuple(map(tuple, rows))  # type: ignore[return-value]
+        return tuple(map(tuple, rows))
 
     correction = msgspec.structs.replace(
         IN_BODY_AXES,

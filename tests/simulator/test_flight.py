@@ -22,7 +22,7 @@ def flight() -> SimulatedFlight:
 
 
 def columns(samples: object) -> dict[str, np.ndarray]:
-    fields = {f.name: getattr(samples, f.name) for f in dataclasses.fields(samples)}  # type: ignore[arg-type]
+    fields = {f.name: getattr(samples, f.name) for f in dataclasses.fields(samples)}
     return {name: value for name, value in fields.items() if isinstance(value, np.ndarray)}
 
 

@@ -180,7 +180,7 @@ class TestRefusals:
 
 
 @pytest.mark.io
-def test_real_flight_passes_the_link_without_loss(data_dir) -> None:  # type: ignore[no-untyped-def]
+def test_real_flight_passes_the_link_without_loss(data_dir) -> None:
     options = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
     flight = open_flown([data_dir / "arduplane_testlog2.csv.gz"], options)
     assert flight.gps_latency_s == 0.28

@@ -138,7 +138,7 @@ class TestNoise:
     @pytest.mark.parametrize(
         "make", [lambda r: Wander(r, 1.0, 5.0, 0.1), lambda r: Walk(r, 1.0, 0.1)]
     )
-    def test_pieces_equal_the_whole(self, make) -> None:  # type: ignore[no-untyped-def]
+    def test_pieces_equal_the_whole(self, make) -> None:
         whole = make(np.random.default_rng(3)).draw(1000)
         source = make(np.random.default_rng(3))
         pieces = np.vstack([source.draw(size) for size in (1, 0, 399, 600)])

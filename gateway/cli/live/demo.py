@@ -8,7 +8,7 @@ import logging
 import signal
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -147,12 +147,12 @@ AT_ONCE: Final = 16
 """Frames that cross at once; the pipe holds some hundreds, which are made ahead."""
 
 
-def made_ahead(frames: Iterator[TimedFrame]) -> Iterator[TimedFrame]:
+def made_ahead(frames: Iterator[TimedFrame]) -> Generator[TimedFrame]:
     """Let a background process make frames, so that the event loop that plays them need not."""
     return _take(begin_copy(_make, frames))
 
 
-def _take(receiver: Connection) -> Iterator[TimedFrame]:
+def _take(receiver: Connection) -> Generator[TimedFrame]:
     with receiver:
         while True:
             try:

@@ -1,6 +1,8 @@
 """`mavgate doctor`: every check finds what is wrong, and says what helps."""
 
+import grp
 import os
+import shutil
 import socket
 import subprocess
 from collections.abc import Callable
@@ -50,7 +52,7 @@ def test_a_port_that_may_not_be_opened(
     assert one(doctor.check_receiver, settings).grade is Grade.GOOD
     monkeypatch.setattr(os, "access", lambda *_: False)
     dialout = SimpleNamespace(gr_name="dialout", gr_mem=[])
-    monkeypatch.setattr(doctor.grp, "getgrgid", lambda _: dialout)
+    monkeypatch.setattr(grp, "getgrgid", lambda _: dialout)
     found = one(doctor.check_receiver, settings)
     assert found.grade is Grade.WRONG
     assert "sudo usermod -aG dialout" in found.text
@@ -135,8 +137,8 @@ def test_a_gateway_that_runs_has_its_ports(
 def test_the_clock(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, said: str, grade: Grade
 ) -> None:
-    monkeypatch.setattr(doctor.shutil, "which", lambda _: "/usr/bin/timedatectl")
-    monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
+    monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/timedatectl")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: SimpleNamespace(stdout=said))
     assert one(doctor.check_clock, settings).grade is grade
 
 

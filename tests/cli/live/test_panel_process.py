@@ -72,7 +72,7 @@ async def test_panel_that_is_launched_but_not_started_ends_when_closed() -> None
 
 async def test_it_is_closed_while_it_waits_for_the_gateway() -> None:
     panel = PanelProcess(None)
-    panel.start(asyncio.get_running_loop().create_future)  # type: ignore[arg-type]
+    panel.start(asyncio.get_running_loop().create_future)
     await asyncio.sleep(0)
     await panel.close()
     assert panel._child is None

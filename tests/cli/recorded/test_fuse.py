@@ -12,10 +12,10 @@ import pytest
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableReader, encode_head, encode_line
-from tests.estimation.test_golden import GOLDEN
 from tests.kit.cli import invoke
 from tests.kit.cli import run as run_words
 from tests.recordings.test_replay import fly_from_the_middle
+from tools.make_golden import GOLDEN
 
 pytestmark = pytest.mark.io
 

@@ -158,7 +158,8 @@ class TestTrouble:
         rig.tick(hub)
         pings = len(page.events) + 1
         await page.until(lambda: len(page.events) >= pings)
-        await rig.until(lambda: hub._clients[1]._answers)
+        client: Any = hub._clients[1]
+        await rig.until(lambda: client._answers)
         page.answers_pings = False
         for _ in range(2):
             rig.clock.us += 4_000_000
@@ -174,12 +175,12 @@ class TestTrouble:
         sock = await plug(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
         (listener,) = hub._endpoints.values()
-        await rig.until(lambda: len(listener._handshakes) == 1)  # type: ignore[union-attr]
+        await rig.until(lambda: len(listener._handshakes) == 1)
         assert not hub.clients()
         rig.clock.us += 5_000_000
         rig.tick(hub)
         assert await hung_up(sock)
-        assert not listener._handshakes  # type: ignore[union-attr]
+        assert not listener._handshakes
 
     async def test_connections_without_handshake_do_not_keep_pages_out(
         self, rig: Rig, plug: Visit, visit: Visit
@@ -258,7 +259,8 @@ class TestCalling:
     async def test_server_that_never_answers_is_given_up(self, rig: Rig) -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
             hub = rig.hub(f"ws:127.0.0.1:{server.getsockname()[1]}")
-            await rig.until(lambda: hub._clients[1]._socket is not None)
+            client: Any = hub._clients[1]
+            await rig.until(lambda: client._socket is not None)
             rig.clock.us += 5_000_000
             rig.tick(hub)
             assert hub.clients()[0].state == "refused"

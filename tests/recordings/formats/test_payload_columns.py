@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.formats.mavlink import columns_of, layout_of
-from gateway.recordings.tlog import Batch, TlogScanner, encode_record
+from gateway.recordings.formats.mavlink import columns_of
+from gateway.recordings.tlog import Batch, TlogScanner, encode_record, layout_of
 from gateway.wire.mavlink_messages import CRC_EXTRA
 
 KINDS = sorted(mavlink.mavlink_map.items())

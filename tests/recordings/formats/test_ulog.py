@@ -1,16 +1,18 @@
 """Topics of a PX4 log that are not as PX4 documents them, and times that cannot be."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
-from gateway.recordings.formats.ulog import Px4Log, Topic
+from gateway.recordings.formats.ulog import Px4Log
 from gateway.records import GpsFix
 
 ROWS = 60
 STEP_US = 20_000
 
 
-def topics() -> dict[str, Topic]:
+def topics() -> dict[str, dict[str, Any]]:
     time_us = 5_000_000 + STEP_US * np.arange(ROWS, dtype=np.uint64)
     axes = [f"{name}[{axis}]" for name in ("gyro_rad", "accelerometer_m_s2") for axis in range(3)]
     attitude = [f"q[{axis}]" for axis in range(4)]
