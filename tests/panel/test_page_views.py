@@ -184,8 +184,10 @@ def test_selected_orientation_of_the_board_is_stored(desk: Desk) -> None:
 
 def test_magnetometer_calibration_is_drawn_and_undone(desk: Desk) -> None:
     view, kept = desk.view("calibration"), desk.kept
-    view.locator(".step", has_text="Magnetometer").click()
+    step = view.locator(".step", has_text="Magnetometer")
+    step.click()
     expect(view.locator(".guide h2")).to_have_text("Magnetometer")
+    expect(step).to_be_focused()
     desk.receiver.is_turned = True
     view.get_by_role("button", name="Start").click()
     sphere = view.locator("canvas.field-sphere")

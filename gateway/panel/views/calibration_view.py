@@ -80,11 +80,11 @@ class CalibrationView:
         self._context = context
         self._step = CalibrationStep.GYRO
         self._drawn: object = None
-        self._drawn_steps: object = None
         self._choice: ui.select
         self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
         with ui.element("div").classes("calibration"):
-            self._steps = ui.element("div").classes("steps")
+            with ui.element("div").classes("steps"):
+                self._steps = {step: self._build_step(step) for step in TITLES}
             self._guide = ui.element("div").classes("card guide")
         self._context.on_select(self._on_select)
         self._context.every(REFRESH_S, self._refresh)
@@ -102,7 +102,7 @@ class CalibrationView:
         self._refresh()
 
     def _refresh(self) -> None:
-        """Rebuild elements whose structure changed; otherwise only update their values."""
+        """Rebuild the guide if its structure changed; otherwise only update values."""
         if self._context.system_id is not None:
             self._context.parts.dialogues.load(self._context.system_id)
         run, dialogue = self._run(), self._context.dialogue
@@ -110,10 +110,13 @@ class CalibrationView:
             done = run.state is RunState.DONE
             self._outcomes[run.step] = ("done", "good") if done else ("failed", "bad")
         ready = dialogue is not None and dialogue.parameters.state is ListState.COMPLETE
-        steps = (self._step, dict(self._outcomes))
-        if steps != self._drawn_steps:
-            self._drawn_steps = steps
-            self._build_steps()
+        for step, (card, state) in self._steps.items():
+            if step is self._step:
+                card.props("aria-current=step")
+            else:
+                card.props(remove="aria-current")
+            outcome, look = self._outcomes.get(step, ("", ""))
+            state.classes(replace=f"state {look}").set_text(outcome)
         guide = (self._step, run, run and run.state, ready)
         if guide != self._drawn:
             self._drawn = guide
@@ -121,21 +124,17 @@ class CalibrationView:
         if run is not None:
             self._move(run)
 
-    def _build_steps(self) -> None:
-        self._steps.clear()
-        with self._steps:
-            for step, (title, icon, short) in TITLES.items():
-                outcome, look = self._outcomes.get(step, ("", ""))
-                card = ui.element("button").classes("card step")
-                card.on("click", partial(self._show, step))
-                if step is self._step:
-                    card.props("aria-current=step")
-                with card:
-                    ui.icon(icon)
-                    with ui.element("b"):
-                        ui.label(title)
-                    ui.label(outcome).classes("state").classes(look)
-                    ui.label(short).classes("soft")
+    def _build_step(self, step: CalibrationStep) -> tuple[ui.element, ui.label]:
+        """Build a button once: one that is replaced would lose clicks and the focus."""
+        title, icon, short = TITLES[step]
+        with ui.element("button").classes("card step") as card:
+            ui.icon(icon)
+            with ui.element("b"):
+                ui.label(title)
+            state = ui.label()
+            ui.label(short).classes("soft")
+        card.on("click", partial(self._show, step))
+        return card, state
 
     def _show(self, step: CalibrationStep) -> None:
         run = self._context.dialogue.calibration if self._context.dialogue else None
