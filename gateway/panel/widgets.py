@@ -205,7 +205,7 @@ class RecorderControls:
             self._detail.set_text("")
             return
         self._state.set_text(recorder["state"])
-        self._state.classes(replace="chip").classes(LOOKS.get(recorder["state"], ""))
+        self._state.classes(LOOKS.get(recorder["state"], ""), replace="chip")
         self._detail.set_text(printable(_detail_of(recorder)))
 
     def _build_buttons(self) -> None:

@@ -116,7 +116,7 @@ class CalibrationView:
             else:
                 card.props(remove="aria-current")
             outcome, look = self._outcomes.get(step, ("", ""))
-            state.classes(replace=f"state {look}").set_text(outcome)
+            state.classes(look, replace="state").set_text(outcome)
         guide = (self._step, run, run and run.state, ready)
         if guide != self._drawn:
             self._drawn = guide
@@ -304,7 +304,7 @@ class CalibrationView:
                 done = side in run.sides_done
                 now = side == run.side_now and not done and run.state is RunState.RUNNING
                 look = "done" if done else "now" if now else ""
-                pose.classes(replace="pose").classes(look)
+                pose.classes(look, replace="pose")
                 state.set_text("done ✓" if done else "hold still …" if now else "still to do")
         if run.step is CalibrationStep.MAG:
             self._move_cloud(run)
