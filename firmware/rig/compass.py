@@ -20,6 +20,9 @@ _OVERFLOW: Final = 0x02
 class Compass(RegisterDevice):
     """Common part of the chips."""
 
+    _registers: dict[int, int]
+    """By address, set by `power_cycle`."""
+
     def __init__(self, world: World, clock: Clock, behind: Imu) -> None:
         super().__init__()
         self._world, self._clock, self._behind = world, clock, behind
