@@ -46,7 +46,7 @@ MODULES: Final = {
     "recorded.catalogue": ("catalogue",),
     "live.clients": ("status", "clients", "mark", "reload"),
 }
-"""The commands of each module below `gateway.cli`."""
+"""The commands of each module below `gateway.cli`, which its `app` contains."""
 
 COMMANDS: Final = {
     "run": "Run the gateway on the receiver's serial port until interrupted.",
@@ -94,14 +94,10 @@ PANELS: Final = {
 
 def load_command(name: str) -> Any:
     """Import the file of a command and create it."""
-    part = typer.Typer(rich_markup_mode="rich")
-    # With a callback it is a group, however few commands the file has.
-    part.callback()(lambda: None)
     if PANELS.get(name) != GATEWAY:
         _load_extensions()
     module = next(module for module, names in MODULES.items() if name in names)
-    import_module(f"gateway.cli.{module}").register(part)
-    group = typer.main.get_group(part)
+    group = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
     gc.enable()
     return tidied(group.commands[name])
 

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli.app import COMMANDS, MODULES, PANELS, app, load_command
+from gateway.cli.app import COMMANDS, MODULES, app, load_command
 
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
 LARGE = (
@@ -19,12 +20,10 @@ LARGE = (
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_list_says_what_the_command_says(name: str) -> None:
+def test_listed_summary_is_first_paragraph_of_command_help(name: str) -> None:
     command = load_command(name)
     assert command.help is not None
     assert " ".join(command.help.split("\n\n")[0].split()) == COMMANDS[name]
-    panel = getattr(command, "rich_help_panel", None)
-    assert (panel if isinstance(panel, str) else None) == PANELS.get(name)
 
 
 def test_every_command_of_every_file_is_listed() -> None:
@@ -33,11 +32,8 @@ def test_every_command_of_every_file_is_listed() -> None:
     assert set(MODULES) == modules
     assert {name for names in MODULES.values() for name in names} == set(COMMANDS)
     for module, listed in MODULES.items():
-        part = typer.Typer()
-        part.callback()(lambda: None)
-        __import__(f"gateway.cli.{module}")
-        sys.modules[f"gateway.cli.{module}"].register(part)
-        assert set(typer.main.get_group(part).commands) == set(listed)
+        part = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
+        assert set(part.commands) == set(listed)
 
 
 @pytest.mark.parametrize("words", [["play"], ["sweep"], ["clients", "add"], []], ids=" ".join)

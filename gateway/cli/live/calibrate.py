@@ -67,6 +67,7 @@ MOVING_US: Final = 3 * US_PER_S
 """A movement by GPS counts for this long."""
 
 console = console_of()
+app = typer.Typer()
 
 
 SIDES: Final = (
@@ -97,11 +98,7 @@ Poses = Callable[[Step], list[NodeSamples]]
 """Returns the samples of each pose of a step; raises CalibrationError with advice."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command("calibrate")(calibrate)
-
-
+@app.command()
 def calibrate(
     steps: Annotated[
         list[Step] | None, typer.Argument(help="Steps; by default gyro accel mag level.")

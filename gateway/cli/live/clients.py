@@ -9,8 +9,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.app import GATEWAY
-from gateway.cli.support.options import USER_CONFIG, AskingTyper, ConfigOption, ask, with_socket
+from gateway.cli.support.options import USER_CONFIG, AskingTyper, ConfigOption, ask
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     UNKNOWN,
@@ -29,17 +28,12 @@ US_PER_MS: Final = 1000
 Record = Mapping[str, Any]
 """A dataclass, as decoded from the control socket."""
 
+app = AskingTyper()
 group = AskingTyper(help="List, add and remove clients and sources.", no_args_is_help=True)
+app.add_typer(group, name="clients")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command(rich_help_panel=GATEWAY)(with_socket(status))
-    app.add_typer(group, name="clients", rich_help_panel=GATEWAY)
-    app.command(rich_help_panel=GATEWAY, context_settings=NEGATIVE_NUMBERS)(with_socket(mark))
-    app.command(rich_help_panel=GATEWAY)(with_socket(reload))
-
-
+@app.command()
 def status(
     *,
     requests: Annotated[
@@ -112,6 +106,7 @@ def remove(name: Annotated[str, typer.Argument(help="Its name, or its URL.")]) -
     print(*ask("clients.remove", {"name": name}), sep="\n")
 
 
+@app.command(context_settings=NEGATIVE_NUMBERS)
 def mark(
     lat_deg: Annotated[float | None, typer.Argument(help="Latitude; south is negative.")] = None,
     lon_deg: Annotated[float | None, typer.Argument(help="Longitude; west is negative.")] = None,
@@ -131,6 +126,7 @@ def mark(
     print(ask("mark", location))
 
 
+@app.command()
 def reload() -> None:
     """Apply changed settings of the hub and of signing; other clients stay connected."""
     print(ask("reload"))

@@ -35,13 +35,10 @@ from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 
 log = logging.getLogger(__name__)
+app = typer.Typer()
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(demo)
-
-
+@app.command()
 def demo(
     *,
     config: ConfigOption = None,

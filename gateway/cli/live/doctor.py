@@ -38,6 +38,8 @@ from gateway.live.part import free_bytes_near
 from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.printable import reason_of
 
+app = typer.Typer()
+
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4
 """FTDI's timer: how long bytes wait in the adapter; 16 is its default."""
@@ -275,6 +277,7 @@ CHECKS: Final[tuple[Check, ...]] = (
 STYLES: Final = {Grade.GOOD: "green", Grade.NOTE: "yellow", Grade.WRONG: "red"}
 
 
+@app.command()
 def doctor(*, config: ConfigOption = None) -> None:
     """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
@@ -291,12 +294,7 @@ def doctor(*, config: ConfigOption = None) -> None:
         raise typer.Exit(1)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(doctor)
-    app.command()(check_config)
-
-
+@app.command()
 def check_config(
     file: Annotated[
         Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")

@@ -49,6 +49,7 @@ SENSORS: Final = {
 STEPS: Final = (Step.GYRO, Step.LEVEL, Step.MAG)
 
 console = console_of()
+app = typer.Typer()
 
 
 @dataclass
@@ -61,11 +62,7 @@ class Observed:
     """The newest fix of each vehicle."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command("setup")(setup)
-
-
+@app.command()
 def setup(
     *,
     vehicle: Annotated[

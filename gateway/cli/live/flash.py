@@ -58,6 +58,7 @@ OPTIONS: Final = {
 }
 
 console = console_of()
+app = typer.Typer()
 
 
 class Board(StrEnum):
@@ -81,12 +82,7 @@ def _option(name: str) -> Any:
     return typer.Option(*flags, help=f"{field.meaning}{allowed}", show_default=False)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(flash)
-    app.command()(ports)
-
-
+@app.command()
 def flash(
     board: Annotated[
         Board | None, typer.Argument(help="Program to write; without it, list the boards.")
@@ -238,6 +234,7 @@ def _print(device: str, block: SettingsBlock) -> None:
     console.print(table)
 
 
+@app.command()
 def ports() -> None:
     """List the serial ports, and the one that `auto` selects.
 
@@ -248,7 +245,6 @@ def ports() -> None:
     for port in found:
         usb = f"usb:{port.usb_id}" if port.usb_id else ""
         table.add_row(port.device, usb, port.serial_number, port.description)
-    console = console_of()
     if found:
         console.print(table)
     try:

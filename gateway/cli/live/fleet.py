@@ -187,20 +187,17 @@ def _digest_of(file: BinaryIO) -> "hashlib._Hash":
     return digest
 
 
+app = typer.Typer()
 group = AskingTyper(
     help="Show the vehicles of many sites here, through a Zenoh router.",
     invoke_without_command=True,
 )
+app.add_typer(group, name="fleet")
 
 recordings_group = AskingTyper(
     help="List the recordings of the sites, and fetch them.", invoke_without_command=True
 )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    group.add_typer(recordings_group, name="recordings")
-    app.add_typer(group, name="fleet")
+group.add_typer(recordings_group, name="recordings")
 
 
 @group.callback()

@@ -11,20 +11,12 @@ from gateway.cli.support.options import ConfigOption, folder_of, read_options, r
 from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, how_to_add, refuse
 
+app = typer.Typer()
 group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")
+app.add_typer(group, name="map")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.add_typer(group, name="map")
-
-
-@group.callback()
-def _group() -> None:
-    """Keep `get` a word of its own."""
-
-
-@group.command("get")
+@group.command()
 def get(
     *,
     source: Annotated[

@@ -21,16 +21,13 @@ from gateway.live.terminal import own_command
 from gateway.printable import LONGEST, PrintableFormatter
 
 log = logging.getLogger(__name__)
+app = typer.Typer()
 
 NICENESS: Final = 5
 """The gateway has priority over the panel, from the panel's imports on."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command("panel")(panel)
-
-
+@app.command()
 def panel(
     *,
     connect: Annotated[

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import (
     AskingTyper,
     ConfigOption,
@@ -36,15 +35,12 @@ if TYPE_CHECKING:
 NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.")]
 
 
+app = typer.Typer()
 group = AskingTyper(
     help="Start, stop, name, list and delete recordings.",
     no_args_is_help=True,
 )
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.add_typer(group, name="record", rich_help_panel=RECORDINGS)
+app.add_typer(group, name="record")
 
 
 @group.command()

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gateway.live.console import LiveView
 
 log = logging.getLogger(__name__)
+app = typer.Typer()
 
 VIEW_INTERVAL_S: Final = 0.5
 """Twice a second: drawing takes some milliseconds, during which no frame is sent."""
@@ -39,11 +40,7 @@ EndpointOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command("run")(run_gateway)
-
-
+@app.command("run")
 def run_gateway(
     *,
     config: ConfigOption = None,

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 
 from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.batch_work import (
     HoldOutOption,
     IntervalOption,
@@ -37,10 +36,12 @@ FOR_PAGES: Final = ("jinja2", "matplotlib")
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 
+app = typer.Typer()
 group = typer.Typer(
     help="Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
     no_args_is_help=True,
 )
+app.add_typer(group, name="batch")
 
 OutputOption = Annotated[
     Path,
@@ -52,11 +53,6 @@ AgainstOption = Annotated[
     Path | None,
     typer.Option("--against", help="Folder of the results of another version, to compare with."),
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.add_typer(group, name="batch", rich_help_panel=RECORDINGS)
 
 
 def _add_judging(name: Literal["fuse", "report"], text: str) -> None:

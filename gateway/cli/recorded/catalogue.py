@@ -10,7 +10,6 @@ from typer.core import TyperGroup
 from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.batch_work import JobsOption
 from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption
@@ -44,10 +43,12 @@ class _IndexByDefault(TyperGroup):
         return super().parse_args(ctx, args)
 
 
+app = typer.Typer()
 group = typer.Typer(
     cls=_IndexByDefault,
     help="Index all recordings under a folder, and list and search what is in them.",
 )
+app.add_typer(group, name="catalogue")
 
 FolderOption = Annotated[
     Path | None,
@@ -58,11 +59,6 @@ WhereOption = Annotated[
     typer.Option("--where", help="Condition in SQL: 'duration > 300 and loss > 0.05'."),
 ]
 GeojsonOption = Annotated[bool, typer.Option("--geojson", help="The tracks, for maps.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.add_typer(group, name="catalogue", rich_help_panel=RECORDINGS)
 
 
 @group.command(INDEX)

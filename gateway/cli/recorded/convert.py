@@ -6,7 +6,6 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -34,17 +33,14 @@ from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
 from gateway.units import US_PER_S, counted
 
+app = typer.Typer()
+
 ONE_KIND: Final = ".parquet"
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 """Formats made from a recording's tlogs, which hold all its vehicles and messages."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command("convert", rich_help_panel=RECORDINGS)(convert)
-    app.command("fuse", rich_help_panel=RECORDINGS)(fuse_log)
-
-
+@app.command()
 def convert(
     files: Files,
     *,
@@ -125,6 +121,7 @@ def _known_estimator(name: str | None) -> str | None:
     return name
 
 
+@app.command("fuse")
 def fuse_log(
     file: Annotated[Path, typer.Argument(help="Recording, by name or file, or log; also gzipped.")],
     *,

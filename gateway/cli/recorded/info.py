@@ -10,7 +10,6 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -40,6 +39,8 @@ from gateway.units import US_PER_S, counted
 if TYPE_CHECKING:
     from gateway.recordings.reading import ReadOptions
 
+app = typer.Typer()
+
 SHOWN: Final = 8
 """Gaps and damaged ranges that are listed one by one."""
 
@@ -49,12 +50,7 @@ EARLIEST_US: Final = 366 * 86_400 * US_PER_S
 Report = Callable[[str], None]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command("info", rich_help_panel=RECORDINGS)(info)
-    app.command("recover", rich_help_panel=RECORDINGS)(recover)
-
-
+@app.command()
 def info(
     file: Annotated[
         Path, typer.Argument(help="Recording, by its name or a file.", show_default=False)
@@ -81,6 +77,7 @@ def info(
             _show(each, info_of_file)
 
 
+@app.command()
 def recover(
     file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
     *,

@@ -12,7 +12,6 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.app import RECORDINGS
 from gateway.cli.live.run import EndpointOption, with_endpoints
 from gateway.cli.support.options import (
     AskingTyper,
@@ -51,21 +50,15 @@ from gateway.recordings.play import (
 )
 from gateway.units import counted
 
+app = typer.Typer()
+
 VIEW_INTERVAL_S: Final = 0.25
 FASTEST: Final = "max"
 KEYS: Final = "space pause  ← → 10 s  ↓ ↑ 1 min  + − speed  . step  home begin  l loop  q quit"
 LEAPS_S: Final = {"left": -10.0, "right": 10.0, "down": -60.0, "up": 60.0}
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command("play", rich_help_panel=RECORDINGS)(play)
-    app.command("seek", rich_help_panel=RECORDINGS, context_settings=NEGATIVE_NUMBERS)(
-        with_socket(seek)
-    )
-    app.add_typer(group, name="player", rich_help_panel=RECORDINGS)
-
-
+@app.command()
 def play(
     files: Files,
     *,
@@ -140,8 +133,11 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
 
 
 group = AskingTyper(help="Control the running player.", no_args_is_help=True)
+app.add_typer(group, name="player")
 
 
+@app.command(context_settings=NEGATIVE_NUMBERS)
+@with_socket
 def seek(
     to: Annotated[
         str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")

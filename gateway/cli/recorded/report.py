@@ -8,7 +8,6 @@ from typing import Annotated, Final
 import typer
 from rich.progress import TimeElapsedColumn
 
-from gateway.cli.app import RECORDINGS
 from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -29,6 +28,8 @@ from gateway.output import check_folder, write_new
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 
+app = typer.Typer()
+
 NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
 OutputOption = Annotated[
@@ -36,12 +37,7 @@ OutputOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(report)
-    app.command("page", rich_help_panel=RECORDINGS)(page)
-
-
+@app.command()
 def report(
     flight: FlightArgument = None,
     *,
@@ -102,6 +98,7 @@ def report(
     print(page)
 
 
+@app.command()
 def page(
     flight: Annotated[
         Path, typer.Argument(help="A recording by its name, or any flight log.", show_default=False)

@@ -55,12 +55,10 @@ from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import ReadOptions
 from gateway.units import counted
 
-
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(sweep)
+app = typer.Typer()
 
 
+@app.command()
 def sweep(
     flights: Annotated[
         list[str] | None,
