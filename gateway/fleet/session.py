@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -18,17 +18,16 @@ from gateway.hub.endpoint import is_loopback
 from gateway.hub.transports.zenoh.session import (
     MAX_KEY,
     OWN,
+    Connection,
     LoopQueue,
     Payload,
     Publishers,
     Subscription,
-    end_session,
     off_loop,
     open_session,
     out_key,
     payload_of,
     ping_key,
-    presence_key,
     session_config,
     site_of,
 )
@@ -103,25 +102,28 @@ class FleetSession:
         self.patterns = [key_pattern(site) for site in settings.sites]
         self._events = events
         self._now_us = now_us
-        self._session: zenoh.Session | None = None
-        self.publishers: Publishers | None = None
-        self._queues: list[LoopQueue[Any]] = []
+        self._connection: Connection | None = None
+        self._round_trips: LoopQueue[tuple[str, int]]
         self._subscriptions: list[Subscription] = []
         self._keys: dict[str, zenoh.KeyExpr | None] = {}
         """Declared keys; a declaration ends with its object."""
-        self._declared: list[object] = []
         self._trouble = ""
 
     @property
     def is_open(self) -> bool:
         """Whether there is a session, with a router or without."""
-        return self._session is not None
+        return self._connection is not None
 
     @property
     def is_linked(self) -> bool:
         """Whether sites can be reached."""
-        session = self._session
-        return session is not None and (self.is_router or bool(session.info.routers_zid()))
+        connection = self._connection
+        return connection is not None and (self.is_router or connection.has_router)
+
+    @property
+    def publishers(self) -> Publishers | None:
+        """The publishers of the session, if it is open."""
+        return None if self._connection is None else self._connection.publishers
 
     @property
     def overflowed(self) -> int:
@@ -130,7 +132,7 @@ class FleetSession:
 
     async def open(self) -> None:
         """Open the session if it is not open, and subscribe; log a failure once."""
-        if self._session is not None:
+        if self._connection is not None:
             return
         try:
             session = await off_loop(open_session, self._config)
@@ -140,35 +142,29 @@ class FleetSession:
                 log.warning("%s: %s; retrying", self.locator, error)
             return
         self._trouble = ""
-        self._session, self.publishers = session, Publishers(session)
-        self._declare(session)
+        self._connection = Connection(session)
+        self._declare(self._connection)
 
     def close(self) -> None:
         """End the session; a thread closes it, which may take a moment."""
-        for each in self._queues:
-            each.close()
-        for subscription in self._subscriptions:
-            subscription.close()
-        if self.publishers is not None:
-            self.publishers.close()
-        if self._session is not None:
-            off_loop(end_session, self._session, self.publishers, self._declared)
-        self._session, self.publishers, self._declared = None, None, []
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
     def ask_round_trips(self) -> None:
         """Query every site for its round trip; one query serves all sites of a pattern."""
         import zenoh
 
-        if self._session is None or not self.is_linked:
+        if self._connection is None or not self.is_linked:
             return
-        asked_us, trips = self._now_us(), self._queues[-1]
+        asked_us, trips = self._now_us(), self._round_trips
 
         def record(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 trips.put((site_of(str(reply.ok.key_expr)), self._now_us() - asked_us))
 
         for pattern in self.patterns:
-            self._session.get(
+            self._connection.session.get(
                 ping_key(pattern),
                 record,
                 target=zenoh.QueryTarget.ALL,
@@ -183,43 +179,30 @@ class FleetSession:
         None is above `MAX_ANSWER`. Raises NoAnswerError if there is none, QueryRefusedError if all
         are refusals.
         """
-        if self._session is None:
+        if self._connection is None:
             raise NoAnswerError(f"{self.locator}: no session")
-        return await off_loop(_query, self._session, key, payload, timeout_s)
+        return await off_loop(_query, self._connection.session, key, payload, timeout_s)
 
-    def _declare(self, session: "zenoh.Session") -> None:
-        import zenoh
-
-        events = self._events
-        presence: LoopQueue[tuple[str, bool]] = LoopQueue(self._handle_token)
-        trips: LoopQueue[tuple[str, int]] = LoopQueue(lambda item: events.round_trip(*item))
-        self._queues = [presence, trips]
-        here = zenoh.SampleKind.PUT
+    def _declare(self, connection: Connection) -> None:
+        self._round_trips = LoopQueue(lambda trip: self._events.round_trip(*trip))
+        connection.readers.append(self._round_trips)
         for pattern in self.patterns:
-            subscription = Subscription(session, out_key(pattern, "*"), self._handle)
-            self._subscriptions.append(subscription)
-            self._declared += [
-                subscription,
-                session.liveliness().declare_subscriber(
-                    presence_key(pattern, "*"),
-                    lambda sample: presence.put((str(sample.key_expr), sample.kind == here)),
-                    history=True,
-                ),
-            ]
+            frames = Subscription(connection.session, out_key(pattern, "*"), self._handle)
+            self._subscriptions.append(frames)
+            connection.readers.append(frames)
+            connection.declared.append(frames)
+            connection.watch_presence(pattern, self._events.presence)
 
     def _handle(self, sample: "zenoh.Sample") -> None:
         key, attachment = str(sample.key_expr), sample.attachment
-        if key not in self._keys and len(self._keys) < MAX_KEYS and len(key) <= MAX_KEY:
+        is_new = key not in self._keys and len(self._keys) < MAX_KEYS and len(key) <= MAX_KEY
+        if is_new and self._connection is not None:
             self._keys[key] = None
-            off_loop(_declare_key, self._session, key, self._keys)
+            off_loop(_declare_key, self._connection.session, key, self._keys)
         is_own = (
             attachment is not None and len(attachment) == len(OWN) and attachment.to_bytes() == OWN
         )
         self._events.frames(site_of(key), payload_of(sample), is_own)
-
-    def _handle_token(self, news: tuple[str, bool]) -> None:
-        key, is_here = news
-        self._events.presence(site_of(key), key.rpartition("/")[2], is_here)
 
 
 def _declare_key(

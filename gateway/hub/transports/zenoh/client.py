@@ -7,7 +7,7 @@ queued, so that old data never arrives as new.
 import asyncio
 import logging
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from gateway.hub.endpoint import JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint
 from gateway.hub.send_queue import Packer
@@ -24,10 +24,10 @@ from gateway.hub.transports.zenoh.session import (
     RELIABLE_IDS,
     ROOT,
     SECURED,
+    Connection,
     LoopQueue,
     Payload,
     Publishers,
-    end_session,
     in_key,
     off_loop,
     open_session,
@@ -43,9 +43,6 @@ from gateway.hub.transports.zenoh.site_queries import QueryAnswers, RecordingAns
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_json import frame_from_json, json_from_frame
 from gateway.wire.mavlink_splitter import MavFrame, split_datagram
-
-if TYPE_CHECKING:
-    import zenoh
 
 log = logging.getLogger(__name__)
 
@@ -64,30 +61,27 @@ class _Topic(NamedTuple):
 class ZenohClient(Client):
     """A fleet behind a router."""
 
-    _session: "zenoh.Session | None" = None
+    _connection: Connection | None = None
     _task: asyncio.Task[None] | None = None
-    _publishers: Publishers | None = None
 
     def __post_init__(self) -> None:
         """Begin without a session; the first tick opens it."""
         super().__post_init__()
         self._duplicate_sessions: set[str] = set()
         self._packers: dict[_Topic, Packer] = {}
-        self._queues: list[LoopQueue[Any]] = []
-        self._declared: list[object] = []
 
     @property
     def queued(self) -> int:
         """Frames that wait for a congested link and must not be lost."""
-        return self._publishers.queued if self._publishers is not None else 0
+        return self._connection.publishers.queued if self._connection is not None else 0
 
     def transmit(self, frame: MavFrame) -> None:
         """Publish one frame, or gather it with others."""
-        if self.state != "open" or self._publishers is None:
+        if self.state != "open" or self._connection is None:
             self.counters.dropped += 1
             return
         if self.endpoint.keys == JSON_KEYS:
-            self._publish_json(frame)
+            self._publish_json(frame, self._connection.publishers)
             return
         origin = frame.origin
         if self.endpoint.keys == RAW_KEYS:
@@ -104,11 +98,11 @@ class ZenohClient(Client):
 
     def tick(self, now_us: int) -> None:
         """Open the session, and check whether it has a router."""
-        if self._session is None:
+        if self._connection is None:
             if self._task is None and self._is_retry_due(now_us):
                 self._task = self.loop.create_task(self._open())
             return
-        is_linked = bool(self._session.info.routers_zid())
+        is_linked = self._connection.has_router
         if is_linked and self.state != "open":
             self.become("open")
             self.context.greet(self)
@@ -121,13 +115,9 @@ class ZenohClient(Client):
         """End the session; a thread closes it, which may take a moment."""
         if self._task is not None:
             self._task.cancel()
-        for each in self._queues:
-            each.close()
-        if self._publishers is not None:
-            self._publishers.close()
-        if self._session is not None:
-            off_loop(end_session, self._session, self._publishers, self._declared)
-        self._session, self._publishers, self._declared = None, None, []
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
 
     def reconfigure(self, endpoint: Endpoint) -> None:
         """Apply changed options; another site or file needs the endpoint to be added again."""
@@ -146,9 +136,8 @@ class ZenohClient(Client):
         except (OSError, ValueError) as error:
             self.become("unreachable", error)
         else:
-            self._session = session
-            self._publishers = Publishers(session)
-            self._declare(session)
+            self._connection = Connection(session)
+            self._declare(self._connection)
             self._warn_of_open_access()
             self.tick(self.context.now_us())
         finally:
@@ -163,37 +152,27 @@ class ZenohClient(Client):
                 self.name,
             )
 
-    def _declare(self, session: "zenoh.Session") -> None:
+    def _declare(self, connection: Connection) -> None:
         """Subscribe to frames for this site, and announce its presence."""
-        import zenoh
-
+        session, site = connection.session, self.endpoint.site
         frames: LoopQueue[Payload] = LoopQueue(
             self._handle, _cost_of, lambda: self.read_pause_us() / US_PER_S
         )
-        presence: LoopQueue[tuple[bool, str]] = LoopQueue(self._handle_presence)
-        self._queues = [frames, presence]
+        connection.readers.append(frames)
         self._duplicate_sessions.clear()
         keys = {RAW_KEYS: RAW_IN, JSON_KEYS: JSON_IN}
-        wanted = keys.get(self.endpoint.keys) or in_key(self.endpoint.site, ALL_SYSTEMS)
-        self._declared = [
+        wanted = keys.get(self.endpoint.keys) or in_key(site, ALL_SYSTEMS)
+        connection.declared.append(
             session.declare_subscriber(wanted, lambda sample: frames.put(payload_of(sample)))
-        ]
+        )
         if self.endpoint.keys != SITE_KEYS:
             return
-        site, liveliness = self.endpoint.site, session.liveliness()
-        here = zenoh.SampleKind.PUT
-        self._declared += [
-            liveliness.declare_token(presence_key(site, session.zid())),
-            liveliness.declare_subscriber(
-                presence_key(site, "*"),
-                lambda sample: presence.put((sample.kind == here, str(sample.key_expr))),
-                history=True,
-            ),
-            QueryAnswers(session, ping_key(site), lambda _: b""),
-        ]
+        token = session.liveliness().declare_token(presence_key(site, session.zid()))
+        connection.declared += [token, QueryAnswers(session, ping_key(site), lambda _: b"")]
+        connection.watch_presence(site, self._handle_presence)
         if self.trusted and self.context.recordings is not None:
             answers = RecordingAnswers(self.context.recordings)
-            self._declared.append(QueryAnswers(session, recordings_key(site), answers))
+            connection.declared.append(QueryAnswers(session, recordings_key(site), answers))
 
     def _handle(self, payload: Payload) -> None:
         data, size = payload
@@ -206,10 +185,8 @@ class ZenohClient(Client):
             return
         self.receive(split_datagram(data), size, self.context.now_us())
 
-    def _handle_presence(self, news: tuple[bool, str]) -> None:
-        is_here, key = news
-        session = key.rpartition("/")[2]
-        if self._session is None or session == str(self._session.zid()):
+    def _handle_presence(self, _site: str, session: str, is_here: bool) -> None:
+        if self._connection is None or session == str(self._connection.session.zid()):
             return
         if is_here and len(self._duplicate_sessions) < MAX_DUPLICATE_SESSIONS:
             self._duplicate_sessions.add(session)
@@ -228,9 +205,8 @@ class ZenohClient(Client):
         if text:
             log.warning("%s: %s; rename one of them", self.name, text)
 
-    def _publish_json(self, frame: MavFrame) -> None:
+    def _publish_json(self, frame: MavFrame, publishers: Publishers) -> None:
         """Publish a message as mavlink-server does: as a whole, by its name, and by its fields."""
-        assert self._publishers is not None
         if (found := json_from_frame(frame.data)) is None:
             self.counters.dropped += 1
             return
@@ -239,9 +215,9 @@ class ZenohClient(Client):
         key = f"{ROOT}/{system_id}/{component_id}/{name}"
         reliable = frame.message_id in RELIABLE_IDS
         self._publish(_Topic(JSON_OUT, None), [whole], reliable=reliable)
-        self._publishers.put_once(key, whole)
+        publishers.put_once(key, whole)
         for field, value in fields.items():
-            self._publishers.put_once(f"{key}/{field}", value)
+            publishers.put_once(f"{key}/{field}", value)
 
     def _pack(self, topic: _Topic, frame: bytes) -> None:
         packer = self._packers.get(topic)
@@ -252,21 +228,18 @@ class ZenohClient(Client):
         packer.add(frame)
 
     def _publish(self, topic: _Topic, frames: list[bytes], *, reliable: bool) -> None:
-        if self._publishers is None or self.state != "open":
-            self.counters.dropped += len(frames)
-            return
         data = b"".join(frames)
-        published = self._publishers.publish(
-            topic.key, data, reliable=reliable, attachment=topic.attachment
-        )
-        self._count(len(frames), len(data), published=published)
-
-    def _count(self, frames: int, size: int, *, published: bool) -> None:
-        if published:
-            self.counters.sent += frames
-            self.counters.bytes_sent += size
+        if (
+            self._connection is not None
+            and self.state == "open"
+            and self._connection.publishers.publish(
+                topic.key, data, reliable=reliable, attachment=topic.attachment
+            )
+        ):
+            self.counters.sent += len(frames)
+            self.counters.bytes_sent += len(data)
         else:
-            self.counters.dropped += frames
+            self.counters.dropped += len(frames)
 
 
 def _cost_of(payload: Payload) -> float:

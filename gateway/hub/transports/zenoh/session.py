@@ -196,25 +196,6 @@ def _check_files(config: "zenoh.Config") -> None:
                 raise OSError(f"{name} {file}: {reason_of(error)}") from None
 
 
-def end_session(
-    session: "zenoh.Session", publishers: "Publishers | None", declared: list[Any]
-) -> None:
-    """Undeclare everything declared, and close; waits, so it is called off the loop.
-
-    A declaration left at the end of Python would wait for ever for threads that have ended. A
-    publisher cannot be undeclared while its thread publishes.
-    """
-    import zenoh
-
-    if publishers is not None:
-        declared += publishers.ended()
-    while declared:
-        with suppress(zenoh.ZError, RuntimeError):
-            declared.pop().undeclare()
-    with suppress(zenoh.ZError):
-        session.close()  # type: ignore[no-untyped-call]
-
-
 def payload_of(sample: "zenoh.Sample") -> Payload:
     """Return the frames of a message and its size; a longer one is not even copied."""
     size = len(sample.payload)
@@ -435,6 +416,59 @@ class Publishers:
                 publisher.put(payload, attachment=attachment)
             except self._zenoh.ZError as error:
                 log.debug("not published: %s", error)
+
+
+class Connection:
+    """An open session with its publishers and all that is declared on it."""
+
+    def __init__(self, session: "zenoh.Session") -> None:
+        self.session = session
+        self.publishers = Publishers(session)
+        self.readers: list[LoopQueue[Any] | Subscription] = []
+        """They pass messages to the loop until the session is closed."""
+        self.declared: list[Any] = []
+
+    @property
+    def has_router(self) -> bool:
+        """Whether the session is linked with a router."""
+        return bool(self.session.info.routers_zid())
+
+    def watch_presence(self, site: str, handle: Callable[[str, str, bool], None]) -> None:
+        """Call back with a site, one of its sessions, and whether that is here or gone."""
+        import zenoh
+
+        here = zenoh.SampleKind.PUT
+        presence: LoopQueue[tuple[str, str, bool]] = LoopQueue(lambda news: handle(*news))
+
+        def put(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            presence.put((site_of(key), key.rpartition("/")[2], sample.kind == here))
+
+        self.readers.append(presence)
+        tokens, liveliness = presence_key(site, "*"), self.session.liveliness()
+        self.declared.append(liveliness.declare_subscriber(tokens, put, history=True))
+
+    def close(self) -> None:
+        """End the session; a thread closes it, which may take a moment."""
+        for reader in self.readers:
+            reader.close()
+        self.publishers.close()
+        off_loop(self._end)
+
+    def _end(self) -> None:
+        """Undeclare everything, and close; waits for Zenoh.
+
+        A declaration left at the end of Python would wait for ever for threads that have ended. A
+        publisher cannot be undeclared while its thread publishes.
+        """
+        import zenoh
+
+        self.declared += self.publishers.ended()
+        while self.declared:
+            with suppress(zenoh.ZError, RuntimeError):
+                self.declared.pop().undeclare()
+        with suppress(zenoh.ZError):
+            self.session.close()  # type: ignore[no-untyped-call]
 
 
 def _message_of(error: Exception) -> str:
