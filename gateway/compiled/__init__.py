@@ -8,17 +8,13 @@ the last digit, because its powers and `hypot` are rounded differently.
 
 import ctypes
 from collections.abc import Callable
-from functools import cache, lru_cache
 from math import prod
 from types import FunctionType
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 Function = TypeVar("Function", bound=Callable[..., object])
-
-MOST_DIMENSIONS: Final = 2
-"""Of a memoryview, which gives no part of one with more."""
 
 _MARKED: set[Callable[..., object]] = set()
 
@@ -38,43 +34,20 @@ def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
     """View the memory at an address as a contiguous array, without a copy.
 
     The caller keeps that memory alive. `kind` is the numpy.dtype of the items, in compiled code a
-    constant of its module. Python gets a memoryview of an array of one dimension or two: it gives
-    plain numbers, with which Python calculates five times faster than with numpy's. But it has no
-    row of a matrix, and no way to fill a slice.
+    constant of its module.
     """
     memory = (ctypes.c_char * (prod(shape) * kind.itemsize)).from_address(address)
-    array: Any = np.frombuffer(memory, kind).reshape(shape)
-    return memoryview(array) if len(shape) <= MOST_DIMENSIONS else array
+    return np.frombuffer(memory, kind).reshape(shape)
 
 
 def record_at(address: int, layout: Any) -> Any:
     """View the record at an address, without a copy; its fields are attributes.
 
-    The caller keeps that record alive. The fields of `layout`, a numpy.dtype, are `f8`, `i8` or
-    arrays of `f8`; in compiled code it is a constant of its module.
+    The caller keeps that record alive. `layout` is a numpy.dtype with fields `f8`, `i8` or arrays
+    of `f8`, in compiled code a constant of its module.
     """
-    return _record_at(address, layout)
-
-
-@lru_cache(maxsize=64)
-def _record_at(address: int, layout: Any) -> Any:
-    record = _numbers_of(layout).from_address(address)
-    for name in layout.names:
-        kind, offset = layout.fields[name][:2]
-        if kind.shape:
-            setattr(record, name, array_at(address + offset, kind.shape, kind.base))
-    return record
-
-
-@cache
-def _numbers_of(layout: Any) -> type[ctypes.Structure]:
-    """Make a class with the numbers of a layout as attributes; arrays are only skipped."""
-    fields: list[tuple[str, Any]] = []
-    for name in layout.names:
-        kind = layout.fields[name][0]
-        number = ctypes.c_double if kind.base.kind == "f" else ctypes.c_int64
-        fields.append((f"_{name}", number * prod(kind.shape)) if kind.shape else (name, number))
-    return type("Record", (ctypes.Structure,), {"_fields_": fields})
+    memory = (ctypes.c_char * layout.itemsize).from_address(address)
+    return np.frombuffer(memory, layout)[0]
 
 
 def address_of(array: Any) -> int:

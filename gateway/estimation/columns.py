@@ -62,12 +62,11 @@ NAV_POS_STD: Final = 19
 NAV_FLAGS: Final = 22
 NAV_COLUMNS: Final = 23
 
-CLIP_FLAGS: Final = ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED
 ROW_FLAGS: Final = (
-    CLIP_FLAGS,
-    ImuFlags.MAG_UNCALIBRATED,
-    ImuFlags.GYRO_UNCALIBRATED,
-    ImuFlags.ACCEL_UNCALIBRATED,
+    int(ImuFlags.ACCEL_CLIPPED | ImuFlags.GYRO_CLIPPED),
+    int(ImuFlags.MAG_UNCALIBRATED),
+    int(ImuFlags.GYRO_UNCALIBRATED),
+    int(ImuFlags.ACCEL_UNCALIBRATED),
 )
 """A column each."""
 
@@ -77,16 +76,21 @@ _flags_of = cache(NavFlags)
 
 def imu_row(sample: ImuSample) -> ImuRow:
     """Lay out an IMU sample: unfiltered, for these estimators do their own averaging."""
-    shown = [1.0 if sample.flags & bits else 0.0 for bits in ROW_FLAGS]
     mag = sample.mag_b_ut or UNKNOWN_VEC3
-    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, *shown)
+    return (*sample.accel_b_mps2, *sample.gyro_b_radps, *mag, *_flag_columns(int(sample.flags)))
+
+
+@cache
+def _flag_columns(flags: int) -> tuple[float, ...]:
+    """Return the columns that show the flags, which are the same for many samples."""
+    return tuple(1.0 if flags & bits else 0.0 for bits in ROW_FLAGS)
 
 
 def imu_rows(
     accel_b_mps2: FloatArray, gyro_b_radps: FloatArray, mag_b_ut: FloatArray, flags: IntArray
 ) -> FloatArray:
     """Lay out n IMU samples, as `imu_row` each: vectors (n, 3), and `ImuFlags` (n,)."""
-    shown = [(flags & int(bits)) != 0 for bits in ROW_FLAGS]
+    shown = [(flags & bits) != 0 for bits in ROW_FLAGS]
     return np.column_stack([accel_b_mps2, gyro_b_radps, mag_b_ut, *shown]).astype(np.float64)
 
 

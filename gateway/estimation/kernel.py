@@ -1,12 +1,8 @@
 """The compiled estimator behind the interface of all: one sample live, or a whole log."""
 
 import struct
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import reduce
-from itertools import pairwise
-from operator import or_
 from typing import Final
 
 import msgspec
@@ -17,7 +13,6 @@ from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
     NAV_COLUMNS,
-    ROW_FLAGS,
     GpsRow,
     gps_row,
     imu_row,
@@ -37,14 +32,10 @@ from gateway.estimation.record import (
     unpack_record,
 )
 from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings
-from gateway.records import UNKNOWN_VEC3, BaroSample, GpsFix, ImuSample, NavState
+from gateway.records import BaroSample, GpsFix, ImuSample, NavState
 
 _ROW: Final = struct.Struct(f"={IMU_COLUMNS}d")
 """Fills the row of one sample in half the time that numpy takes for a tuple."""
-
-_ROW_FLAGS: Final = reduce(or_, map(int, ROW_FLAGS))
-_FLAG_COLUMNS: Final[dict[int, tuple[float, ...]]] = {}
-"""The last columns of a row by the flags that they show: they are the same for many samples."""
 
 Aiding = tuple[int, BaroSample | GpsFix]
 """A height or a fix, and the number of the IMU sample before which it arrived."""
@@ -71,8 +62,6 @@ class FoundLatency:
 
     latency_s: float
     std_s: float
-    used_s: float
-    """The same, or the set one where both agree."""
 
 
 class KernelEstimator:
@@ -137,16 +126,15 @@ class KernelEstimator:
         other = KernelEstimator(self._gains, self._reference)
         other.state = self._state
         other.run(log)
-        found = other.found_latency()
-        return self._reference.gps_latency_s if found is None else found.used_s
+        found, set_s = other.found_latency(), self._reference.gps_latency_s
+        return set_s if found is None else latency_to_use(found.latency_s, set_s)
 
-    def found_latency(self) -> "FoundLatency | None":
+    def found_latency(self) -> FoundLatency | None:
         """Return the GPS latency that manoeuvres have shown so far; None where none has."""
         std_s = latency_std(self._state)
         if std_s > KNOWN_STD_S:
             return None
-        found_s = float(self._state.latency_found[0])
-        return FoundLatency(found_s, std_s, latency_to_use(found_s, self._reference.gps_latency_s))
+        return FoundLatency(float(self._state.latency_found[0]), std_s)
 
     @property
     def gains(self) -> Gains:
@@ -177,15 +165,7 @@ class KernelEstimator:
             State at its time.
         """
         self._time_view[0] = sample.time_us
-        flags = sample.flags & _ROW_FLAGS
-        _ROW.pack_into(
-            self._row_view,
-            0,
-            *sample.accel_b_mps2,
-            *sample.gyro_b_radps,
-            *(sample.mag_b_ut or UNKNOWN_VEC3),
-            *(_FLAG_COLUMNS.get(flags) or _flag_columns(sample)),
-        )
+        _ROW.pack_into(self._row_view, 0, *imu_row(sample))
         self._step()
         return nav_state(sample.time_us, self._output)
 
@@ -227,19 +207,11 @@ class KernelEstimator:
         ndarray, shape (n, NAV_COLUMNS)
             One row per IMU sample.
         """
-        return self._run(
-            log,
-            _taken_before(log.imu_time_us, log.baro_time_us),
-            _taken_before(log.imu_time_us, log.gps_time_us),
-        )
-
-    def _run(self, log: SampleLog, baro_before: IntArray, gps_before: IntArray) -> FloatArray:
-        """Run the compiled loop; see `filter.run`."""
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
         kinds = (
             (log.imu_time_us, log.imu),
-            (baro_before, log.baro_alt_m),
-            (gps_before, log.gps_time_us, log.gps),
+            (log.baro_time_us, log.baro_alt_m),
+            (log.gps_time_us, log.gps),
         )
         # Their addresses hold only while the arrays are kept.
         arrays = [[*map(np.ascontiguousarray, kind)] for kind in kinds]
@@ -272,64 +244,25 @@ class KernelEstimator:
         ndarray, shape (n, NAV_COLUMNS)
             One row per IMU sample.
         """
-        # The compiled loop takes heights first: it is interrupted where one came after a fix.
-        cuts = {k for (k, a), (m, b) in pairwise(aiding) if k == m and _is_fix(a) > _is_fix(b)}
-        if on_fix is not None:
-            cuts = {k for k, record in aiding if _is_fix(record)}
-        pieces = []
-        begin = taken = 0
-        for end in [*sorted(cuts - {len(time_us)}), len(time_us)]:
-            until = bisect_left(aiding, end, taken, key=_sample_of)
-            within = [(k - begin, record) for k, record in aiding[taken:until]]
-            pieces.append(self._run_piece(time_us[begin:end], imu[begin:end], within))
-            begin, taken = end, bisect_right(aiding, end, until, key=_sample_of)
-            for _, record in aiding[until:taken]:
-                self._take(record)
-                if on_fix is not None and _is_fix(record):
-                    on_fix()
-        return np.concatenate(pieces)
-
-    def _run_piece(
-        self, time_us: IntArray, imu: FloatArray, aiding: Sequence[Aiding]
-    ) -> FloatArray:
-        heights = [(k, r.alt_pressure_m) for k, r in aiding if isinstance(r, BaroSample)]
-        fixes = [(k, r.time_us, self.fix_row(r)) for k, r in aiding if isinstance(r, GpsFix)]
-        log = SampleLog(
-            imu_time_us=time_us,
-            imu=imu,
-            baro_time_us=np.empty(0, np.int64),
-            baro_alt_m=np.array([alt_m for _, alt_m in heights], np.float64),
-            gps_time_us=np.array([arrival_us for _, arrival_us, _ in fixes], np.int64),
-            gps=np.array([row for *_, row in fixes], np.float64).reshape(-1, GPS_COLUMNS),
+        arrays = (
+            np.ascontiguousarray(time_us),
+            np.ascontiguousarray(imu),
+            np.empty((len(time_us), NAV_COLUMNS)),
         )
-        baro_before = np.array([k for k, _ in heights], np.int64)
-        return self._run(log, baro_before, np.array([k for k, *_ in fixes], np.int64))
-
-    def _take(self, record: BaroSample | GpsFix) -> None:
-        if isinstance(record, BaroSample):
-            self.update_baro(record)
-        else:
-            self.update_gps(record)
-
-
-def _flag_columns(sample: ImuSample) -> tuple[float, ...]:
-    """Return the columns of a sample's row that show its flags, and keep them."""
-    columns = _FLAG_COLUMNS[sample.flags & _ROW_FLAGS] = imu_row(sample)[-len(ROW_FLAGS) :]
-    return columns
-
-
-def _sample_of(aiding: Aiding) -> int:
-    return aiding[0]
-
-
-def _is_fix(record: BaroSample | GpsFix) -> bool:
-    return isinstance(record, GpsFix)
-
-
-def _taken_before(imu_time_us: IntArray, time_us: IntArray) -> IntArray:
-    """Return before which IMU sample each of a queue is taken: the first that is not earlier."""
-    reached = np.searchsorted(np.maximum.accumulate(imu_time_us), time_us)
-    return np.maximum.accumulate(reached)
+        starts = [(address_of(array), array.strides[0]) for array in arrays]
+        begin = 0
+        for end, record in (*aiding, (len(time_us), None)):
+            if end > begin:
+                rows = (start + begin * size for start, size in starts)
+                kernels.imu_steps(self._at, self._gains_at, end - begin, *rows)
+                begin = end
+            if isinstance(record, BaroSample):
+                self.update_baro(record)
+            elif isinstance(record, GpsFix):
+                self.update_gps(record)
+                if on_fix is not None:
+                    on_fix()
+        return arrays[2]
 
 
 def estimate_latency(log: SampleLog) -> FoundLatency | None:

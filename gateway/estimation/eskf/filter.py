@@ -445,30 +445,25 @@ def run(
     imu_times_us: int,
     imu_rows: int,
     baro_count: int,
-    baro_before_at: int,
+    baro_times_us: int,
     baro_alts_m: int,
     gps_count: int,
-    gps_before_at: int,
     gps_times_us: int,
     gps_rows: int,
     outputs: int,
 ) -> None:
-    """Advance over a log: at each IMU sample first the heights, then the fixes before it.
-
-    Heights and fixes come with the number of the IMU sample before which each arrived.
-    """
+    """Advance over a log: before each IMU sample the heights, then the fixes not later than it."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     imu_time_us = array_at(imu_times_us, (imu_count,), INT)
-    baro_before = array_at(baro_before_at, (baro_count,), INT)
+    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
     baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
-    gps_before = array_at(gps_before_at, (gps_count,), INT)
     gps_time_us = array_at(gps_times_us, (gps_count,), INT)
     baros = fixes = 0
     for i in range(imu_count):
-        while baros < baro_count and baro_before[baros] <= i:
+        while baros < baro_count and baro_time_us[baros] <= imu_time_us[i]:
             take_baro(s, p, baro_alt_m[baros])
             baros += 1
-        while fixes < gps_count and gps_before[fixes] <= i:
+        while fixes < gps_count and gps_time_us[fixes] <= imu_time_us[i]:
             take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
             fixes += 1
         take_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))

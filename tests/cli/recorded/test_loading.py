@@ -45,7 +45,7 @@ def test_recording_is_loaded_with_its_recorded_settings(tmp_path: Path) -> None:
 def test_latency_contradicted_by_the_motion_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01, 0.9))
+    monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01))
     load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
     assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
 
