@@ -2,11 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 from gateway.aircraft import Aircraft
+from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
+from gateway.printable import receiver_state
 from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus
+from gateway.units import counted
 from gateway.vehicle.plan import Location, distance_and_bearing
+
+UNKNOWN: Final = "—"
+"""Figure that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,3 +106,28 @@ def _way(here: Location | None, there: Location | None) -> Way | None:
         return Way(*location, None, None)
     distance_m, bearing_rad = distance_and_bearing(here, there)
     return Way(*location, distance_m, math.degrees(bearing_rad) % 360.0)
+
+
+def summary_line(snapshot: Snapshot) -> str:
+    """Summarise a snapshot in one line for a log."""
+    report = snapshot.report
+    receiver = receiver_state(report.connected, report.bytes_received, report.frames)
+    parts = [f"receiver {report.port} {receiver}"]
+    parts += [
+        f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
+        for node in report.nodes
+    ]
+    for vehicle_id, state in snapshot.states:
+        roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
+        position = f"{figure_of(state.lat_deg, '.6f')} {figure_of(state.lon_deg, '.6f')}"
+        parts.append(
+            f"aircraft {vehicle_id} at {position} {figure_of(state.alt_amsl_m, '.1f')} m, "
+            f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
+        )
+    parts.append(counted(len(snapshot.clients), "client"))
+    return "; ".join(parts)
+
+
+def figure_of(value: float, spec: str) -> str:
+    """Format a number, or a dash for one that is not known."""
+    return format(value, spec) if math.isfinite(value) else UNKNOWN

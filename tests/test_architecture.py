@@ -34,7 +34,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "simulator": FOUNDATION | {"wire"},
     "aircraft": FOUNDATION | {"sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
-    "status": FOUNDATION | {"hub", "vehicle", "aircraft"},
+    "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},
     "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output", "printable"},
     "batch": FOUNDATION

@@ -21,10 +21,9 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
-from gateway.live.log_limit import UNKNOWN, figure_of
 from gateway.printable import PrintableFormatter
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from gateway.status import UNKNOWN, AircraftStatus, RecorderStatus, Snapshot, Way, figure_of
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 OUTAGE_US: Final = 2 * US_PER_S

@@ -1,4 +1,4 @@
-"""A rate limit for the log, so that no repeated error fills the disk, and its periodic summary.
+"""A rate limit for the log, so that no repeated error fills the disk.
 
 A kind of line is the code position that writes it and, for an unexpected error, the one that
 raised it. Of each kind a few lines at once are written and then one a second; the next one written
@@ -6,50 +6,11 @@ says how many were not. Time is monotonic: a wall clock that is set back suppres
 """
 
 import logging
-import math
 import time
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
-
-from gateway.printable import receiver_state
-from gateway.units import counted
-
-if TYPE_CHECKING:
-    from gateway.status import Snapshot
-
-UNKNOWN: Final = "—"
-
-
-def summary_line(snapshot: "Snapshot") -> str:
-    """Summarise a snapshot in one line for a log."""
-    # Imported here, since it loads NumPy and every command limits its log.
-    from gateway.geometry.quaternion import to_euler
-
-    report = snapshot.report
-    receiver = receiver_state(report.connected, report.bytes_received, report.frames)
-    parts = [f"receiver {report.port} {receiver}"]
-    parts += [
-        f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
-        for node in report.nodes
-    ]
-    for vehicle_id, state in snapshot.states:
-        roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
-        position = f"{figure_of(state.lat_deg, '.6f')} {figure_of(state.lon_deg, '.6f')}"
-        parts.append(
-            f"aircraft {vehicle_id} at {position} {figure_of(state.alt_amsl_m, '.1f')} m, "
-            f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
-        )
-    count = len(snapshot.clients)
-    parts.append(counted(count, "client"))
-    return "; ".join(parts)
-
-
-def figure_of(value: float, spec: str) -> str:
-    """Format a number, or a dash for one that is not known."""
-    return format(value, spec) if math.isfinite(value) else UNKNOWN
-
+from typing import Final
 
 BURST: Final = 20
 """Lines of a kind at once: a start with many endpoints writes one for each."""

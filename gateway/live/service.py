@@ -42,10 +42,6 @@ class ServiceNotifier:
         """Report that settings are being read again; `ready` ends it."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // NS_PER_US}")
 
-    def status(self, text: str) -> None:
-        """Show one line in `systemctl status`."""
-        self._send(f"STATUS={text}")
-
     def stopping(self) -> None:
         """Report that the service is stopping."""
         if self._timer is not None:

@@ -11,7 +11,6 @@ from rich.console import Console
 from gateway.geometry.quaternion import from_euler
 from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.console import LiveView
-from gateway.live.log_limit import summary_line
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,
@@ -24,7 +23,7 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way
+from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way, summary_line
 from tests.client_stats import TABLET
 from tests.kit.records import FIX
 

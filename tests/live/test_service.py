@@ -29,13 +29,12 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
 async def test_systemd_is_notified_of_every_state(systemd: socket.socket) -> None:
     notifier = ServiceNotifier()
     notifier.ready()
-    notifier.status("2 clients")
     notifier.reloading()
     notifier.stopping()
-    notified = [systemd.recv(200).decode() for _ in range(4)]
-    assert notified[:2] == ["READY=1", "STATUS=2 clients"]
-    assert notified[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
-    assert notified[3] == "STOPPING=1"
+    notified = [systemd.recv(200).decode() for _ in range(3)]
+    assert notified[0] == "READY=1"
+    assert notified[1].startswith("RELOADING=1\nMONOTONIC_USEC=")
+    assert notified[2] == "STOPPING=1"
 
 
 async def test_watchdog_is_notified_at_twice_its_rate(

@@ -29,20 +29,8 @@ from gateway.live.control_verbs import raw_of
 from gateway.live.serial_port import SerialPort, SerialSettings, find_receiver
 from gateway.recordings.reading import open_rows
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
-from gateway.sensing.calibrating import (
-    FIELD_SIDES,
-    CalibrationError,
-    NodeSamples,
-    calibrate_accelerometer,
-    calibrate_gyro,
-    calibrate_level,
-    calibrate_magnetometer,
-    calibrate_mounting,
-    field_sides,
-    node_samples,
-    sides_of,
-    still_windows,
-)
+from gateway.sensing import calibrating
+from gateway.sensing.calibrating import CalibrationError, NodeSamples, node_samples
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
 from gateway.wire.link import Link
@@ -59,7 +47,7 @@ MAG_LIMIT_S: Final = 120.0
 """The compass is turned for at least and at most this long."""
 SIDES_EVERY_S: Final = 0.5
 MAG_SIDES: Final = 20
-"""Of `FIELD_SIDES`: enough to end the turning."""
+"""Of `calibrating.FIELD_SIDES`: enough to end the turning."""
 MAX_TRIES: Final = 24
 MOVING_MPS: Final = 1.0
 """GPS speed that is not rest; a receiver at rest reports up to 0.3 m/s."""
@@ -188,15 +176,15 @@ def _solve(
 ) -> NodeCalibration:
     match step:
         case Step.GYRO:
-            return calibrate_gyro(poses[0], calibration)
+            return calibrating.calibrate_gyro(poses[0], calibration)
         case Step.ACCEL:
-            return calibrate_accelerometer(poses, calibration)
+            return calibrating.calibrate_accelerometer(poses, calibration)
         case Step.MAG:
-            return calibrate_magnetometer(poses[0], calibration, field_ut)
+            return calibrating.calibrate_magnetometer(poses[0], calibration, field_ut)
         case Step.MOUNTING:
-            return calibrate_mounting(poses[0], poses[1], calibration)
+            return calibrating.calibrate_mounting(poses[0], poses[1], calibration)
         case Step.LEVEL:
-            return calibrate_level(poses[0], calibration)
+            return calibrating.calibrate_level(poses[0], calibration)
 
 
 def poses_from(capture: Capture) -> Poses:
@@ -247,7 +235,7 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
             f"go: {', '.join(missing)}."
         )
         samples = capture(POSE_S)
-        if not still_windows(samples):
+        if not calibrating.still_windows(samples):
             console.print("It moved; once more.")
         elif _missing([*held, samples]) == missing:
             console.print("That side was done before, or it is too far from upright; once more.")
@@ -257,7 +245,7 @@ def _six_sides(capture: Capture) -> list[NodeSamples]:
 
 def _missing(samples: list[NodeSamples]) -> list[str]:
     """Name the sides on which the node was not laid yet."""
-    seen = sides_of(samples)
+    seen = calibrating.sides_of(samples)
     return [name for number, name in enumerate(SIDES) if number not in seen]
 
 
@@ -331,12 +319,13 @@ class _Collecting:
         """What the IMU node reported last."""
         self._shown_s = 0.0
         label = "sides of the field seen" if turned else "listening"
-        unit = f"{{task.completed:.0f}} of {FIELD_SIDES}" if turned else "{task.completed:.0f} s"
+        total = calibrating.FIELD_SIDES if turned else seconds
+        unit = f"of {total}" if turned else "s"
         self.bar = Progress(
-            TextColumn(label), BarColumn(), TextColumn(unit),
+            TextColumn(label), BarColumn(), TextColumn(f"{{task.completed:.0f}} {unit}"),
             console=console, transient=True, auto_refresh=False, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self.bar.add_task("", total=FIELD_SIDES if turned else seconds)
+        self._task = self.bar.add_task("", total=total)
         self.limit_s = MAG_LIMIT_S if turned else seconds
 
     def add(self, records: Iterable[RawRecord]) -> bool:
@@ -356,7 +345,7 @@ class _Collecting:
         if span_s < self._shown_s + SIDES_EVERY_S:
             return False
         self._shown_s = span_s
-        sides = field_sides(node_samples(raws))
+        sides = calibrating.field_sides(node_samples(raws))
         self.bar.update(self._task, completed=sides, refresh=True)
         return span_s > MAG_LIMIT_S or (span_s > seconds and sides >= MAG_SIDES)
 

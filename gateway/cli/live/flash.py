@@ -10,24 +10,8 @@ import typer
 from intelhex import IntelHex
 
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.flashing.boards import (
-    CLOCKS_MHZ,
-    USED_BY,
-    BoardSettings,
-    FlashError,
-    Program,
-    SettingsBlock,
-    block_of,
-    default_pipe,
-    find_bootloader,
-    image_path,
-    read_flash,
-    read_image,
-    require_bootloader,
-    reserved,
-    with_settings,
-    write_flash,
-)
+from gateway.flashing import boards
+from gateway.flashing.boards import USED_BY, BoardSettings, FlashError, Program, SettingsBlock
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialSettings,
@@ -125,25 +109,25 @@ def flash(
     sensors = (send_rate, raw, accel_range, gyro_range, gps_rate, gps_model)
     given: tuple[object, ...] = (vehicle, node, *radio, *sensors)
     changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
-    if clock not in CLOCKS_MHZ:
+    if clock not in boards.CLOCKS_MHZ:
         refuse(f"--clock {clock}: 16 or 8")
     try:
         if show:
             device = find_port(port, list_serial_ports())
-            with reserved(device):
-                block = block_of(read_flash(device, require_bootloader(device)))
-            _print(device, block)
+            with boards.reserved(device):
+                written = boards.read_flash(device, boards.require_bootloader(device))
+            _print(device, boards.block_of(written))
         elif board is None:
             _list()
         else:
             program = Program[board.name]
             _check(program, changes)
-            image = read_image(image_path(program, clock))
+            image = boards.read_image(boards.image_path(program, clock))
             if output is None:
                 _write(program, image, changes, port=port, keep=keep)
             else:
-                settings = _changed(program, block_of(image).settings, changes)
-                write_new(output, [with_settings(image, settings)], overwrite=force)
+                settings = _changed(program, boards.block_of(image).settings, changes)
+                write_new(output, [boards.with_settings(image, settings)], overwrite=force)
     except FileExistsError:
         refuse(f"{output} already exists; use --force to overwrite")
     except OSError as error:
@@ -174,8 +158,8 @@ def _list() -> None:
 
 def _bootloader_text(device: str) -> str:
     try:
-        with reserved(device):
-            loader = find_bootloader(device)
+        with boards.reserved(device):
+            loader = boards.find_bootloader(device)
     except FlashError as error:
         return str(error).removeprefix(f"{device}: ")
     return "no answer" if loader is None else f"{loader.name}, {loader.baud} baud"
@@ -186,18 +170,18 @@ def _write(
 ) -> None:
     """Patch an image and write it to a board."""
     device = find_port(port, list_serial_ports())
-    with reserved(device):
-        loader = require_bootloader(device)
-        before = block_of(image).settings
+    with boards.reserved(device):
+        loader = boards.require_bootloader(device)
+        before = boards.block_of(image).settings
         if keep:
-            kept = block_of(read_flash(device, loader))
+            kept = boards.block_of(boards.read_flash(device, loader))
             if kept.program is not program:
                 refuse(f"--keep: the board holds the program {kept.program.name.lower()}")
             before = kept.settings
         before = msgspec.structs.replace(before, soft_restart=loader.leaves_watchdog_on)
         settings = _changed(program, before, changes)
-        write_flash(device, loader, with_settings(image, settings))
-    _print(device, block_of(image))
+        boards.write_flash(device, loader, boards.with_settings(image, settings))
+    _print(device, boards.block_of(image))
 
 
 def _check(program: Program, changes: dict[str, Any]) -> None:
@@ -216,7 +200,7 @@ def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -
     """Apply the options; another vehicle gets its own pipe."""
     after = msgspec.structs.replace(before, **changes)
     if "vehicle_id" in changes and "radio_pipe" not in changes:
-        pipe = default_pipe(program, after.vehicle_id)
+        pipe = boards.default_pipe(program, after.vehicle_id)
         after = msgspec.structs.replace(after, radio_pipe=pipe)
     return after
 

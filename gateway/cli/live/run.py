@@ -18,9 +18,9 @@ from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
 from gateway.live.daemon import Daemon
-from gateway.live.log_limit import summary_line
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
+from gateway.status import summary_line
 
 if TYPE_CHECKING:
     from gateway.live.console import LiveView
