@@ -5,7 +5,7 @@ firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself ch
 """
 
 import json
-from dataclasses import replace
+
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -126,7 +126,7 @@ RADIO: dict[str, tuple[payloads.Header, payloads.Payload]] = {
     ),
     "node_status_imu_chips": (
         payloads.Header(NodeId(1, 0), 513, 61_000_000),
-        replace(
+        msgspec.structs.replace(
             NODE_STATUS,
             firmware_version=(1, 1),
             reset_cause=1,

@@ -379,7 +379,6 @@ MAX_ENTRIES: Final = 64
 
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_@/.? =-]")
 _GOOD_RESULTS: Final = (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
-_FTP_NAK: Final = 129
 _FTP_OPCODE, _FTP_DATA = 3, 12
 
 
@@ -430,7 +429,7 @@ def failure_of(message: Any) -> str | None:
             return _name("PARAM_ACK", message.param_result)
         case "CHANGE_OPERATOR_CONTROL_ACK" if message.ack:
             return f"NACK {message.ack}"
-        case "FILE_TRANSFER_PROTOCOL" if message.payload[_FTP_OPCODE] == _FTP_NAK:
+        case "FILE_TRANSFER_PROTOCOL" if message.payload[_FTP_OPCODE] == mavlink.MAV_FTP_OPCODE_NAK:
             return f"FTP error {message.payload[_FTP_DATA]}"
     return None
 

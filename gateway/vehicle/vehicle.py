@@ -1,8 +1,7 @@
 """One aircraft as a MAVLink system: records in, frames out; requests in, answers out."""
 
-from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -112,6 +111,8 @@ class Vehicle:
         self._timestamps = timestamps or SigningTimestamps()
         self._encoder = Encoder(system_id)
         self._reader = RequestReader(system_id)
+        self.faults = self._reader.faults
+        """Frames of clients that were dropped, by reason."""
         self.signing_key: bytes | None = None
         """The key that signs this vehicle's frames as they leave the gateway, if any."""
         self._sign_by(settings.signing_passphrase)
@@ -130,8 +131,9 @@ class Vehicle:
         self._parameters = ParameterService(
             self.system_id, ParameterTable(sections), {HOME_SECTION: self.plan}
         )
-        self._metadata = Metadata(self._parameters.table)
-        self._ftp = FtpService({**self._metadata.files, PACKED_PATH: self._parameters.packed})
+        self.metadata = Metadata(self._parameters.table)
+        """Descriptions of the parameters."""
+        self._ftp = FtpService({**self.metadata.files, PACKED_PATH: self._parameters.packed})
         self._calibrator = Calibrator(lambda: self.in_flight, lambda: self.telemetry.state)
         self._recording = RecordingService(self._explain)
         self._control = OperatorControl(
@@ -162,7 +164,7 @@ class Vehicle:
             mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, lambda _: encoding.available_modes(of.autopilot)
         )
         add(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, lambda _: encoding.current_mode(of.autopilot))
-        add(MAVLINK_MSG_ID_COMPONENT_METADATA, self._metadata.announcement)
+        add(MAVLINK_MSG_ID_COMPONENT_METADATA, self.metadata.announcement)
 
     def _route(self, commands: CommandService) -> None:
         """Register which service handles which message, and which are polled."""
@@ -179,11 +181,6 @@ class Vehicle:
         self._services = {kind: service for service in services for kind in service.types}
 
     @property
-    def faults(self) -> Counter[str]:
-        """Frames of clients that were dropped, by reason."""
-        return self._reader.faults
-
-    @property
     def in_flight(self) -> bool:
         """Whether the aircraft is in flight."""
         return self.telemetry.motion.landed_state == IN_AIR
@@ -191,53 +188,45 @@ class Vehicle:
     def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Action]:
         """Take in the estimate for one IMU sample."""
         self.health.on_state(state, sample)
-        messages = self.telemetry.on_state(state, sample)
-        messages += self._announcements.on_state(state, sample, now_us)
-        actions: list[Action] = [self._encoder.encode(message) for message in messages]
+        found = self.telemetry.on_state(state, sample)
+        found += self._announcements.on_state(state, sample, now_us)
         if self._intervals.has_fast:
-            actions += self._finish(self._intervals.on_state(state.time_us))
+            found += self._intervals.on_state(state.time_us)
         if self._calibrator.busy:
-            actions += self._finish(self._calibrator.on_sample(sample))
-        return actions
+            found += self._calibrator.on_sample(sample)
+        return self._finish(found) if found else []
 
     def on_baro(self, sample: BaroSample, _now_us: int) -> list[Action]:
         """Take in one barometer sample."""
         self.health.on_baro(sample)
-        return self._finish(self._replies(self.telemetry.on_baro(sample)))
+        return self._finish(self.telemetry.on_baro(sample))
 
     def on_gps(self, fix: GpsFix, now_us: int) -> list[Action]:
         """Take in one GPS fix."""
         self.health.on_gps(fix)
         had_home = self.telemetry.home is not None
-        found = self._replies(self.telemetry.on_gps(fix))
+        found = self.telemetry.on_gps(fix)
         if self.telemetry.home is not None and not had_home:
-            found += self._replies(
-                self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
-            )
+            found += self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
         found += self.plan.on_fix(fix, now_us)
-        found += self._replies(self._announcements.on_fix(now_us))
+        found += self._announcements.on_fix(now_us)
         return self._finish(found)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:
         """Take in the GPS latency that the estimator uses, and the one that is set, s."""
-        found = self._announcements.on_latency(used_s, set_s, now_us)
-        return self._finish(self._replies(found))
+        return self._finish(self._announcements.on_latency(used_s, set_s, now_us))
 
     def on_node_status(self, status: NodeStatus, now_us: int) -> list[Action]:
         """Take in a node's report about itself."""
         findings = self.health.on_node_status(status)
         found = self.telemetry.on_node_status(status)
-        return self._finish(
-            self._replies(found + self._announcements.on_findings(findings, now_us))
-        )
+        return self._finish(found + self._announcements.on_findings(findings, now_us))
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Action]:
         """Take in the state of the serial link and of all radio links."""
         findings = self.health.on_link(report)
         found = self._announcements.on_link(report, now_us)
-        return self._finish(
-            self._replies(found + self._announcements.on_findings(findings, now_us))
-        )
+        return self._finish(found + self._announcements.on_findings(findings, now_us))
 
     def handle(self, incoming: Incoming, now_us: int) -> list[Action]:
         """Answer one frame of a client; ignore one that is not for this vehicle."""
@@ -266,13 +255,8 @@ class Vehicle:
         name = _describe(request)
         status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}{reason}")
         answers = service.refuse(request)
-        answers += self._replies(self._refusal_texts.say(status, now_us))
+        answers += self._refusal_texts.say(status, now_us)
         return self._finish(answers)
-
-    @property
-    def metadata(self) -> Metadata:
-        """Descriptions of the parameters."""
-        return self._metadata
 
     def introduction(self) -> list[Outgoing]:
         """Encode what every ground station requests at its start, for a recording alone.
@@ -296,8 +280,7 @@ class Vehicle:
     def poll(self, now_us: int) -> list[Action]:
         """Return the actions that are due by time."""
         self.telemetry.calibrating = self._calibrator.busy
-        found = self._replies(self.telemetry.poll(now_us))
-        found += self._replies(self._announcements.poll(now_us))
+        found = self.telemetry.poll(now_us) + self._announcements.poll(now_us)
         for service in self._timed:
             found += service.poll(now_us)
         return self._finish(found)
@@ -316,15 +299,14 @@ class Vehicle:
     def on_recorder(self, trouble: str, now_us: int, *, recording: bool) -> list[Action]:
         """Note whether a recording runs, or why not; the armed bit may follow it."""
         self.health.recording = recording
-        answers = self._recording.update(trouble, now_us, recording=recording)
-        return self._finish(answers) if answers else []
+        return self._finish(self._recording.update(trouble, now_us, recording=recording))
 
     def on_saved(self, request: Request, text: str, now_us: int, *, stored: bool) -> list[Action]:
         """Acknowledge the request of `SaveSettings`; the text names the file, or the error."""
         ack = read_command(request).ack(ACCEPTED if stored else FAILED)
         saved = StatusText(INFO, f"Settings saved: {text}")
         status = saved if stored else StatusText(WARNING, f"Settings not saved: {text}")
-        return self._finish([ack, *self._replies(self._announcements.say(status, now_us))])
+        return self._finish([ack, *self._announcements.say(status, now_us)])
 
     def put_mark(self, location: Location | None, now_us: int) -> list[Action]:
         """Mark a location (its height may be NaN), or clear the mark.
@@ -335,7 +317,7 @@ class Vehicle:
 
     def say(self, text: StatusText, now_us: int) -> list[Action]:
         """Announce an event of the gateway, such as a recording that stopped."""
-        return self._finish(self._replies(self._announcements.say(text, now_us)))
+        return self._finish(self._announcements.say(text, now_us))
 
     def take_settings(self, section: str, settings: Settings) -> list[Action]:
         """Apply a section that was changed elsewhere, and send the parameters that differ."""
@@ -344,7 +326,7 @@ class Vehicle:
         return self._finish(self._parameters.update(section, settings))
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return self._replies(self._announcements.say(StatusText(NOTICE, text), now_us))
+        return self._announcements.say(StatusText(NOTICE, text), now_us)
 
     def _reconfigure(self, settings: VehicleSettings) -> None:
         self.health.silent_us = round(settings.node_silent_s * 1e6)
@@ -360,9 +342,6 @@ class Vehicle:
             return
         self.signing_key = key
         self._reader.verifier = Verifier(key, self._clock, self._timestamps) if key else None
-
-    def _replies(self, messages: Iterable[Any]) -> list[Answer]:
-        return [Reply(message) for message in messages]
 
     def _finish(self, answers: Iterable[Answer]) -> list[Action]:
         """Encode the messages, and apply the actions that concern the vehicle itself."""

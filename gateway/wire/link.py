@@ -10,6 +10,8 @@ from enum import Enum
 from itertools import takewhile
 from typing import Final
 
+import msgspec
+
 from gateway.records import (
     NAN,
     BaroRaw,
@@ -353,36 +355,23 @@ def _unless_saturated(value: float, scale: float) -> float:
 def _node_status(
     header: payloads.Header, status: payloads.NodeStatusPayload, time_us: int
 ) -> NodeStatus:
+    """Copy the fields, which have the same names, and name the chips."""
+    fields = msgspec.structs.asdict(status)
+    chips = fields.pop("chips")
     return NodeStatus(
         time_us=time_us,
         node=header.node,
         node_time_us=header.node_time_us,
-        firmware_version=status.firmware_version,
-        reset_cause=status.reset_cause,
-        sensors_present=status.sensors_present,
-        sensors_failed=status.sensors_failed,
-        bus_errors=status.bus_errors,
-        radio_failed=status.radio_failed,
-        radio_retries=status.radio_retries,
-        loop_max_us=status.loop_max_us,
-        sample_rate_hz=status.sample_rate_hz,
-        supply_mv=status.supply_mv,
-        radio=status.radio,
-        chips=() if status.chips is None else chip_names(status.chips, status.sensors_present),
+        chips=() if chips is None else chip_names(chips, status.sensors_present),
+        **fields,
     )
 
 
-def _receiver_status(status: payloads.ReceiverStatusFrame, time_us: int) -> ReceiverStatus:
-    return ReceiverStatus(
-        time_us=time_us,
-        receiver_time_us=status.receiver_time_us,
-        channel=status.channel,
-        noise_percent=status.noise_percent,
-        uart_dropped=status.uart_dropped,
-        reset_cause=status.reset_cause,
-        pipes=status.pipes,
-        radio=status.radio,
-    )
+def _receiver_status(frame: payloads.ReceiverStatusFrame, time_us: int) -> ReceiverStatus:
+    """Copy the fields, which have the same names."""
+    fields = msgspec.structs.asdict(frame)
+    del fields["frame_seq"]
+    return ReceiverStatus(time_us=time_us, **fields)
 
 
 def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:

@@ -11,8 +11,12 @@ from typing import Any, Final
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
-DROPPED: Final = {300: ("PROTOCOL_VERSION", 217), 397: ("COMPONENT_METADATA", 182)}
-"""Name and checksum seed of messages that the dialects lack and ground stations ask for."""
+MISSING: Final = {
+    300: ("PROTOCOL_VERSION", 217),
+    397: ("COMPONENT_METADATA", 182),
+    512: ("CONTROL_STATUS", 21),
+}
+"""Name and checksum seed of messages that the dialects lack and a vehicle of the gateway sends."""
 
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
@@ -35,7 +39,7 @@ def offset_of(message: Any, field: str) -> int:
 
 CRC_EXTRA: Final[dict[int, bytes]] = {
     message_id: bytes((message.crc_extra,)) for message_id, message in dialect.mavlink_map.items()
-} | {message_id: bytes((extra,)) for message_id, (_, extra) in DROPPED.items()}
+} | {message_id: bytes((extra,)) for message_id, (_, extra) in MISSING.items()}
 """The byte that closes each message's checksum, as the checksum function wants it."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
@@ -52,7 +56,7 @@ TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
 
 MESSAGE_NAMES: Final[dict[int, str]] = {
     message_id: message.msgname for message_id, message in dialect.mavlink_map.items()
-} | {message_id: name for message_id, (name, _) in DROPPED.items()}
+} | {message_id: name for message_id, (name, _) in MISSING.items()}
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
 

@@ -6,7 +6,6 @@ Encoding serves the simulator and the golden vectors that the firmware's tests s
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import IntEnum
 from functools import cache
@@ -56,8 +55,7 @@ _GPS_NAMES: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Chips:
+class Chips(msgspec.Struct, frozen=True, gc=False):
     """The chips that a node has found, as it sends them; 0 for none."""
 
     imu: int = 0
@@ -190,16 +188,14 @@ class ImuPayload(msgspec.Struct, frozen=True, gc=False):
     mag_gain: int
 
 
-@dataclass(frozen=True, slots=True)
-class BaroPayload:
+class BaroPayload(msgspec.Struct, frozen=True, gc=False):
     """Barometer reading, compensated on the node."""
 
     pressure_centipa: int
     temperature_ddegc: int
 
 
-@dataclass(frozen=True, slots=True)
-class GpsFixPayload:
+class GpsFixPayload(msgspec.Struct, frozen=True, gc=False):
     """Position and velocity of one UBX-NAV-PVT."""
 
     itow_ms: int
@@ -212,8 +208,7 @@ class GpsFixPayload:
     satellites: int
 
 
-@dataclass(frozen=True, slots=True)
-class GpsQualityPayload:
+class GpsQualityPayload(msgspec.Struct, frozen=True, gc=False):
     """Accuracy and UTC of the fix with the same `itow_ms`; sent before it."""
 
     itow_ms: int
@@ -227,8 +222,7 @@ class GpsQualityPayload:
     """To a hundredth of a second; None unless the receiver reports date and time as valid."""
 
 
-@dataclass(frozen=True, slots=True)
-class NodeStatusPayload:
+class NodeStatusPayload(msgspec.Struct, frozen=True, gc=False):
     """A node's once-a-second report."""
 
     firmware_version: tuple[int, int]
@@ -259,8 +253,7 @@ class RadioFrame(msgspec.Struct, frozen=True, gc=False):
     payload: Payload
 
 
-@dataclass(frozen=True, slots=True)
-class ReceiverStatusFrame:
+class ReceiverStatusFrame(msgspec.Struct, frozen=True, gc=False):
     """The receiver's once-a-second report."""
 
     frame_seq: int
@@ -455,8 +448,7 @@ def _encode_node_status(payload: NodeStatusPayload) -> bytes:
     chips = payload.chips
     if chips is None:
         return _NODE_STATUS_1_0.pack(*values)
-    found = (chips.imu, chips.magnetometer, chips.barometer, chips.gps, chips.gps_baud_hundreds)
-    return _NODE_STATUS.pack(*values, *found)
+    return _NODE_STATUS.pack(*values, *msgspec.structs.astuple(chips))
 
 
 def _read_imu(words: tuple[int, ...]) -> ImuPayload:

@@ -1,11 +1,11 @@
 """One receiver's line: records on the gateway clock, and an account that adds up."""
 
-from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from gateway.records import (
     BaroRaw,

@@ -23,6 +23,7 @@ from gateway.wire.mavlink_splitter import (
     target_of,
     with_sequence,
 )
+from tests.kit.ground_station import OWN_MESSAGES
 from tests.kit.mavlink import frames_in, frames_of
 
 
@@ -253,7 +254,8 @@ class TestSequence:
         assert with_sequence(frame, 200) == frame
 
 
-def test_catalog_knows_the_message_that_the_dialects_dropped() -> None:
-    assert CRC_EXTRA[300] == bytes((217,))
-    assert MESSAGE_NAMES[300] == "PROTOCOL_VERSION"
-    assert MESSAGE_IDS["HEARTBEAT"] == 0
+@pytest.mark.parametrize("number", [300, 397, 512])
+def test_messages_that_the_dialects_lack_are_known(number: int) -> None:
+    name, extra = OWN_MESSAGES[number]
+    assert (MESSAGE_NAMES[number], CRC_EXTRA[number]) == (name, bytes((extra,)))
+    assert (MESSAGE_IDS[name], MESSAGE_IDS["HEARTBEAT"]) == (number, 0)

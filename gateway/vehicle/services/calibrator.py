@@ -41,7 +41,7 @@ from gateway.sensing.calibrating import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
-from gateway.vehicle.requests import INFO, Answer, CalibrationMeasured, Reply, Service, StatusText
+from gateway.vehicle.requests import INFO, Answer, CalibrationMeasured, Service, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -142,7 +142,7 @@ class Calibrator(Service):
     def __init__(
         self,
         in_flight: Callable[[], bool],
-        state: Callable[[], NavState | None] = lambda: None,
+        state: Callable[[], NavState | None],
     ) -> None:
         self._in_flight = in_flight
         self._state = state
@@ -269,4 +269,4 @@ class Calibrator(Service):
 
 
 def _text(text: str) -> list[Answer]:
-    return [Reply(message) for message in chunks(StatusText(INFO, f"[cal] {text}"))]
+    return chunks(StatusText(INFO, f"[cal] {text}"))

@@ -35,8 +35,8 @@ MIN_BURST_DATA: Final = 64
 _SCHEME: Final = re.compile(r"mftp://(?:\[?;comp=\d+\]?)?", re.IGNORECASE)
 """The part before the path in a URI of the component metadata."""
 
-ACK: Final = 128
-NAK: Final = 129
+ACK: Final = mavlink.MAV_FTP_OPCODE_ACK
+NAK: Final = mavlink.MAV_FTP_OPCODE_NAK
 
 
 class Opcode(IntEnum):

@@ -32,7 +32,7 @@ from gateway.vehicle.plan import (
     is_on_earth,
     location_of,
 )
-from gateway.vehicle.requests import INFO, Answer, Reply, SavePlan, StatusText
+from gateway.vehicle.requests import INFO, Answer, SavePlan, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -101,7 +101,7 @@ class Mark:
 NUMBERS: Final = {"lat_deg": "lat_deg", "lon_deg": "lon_deg", "alt_m": "alt_amsl_m"}
 """Parameters of home, and the fields of `Location` that they set."""
 
-Say = Callable[[StatusText, int], list[Any]]
+Say = Callable[[StatusText, int], list[Answer]]
 
 USE_CURRENT: Final = 1
 """First parameter of MAV_CMD_DO_SET_HOME."""
@@ -219,7 +219,7 @@ class PlanService:
     def _put_home(self, location: Location, now_us: int) -> list[Answer]:
         """Set home for an operator, and send HOME_POSITION."""
         self._entered.clear()
-        return [Reply(m) for m in self._telemetry.set_home(Home(location, now_us, "operator"))]
+        return [self._telemetry.set_home(Home(location, now_us, "operator"))]
 
     def _keep_home(self) -> None:
         """Keep the present home over a restart if an operator set it; else keep none."""
@@ -245,7 +245,7 @@ class PlanService:
         return home.location.alt_amsl_m if home else NAN
 
     def _explain(self, text: str, now_us: int) -> list[Answer]:
-        return [Reply(message) for message in self._say(StatusText(INFO, text), now_us)]
+        return self._say(StatusText(INFO, text), now_us)
 
     def _on_items(self, kind: int) -> list[Answer]:
         if kind != FENCE:

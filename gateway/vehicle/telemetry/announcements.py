@@ -11,13 +11,13 @@ every `REFILL_US`.
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
-from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, StatusText
+from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, Answer, Reply, StatusText
 from gateway.vehicle.telemetry.health import Finding, Health, status_text
 
 HOLD_US: Final = 5 * US_PER_S
@@ -48,7 +48,7 @@ class Announcer:
         self._refilled_us = 0
         self._next_id = 0
 
-    def track(self, finding: Finding, now_us: int) -> list[Any]:
+    def track(self, finding: Finding, now_us: int) -> list[Answer]:
         """Note the present state of a topic, and announce it if it changed."""
         topic, state, text = finding
         known = self._topics.get(topic)
@@ -64,7 +64,7 @@ class Announcer:
         self._pending.pop(topic, None)
         return self._announce(known, now_us)
 
-    def say(self, text: StatusText, now_us: int) -> list[Any]:
+    def say(self, text: StatusText, now_us: int) -> list[Answer]:
         """Announce a single event, unless there were too many recently."""
         self._refill(now_us)
         if self._tokens == 0:
@@ -72,18 +72,18 @@ class Announcer:
         self._tokens -= 1
         return chunks(text, self._number())
 
-    def poll(self, now_us: int) -> list[Any]:
+    def poll(self, now_us: int) -> list[Answer]:
         """Return the states that changed while their topics were held."""
         if not self._pending:
             return []
         due = [name for name, topic in self._pending.items() if now_us >= topic.held_until_us]
-        return [m for name in due for m in self._announce(self._pending.pop(name), now_us)]
+        return [a for name in due for a in self._announce(self._pending.pop(name), now_us)]
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to announce."""
         return min((topic.held_until_us for topic in self._pending.values()), default=None)
 
-    def _announce(self, topic: _Topic, now_us: int) -> list[Any]:
+    def _announce(self, topic: _Topic, now_us: int) -> list[Answer]:
         topic.announced = topic.state
         topic.held_until_us = now_us + HOLD_US
         return chunks(topic.text, self._number())
@@ -99,17 +99,19 @@ class Announcer:
             self._refilled_us += fresh * self._refill_us
 
 
-def chunks(text: StatusText, number: int = 1) -> list[Any]:
+def chunks(text: StatusText, number: int = 1) -> list[Answer]:
     """Encode a text as one STATUSTEXT, or as several chunks."""
     data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
     if len(data) <= TEXT_BYTES:
         # Id 0 means a text of one chunk.
-        return [mavlink.MAVLink_statustext_message(text.severity, data)]
+        return [Reply(mavlink.MAVLink_statustext_message(text.severity, data))]
     # A receiver takes a chunk that is not full for the last one.
     starts = range(0, len(data) + (len(data) % TEXT_BYTES == 0), TEXT_BYTES)
     return [
-        mavlink.MAVLink_statustext_message(
-            text.severity, data[start : start + TEXT_BYTES], number, chunk
+        Reply(
+            mavlink.MAVLink_statustext_message(
+                text.severity, data[start : start + TEXT_BYTES], number, chunk
+            )
         )
         for chunk, start in enumerate(starts)
     ]
@@ -161,7 +163,7 @@ class Announcements(Announcer):
         self._latency_s: float | None = None
         self._latency_since_us = 0
 
-    def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Any]:
+    def on_state(self, state: NavState, sample: ImuSample, now_us: int) -> list[Answer]:
         """Announce changes of the sensors' and the estimator's flags."""
         changed = (sample.flags & UNCALIBRATED) ^ self._uncalibrated
         if changed and sample.mag_b_ut is None:
@@ -172,7 +174,7 @@ class Announcements(Announcer):
             found += self._on_flags(state.flags, now_us)
         return found
 
-    def _on_flags(self, flags: NavFlags, now_us: int) -> list[Any]:
+    def _on_flags(self, flags: NavFlags, now_us: int) -> list[Answer]:
         changed, self._flags = flags ^ self._flags, flags
         found = []
         for flag, raised, fallen in FLAG_TEXTS:
@@ -184,7 +186,7 @@ class Announcements(Announcer):
                 found.append(Finding(str(flag.name), is_raised, text))
         return self.on_findings(found, now_us)
 
-    def _on_uncalibrated(self, changed: int, now_us: int) -> list[Any]:
+    def _on_uncalibrated(self, changed: int, now_us: int) -> list[Answer]:
         """Announce sensors that were never calibrated."""
         self._uncalibrated ^= changed
         found = []
@@ -195,12 +197,12 @@ class Announcements(Announcer):
                 found.append(Finding(sensor, is_bad, text))
         return self.on_findings(found, now_us)
 
-    def on_fix(self, now_us: int) -> list[Any]:
+    def on_fix(self, now_us: int) -> list[Answer]:
         """Announce whether GPS fixes arrive."""
         finding = GPS_FIX if self._health.has_fix(now_us) else GPS_LOST
         return self.track(finding, now_us)
 
-    def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Any]:
+    def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Answer]:
         """Announce once that the estimated latency of fixes differs from the setting.
 
         The latency in use approaches the estimate slowly, and stays constant while fixes are lost.
@@ -213,11 +215,11 @@ class Announcements(Announcer):
         finding = Finding("latency", f"{set_s} s is wrong", StatusText(NOTICE, text))
         return self.track(finding, now_us)
 
-    def on_findings(self, findings: Iterable[Finding], now_us: int) -> list[Any]:
+    def on_findings(self, findings: Iterable[Finding], now_us: int) -> list[Answer]:
         """Announce changes of state."""
-        return [m for finding in findings for m in self.track(finding, now_us)]
+        return [a for finding in findings for a in self.track(finding, now_us)]
 
-    def on_link(self, report: LinkReport, now_us: int) -> list[Any]:
+    def on_link(self, report: LinkReport, now_us: int) -> list[Answer]:
         """Announce that the receiver or a node was lost or is back."""
         lost, back = f"Receiver lost: {report.port}", f"Receiver connected: {report.port}"
         text = status_text(not report.connected, lost, back, CRITICAL)
@@ -232,11 +234,11 @@ class Announcements(Announcer):
             findings.append(Finding(f"node {node}", is_silent, text))
         return self.on_findings(findings, now_us) + self._on_restarts(now_us)
 
-    def poll(self, now_us: int) -> list[Any]:
+    def poll(self, now_us: int) -> list[Answer]:
         """Announce what changed while its topic was held."""
         return self.on_fix(now_us) + super().poll(now_us)
 
-    def _on_restarts(self, now_us: int) -> list[Any]:
+    def _on_restarts(self, now_us: int) -> list[Answer]:
         """Announce restarts one by one; many at once only as a state: no board starts so fast."""
         found = []
         for node, restarts in sorted(self._health.restarts().items()):

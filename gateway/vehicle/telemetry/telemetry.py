@@ -18,7 +18,7 @@ stall turn or a touch-and-go does not flip the state.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
@@ -38,6 +38,7 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES
 from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
+from gateway.vehicle.requests import Answer, Reply
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import GPS, GYRO, Health
 from gateway.vehicle.telemetry.messages import high_latency2
@@ -238,7 +239,7 @@ class Telemetry:
         recording = self.health.recording and rule.endswith("recording")
         return flying or recording or rule == "always"
 
-    def on_state(self, state: NavState, sample: ImuSample) -> list[Any]:
+    def on_state(self, state: NavState, sample: ImuSample) -> list[Answer]:
         """Take in a navigation state and its IMU sample, and return the messages due."""
         time_us = state.time_us
         if self.state is None:
@@ -260,9 +261,9 @@ class Telemetry:
         period_us = self._pace.take(time_us)
         return [] if time_us + period_us < self._state_due_us else self._carried(time_us, period_us)
 
-    def _carried(self, time_us: int, period_us: int) -> list[Any]:
+    def _carried(self, time_us: int, period_us: int) -> list[Answer]:
         """Build the messages that a sample carries, and note when the next one is due."""
-        found: list[Any] = []
+        found: list[Answer] = []
         soon_us, next_us = time_us + period_us, time_us + US_PER_S
         for stream, build in self._state_streams:
             due_us = stream.due_us
@@ -272,21 +273,21 @@ class Telemetry:
                 if stream.offer_paced(time_us, period_us):
                     message = build(time_us)
                     if message is not None:
-                        found.append(message)
+                        found.append(Reply(message))
                 due_us = stream.due_us
             if due_us is not None and due_us < next_us:
                 next_us = due_us
         self._state_due_us = next_us
         return found
 
-    def on_baro(self, sample: BaroSample) -> list[Any]:
+    def on_baro(self, sample: BaroSample) -> list[Answer]:
         """Take in a barometer sample, and return its message if due."""
         self._baro = sample
         self._updated |= messages.PRESSURE_UPDATED
         stream = self.streams[mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE]
-        return [messages.scaled_pressure(sample)] if stream.offer(sample.time_us) else []
+        return [Reply(messages.scaled_pressure(sample))] if stream.offer(sample.time_us) else []
 
-    def on_gps(self, fix: GpsFix) -> list[Any]:
+    def on_gps(self, fix: GpsFix) -> list[Answer]:
         """Take in a GPS fix, return its messages if due, and set home at the first good one."""
         self.fix = fix
         if messages.is_located(fix):
@@ -294,36 +295,38 @@ class Telemetry:
         if fix.utc_us is not None:
             self._unix_offset_us = fix.utc_us - fix.time_us
         stream = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
-        found = [messages.gps_raw_int(fix, self._located_fix)] if stream.offer(fix.time_us) else []
+        found: list[Answer] = []
+        if stream.offer(fix.time_us):
+            found.append(Reply(messages.gps_raw_int(fix, self._located_fix)))
         wanted = self.home is None or math.isnan(self._ground_alt_m)
         limits = self.settings
         if wanted and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
             self._ground_alt_m = fix.alt_amsl_m
             if self.home is None:
-                found += self.set_home(Home(location_of(fix), fix.time_us))
+                found.append(self.set_home(Home(location_of(fix), fix.time_us)))
         return found
 
-    def on_node_status(self, status: NodeStatus) -> list[Any]:
+    def on_node_status(self, status: NodeStatus) -> list[Answer]:
         """Return a node's supply message, if due."""
         common_us = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS].interval_us
         stream = self._batteries.setdefault(status.node.node_id, Stream(common_us))
         if stream.interval_us != common_us:
             stream.change(common_us)
         message = self.health.battery(status) if stream.offer(status.time_us) else None
-        return [] if message is None else [message]
+        return [] if message is None else [Reply(message)]
 
-    def set_home(self, home: Home) -> list[Any]:
-        """Set home, and return HOME_POSITION at once."""
+    def set_home(self, home: Home) -> Reply:
+        """Set home, and return HOME_POSITION."""
         self.home = home
         self._origin = self._origin or home
         self._reference_alt_m = home.location.alt_amsl_m
-        return [messages.home_position(home)]
+        return Reply(messages.home_position(home))
 
     def clear_home(self) -> None:
         """Let the next good fix set home; heights stay relative to the old one until then."""
         self.home = None
 
-    def poll(self, now_us: int) -> list[Any]:
+    def poll(self, now_us: int) -> list[Answer]:
         """Return the timed messages that are due."""
         if not self._polled:
             self._polled, self._timed_due_us = True, None
@@ -333,12 +336,13 @@ class Telemetry:
             return []
         due = [m for m in self._timed if self.streams[m].tick(now_us)]
         self._timed_due_us = None
-        found = self._build_all(due, now_us)
+        built = (self.build(message_id, now_us) for message_id in due)
+        found: list[Answer] = [Reply(message) for message in built if message is not None]
         silent = not self.health.is_alive(GPS, now_us)
         wanted = self.streams[mavlink.MAVLINK_MSG_ID_GPS_RAW_INT].interval_us > 0
         if silent and wanted and mavlink.MAVLINK_MSG_ID_HEARTBEAT in due:
             # Nothing else carries GPS_RAW_INT while the node is silent.
-            found.append(messages.gps_absent(now_us, self._located_fix))
+            found.append(Reply(messages.gps_absent(now_us, self._located_fix)))
         return found
 
     def next_due_us(self) -> int:
@@ -352,10 +356,6 @@ class Telemetry:
         """Build one message from the newest records; None if it is never sent, or not yet."""
         builder = self._builders.get(message_id)
         return builder(now_us) if builder else None
-
-    def _build_all(self, ids: Iterable[int], now_us: int) -> list[Any]:
-        built = [self.build(message_id, now_us) for message_id in ids]
-        return [message for message in built if message is not None]
 
     def _of_state(self, build: Callable[[NavState], Any]) -> Builder:
         return lambda _: None if self.state is None else build(self.state)

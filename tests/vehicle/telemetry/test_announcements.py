@@ -178,7 +178,7 @@ GOOD, BAD = StatusText(INFO, "good"), StatusText(WARNING, "bad")
 
 def track(announcer: Announcer, good: bool, now_us: int) -> list[str]:
     finding = Finding("topic", not good, GOOD if good else BAD)
-    return [m.text for m in announcer.track(finding, now_us)]
+    return [a.message.text for a in announcer.track(finding, now_us)]
 
 
 def test_change_is_announced_once() -> None:
@@ -195,9 +195,9 @@ def test_announcements_of_a_flapping_state_are_limited_and_end_with_the_true_one
     for n in range(10_000):
         now_us = n * 1000
         reported += track(announcer, n % 2 == 0, now_us)
-        reported += [m.text for m in announcer.poll(now_us)]
+        reported += [a.message.text for a in announcer.poll(now_us)]
     track(announcer, False, 10_000_000)
-    reported += [m.text for m in announcer.poll(10_000_000 + HOLD_US)]
+    reported += [a.message.text for a in announcer.poll(10_000_000 + HOLD_US)]
     assert len(reported) <= 4
     assert reported[-1] == "bad"
 
@@ -208,7 +208,7 @@ def test_change_within_the_hold_time_is_announced_at_its_end() -> None:
     assert track(announcer, True, 1000) == []
     assert announcer.next_due_us() == HOLD_US
     assert announcer.poll(HOLD_US - 1) == []
-    assert [m.text for m in announcer.poll(HOLD_US)] == ["good"]
+    assert [a.message.text for a in announcer.poll(HOLD_US)] == ["good"]
 
 
 def test_single_events_are_limited_in_rate() -> None:
@@ -221,7 +221,7 @@ def test_single_events_are_limited_in_rate() -> None:
 @pytest.mark.parametrize("size", [1, 49, 50, 51, 99, 100, 101, 199])
 def test_long_texts_are_chunked(size: int) -> None:
     text = "".join(chr(ord("a") + n % 26) for n in range(size))
-    found = Announcer().say(StatusText(INFO, text), 0)
+    found = [answer.message for answer in Announcer().say(StatusText(INFO, text), 0)]
     assert "".join(m.text for m in found) == text
     assert [m.chunk_seq for m in found] == list(range(len(found)))
     if size <= 50:
