@@ -26,7 +26,7 @@ from gateway.recordings.reading import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, sequence_of, with_sequence
+from gateway.wire.mavlink_splitter import frame_of, message_id_of, renumbered
 
 READY_S: Final = 3.0
 """A name that takes longer to be resolved is not waited for."""
@@ -203,14 +203,14 @@ class _Numbering:
 
     def played(self, frame: bytes) -> bytes:
         """Return a recorded frame, renumbered after inserted answers."""
-        origin = origin_of(frame)
-        sequence = sequence_of(frame) + self._added.get(origin, 0) & 0xFF
-        self._last[origin] = sequence
-        return with_sequence(frame, sequence)
+        read = frame_of(frame)
+        sequence = read.sequence + self._added.get(read.origin, 0) & 0xFF
+        self._last[read.origin] = sequence
+        return renumbered(read, sequence).data
 
     def inserted(self, frame: bytes) -> bytes:
         """Return an answer, numbered in between the recorded frames."""
-        origin = origin_of(frame)
-        sequence = self._last[origin] = self._last.get(origin, 0xFF) + 1 & 0xFF
-        self._added[origin] = self._added.get(origin, 0) + 1
-        return with_sequence(frame, sequence)
+        read = frame_of(frame)
+        sequence = self._last[read.origin] = self._last.get(read.origin, 0xFF) + 1 & 0xFF
+        self._added[read.origin] = self._added.get(read.origin, 0) + 1
+        return renumbered(read, sequence).data

@@ -20,7 +20,7 @@ from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
-from gateway.wire.mavlink_splitter import with_sequence
+from gateway.wire.mavlink_splitter import frame_of, renumbered
 from tests.kit.mavlink import STATION, Sender
 from tests.recordings.frames import START_US, make_tlog
 
@@ -113,7 +113,7 @@ async def test_commands_of_stations_are_played_only_on_request(
     wanted = [r.frame for r in recording()]
     if not with_commands:
         # The parameters are an answer; without it the second heartbeat follows the first.
-        wanted = [wanted[0], with_sequence(wanted[-1], 1)]
+        wanted = [wanted[0], renumbered(frame_of(wanted[-1]), 1).data]
     await station.until(len(wanted))
     daemon.close()
     assert station.frames == wanted

@@ -5,7 +5,6 @@ firmware/PROTOCOL.md cannot drift apart. Run it only when the protocol itself ch
 """
 
 import json
-
 from datetime import UTC, datetime
 from pathlib import Path
 

@@ -25,7 +25,7 @@ from gateway.panel.state.fleet import FleetState, Spot, command_long
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import DEGE7
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, target_of
+from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 log = logging.getLogger(__name__)
 
@@ -239,7 +239,7 @@ class Uplink:
     def _send(self, message: Any, mav: Any) -> int:
         frame = message.pack(mav)
         mav.seq = (mav.seq + 1) % 256
-        is_played = target_of(frame)[0] in self._fleet.origins
+        is_played = frame_of(frame).target[0] in self._fleet.origins
         hub = self._player_hub if is_played else self._hub
         hub.send(Outgoing(frame, message.get_msgId()))
         return len(frame)

@@ -27,7 +27,7 @@ from fastcrc.crc16 import mcrf4xx
 from gateway.recordings.tlog import Batch, fields_of, payload_of, readdress
 from gateway.recordings.tlog_scan import IntArray
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import START_V2, message_id_of, origin_of, target_of
+from gateway.wire.mavlink_splitter import START_V2, frame_of, message_id_of, origin_of
 
 FIRST_GROUND_STATION: Final = 250
 """System ids from here on are by custom ground stations, which keep their id."""
@@ -85,7 +85,7 @@ def is_command(frame: bytes, stations: Set[int]) -> bool:
         return origin_of(frame)[1] != AUTOPILOT
     if message_id not in _ASKING:
         return False
-    target = target_of(frame)[0]
+    target = frame_of(frame).target[0]
     return target < FIRST_GROUND_STATION and target not in {s >> 8 for s in stations}
 
 
@@ -205,7 +205,7 @@ class LogAnswers:
                 self._kept += 1
 
     def _note_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
-        vehicle = target_of(frame)[0] if is_upload else origin_of(frame)[0]
+        vehicle = frame_of(frame).target[0] if is_upload else origin_of(frame)[0]
         message_id, message = message_id_of(frame), fields_of(frame)
         kind = message["mission_type"]
         kinds = KINDS if kind == ALL_KINDS else (kind,)

@@ -37,7 +37,7 @@ from gateway.recordings.tlog import (
 )
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of, origin_of, sequence_of, with_sequence
+from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of, renumbered
 
 BLOCK_BYTES: Final = 1 << 18
 """Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
@@ -164,7 +164,8 @@ class Track:
                     continue
                 frame = batch.frame(i)
                 if count := left_out[origin]:
-                    frame = with_sequence(frame, sequence_of(frame) - count & 0xFF)
+                    read = frame_of(frame)
+                    frame = renumbered(read, read.sequence - count & 0xFF).data
                 yield TlogRecord(int(batch.time_us[i]), frame)
 
     def _left_out(self, batch: Batch) -> IntArray:

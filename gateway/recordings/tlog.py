@@ -30,13 +30,7 @@ from gateway.recordings.tlog_scan import (
 )
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import (
-    SIGNATURE_SIZE,
-    START_V2,
-    is_signed,
-    is_station_heartbeat,
-    message_id_of,
-)
+from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, START_V2, frame_of, message_id_of
 from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
@@ -369,7 +363,7 @@ class TlogIndex:
     def _add_stations(self, batch: Batch) -> None:
         for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
             origin = int(batch.origins[i])
-            if origin not in self.stations and is_station_heartbeat(batch.frame(i)):
+            if origin not in self.stations and frame_of(batch.frame(i)).is_station_heartbeat:
                 self.stations.add(origin)
 
     def offset_before(self, time_us: int, records: int = 0) -> int:
@@ -458,7 +452,7 @@ def readdress(frame: bytes, system_id: int) -> bytes:
     extra = CRC_EXTRA.get(message_id_of(frame))
     if extra is None:
         return frame
-    body = bytearray(frame[: -SIGNATURE_SIZE - 2] if is_signed(frame) else frame[:-2])
+    body = bytearray(frame[: -SIGNATURE_SIZE - 2] if frame_of(frame).signed else frame[:-2])
     if frame[0] == START_V2:
         body[_FLAGS_AT] = 0
         body[_SYSTEM_AT_V2] = system_id

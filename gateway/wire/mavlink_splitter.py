@@ -180,44 +180,6 @@ def message_id_of(data: bytes) -> int:
     return data[5]
 
 
-def is_station_heartbeat(data: bytes) -> bool:
-    """Return whether a HEARTBEAT reports that its sender is a ground station."""
-    return frame_of(data).is_station_heartbeat
-
-
-def is_signed(data: bytes) -> bool:
-    """Return whether a frame carries a MAVLink 2 signature."""
-    return frame_of(data).signed
-
-
-def sequence_of(data: bytes) -> int:
-    """Return the sequence number of a frame."""
-    return frame_of(data).sequence
-
-
-def target_of(data: bytes) -> tuple[int, int]:
-    """Return the system and component that a frame addresses; 0 is everybody."""
-    return frame_of(data).target
-
-
-def with_sequence(data: bytes, sequence: int) -> bytes:
-    """Return an unsigned frame with this sequence number and the checksum that fits.
-
-    Parameters
-    ----------
-    data : bytes
-        A complete frame; a signed or an unknown one is returned as it is.
-    sequence : int
-        0 to 255.
-
-    Returns
-    -------
-    bytes
-        The frame to send instead.
-    """
-    return renumbered(frame_of(data), sequence).data
-
-
 def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
     """Return a frame with another sequence number; a signed or an unknown one as it is."""
     message_id = frame.message_id

@@ -15,7 +15,7 @@ from gateway.fleet.frame_translation import (
 from gateway.fleet.id_map import IdMap
 from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, TICKS_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import MavFrame, frame_of, target_of
+from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.kit import mavlink as kit
 from tests.kit.mavlink import frames_in
 
@@ -259,10 +259,10 @@ def test_target_of_every_message_is_translated(message_id: int) -> None:
     system_id, changed = to_site(there, frame) or (0, b"")
     assert system_id == 1
     assert frames_in(changed) == [changed]
-    assert target_of(changed)[0] == 1
+    assert frame_of(changed).target[0] == 1
     back = from_site(translation(), changed)
     assert back is not None
-    assert target_of(back)[0] == 2
+    assert frame_of(back).target[0] == 2
     differing = sum(a != b for a, b in zip(changed, frame, strict=True))
     assert differing <= 3
 

@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_signing import FrameSigner
-from gateway.wire.mavlink_splitter import MavlinkSplitter, is_signed, message_id_of
+from gateway.wire.mavlink_splitter import MavlinkSplitter, frame_of, message_id_of
 from tests.hub.conftest import LIMIT_S
 from tests.kit.mavlink import frames_of
 
@@ -137,4 +137,4 @@ async def test_changed_key_applies_from_the_next_frame_on(rig: Any) -> None:
         receiver.read(await station.receive())
     del keys.keys[1]
     hub.send(rig.out(rig.vehicle.heartbeat()))
-    assert not is_signed(await station.receive())
+    assert not frame_of(await station.receive()).signed

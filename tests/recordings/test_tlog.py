@@ -27,7 +27,7 @@ from gateway.recordings.tlog import (
 )
 from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import is_signed, message_id_of
+from gateway.wire.mavlink_splitter import frame_of, message_id_of
 from gateway.wire.timesync import ENOUGH
 from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
 
@@ -340,7 +340,7 @@ def test_readdressed_frame_changes_only_its_sender_and_loses_its_signature(
     assert after.get_srcSystem() == 42
     assert after.get_srcComponent() == before.get_srcComponent()
     assert after.to_dict() == before.to_dict()
-    assert len(changed) == len(frame) - 13 * is_signed(frame)
+    assert len(changed) == len(frame) - 13 * frame_of(frame).signed
 
 
 def test_unknown_message_is_not_readdressed() -> None:

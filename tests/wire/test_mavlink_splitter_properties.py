@@ -12,8 +12,8 @@ from gateway.wire.mavlink_splitter import (
     message_id_of,
     origin_of,
     read_datagram,
+    renumbered,
     split_datagram,
-    with_sequence,
 )
 from tests.kit.mavlink import frames_in, frames_of
 from tests.wire.test_mavlink_splitter import FRAMES
@@ -57,7 +57,7 @@ def test_every_frame_of_any_bytes_can_be_read(data: bytes, sequence: int) -> Non
         assert frame.key == bytes(frame.origin) + frame.message_id.to_bytes(size, "little")
         assert len(frame.target) == 2
         assert frame.is_station_heartbeat in (True, False)
-        numbered = with_sequence(frame.data, sequence)
+        numbered = renumbered(frame, sequence).data
         assert len(numbered) == len(frame.data)
         assert frames_in(numbered) == [numbered] or frame.signed
 

@@ -21,7 +21,7 @@ from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, fields_of
 from gateway.records import FusionState, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
 from gateway.vehicle.plan import is_good_enough, location_of
-from gateway.wire.mavlink_splitter import is_station_heartbeat, message_id_of, origin_of
+from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
@@ -325,9 +325,10 @@ def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> li
     drawn: dict[int, _Drawn] = {}
     stations: set[int] = set()
     for record in records:
-        system, component = origin_of(record.frame)
+        frame = frame_of(record.frame)
+        system, component = frame.origin
         origin = system << 8 | component
-        if message_id_of(record.frame) == HEARTBEAT_ID and is_station_heartbeat(record.frame):
+        if frame.message_id == HEARTBEAT_ID and frame.is_station_heartbeat:
             stations.add(origin)
         if system_id in (None, system) and not is_station(origin, stations):
             one = drawn.setdefault(system, _Drawn(VehicleTrack(f"system {system}")))

@@ -32,12 +32,7 @@ from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.formats.parquet import Pieces, decoded
 from gateway.records import Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_CM, M_PER_MM, US_PER_S
-from gateway.wire.mavlink_splitter import (
-    is_station_heartbeat,
-    message_id_of,
-    origin_of,
-    sequence_of,
-)
+from gateway.wire.mavlink_splitter import frame_of
 
 MAP: Final = "map"
 AUTOPILOT: Final = 1
@@ -382,14 +377,14 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
     topics, view = _Topics(writer), FoxgloveView()
     stations: set[int] = set()
     for record, message in decoded(flight):
-        frame, time_us = record.frame, record.time_us
-        system, component = origin_of(frame)
+        frame, time_us = frame_of(record.frame), record.time_us
+        system, component = frame.origin
         origin = system << 8 | component
-        if message_id_of(frame) == mavlink.MAVLINK_MSG_ID_HEARTBEAT and is_station_heartbeat(frame):
+        if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT and frame.is_station_heartbeat:
             stations.add(origin)
         topic = f"/mavlink/{system}/{component}/{message.msgname}"
         fields = fields_of_message(message)
-        topics.add(topic, schema_of_message(message), fields, time_us, sequence_of(frame))
+        topics.add(topic, schema_of_message(message), fields, time_us, frame.sequence)
         if not is_station(origin, stations):
             for shown in view.feed(system, component, message, time_us):
                 topics.add(shown.topic, SCHEMAS[shown.schema], shown.content, time_us)
