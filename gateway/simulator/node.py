@@ -1,7 +1,6 @@
 """The two radio nodes of an aircraft: samples in, payloads out, each at its time."""
 
 import heapq
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -69,10 +68,17 @@ class Sent:
     payload: Payload
 
 
-class Node(ABC):
-    """A source of payloads."""
+class Node:
+    """A source of payloads: those of its sensors, in order, and its own reports between them."""
 
-    def __init__(self, node_id: NodeId, clock: DeviceClock, sensors: int, rate_hz: int) -> None:
+    def __init__(
+        self,
+        node_id: NodeId,
+        clock: DeviceClock,
+        sensors: int,
+        rate_hz: int,
+        samples: Iterator[Sent],
+    ) -> None:
         self.node_id = node_id
         self.restart_s = 0.0
         """True time at which its watchdog resets it; 0 for never."""
@@ -81,22 +87,16 @@ class Node(ABC):
         self._clock = clock
         self._sensors = sensors
         self._rate_hz = rate_hz
+        self._samples = samples
 
     def sent(self) -> Iterator[Sent]:
-        """Yield every payload passed to the radio, in order, without end.
-
-        Samples are made a few at a time, as they are asked for.
-        """
+        """Yield every payload passed to the radio, in order, without end; call it once."""
         return filter(None, map(self._after_restart, self._with_reports()))
-
-    @abstractmethod
-    def _samples(self) -> Iterator[Sent]:
-        """Yield the sensors' payloads in order."""
 
     def _with_reports(self) -> Iterator[Sent]:
         times = ((k + 0.5) * STATUS_S for k in count())
         report_s = next(times)
-        for sent in self._samples():
+        for sent in self._samples:
             while report_s <= sent.time_s:
                 yield self._report(report_s)
                 report_s = next(times)
@@ -129,59 +129,61 @@ class Node(ABC):
         )
         return Sent(time_s, self._clock.at(time_s), status)
 
-    def _pieces(self, length_s: float) -> Iterator[float]:
-        """Yield when each piece of samples ends; those of the next aircraft end at other times."""
-        first_s = length_s * (1.0 - self.node_id.vehicle_id % PHASES / PHASES)
-        return (first_s + k * length_s for k in count())
 
+def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[Node, Node]:
+    """Create the node with MPU6050, HMC5883L and BMP180, and that with the M8N, of an aircraft.
 
-class ImuNode(Node):
-    """MPU6050, HMC5883L and BMP180 of a simulated aircraft."""
-
-    def __init__(self, aircraft: SimulatedAircraft, rate_hz: int, baro_rate_hz: int) -> None:
-        node_id = NodeId(aircraft.vehicle_id, IMU_NODE)
-        super().__init__(node_id, aircraft.imu.clock, IMU_SENSORS, rate_hz)
-        self._aircraft = aircraft
-        self._baro_rate_hz = baro_rate_hz
-
-    def _samples(self) -> Iterator[Sent]:
-        return heapq.merge(self._imu(), self._baro(), key=attrgetter("time_s"))
-
-    def _imu(self) -> Iterator[Sent]:
-        for until_s in self._pieces(SAMPLES_AT_ONCE / self._rate_hz):
-            imu = self._aircraft.imu.take(until_s)
-            columns = (imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw)
-            yield from pack_imu(
-                (*columns, imu.temperature_raw, imu.flags), (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN)
-            )
-
-    def _baro(self) -> Iterator[Sent]:
-        for until_s in self._pieces(SAMPLES_AT_ONCE / self._baro_rate_hz):
-            baro = self._aircraft.baro.take(until_s)
-            columns = (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
-            yield from pack_baro(columns)
-
-
-class GpsNode(Node):
-    """M8N of a simulated aircraft."""
-
-    def __init__(self, aircraft: SimulatedAircraft, geoid_separation_m: float) -> None:
-        node_id = NodeId(aircraft.vehicle_id, GPS_NODE)
-        super().__init__(node_id, aircraft.gps_clock, GPS_SENSORS, GPS_RATE_HZ)
-        self._aircraft = aircraft
-        self._geoid_separation_m = geoid_separation_m
-
-    def _samples(self) -> Iterator[Sent]:
-        for until_s in self._pieces(FIXES_AT_ONCE / GPS_RATE_HZ):
-            gps = self._aircraft.gps.take(until_s)
-            yield from gps_payloads(gps, self._clock, self._geoid_separation_m)
-
-
-def nodes_of(aircraft: SimulatedAircraft, settings: SimulatorSettings) -> tuple[ImuNode, GpsNode]:
-    """Create the two nodes of an aircraft."""
-    imu = ImuNode(aircraft, settings.imu_rate_hz, settings.baro_rate_hz)
+    Samples are made a few at a time, as they are asked for.
+    """
+    imu = Node(
+        NodeId(aircraft.vehicle_id, IMU_NODE),
+        aircraft.imu.clock,
+        IMU_SENSORS,
+        settings.imu_rate_hz,
+        heapq.merge(
+            _imu_samples(aircraft, settings.imu_rate_hz),
+            _baro_samples(aircraft, settings.baro_rate_hz),
+            key=attrgetter("time_s"),
+        ),
+    )
     imu.restart_s = settings.imu_restart_s
-    return (imu, GpsNode(aircraft, settings.geoid_separation_m))
+    gps = Node(
+        NodeId(aircraft.vehicle_id, GPS_NODE),
+        aircraft.gps_clock,
+        GPS_SENSORS,
+        GPS_RATE_HZ,
+        _gps_samples(aircraft, settings.geoid_separation_m),
+    )
+    return imu, gps
+
+
+def _imu_samples(aircraft: SimulatedAircraft, rate_hz: int) -> Iterator[Sent]:
+    for until_s in _ends_of_pieces(aircraft, SAMPLES_AT_ONCE / rate_hz):
+        imu = aircraft.imu.take(until_s)
+        columns = (imu.time_s, imu.node_time_us, imu.accel_raw, imu.gyro_raw, imu.mag_raw)
+        yield from pack_imu(
+            (*columns, imu.temperature_raw, imu.flags), (ACCEL_RANGE, GYRO_RANGE, MAG_GAIN)
+        )
+
+
+def _baro_samples(aircraft: SimulatedAircraft, rate_hz: int) -> Iterator[Sent]:
+    for until_s in _ends_of_pieces(aircraft, SAMPLES_AT_ONCE / rate_hz):
+        baro = aircraft.baro.take(until_s)
+        yield from pack_baro(
+            (baro.time_s, baro.node_time_us, baro.pressure_pa, baro.temperature_degc)
+        )
+
+
+def _gps_samples(aircraft: SimulatedAircraft, geoid_separation_m: float) -> Iterator[Sent]:
+    for until_s in _ends_of_pieces(aircraft, FIXES_AT_ONCE / GPS_RATE_HZ):
+        gps = aircraft.gps.take(until_s)
+        yield from gps_payloads(gps, aircraft.gps_clock, geoid_separation_m)
+
+
+def _ends_of_pieces(aircraft: SimulatedAircraft, length_s: float) -> Iterator[float]:
+    """Yield when each piece of samples ends; those of the next aircraft end at other times."""
+    first_s = length_s * (1.0 - aircraft.vehicle_id % PHASES / PHASES)
+    return (first_s + k * length_s for k in count())
 
 
 def pack_imu(

@@ -161,24 +161,6 @@ class RecordedFlight:
         )
 
 
-class RecordedNode(Node):
-    """A node that sends recorded samples."""
-
-    def __init__(
-        self,
-        node_id: NodeId,
-        clock: DeviceClock,
-        sensors: int,
-        rate_hz: int,
-        payloads: Iterator[Sent],
-    ) -> None:
-        super().__init__(node_id, clock, sensors, rate_hz)
-        self._payloads = payloads
-
-    def _samples(self) -> Iterator[Sent]:
-        return self._payloads
-
-
 def in_rounds(
     frames: Iterator[TimedFrame], duration_s: float, on_round: Callable[[int], None]
 ) -> Iterator[TimedFrame]:
@@ -209,7 +191,7 @@ def replay(
         rounds = _rounds(flight, endless)
         pressures = chain.from_iterable(_baro_payloads(f, imu_clock) for f in rounds)
     nodes: list[Node] = [
-        RecordedNode(
+        Node(
             NodeId(settings.vehicle_id, IMU_NODE),
             imu_clock,
             _imu_sensors(flight),
@@ -226,7 +208,7 @@ def replay(
             for f in _rounds(flight, endless)
         )
         nodes.append(
-            RecordedNode(
+            Node(
                 NodeId(settings.vehicle_id, GPS_NODE),
                 gps_clock,
                 GPS_SENSORS,

@@ -7,7 +7,7 @@ import pytest
 
 from gateway.records import GpsFixType, ImuFlags, NodeId
 from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.node import GpsNode, ImuNode, Node, Sent, nodes_of
+from gateway.simulator.node import Node, Sent, nodes_of
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.wire.payloads import (
     BaroPayload,
@@ -25,7 +25,7 @@ SETTINGS = SimulatorSettings()
 SECONDS = 20.0
 
 
-def nodes() -> tuple[ImuNode, GpsNode]:
+def nodes() -> tuple[Node, Node]:
     return nodes_of(SimulatedAircraft(SETTINGS), SETTINGS)
 
 
