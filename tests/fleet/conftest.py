@@ -124,9 +124,7 @@ async def opened_world(
             await asyncio.sleep(0.01)
     yield World(rig, fleet, locator or settings.listen, station)
     fleet.close()
-    for close in rig.closing:
-        close()
-    rig.closing.clear()
+    rig.close()
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """Mutual TLS with the commands and files of docs/fleet.md as they stand there."""
 
 import re
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -72,6 +73,12 @@ def documented(tmp_path_factory: pytest.TempPathFactory) -> Documented:
     return Documented(folder, f"tls/localhost:{port}", url)
 
 
+def answers(locator: str) -> bool:
+    """Return whether a router still accepts connections; it ends on a thread."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", int(locator.rpartition(":")[2]))) == 0
+
+
 @pytest.fixture
 async def world(
     rig: Rig, documented: Documented, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -81,6 +88,8 @@ async def world(
     fleet = replace(settings.fleet, ids_file=str(tmp_path / "ids.json"))
     async with opened_world(rig, fleet, settings.hub, documented.locator) as world:
         yield world
+    # The next test's router listens at the same port.
+    await rig.until(lambda: not answers(documented.locator))
 
 
 async def test_documented_site_is_shown_and_commanded_through_the_documented_fleet(

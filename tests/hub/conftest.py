@@ -140,6 +140,11 @@ class Rig:
         self.vehicle = Sender(1, 1)
         self.closing: list[Callable[[], object]] = []
 
+    def close(self) -> None:
+        for close in self.closing:
+            close()
+        self.closing.clear()
+
     def hub(
         self,
         *endpoints: str,
@@ -216,5 +221,4 @@ class Rig:
 async def rig() -> AsyncIterator[Rig]:
     rig = Rig()
     yield rig
-    for close in rig.closing:
-        close()
+    rig.close()

@@ -322,8 +322,7 @@ class HubMachine(RuleBasedStateMachine):
 
     def teardown(self) -> None:
         async def end() -> None:
-            for close in reversed(self.rig.closing):
-                close()
+            self.rig.close()
             await asyncio.sleep(0)
 
         self.run(end())

@@ -370,8 +370,7 @@ def test_uvloop_serves_every_transport_too(kind: str) -> None:
             if kind in NOTICES_THE_END:
                 await test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link)
         finally:
-            for close in rig.closing:
-                close()
+            rig.close()
             await asyncio.sleep(0)
 
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:

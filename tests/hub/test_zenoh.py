@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -15,6 +15,7 @@ from unittest.mock import MagicMock
 import pytest
 import zenoh
 
+from gateway.hub.hub import Hub
 from gateway.hub.transports.zenoh import client as zenoh_client
 from gateway.hub.transports.zenoh import session as zenoh_session
 from gateway.hub.transports.zenoh.session import (
@@ -112,17 +113,31 @@ class Far:
         return [data for _, data in self.got if message_id_of(data) == message_id]
 
 
+class Site(Rig):
+    """A rig whose hubs are sites at one router, with other sessions there."""
+
+    def __init__(self, router: Router) -> None:
+        super().__init__()
+        self.router = router
+
+    async def join(self, options: str = "site=field") -> Hub:
+        """Return a hub that is linked with the router."""
+        hub = self.hub(f"zenoh:{self.router.locator}?{options}")
+        hub.send(self.out(self.vehicle.heartbeat()))
+        await until(self, hub, lambda: hub.clients()[0].state == "open")
+        return hub
+
+    def visit(self, *keys: str) -> Far:
+        far = Far(self.router.locator, *keys)
+        self.closing.append(far.session.close)
+        return far
+
+
 @pytest.fixture
-def visit(router: Router) -> Iterator[Callable[..., Far]]:
-    clients: list[Far] = []
-
-    def make(*keys: str) -> Far:
-        clients.append(Far(router.locator, *keys))
-        return clients[-1]
-
-    yield make
-    for client in clients:
-        client.session.close()
+async def site(router: Router) -> AsyncIterator[Site]:
+    site = Site(router)
+    yield site
+    site.close()
 
 
 @pytest.fixture
@@ -142,143 +157,100 @@ async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.01)
 
 
-async def open_site(rig: Rig, router: Router, options: str = "site=field") -> Any:
-    hub = rig.hub(f"zenoh:{router.locator}?{options}")
-    hub.send(rig.out(rig.vehicle.heartbeat()))
-    await until(rig, hub, lambda: hub.clients()[0].state == "open")
-    return hub
+async def until_received(rig: Rig, hub: Any, far: Far, count: int = 1) -> None:
+    """Publish until so many messages have arrived: a subscription takes a while."""
 
-
-async def until_heard(rig: Rig, hub: Any, far: Far) -> None:
-    """Publish until the subscription has reached the site."""
-
-    def said() -> bool:
+    def are_received() -> bool:
         hub.send(rig.out(rig.vehicle.attitude()))
-        return bool(far.got)
+        return len(far.got) >= count
 
-    await until(rig, hub, said)
+    await until(rig, hub, are_received)
 
 
 class TestSite:
-    async def test_frames_pass_in_both_directions(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
-        hub = await open_site(rig, router)
-        far = visit("mavlink/field/*/out")
-        await until_heard(rig, hub, far)
+    async def test_frames_pass_in_both_directions(self, site: Site) -> None:
+        hub = await site.join()
+        far = site.visit("mavlink/field/*/out")
+        await until_received(site, hub, far)
         assert far.got[0][0] == "mavlink/field/1/out"
-        said = rig.sender(255, 190).command(1, 1)
+        said = site.sender(255, 190).command(1, 1)
         far.session.put("mavlink/field/1/in", said)
-        await until(rig, hub, lambda: bool(rig.incoming))
-        assert rig.incoming[0].frame == said
-        assert not rig.incoming[0].trusted
+        await until(site, hub, lambda: bool(site.incoming))
+        assert site.incoming[0].frame == said
+        assert not site.incoming[0].trusted
         far.session.put("mavlink/field/1/in", b"no MAVLink")
-        await until(rig, hub, lambda: hub.clients()[0].bytes_garbage == 10)
+        await until(site, hub, lambda: hub.clients()[0].bytes_garbage == 10)
         far.session.put("mavlink/other/1/in", said)
-        far.session.put("mavlink/field/1/in", rig.sender(255, 190).heartbeat())
-        await until(rig, hub, lambda: hub.clients()[0].received == 2)
+        far.session.put("mavlink/field/1/in", site.sender(255, 190).heartbeat())
+        await until(site, hub, lambda: hub.clients()[0].received == 2)
 
     async def test_autopilot_behind_the_site_has_its_own_key_and_no_attachment(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
+        self, site: Site
     ) -> None:
-        hub = await open_site(rig, router)
+        hub = await site.join()
         hub.add("udp-listen:127.0.0.1:0?trusted=yes")
-        station = rig.station(hub.listening_ports()[0])
-        far = visit("mavlink/field/*/out")
-        autopilot = rig.sender(7)
+        station = site.station(hub.listening_ports()[0])
+        far = site.visit("mavlink/field/*/out")
+        autopilot = site.sender(7)
 
         def heard() -> bool:
             station.send(autopilot.heartbeat())
-            hub.send(rig.out(rig.vehicle.command(1, 1)))
-            hub.send(rig.out(rig.vehicle.heartbeat()))
+            hub.send(site.out(site.vehicle.command(1, 1)))
+            hub.send(site.out(site.vehicle.heartbeat()))
             return far.marks.keys() >= {"mavlink/field/7/out"} and bool(far.messages(76))
 
-        await until(rig, hub, heard)
+        await until(site, hub, heard)
         assert far.marks == {"mavlink/field/7/out": {None}, "mavlink/field/1/out": {OWN}}
 
-    async def test_filters_rates_and_packing_apply(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
-        hub = await open_site(rig, router, "site=field&deny=RAW_IMU&pack=1100")
-        far = visit("mavlink/field/*/out")
-        await until_heard(rig, hub, far)
+    async def test_filters_rates_and_packing_apply(self, site: Site) -> None:
+        hub = await site.join("site=field&deny=RAW_IMU&pack=1100")
+        far = site.visit("mavlink/field/*/out")
+        await until_received(site, hub, far)
         (packer,) = hub._clients[1]._packers.values()
-        await until(rig, hub, lambda: not packer._is_flush_due)
+        await until(site, hub, lambda: not packer._is_flush_due)
         for _ in range(5):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
-            hub.send(rig.out(rig.vehicle.attitude()))
-        size = len(rig.vehicle.attitude())
-        await until(rig, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
+            hub.send(site.out(site.vehicle.raw_imu()))
+            hub.send(site.out(site.vehicle.attitude()))
+        size = len(site.vehicle.attitude())
+        await until(site, hub, lambda: any(len(data) == 5 * size for _, data in far.got))
         assert not far.messages(27)
 
-    async def test_burst_arrives_completely_and_in_order(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
+    async def test_burst_arrives_completely_and_in_order(self, site: Site) -> None:
         """Telemetry gives way on a congested link, never on an idle one."""
-        hub = await open_site(rig, router)
-        far = visit("mavlink/field/*/out")
-        await until_heard(rig, hub, far)
-        burst = [rig.vehicle.raw_imu() for _ in range(200)]
+        hub = await site.join()
+        far = site.visit("mavlink/field/*/out")
+        await until_received(site, hub, far)
+        burst = [site.vehicle.raw_imu() for _ in range(200)]
         for frame in burst:
-            hub.send(rig.out(frame))
-        await until(rig, hub, lambda: far.messages(27)[-1:] == burst[-1:])
+            hub.send(site.out(frame))
+        await until(site, hub, lambda: far.messages(27)[-1:] == burst[-1:])
         assert far.messages(27) == burst
 
     @pytest.mark.parametrize(
         ("option", "trusted"), [("", False), ("&trusted=no", False), ("&trusted=yes", True)]
     )
     async def test_only_an_explicit_option_makes_a_fleet_trusted(
-        self, rig: Rig, router: Router, visit: Callable[..., Far], option: str, trusted: bool
+        self, site: Site, option: str, trusted: bool
     ) -> None:
-        hub = await open_site(rig, router, f"site=field{option}")
-        far = visit()
-        far.session.put("mavlink/field/1/in", rig.sender(255, 190).command(1, 1))
-        await until(rig, hub, lambda: bool(rig.incoming))
-        assert rig.incoming[0].trusted == trusted
+        hub = await site.join(f"site=field{option}")
+        far = site.visit()
+        far.session.put("mavlink/field/1/in", site.sender(255, 190).command(1, 1))
+        await until(site, hub, lambda: bool(site.incoming))
+        assert site.incoming[0].trusted == trusted
 
-    async def test_raw_keys_of_mavlink_server(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
-        hub = await open_site(rig, router, "keys=mavlink_raw")
-        far = visit("mavlink_raw/out")
-        await until_heard(rig, hub, far)
+    async def test_raw_keys_of_mavlink_server(self, site: Site) -> None:
+        hub = await site.join("keys=mavlink_raw")
+        far = site.visit("mavlink_raw/out")
+        await until_received(site, hub, far)
         assert far.marks == {"mavlink_raw/out": {None}}
-        far.session.put("mavlink_raw/in", rig.sender(255, 190).command(1, 1))
-        await until(rig, hub, lambda: bool(rig.incoming))
+        far.session.put("mavlink_raw/in", site.sender(255, 190).command(1, 1))
+        await until(site, hub, lambda: bool(site.incoming))
 
-
-class TestTrouble:
-    async def test_site_reconnects_after_a_router_restart(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
-        hub = await open_site(rig, router)
-        hub.add("udp-listen:127.0.0.1:0")
-        far = visit("mavlink/field/*/out")
-        await until_heard(rig, hub, far)
-        router.kill()
-        await until(rig, hub, lambda: hub.clients()[0].state == "connecting")
-        dropped, before = hub.clients()[0].dropped, len(far.messages(27))
-        for _ in range(500):
-            hub.send(rig.out(rig.vehicle.raw_imu()))
-            hub.send(rig.out(rig.vehicle.command(1, 1)))
-        assert hub.clients()[0].dropped == dropped + 1000
-        assert hub.clients()[0].queued == 0
-        router.start()
-        await until(rig, hub, lambda: hub.clients()[0].state == "open")
-        heard = len(far.got)
-        await until(rig, hub, lambda: said_again(rig, hub, far, heard))
-        assert len(far.messages(27)) == before, "what was old is not delivered as new"
-        assert not far.messages(76)
-        numbers = [data[4] for data in far.messages(30)]
-        assert len(set(numbers)) == len(numbers), "no frame twice"
-
-    async def test_json_keys_of_mavlink_server(
-        self, rig: Rig, router: Router, visit: Callable[..., Far]
-    ) -> None:
-        hub = await open_site(rig, router, "keys=mavlink_json&trusted=yes")
-        far = visit("mavlink/out", "mavlink/*/*/*", "mavlink/1/1/ATTITUDE/rollspeed")
-        await until_heard(rig, hub, far)
-        await until(rig, hub, lambda: len({key for key, _ in far.got}) >= 3)
+    async def test_json_keys_of_mavlink_server(self, site: Site) -> None:
+        hub = await site.join("keys=mavlink_json&trusted=yes")
+        far = site.visit("mavlink/out", "mavlink/*/*/*", "mavlink/1/1/ATTITUDE/rollspeed")
+        await until_received(site, hub, far)
+        await until(site, hub, lambda: len({key for key, _ in far.got}) >= 3)
         by_key = {key: json.loads(data) for key, data in far.got}
         whole = by_key["mavlink/1/1/ATTITUDE"]
         assert whole["header"] | {"sequence": 0} == {
@@ -293,10 +265,33 @@ class TestTrouble:
         for wrong in (b"no JSON", b"{}", b'{"header": {"system_id": 256}}', b"[" * 4000):
             far.session.put("mavlink/in", wrong)
         far.session.put("mavlink/in", json.dumps(command))
-        await until(rig, hub, lambda: bool(rig.incoming))
-        assert origin_of(rig.incoming[0].frame) == (255, 190)
-        assert rig.incoming[0].frame[4] == 7
+        await until(site, hub, lambda: bool(site.incoming))
+        assert origin_of(site.incoming[0].frame) == (255, 190)
+        assert site.incoming[0].frame[4] == 7
         assert hub.clients()[0].bytes_garbage > 4000
+
+
+class TestTrouble:
+    async def test_site_reconnects_after_a_router_restart(self, site: Site) -> None:
+        hub = await site.join()
+        hub.add("udp-listen:127.0.0.1:0")
+        far = site.visit("mavlink/field/*/out")
+        await until_received(site, hub, far)
+        site.router.kill()
+        await until(site, hub, lambda: hub.clients()[0].state == "connecting")
+        dropped = hub.clients()[0].dropped
+        for _ in range(500):
+            hub.send(site.out(site.vehicle.raw_imu()))
+            hub.send(site.out(site.vehicle.command(1, 1)))
+        assert hub.clients()[0].dropped == dropped + 1000
+        assert hub.clients()[0].queued == 0
+        site.router.start()
+        await until(site, hub, lambda: hub.clients()[0].state == "open")
+        await until_received(site, hub, far, len(far.got) + 1)
+        assert not far.messages(27), "old frames are not delivered as new ones"
+        assert not far.messages(76)
+        numbers = [data[4] for data in far.messages(30)]
+        assert len(set(numbers)) == len(numbers), "no frame twice"
 
     @pytest.mark.parametrize(
         ("locator", "trusted", "warns"),
@@ -335,37 +330,33 @@ class TestTrouble:
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
         assert hub.clients()[0].reason == f"{name} {missing}: No such file or directory"
 
-    async def test_stalled_router_delays_no_other_client(
-        self, rig: Rig, router: Router, patient: Path
-    ) -> None:
-        hub = await open_site(rig, router, f"site=field&config={patient}")
+    async def test_stalled_router_delays_no_other_client(self, site: Site, patient: Path) -> None:
+        hub = await site.join(f"site=field&config={patient}")
         hub.add("udp-listen:127.0.0.1:0")
-        station = rig.station(hub.listening_ports()[0])
+        station = site.station(hub.listening_ports()[0])
         station.send(station.sender.heartbeat())
-        await rig.until(lambda: len(hub.clients()) == 2)
-        hub.send(rig.out(rig.vehicle.attitude()))
+        await site.until(lambda: len(hub.clients()) == 2)
+        hub.send(site.out(site.vehicle.attitude()))
         station.received()
         # Blocking reads: the loop does nothing meanwhile.
         station.socket.settimeout(LIMIT_S)
-        router.signal(signal.SIGSTOP)
+        site.router.signal(signal.SIGSTOP)
         for _ in range(5000):
-            for frame in (rig.vehicle.raw_imu(), rig.vehicle.command(1, 1)):
-                hub.send(rig.out(frame))
+            for frame in (site.vehicle.raw_imu(), site.vehicle.command(1, 1)):
+                hub.send(site.out(frame))
                 assert station.socket.recv(65535) == frame, "a local client has it at once"
         fleet, local = hub.clients()
         assert fleet.queued <= zenoh_session.MAX_RELIABLE
         assert fleet.dropped > 0
         assert local.dropped == 0
-        router.signal(signal.SIGCONT)
+        site.router.signal(signal.SIGCONT)
 
-    async def test_two_sites_of_one_name_are_reported_on_both(
-        self, rig: Rig, router: Router
-    ) -> None:
-        first, second = [await open_site(rig, router) for _ in range(2)]
+    async def test_two_sites_of_one_name_are_reported_on_both(self, site: Site) -> None:
+        first, second = [await site.join() for _ in range(2)]
         for hub in (first, second):
-            await until(rig, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023
+            await until(site, hub, lambda: "'field' too" in hub.clients()[0].reason)  # noqa: B023
         second.close()
-        await until(rig, first, lambda: first.clients()[0].reason == "")
+        await until(site, first, lambda: first.clients()[0].reason == "")
 
     async def test_missing_zenoh_package_is_reported(
         self, rig: Rig, monkeypatch: pytest.MonkeyPatch
@@ -382,11 +373,6 @@ class TestTrouble:
         hub = rig.hub(f"zenoh:tcp/127.0.0.1:7447?site=field&config={file}")
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
         assert "zenoh" in hub.clients()[0].reason
-
-
-def said_again(rig: Rig, hub: Any, far: Far, heard: int) -> bool:
-    hub.send(rig.out(rig.vehicle.attitude()))
-    return len(far.got) > heard
 
 
 class TestLoopQueue:
@@ -457,11 +443,11 @@ class TestSubscription:
         assert len(taken) == BYTES_AT_ONCE // MAX_MESSAGE
 
     async def test_flood_is_handled_in_turns_and_the_oldest_telemetry_is_dropped(
-        self, router: Router, visit: Callable[..., Far], monkeypatch: pytest.MonkeyPatch
+        self, site: Site, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(zenoh_session, "MAX_WAITING", 100)
         monkeypatch.setattr(zenoh_session, "AT_ONCE", 10)
-        far, near = visit(), visit()
+        far, near = site.visit(), site.visit()
         taken: list[tuple[str, bytes]] = []
         all_sent = threading.Event()
         reader = Subscription(
