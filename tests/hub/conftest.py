@@ -186,6 +186,20 @@ class Rig:
         self.closing.append(station.socket.close)
         return station
 
+    async def connect(
+        self, port: int, kind: socket.SocketKind = socket.SOCK_STREAM, *, room_bytes: int = 0
+    ) -> socket.socket:
+        """Return a socket that is connected to a port, with a receive buffer of some size."""
+        sock = socket.socket(socket.AF_INET, kind)
+        self.closing.append(sock.close)
+        sock.setblocking(False)
+        if room_bytes:
+            # Before it connects: a window that shrinks later makes the kernel drop data.
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room_bytes)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
+        await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+        return sock
+
     def sender(self, system: int, component: int = 1, *, signed: bool = False) -> Sender:
         return Sender(system, component, signed=signed)
 

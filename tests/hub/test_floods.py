@@ -20,10 +20,7 @@ NOISE = bytes(1024)
 
 async def caller(rig: Any, kind: str, port: int) -> socket.socket:
     """Open a connection that has said one heartbeat."""
-    sock = socket.socket(socket.AF_INET, KINDS[kind])
-    rig.closing.append(sock.close)
-    sock.setblocking(False)
-    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+    sock: socket.socket = await rig.connect(port, KINDS[kind])
     sock.send(rig.sender(255, 190).heartbeat())
     return sock
 

@@ -15,6 +15,7 @@ from gateway.wire.mavlink_splitter import frame_of
 pytestmark = pytest.mark.io
 
 STATIONS = 4
+KINDS = {"udp": socket.SOCK_DGRAM, "tcp": socket.SOCK_STREAM}
 FRAMES_A_TURN = SENDS_AT_ONCE // STATIONS
 
 
@@ -112,15 +113,13 @@ async def test_simultaneous_clients_are_admitted_one_a_turn(rig: Any, kind: str)
 
 
 @pytest.mark.parametrize(("stations", "most"), [(1, READ_BYTES), (15, 768), (80, LEAST_READ_BYTES)])
-@pytest.mark.parametrize("kind", ["udp", "tcp"])
+@pytest.mark.parametrize("kind", KINDS)
 async def test_flood_is_forwarded_over_many_turns(
     rig: Any, kind: str, stations: int, most: int
 ) -> None:
     takers = [rig.station() for _ in range(stations)]
     hub = await rig.open(f"{kind}-listen:127.0.0.1:0", *(f"udp:127.0.0.1:{t.port}" for t in takers))
-    source = socket.socket(type=socket.SOCK_DGRAM if kind == "udp" else socket.SOCK_STREAM)
-    rig.closing.append(source.close)
-    source.connect(("127.0.0.1", hub.listening_ports()[0]))
+    source = await rig.connect(hub.listening_ports()[0], KINDS[kind])
     vehicle = rig.sender(7)
     source.send(vehicle.attitude())
     await rig.until(lambda: hub.counters().forwarded == 1)

@@ -1,7 +1,6 @@
 """Our own frames are sent signed, on every route; frames of others are sent unchanged."""
 
 import asyncio
-import socket
 from typing import Any
 
 import pytest
@@ -78,11 +77,7 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
 async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
-    client = socket.socket()
-    client.setblocking(False)
-    rig.closing.append(client.close)
-    loop = asyncio.get_running_loop()
-    await loop.sock_connect(client, ("127.0.0.1", hub.listening_ports()[0]))
+    client, loop = await rig.connect(hub.listening_ports()[0]), asyncio.get_running_loop()
     await rig.until(lambda: len(hub.clients()) == 1)
     while hub.clients()[0].queued < 50:
         hub.send(rig.out(rig.vehicle.raw_imu()))

@@ -5,7 +5,7 @@ import contextlib
 import os
 import pty
 import socket
-import termios
+import tty
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import gettempdir
@@ -139,7 +139,7 @@ class WebFar(TcpFar):
 
     def open(self) -> None:
         super().open()
-        self.url = f"ws:127.0.0.1:{self.port}"
+        self.url = self.url.replace("tcp", "ws")
         self.web = WSConnection(self.role)
 
     def read(self) -> bytes:
@@ -165,35 +165,24 @@ class WebFar(TcpFar):
         super().write(self.web.send(BytesMessage(data=data)))
 
 
-class WebCaller(WebFar):
+class WebCaller(WebFar, TcpCaller):
     role = ConnectionType.CLIENT
 
-    def open(self) -> None:
-        self.url, self.peer = "ws-listen:127.0.0.1:0", None
-        self.web = WSConnection(self.role)
-
     def arrive(self, hub: Hub) -> None:
-        self.peer = socket.create_connection(("127.0.0.1", hub.listening_ports()[0]))
-        self.peer.setblocking(False)
+        super().arrive(hub)
+        assert self.peer is not None
         self.peer.send(self.web.send(Request(host="127.0.0.1", target="/")))
-
-    def shut(self) -> None:
-        if self.peer is not None:
-            self.peer.close()
 
 
 class SerialFar(Far):
     def open(self) -> None:
-        self.near, far = pty.openpty()
+        self.near, self.far = pty.openpty()
         os.set_blocking(self.near, False)
-        attributes = termios.tcgetattr(self.near)
-        attributes[3] &= ~(termios.ECHO | termios.ICANON)
-        termios.tcsetattr(self.near, termios.TCSANOW, attributes)
+        tty.setraw(self.far)
         self.link = Path(gettempdir(), f"mavgate-{os.getpid()}-{id(self.rig)}")
         self.link.unlink(missing_ok=True)
-        self.link.symlink_to(os.ttyname(far))
+        self.link.symlink_to(os.ttyname(self.far))
         self.url = f"serial:{self.link}:115200"
-        self.far = far
 
     def read(self) -> bytes:
         return os.read(self.near, 4096)

@@ -7,7 +7,7 @@ import os
 import pty
 import socket
 import sys
-import termios
+import tty
 from typing import Any
 
 import pytest
@@ -25,14 +25,6 @@ pytestmark = pytest.mark.io
 ATTITUDE, COMMAND_ACK = 30, 77
 SIOCOUTQNSD = 0x894B
 """Bytes that the kernel has not sent, not even once."""
-
-
-async def connect(rig: Any, port: int) -> socket.socket:
-    client = socket.socket()
-    client.setblocking(False)
-    rig.closing.append(client.close)
-    await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
-    return client
 
 
 async def receive(client: socket.socket) -> bytes:
@@ -54,7 +46,7 @@ class TestTcpListen:
         hub = rig.hub("tcp-listen:127.0.0.1:0", queue_bytes=4096)
         hub.send(rig.out(rig.vehicle.heartbeat()))
         port = hub.listening_ports()[0]
-        stalled, lively = await connect(rig, port), await connect(rig, port)
+        stalled, lively = [await rig.connect(port) for _ in range(2)]
         await rig.until(lambda: len(hub.clients()) == 2)
         splitter, got = MavlinkSplitter(), []
         sent = 0
@@ -77,13 +69,7 @@ class TestTcpListen:
 
     async def narrow_client(self, rig: Any, hub: Any) -> socket.socket:
         """Connect with the smallest buffer that the kernel gives."""
-        client = socket.socket()
-        rig.closing.append(client.close)
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_MAXSEG, 536)
-        client.setblocking(False)
-        address = ("127.0.0.1", hub.listening_ports()[0])
-        await asyncio.get_running_loop().sock_connect(client, address)
+        client = await rig.connect(hub.listening_ports()[0], room_bytes=1)
         await rig.until(lambda: len(hub.clients()) == 1)
         return client
 
@@ -99,7 +85,7 @@ class TestTcpListen:
     async def test_kernel_holds_few_unsent_bytes_of_joined_writes(self, rig: Any) -> None:
         """With a wide window it may join 40 kB: 20 s of a link of 2 kB/s."""
         hub = rig.hub("tcp-listen:127.0.0.1:0")
-        await connect(rig, hub.listening_ports()[0])
+        await rig.connect(hub.listening_ports()[0])
         await rig.until(lambda: len(hub.clients()) == 1)
         (client,) = hub._clients.values()
         while not client.queued:
@@ -183,9 +169,7 @@ class TestSerial:
         near, far = pty.openpty()
         rig.closing += [lambda: os.close(near), lambda: os.close(far)]
         os.set_blocking(near, False)
-        attributes = termios.tcgetattr(near)
-        attributes[3] &= ~(termios.ECHO | termios.ICANON)
-        termios.tcsetattr(near, termios.TCSANOW, attributes)
+        tty.setraw(far)
         return near, os.ttyname(far)
 
     @staticmethod
@@ -273,7 +257,7 @@ async def test_silent_readers_make_room_for_newcomers(rig: Any) -> None:
     for count, reader in enumerate(readers, start=1):
         reader.socket.connect_ex(reader.target)
         await rig.until(lambda count=count: len(hub.clients()) == count)
-    assert await receive(await connect(rig, port)) == b"", "while all are alive"
+    assert await receive(await rig.connect(port)) == b"", "while all are alive"
     assert hub.listeners()[0].turned_away == 1
     rig.clock.us += SILENT_AFTER_US
     readers[1].socket.send(readers[1].sender.heartbeat())

@@ -165,39 +165,38 @@ async def test_station_that_starts_late_loses_nothing_after_its_start(rig: Any) 
         assert await asyncio.get_running_loop().sock_recv(started, 100) == frame
 
 
-async def test_name_that_resolves_later_is_used_then(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    station = rig.station()
-    known: list[str] = []
+@pytest.fixture
+async def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[tuple[str, int]]]:
+    """Resolve names to the addresses of a table instead."""
+    known: dict[str, list[tuple[str, int]]] = {}
 
-    async def resolve(host: str, port: int, **_: object) -> list[object]:
+    async def resolve(host: str, _port: int, **_: object) -> list[object]:
         if host not in known:
             raise socket.gaierror(socket.EAI_AGAIN, "no network yet")
-        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", ("127.0.0.1", port))]
+        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", address) for address in known[host]]
 
     monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
-    hub = rig.hub(f"udp:observer.example:{station.port}")
+    return known
+
+
+async def test_name_that_resolves_later_is_used_then(rig: Any, names: Any) -> None:
+    station = rig.station()
+    hub = rig.hub("udp:observer.example:14550")
     hub.send(rig.out(rig.vehicle.attitude()))
     (client,) = hub.clients()
     assert (client.state, client.dropped) == ("resolving", 1)
-    known.append("observer.example")
+    names["observer.example"] = [("127.0.0.1", station.port)]
     rig.clock.us = 2_000_000
     await rig.until_open(hub)
     await rig.check_passes(hub, station)
 
 
 async def test_second_address_of_a_name_is_used_when_the_first_refuses(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
+    rig: Any, names: Any
 ) -> None:
     """As `localhost` has, whose first address is often not the one that a station listens at."""
     station = rig.station()
-
-    async def resolve(host: str, port: int, **_: object) -> list[object]:
-        addresses = (("127.0.0.2", port), ("127.0.0.1", port))
-        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", address) for address in addresses]
-
-    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    names["here.example"] = [(host, station.port) for host in ("127.0.0.2", "127.0.0.1")]
     hub = await rig.open(f"udp:here.example:{station.port}")
     assert hub.clients()[0].remote == f"127.0.0.2:{station.port}"
     hub.send(rig.out(rig.vehicle.attitude()))
@@ -210,28 +209,20 @@ async def test_second_address_of_a_name_is_used_when_the_first_refuses(
         assert (await station.receive())[7] == 30
 
 
-async def test_changed_address_of_a_name_is_followed(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_changed_address_of_a_name_is_followed(rig: Any, names: Any) -> None:
     old, new = rig.station(), rig.station()
-    ports = [old.port]
-
-    async def resolve(host: str, port: int, **_: object) -> list[object]:
-        return [(socket.AF_INET, socket.SOCK_DGRAM, 0, "", ("127.0.0.1", ports[-1]))]
-
-    monkeypatch.setattr(asyncio.get_running_loop(), "getaddrinfo", resolve)
+    names["observer.example"] = [("127.0.0.1", old.port)]
     hub = await rig.open("udp:observer.example:14550")
     source = hub._clients[1]._socket.getsockname()
-    for moved_at_us in (61_000_000, 122_000_000):
+    for station, moved_at_us in ((old, 61_000_000), (new, 122_000_000)):
         rig.clock.us = moved_at_us
         await rig.until(lambda at_us=moved_at_us: hub._clients[1]._resolve_us > at_us)
         await rig.until(lambda: hub._clients[1]._task is None)
         frame = rig.vehicle.attitude()
         hub.send(rig.out(frame))
-        station = old if ports == [old.port] else new
         assert await station.receive() == frame
         assert hub._clients[1]._socket.getsockname() == source
-        ports.append(new.port)
+        names["observer.example"] = [("127.0.0.1", new.port)]
 
 
 async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> None:

@@ -120,23 +120,6 @@ async def visit(rig: Rig) -> AsyncIterator[Callable[..., Any]]:
     await rig.quiet()
 
 
-@pytest.fixture
-def plug(rig: Rig) -> Callable[..., Any]:
-    """Return a function that opens a bare connection to a hub's port."""
-
-    async def open_socket(port: int, *, room_bytes: int = 0) -> socket.socket:
-        sock = socket.socket()
-        sock.setblocking(False)
-        if room_bytes:
-            # Before it connects: a window that shrinks later makes the kernel drop what comes.
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, room_bytes)
-        rig.closing.append(sock.close)
-        await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
-        return sock
-
-    return open_socket
-
-
 async def hung_up(sock: socket.socket) -> bool:
     """Return whether the hub closes a bare connection without an answer."""
     try:

@@ -134,11 +134,9 @@ class TestTrouble:
         assert [frame[4] for frame in late] == [n & 0xFF for n in range(slow.sent)]
         assert hub.clients()[0].queued == 0
 
-    async def test_client_that_sends_pings_and_never_reads_is_dropped(
-        self, rig: Rig, plug: Visit
-    ) -> None:
+    async def test_client_that_sends_pings_and_never_reads_is_dropped(self, rig: Rig) -> None:
         hub = rig.hub(LISTEN)
-        sock = await plug(hub.listening_ports()[0], room_bytes=4096)
+        sock = await rig.connect(hub.listening_ports()[0], room_bytes=4096)
         await self.shake_hands(rig, hub, sock)
         ping = b"\x89\xfd" + bytes(4 + 125)
         async with asyncio.timeout(LIMIT_S):
@@ -170,9 +168,9 @@ class TestTrouble:
         (left,) = hub.clients()
         assert left.client_id == 2, "one that never answered pings is left to the kernel"
 
-    async def test_connection_without_handshake_is_dropped(self, rig: Rig, plug: Visit) -> None:
+    async def test_connection_without_handshake_is_dropped(self, rig: Rig) -> None:
         hub = rig.hub(LISTEN)
-        sock = await plug(hub.listening_ports()[0])
+        sock = await rig.connect(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n")
         (listener,) = hub._endpoints.values()
         await rig.until(lambda: len(listener._handshakes) == 1)
@@ -183,26 +181,26 @@ class TestTrouble:
         assert not listener._handshakes
 
     async def test_connections_without_handshake_do_not_keep_pages_out(
-        self, rig: Rig, plug: Visit, visit: Visit
+        self, rig: Rig, visit: Visit
     ) -> None:
         hub = rig.hub(LISTEN, max_clients=3)
         port = hub.listening_ports()[0]
         for _ in range(20):
-            await plug(port)
+            await rig.connect(port)
         pages = [await visit(port) for _ in range(3)]
         assert all(page.is_open for page in pages)
         assert len(hub.clients()) == 3
-        late = await plug(port)
+        late = await rig.connect(port)
         assert await hung_up(late)
         assert len(hub.clients()) == 3
 
     @pytest.mark.parametrize("seed", range(10))
     async def test_garbage_ends_only_its_own_connection(
-        self, rig: Rig, plug: Visit, visit: Visit, seed: int
+        self, rig: Rig, visit: Visit, seed: int
     ) -> None:
         hub = rig.hub(LISTEN)
         page = await visit(hub.listening_ports()[0])
-        sock = await plug(hub.listening_ports()[0])
+        sock = await rig.connect(hub.listening_ports()[0])
         if seed % 2:
             await self.shake_hands(rig, hub, sock)
         await asyncio.get_running_loop().sock_sendall(sock, bytes(range(seed, 250)) * 20)
@@ -330,10 +328,10 @@ class TestTls:
         assert "certificate is not valid for 'localhost'" in hub.clients()[0].reason
 
     async def test_plain_http_at_a_tls_port_is_refused(
-        self, rig: Rig, plug: Visit, certificate: Path, caplog: pytest.LogCaptureFixture
+        self, rig: Rig, certificate: Path, caplog: pytest.LogCaptureFixture
     ) -> None:
         hub = rig.hub("wss-listen:127.0.0.1:0", tls_certificate=str(certificate))
-        sock = await plug(hub.listening_ports()[0])
+        sock = await rig.connect(hub.listening_ports()[0])
         await asyncio.get_running_loop().sock_sendall(sock, b"GET / HTTP/1.1\r\n\r\n")
         await rig.until(lambda: hub.listeners()[0].turned_away == 1)
         assert re.search("tls: http request", caplog.text)
