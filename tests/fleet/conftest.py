@@ -30,7 +30,7 @@ class World:
         self.locator = locator
         self.station = station
         self.sites: dict[str, Any] = {}
-        self.heard: dict[str, list[Any]] = {}
+        self.received: dict[str, list[Any]] = {}
         self.vehicles: dict[str, Sender] = {}
         self.got: list[Any] = []
 
@@ -56,11 +56,11 @@ class World:
         rig.vehicle = rig.sender(system)
         hub = rig.hub(url, *filter(None, [extra]), recordings=recordings)
         self.rig.closing += rig.closing
-        self.sites[name], self.heard[name], self.vehicles[name] = hub, incoming, rig.vehicle
+        self.sites[name], self.received[name], self.vehicles[name] = hub, incoming, rig.vehicle
         return hub
 
-    def say(self) -> None:
-        """Let every vehicle and the station speak, and take what the station gets."""
+    def exchange(self) -> None:
+        """Send frames of every vehicle and the station, and read those that the station gets."""
         for name, hub in self.sites.items():
             if hub._timer is not None:
                 self.rig.tick(hub)
@@ -79,7 +79,7 @@ class World:
         async with asyncio.timeout(LIMIT_S):
             while not condition():
                 self.rig.clock.us += 100_000
-                self.say()
+                self.exchange()
                 await asyncio.sleep(0.01)
 
     def systems(self) -> set[int]:
@@ -87,7 +87,7 @@ class World:
 
     def commands(self, name: str) -> list[Any]:
         link = mavlink.MAVLink(None)
-        found = [link.decode(bytearray(each.frame)) for each in self.heard[name]]
+        found = [link.decode(bytearray(each.frame)) for each in self.received[name]]
         return [message for message in found if message.get_type() == "COMMAND_LONG"]
 
 

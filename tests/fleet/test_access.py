@@ -99,7 +99,7 @@ async def test_documented_site_is_shown_and_commanded_through_the_documented_fle
     await world.until(lambda: world.systems() == {1})
     world.station.send(world.station.sender.command(1, 1))
     await world.until(lambda: bool(world.commands("field-1")))
-    assert world.heard["field-1"][-1].trusted
+    assert world.received["field-1"][-1].trusted
     assert world.fleet._session.warning == ""
 
 

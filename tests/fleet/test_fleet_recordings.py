@@ -60,7 +60,7 @@ async def opened(world: World, folder: Path) -> None:
     await world.until(lambda: bool(world.systems()))
 
 
-async def spoken_for(world: World, work: "asyncio.Task[Any]") -> Any:
+async def result_of(world: World, work: "asyncio.Task[Any]") -> Any:
     """Let all go on while somebody works in a thread."""
     await world.until(work.done)
     return work.result()
@@ -74,7 +74,7 @@ class TestOverTheSession:
 
         async def run(*words: str) -> Any:
             task = asyncio.create_task(asyncio.to_thread(invoke, *words))
-            return await spoken_for(world, task)
+            return await result_of(world, task)
 
         listed = await run("fleet", "recordings", "--json")
         assert {each["name"] for each in json.loads(listed.output)["field-a"]} == {"flight", "link"}
@@ -103,7 +103,7 @@ class TestOverTheSession:
         ask, asked = over(world), []
         gone, retried = threading.Event(), threading.Event()
 
-        def noting(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+        def recorded(verb: str, params: dict[str, Any], wait_s: float) -> Any:
             asked.append((verb, params.get("offset")))
             if len(asked) == 20:
                 assert gone.wait(LIMIT_S)
@@ -116,7 +116,7 @@ class TestOverTheSession:
 
         back = threading.Event()
         to = tmp_path / "fetched"
-        fetch = RecordingFetch("field-a", to, noting, wait=wait)
+        fetch = RecordingFetch("field-a", to, recorded, wait=wait)
         task = asyncio.create_task(asyncio.to_thread(fetch.fetch, NAME, SIZE, lambda _: None))
         await world.until(lambda: len(asked) == 20)
         world.sites.pop("field-a").close()
@@ -125,7 +125,7 @@ class TestOverTheSession:
         await world.until(retried.is_set)
         assert [path.name for path in to.iterdir()] == [f".{NAME}.part"], "nothing looks whole"
         world.open_site("field-a", "&trusted=yes", recordings=folder)
-        assert await spoken_for(world, task) is True
+        assert await result_of(world, task) is True
         assert (to / NAME).read_bytes() == CONTENT
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
         assert sorted(set(offsets)) == [*range(0, SIZE, fleet_command.SMALLEST)], (
@@ -139,16 +139,16 @@ class TestOverTheSession:
         asked: list[int] = []
         ask = over(world)
 
-        def noting(verb: str, params: dict[str, Any], wait_s: float) -> Any:
+        def recorded(verb: str, params: dict[str, Any], wait_s: float) -> Any:
             asked.append(params.get("offset", -1))
             if len(asked) == 5:
                 raise ControlError("stopped")
             return ask(verb, params, wait_s)
 
         async def fetch() -> Any:
-            one = RecordingFetch("field-a", tmp_path / "fetched", noting)
+            one = RecordingFetch("field-a", tmp_path / "fetched", recorded)
             work = asyncio.to_thread(one.fetch, NAME, SIZE, lambda _: None)
-            return await spoken_for(world, asyncio.create_task(work))
+            return await result_of(world, asyncio.create_task(work))
 
         with pytest.raises(ControlError):
             await fetch()
@@ -166,7 +166,7 @@ class TestOverTheSession:
         world.open_site("field-a", recordings=folder)
         await world.until(lambda: bool(world.systems()))
         work = asyncio.to_thread(over(world), "fleet.recordings", {"site": "field-a"}, 20.0)
-        assert await spoken_for(world, asyncio.create_task(work)) == {}
+        assert await result_of(world, asyncio.create_task(work)) == {}
 
 
 async def test_malformed_list_of_one_site_hides_no_others() -> None:

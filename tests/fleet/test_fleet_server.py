@@ -95,9 +95,9 @@ async def test_frames_of_one_site_never_reach_another(world: World) -> None:
     await world.until(lambda: len(world.got) > 200)
     assert world.vehicles["field-a"].heartbeat() == world.vehicles["field-b"].heartbeat()
     looped = [site["looped"] for site in world.fleet.status()["sites"]]
-    assert looped == [0, 0], "each is known for its own, though they say the same"
+    assert looped == [0, 0], "equal frames of two vehicles are no loop"
     for name, hub in world.sites.items():
-        senders = {each.frame[5] for each in world.heard[name]}
+        senders = {each.frame[5] for each in world.received[name]}
         assert senders <= {255}
         assert hub.clients()[0].systems == ((255, 190),)
         assert before[name] <= hub.clients()[0].received
@@ -110,7 +110,7 @@ async def test_disconnected_site_is_reported_once(world: World) -> None:
     world.sites["field-b"].close()
     await world.until(lambda: any(m.get_type() == "STATUSTEXT" for m in world.got))
     for _ in range(20):
-        world.say()
+        world.exchange()
         await asyncio.sleep(0.01)
     texts = [m.text for m in world.got if m.get_type() == "STATUSTEXT"]
     assert texts == ["Site field-b disconnected"]

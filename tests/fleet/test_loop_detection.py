@@ -108,16 +108,16 @@ def test_looped_vehicle_with_an_id_is_dropped_after_a_run() -> None:
 
 def test_returned_command_ends_on_both_ways() -> None:
     ring = Ring(IdMap({("a", 1): 7}))
-    said = Sender(255, 190).command(7, 1)
-    found = ring.sites["a"].to_site(frame_of(said), 0)
+    asked = Sender(255, 190).command(7, 1)
+    found = ring.sites["a"].to_site(frame_of(asked), 0)
     assert found is not None
     system_id, sent = found[0], found[1].data
     assert system_id == 1
-    for frame in (said, sent):
+    for frame in (asked, sent):
         assert ring.give("c", frame) is None
     assert ring.ids.known_id("c", 255) is None
     assert ring.loops.is_returned_by_client(sent, 0), "for another vehicle's id"
-    assert not ring.loops.is_returned_by_client(said, 0), "a program may say the same again"
+    assert not ring.loops.is_returned_by_client(asked, 0), "a program may send the same frame again"
     assert ring.loops.looped == 1
 
 

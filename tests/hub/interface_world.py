@@ -1,7 +1,7 @@
 """A hub between loopback and an Ethernet cable that is pulled out; needs its own namespace.
 
 The cable is a pair of virtual interfaces, its far end in the namespace of a child process. Writes
-what each of the two clients heard as JSON.
+what each of the two clients received as JSON.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ class World:
         endpoints = (f"udp:127.0.0.1:{self.near.getsockname()[1]}", "udp:10.99.0.2:14550")
         self.hub = Hub(HubSettings(endpoints=endpoints), lambda _: None, GatewayClock())
         self.link = dialect.MAVLink(None, 1, 1)
-        self.sent = self.heard = 0
+        self.sent = self.received = 0
 
     async def fly(self, seconds: float) -> None:
         loop = asyncio.get_running_loop()
@@ -84,7 +84,7 @@ class World:
     def listen(self) -> None:
         with contextlib.suppress(BlockingIOError):
             while self.near.recv(4096):
-                self.heard += 1
+                self.received += 1
 
     def state(self) -> str:
         return self.hub.clients()[1].state
@@ -118,9 +118,9 @@ async def fly(far: "subprocess.Popen[str]") -> dict[str, object]:
     return {
         "state while down": state_down,
         "dropped while down": dropped,
-        "loopback lost": world.sent - world.heard,
+        "loopback lost": world.sent - world.received,
         "sent after": world.sent - sent_down,
-        "far end heard": far_heard,
+        "far end received": far_heard,
         "far end could hear": world.sent - dropped,
     }
 

@@ -53,11 +53,11 @@ async def listening() -> AsyncIterator[socket.socket]:
             asyncio.get_running_loop().remove_reader(sock)
 
 
-async def test_a_connection_waits_for_a_descriptor_and_both_ends_are_reported_once(
+async def test_connection_waits_for_a_descriptor_and_begin_and_end_are_reported_once(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[socket.socket] = []
-    said: list[str] = []
+    reasons: list[str] = []
     tries: list[float] = []
     loop = asyncio.get_running_loop()
     call_later = loop.call_later
@@ -71,20 +71,20 @@ async def test_a_connection_waits_for_a_descriptor_and_both_ends_are_reported_on
     accept_each(
         listening,
         lambda connection, _: taken.append(connection),
-        lambda error: said.append("" if error is None else str(error.strerror)),
+        lambda error: reasons.append("" if error is None else str(error.strerror)),
     )
     with socket.socket() as caller:
         with no_descriptors():
             caller.connect(listening.getsockname())
             await until(lambda: len(tries) > 3)
-            assert said == ["Too many open files"]
+            assert reasons == ["Too many open files"]
             assert taken == []
         await until(lambda: bool(taken))
-    assert said == ["Too many open files", ""]
+    assert reasons == ["Too many open files", ""]
     taken.pop().close()
 
 
-async def test_a_socket_that_is_closed_meanwhile_is_left_alone(
+async def test_socket_closed_during_the_pause_is_not_watched_again(
     listening: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loop, later = asyncio.get_running_loop(), list[Callable[[], None]]()
@@ -104,7 +104,7 @@ async def test_a_socket_that_is_closed_meanwhile_is_left_alone(
     watch()
 
 
-async def test_metrics_keep_their_port_and_say_why_nobody_is_answered() -> None:
+async def test_metrics_server_keeps_its_port_and_reports_missing_descriptors() -> None:
     server = MetricsServer(lambda: iter(["text"]))
     server.listen(free_port())
     port, listening = server.port, list(server._sockets)
@@ -119,7 +119,7 @@ async def test_metrics_keep_their_port_and_say_why_nobody_is_answered() -> None:
     server.close()
 
 
-async def test_the_control_socket_waits_and_logs_it_once(
+async def test_control_socket_answers_later_and_logs_missing_descriptors_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     server = ControlServer(tmp_path / "run.sock")

@@ -19,7 +19,7 @@ NOISE = bytes(1024)
 
 
 async def caller(rig: Any, kind: str, port: int) -> socket.socket:
-    """Open a connection that has said one heartbeat."""
+    """Open a connection that has sent one heartbeat."""
     sock: socket.socket = await rig.connect(port, KINDS[kind])
     sock.send(rig.sender(255, 190).heartbeat())
     return sock

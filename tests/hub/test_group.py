@@ -49,11 +49,11 @@ async def test_multicast_is_sent_and_received_without_own_frames(rig: Any) -> No
     hub.send(rig.out(frame))
     data, sender = await receive(listener)
     assert data == frame
-    answer, said = rig.sender(255, 190), []
+    answer, sent = rig.sender(255, 190), []
     for target in ((GROUP, port), sender):
-        said.append(answer.heartbeat())
-        listener.sendto(said[-1], target)
+        sent.append(answer.heartbeat())
+        listener.sendto(sent[-1], target)
     await rig.until(lambda: len(rig.incoming) == 2)
-    assert [incoming.frame for incoming in rig.incoming] == said
+    assert [incoming.frame for incoming in rig.incoming] == sent
     (client,) = hub.clients()
     assert (client.received, client.trusted) == (2, False)

@@ -18,7 +18,7 @@ from gateway.hub.endpoint import admits_page
         "http://192.168.4.1:8000",
     ],
 )
-def test_pages_of_this_machine(origin: str) -> None:
+def test_page_of_this_machine_is_admitted(origin: str) -> None:
     assert admits_page(origin, "192.168.4.1", ())
 
 
@@ -39,10 +39,10 @@ def test_pages_of_this_machine(origin: str) -> None:
         "http://user@example.org#127.0.0.1",
     ],
 )
-def test_other_pages(origin: str) -> None:
+def test_page_of_another_machine_is_admitted_only_if_named(origin: str) -> None:
     assert not admits_page(origin, "192.168.4.1", ())
     assert admits_page(origin.upper(), "192.168.4.1", {origin})
 
 
-def test_a_mapped_address_is_the_same_machine() -> None:
+def test_mapped_address_is_the_same_machine() -> None:
     assert admits_page("http://192.168.4.1", "::ffff:192.168.4.1", ())

@@ -72,9 +72,9 @@ async def test_request_to_an_unknown_system_is_unroutable(world: Any) -> None:
 
 
 async def test_broadcast_of_a_station_reaches_vehicles_only(world: Any) -> None:
-    said = world.first.sender.heartbeat()
-    world.first.send(said)
-    assert await world.autopilot.receive() == said
+    beat = world.first.sender.heartbeat()
+    world.first.send(beat)
+    assert await world.autopilot.receive() == beat
     assert world.second.is_empty()
 
 
@@ -112,13 +112,13 @@ async def test_copy_passes_a_loop_once_at_most(world: Any) -> None:
     """A client that echoes from the start is a second path, whose copies are then dropped."""
     port = world.world.listening_ports()[0]
     echo = world.station(port)
-    said = [world.autopilot.sender.attitude() for _ in range(5)]
-    world.autopilot.send(said[0])
-    assert await world.first.receive() == said[0]
+    frames = [world.autopilot.sender.attitude() for _ in range(5)]
+    world.autopilot.send(frames[0])
+    assert await world.first.receive() == frames[0]
     world.clock.us += 1000
-    echo.send(said[0])
-    assert [await world.first.receive(), await world.autopilot.receive()] == [said[0], said[0]]
-    for count, frame in enumerate(said[1:], start=1):
+    echo.send(frames[0])
+    assert [await world.first.receive(), await world.autopilot.receive()] == [frames[0], frames[0]]
+    for count, frame in enumerate(frames[1:], start=1):
         world.clock.us += 1000
         world.autopilot.send(frame)
         assert [await world.first.receive(), await echo.receive()] == [frame, frame]
@@ -158,7 +158,7 @@ async def test_no_frame_circulates_between_hubs_joined_twice(rig: Any) -> None:
         counts.append(counted())
     await rig.quiet()
     assert [first.counters(), second.counters()] == [*found]
-    # Before both cables have been heard, copies may pass.
+    # Until frames have arrived by both cables, copies may pass.
     for before, after in itertools.pairwise(counts[2:]):
         looped, passed_here, passed_there = np.subtract(after, before)
         assert looped == 11, "each of ours comes back by the other cable, once, and ends"
@@ -223,9 +223,9 @@ async def test_monitor_gets_all_traffic_and_its_own_frames_are_ignored(world: An
     await world.until(lambda: client.counters.received == 3)
     assert (len(world.incoming), hub.counters().forwarded) == (count, forwarded)
     await world.quiet()
-    heard = [frame_of(data) for data in world.first.received()]
-    assert telemetry in [frame.data for frame in heard]
-    assert 77 not in {frame.origin[0] for frame in heard}
+    received = [frame_of(data) for data in world.first.received()]
+    assert telemetry in [frame.data for frame in received]
+    assert 77 not in {frame.origin[0] for frame in received}
 
 
 async def test_allow_restricts_round_trip_requests_and_greetings_too(rig: Any) -> None:
@@ -344,16 +344,16 @@ class TestChangesAtRunTime:
         assert {remote: after.get(remote) for remote in before} == before | {
             f"127.0.0.1:{goes.port}": None
         }
-        heard = {}
+        received = {}
         frames = [rig.vehicle.raw_imu(), rig.vehicle.attitude()]
         for frame in frames:
             hub.send(rig.out(frame))
         hub.send(rig.out(rig.vehicle.heartbeat()))
         for name, station in (("stays", stays), ("comes", comes), ("caller", caller)):
-            heard[name] = []
+            received[name] = []
             while message_id := (await station.receive())[7]:
-                heard[name].append(message_id)
-        assert heard == {"stays": [27], "comes": [27, 30], "caller": [30]}
+                received[name].append(message_id)
+        assert received == {"stays": [27], "comes": [27, 30], "caller": [30]}
         assert goes.is_empty()
         assert "laptop" in {client.name for client in hub.clients()}
 

@@ -31,7 +31,7 @@ class Healthy:
         self.hub = rig.hub("udp-listen:127.0.0.1:0", *configured, *endpoints, **settings)
         self.stations.append(rig.station(self.hub.listening_ports()[0]))
         self.sent: list[bytes] = []
-        self.heard: list[list[int]] = [[] for _ in self.stations]
+        self.received: list[list[int]] = [[] for _ in self.stations]
 
     async def start(self) -> None:
         caller = self.stations[-1]
@@ -50,16 +50,16 @@ class Healthy:
 
     def listen(self) -> bool:
         """Read the frames received by the clients; return whether those are all."""
-        for station, heard in zip(self.stations, self.heard, strict=True):
-            heard += [frame[4] for frame in station.received()]
-        return all(len(heard) >= len(self.sent) for heard in self.heard)
+        for station, received in zip(self.stations, self.received, strict=True):
+            received += [frame[4] for frame in station.received()]
+        return all(len(received) >= len(self.sent) for received in self.received)
 
     async def lost(self) -> int:
         """Count the clients that did not get every frame in order."""
         with contextlib.suppress(TimeoutError):
             await self.rig.until(self.listen)
         whole = [frame[4] for frame in self.sent]
-        return sum(heard != whole for heard in self.heard)
+        return sum(received != whole for received in self.received)
 
 
 @pytest.mark.parametrize("garbage", [b"\xfd", b"\xfe", b"\xfd\xff\x02", bytes(range(256))])
@@ -79,11 +79,11 @@ async def test_garbage_of_a_tcp_client_costs_others_no_frame(rig: Any, garbage: 
         client = flight.hub.clients()[-1]
         assert client.bytes_garbage > 100_000
         assert client.received == 0
-        said = rig.sender(200, 190).heartbeat()
+        heartbeat = rig.sender(200, 190).heartbeat()
         while not flight.hub.clients()[-1].received:
             # What looks like the head of a frame swallows the first ones.
             with contextlib.suppress(BlockingIOError):
-                rude.send(said)
+                rude.send(heartbeat)
             await flight.fly(1)
 
 
@@ -128,8 +128,8 @@ async def test_interface_that_goes_down_and_up_costs_others_no_frame(tmp_path: A
     assert seen["state while down"] == "unreachable"
     assert seen["loopback lost"] == 0
     before_and_after = seen["far end could hear"]
-    assert before_and_after - 50 <= seen["far end heard"] <= before_and_after
-    assert seen["far end heard"] >= seen["sent after"] - 5
+    assert before_and_after - 50 <= seen["far end received"] <= before_and_after
+    assert seen["far end received"] >= seen["sent after"] - 5
 
 
 class TestLinkThatRaises:

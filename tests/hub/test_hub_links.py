@@ -33,7 +33,7 @@ class Joined:
             for system, here, there in ((1, *ports), (2, *reversed(ports)))
         )
         self.station = rig.station(ports[1])
-        self.heard: dict[int, list[bytes]] = {1: [], 2: []}
+        self.received: dict[int, list[bytes]] = {1: [], 2: []}
 
     async def run(self, seconds: float) -> None:
         for step in range(round(seconds * 1e6 / STEP_US)):
@@ -51,32 +51,32 @@ class Joined:
 
     def listen(self) -> None:
         for frame in self.station.received():
-            if frame[5] in self.heard and frame[6] == 1:
-                self.heard[frame[5]].append(frame)
+            if frame[5] in self.received and frame[6] == 1:
+                self.received[frame[5]].append(frame)
 
     def gaps(self, system: int) -> int:
-        numbers = [frame[4] for frame in self.heard[system]]
+        numbers = [frame[4] for frame in self.received[system]]
         return sum((b - a) % 256 != 1 for a, b in itertools.pairwise(numbers))
 
 
 async def test_two_gateways_joined_twice_send_every_frame_once(rig: Any) -> None:
     joined = Joined(rig)
     await joined.run(4)
-    joined.heard = {1: [], 2: []}
+    joined.received = {1: [], 2: []}
     await joined.run(10)
     for system in (1, 2):
-        assert len(joined.heard[system]) > 500
+        assert len(joined.received[system]) > 500
         assert joined.gaps(system) == 0
 
 
 async def test_request_over_two_links_is_answered_on_both_without_a_gap(rig: Any) -> None:
     joined = Joined(rig)
     await joined.run(4)
-    joined.heard = {1: [], 2: []}
+    joined.received = {1: [], 2: []}
     for _ in range(10):
         joined.station.send(joined.station.sender.command(1, 1))
         await joined.run(0.2)
-    acks = [frame for frame in joined.heard[1] if message_id_of(frame) == 77]
+    acks = [frame for frame in joined.received[1] if message_id_of(frame) == 77]
     assert len(acks) == 10
     assert (joined.gaps(1), joined.gaps(2)) == (0, 0)
 

@@ -98,24 +98,24 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     source, station, receiver = rig.station(port), rig.station(port), Strict()
     station.send(station.sender.heartbeat())
     autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
-    for said in [pilot.heartbeat() for pilot in autopilots]:
-        source.send(said)
+    for sent in [pilot.heartbeat() for pilot in autopilots]:
+        source.send(sent)
 
     def received() -> int:
         return sum(client.received for client in hub.clients())
 
     await rig.until(lambda: received() == 1 + len(autopilots))
-    said = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
-    for frame in said:
+    sent = [make() for pilot in autopilots for make in (pilot.attitude, pilot.raw_imu)]
+    for frame in sent:
         source.send(frame)
-    await rig.until(lambda: received() == 1 + len(autopilots) + len(said))
+    await rig.until(lambda: received() == 1 + len(autopilots) + len(sent))
     hub.send(rig.out(rig.vehicle.raw_imu()))
     got = []
     while not got or (got[-1][5:7], message_id_of(got[-1])) != (b"\1\1", 27):
         got.append(await station.receive())
         if got[-1][5:7] == b"\1\1":
             receiver.read(got[-1])
-    assert [frame for frame in got if frame in said] == said
+    assert [frame for frame in got if frame in sent] == sent
 
 
 async def test_changed_key_applies_from_the_next_frame_on(rig: Any) -> None:

@@ -45,7 +45,7 @@ COMMAND_ACK = dialect.MAVLINK_MSG_ID_COMMAND_ACK
 NAMES = st.sampled_from([OURS, AUTOPILOT, GOOD, (42, 190), (7, 7), (1, 240), (200, 190)])
 
 
-def lies(sender: Any, guessed: bytes) -> dict[str, bytes]:
+def forged_frames(sender: Any, guessed: bytes) -> dict[str, bytes]:
     """Return forged frames of a name; `guessed` is the next frame of the good client."""
     pack = sender.pack
 
@@ -85,8 +85,8 @@ class HubMachine(RuleBasedStateMachine):
         self.requests: list[bytes] = []
         """Frames of the good client that the autopilot has not received yet."""
         self.answers = 0
-        self.lies: set[bytes] = set()
-        self.said: set[bytes] = set()
+        self.forged: set[bytes] = set()
+        self.sent_to_ours: set[bytes] = set()
         self.outsiders: list[Station] = []
         self.readers: list[socket.socket] = []
 
@@ -127,7 +127,7 @@ class HubMachine(RuleBasedStateMachine):
         await self._settle()
 
     def _ask(self, frame: bytes) -> None:
-        self.said.add(frame)
+        self.sent_to_ours.add(frame)
         self.requests.append(frame)
         self.good.send(frame)
 
@@ -144,19 +144,19 @@ class HubMachine(RuleBasedStateMachine):
 
     def _listen(self) -> None:
         for frame in self.good.received():
-            assert frame not in self.lies
+            assert frame not in self.forged
             if origin_of(frame) == OURS:
                 self.numbers.append(frame[4])
                 self.answers += message_id_of(frame) == COMMAND_ACK
             elif origin_of(frame) == AUTOPILOT:
                 assert frame == self.telemetry.pop(0)
         for frame in self.autopilot.received():
-            assert frame not in self.lies
+            assert frame not in self.forged
             if origin_of(frame) == GOOD:
                 assert frame == self.requests.pop(0)
         for outsider in self.outsiders:
             for frame in outsider.received():
-                assert frame not in self.said, (
+                assert frame not in self.sent_to_ours, (
                     "an untrusted client received a frame of the good client"
                 )
 
@@ -182,7 +182,7 @@ class HubMachine(RuleBasedStateMachine):
         async def steps() -> None:
             before = self.answers
             frame = self.good.sender.command(*OURS)
-            self.said.add(frame)
+            self.sent_to_ours.add(frame)
             self.good.send(frame)
 
             def answered() -> bool:
@@ -210,7 +210,9 @@ class HubMachine(RuleBasedStateMachine):
     @rule(
         data=st.data(),
         name=NAMES,
-        kinds=st.lists(st.sampled_from(sorted(lies(Rig().sender(1), b""))), min_size=1, max_size=9),
+        kinds=st.lists(
+            st.sampled_from(sorted(forged_frames(Rig().sender(1), b""))), min_size=1, max_size=9
+        ),
         times=st.integers(1, 8),
     )
     def an_untrusted_client_forges(
@@ -228,9 +230,9 @@ class HubMachine(RuleBasedStateMachine):
                 link = self.good.sender.link
                 guessed = self.good.sender.command(*AUTOPILOT)
                 link.seq = (link.seq - 1) % 256
-                frame = lies(sender, guessed)[kind]
+                frame = forged_frames(sender, guessed)[kind]
                 if kind != "copy in advance":
-                    self.lies.add(frame)
+                    self.forged.add(frame)
                 outsider.send(frame)
                 await asyncio.sleep(0)
             await self._settle()
@@ -245,7 +247,7 @@ class HubMachine(RuleBasedStateMachine):
             gone.socket.close()
 
     @rule()
-    def somebody_connects_and_never_reads(self) -> None:
+    def a_tcp_client_connects_and_never_reads(self) -> None:
         async def steps() -> None:
             reader = socket.create_connection((TRUSTED, self.tcp))
             self.rig.closing.append(reader.close)

@@ -29,24 +29,24 @@ async def world(rig: Any) -> Any:
     return rig
 
 
-async def lie(world: Any, *frames: bytes) -> None:
+async def send_untrusted(world: Any, *frames: bytes) -> None:
     """Send frames as the untrusted client, and wait until they are received."""
     hub = world.world
 
-    def heard() -> int:
+    def received() -> int:
         return sum(client.received for client in hub.clients())
 
-    before = heard()
+    before = received()
     for frame in frames:
         world.untrusted.send(frame)
-    await world.until(lambda: heard() == before + len(frames))
+    await world.until(lambda: received() == before + len(frames))
 
 
 async def test_heartbeat_forged_by_an_untrusted_client_does_not_stop_telemetry(world: Any) -> None:
     forged = world.sender(42, 190)
     forged.link.srcComponent = 1
     for _ in range(20):
-        await lie(world, forged.heartbeat())
+        await send_untrusted(world, forged.heartbeat())
         frame = world.autopilot.sender.attitude()
         world.autopilot.send(frame)
         assert await world.station_.receive() == frame
@@ -58,7 +58,7 @@ async def test_copies_sent_in_advance_drop_no_request(world: Any) -> None:
     for _ in range(10):
         request = world.station_.sender.command(42, 1)
         assert seen.command(42, 1) == request, "numbers are easily guessed"
-        await lie(world, request)
+        await send_untrusted(world, request)
         world.station_.send(request)
         assert await world.autopilot.receive() == request
     assert world.world.counters().duplicates == 0
@@ -68,7 +68,7 @@ async def test_command_goes_to_the_trusted_path_despite_a_forged_component(
     world: Any,
 ) -> None:
     claimed = world.sender(42, 77)
-    await lie(world, claimed.heartbeat(), claimed.attitude())
+    await send_untrusted(world, claimed.heartbeat(), claimed.attitude())
     request = world.station_.sender.command(42, 77)
     world.station_.send(request)
     assert await world.autopilot.receive() == request
@@ -80,19 +80,19 @@ async def test_forged_stations_displace_no_other_client(world: Any) -> None:
     for number in range(357):
         forged = world.sender(1 + number % 200, 1 + number // 200)
         forged.is_station = True
-        await lie(world, forged.heartbeat())
+        await send_untrusted(world, forged.heartbeat())
         world.clock.us += 10_000
     late = world.station(world.world.listening_ports()[0])
     late.sender = world.sender(253, 190)
-    said = late.sender.heartbeat()
-    late.send(said)
-    assert await world.autopilot.receive() == said
+    heartbeat = late.sender.heartbeat()
+    late.send(heartbeat)
+    assert await world.autopilot.receive() == heartbeat
     assert world.station_.is_empty(), "what a station says to all goes to vehicles only"
 
 
 async def test_systems_shown_for_an_untrusted_client_are_bounded(world: Any) -> None:
     for number in range(100):
-        await lie(world, world.sender(100 + number, 1).attitude())
+        await send_untrusted(world, world.sender(100 + number, 1).attitude())
     untrusted = next(c for c in world.world.clients() if not c.trusted)
     assert 1 <= len(untrusted.systems) <= 8
 
@@ -116,7 +116,7 @@ class TestRequests:
         before = len(world.incoming)
         hub = world.world
         hub._router.charge(hub.clients()[0].client_id, UNTRUSTED_BURST)
-        await lie(world, *(world.untrusted.sender.command(1, 1) for _ in range(100)))
+        await send_untrusted(world, *(world.untrusted.sender.command(1, 1) for _ in range(100)))
         await world.quiet()
         assert len(world.incoming) == before
         assert hub.counters().unserved == 100 - 64
@@ -133,10 +133,10 @@ class TestRequests:
         frame = world.autopilot.sender.attitude()
         world.autopilot.send(frame)
 
-        def heard() -> bool:
+        def received() -> bool:
             if not world.station_.is_empty():
                 order.append(frame)
             return frame in order
 
-        await world.until(heard)
+        await world.until(received)
         assert order.index(frame) <= 5

@@ -60,7 +60,7 @@ class Gateway(FlyingHub):
 
     def __init__(self, rig: Any) -> None:
         self.steady = rig.station()
-        self.attitudes = self.attitudes_heard = 0
+        self.attitudes = self.attitudes_received = 0
         self.sequence = bytearray()
         """Numbers of the vehicle's frames that the client got."""
         endpoints = (f"udp:127.0.0.1:{self.steady.port}", "udp-listen:127.0.0.1:0?trusted=no")
@@ -76,7 +76,7 @@ class Gateway(FlyingHub):
         for frame in self.steady.received():
             if frame[5:7] == b"\x01\x01":
                 self.sequence.append(frame[4])
-                self.attitudes_heard += frame[7:10] == b"\x1f\0\0"
+                self.attitudes_received += frame[7:10] == b"\x1f\0\0"
 
 
 async def test_thousands_of_unknown_addresses_cost_no_frame_and_no_memory(
@@ -107,12 +107,12 @@ async def test_thousands_of_unknown_addresses_cost_no_frame_and_no_memory(
     await assail(CLIENTS // 2, CLIENTS)
     assert sys.getallocatedblocks() - before < GROWTH_LIMIT_BLOCKS
 
-    def is_all_heard() -> bool:
+    def is_all_received() -> bool:
         gateway.listen()
-        return gateway.attitudes_heard >= gateway.attitudes
+        return gateway.attitudes_received >= gateway.attitudes
 
-    await rig.until(is_all_heard)
-    assert gateway.attitudes_heard == gateway.attitudes
+    await rig.until(is_all_received)
+    assert gateway.attitudes_received == gateway.attitudes
     steps = {(b - a) % 256 for a, b in itertools.pairwise(gateway.sequence)}
     assert steps == {1}, "nothing lost, and no gap from what others were answered"
     assert gateway.vehicle.refusals > CLIENTS // 20

@@ -254,9 +254,9 @@ async def test_frames_are_sent_and_received(link: Link) -> None:
     before = link.hub.clients()[0].dropped
     for _ in range(3):
         await link.is_sent(link.rig.vehicle.attitude())
-    said = link.rig.sender(255, 190).command(1, 1)
-    link.far.write(said)
-    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [said])
+    command = link.rig.sender(255, 190).command(1, 1)
+    link.far.write(command)
+    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [command])
     (client,) = link.hub.clients()
     assert (client.state, client.dropped, client.queued) == ("open", before, 0)
     assert client.sent >= 3
@@ -265,13 +265,13 @@ async def test_frames_are_sent_and_received(link: Link) -> None:
 
 async def test_garbage_is_counted_and_the_next_frame_is_received(link: Link) -> None:
     await link.is_sent(link.rig.vehicle.attitude())
-    said = link.rig.sender(255, 190).command(1, 1)
-    link.far.write(b"garbage" + said)
-    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [said])
+    command = link.rig.sender(255, 190).command(1, 1)
+    link.far.write(b"garbage" + command)
+    await link.until(lambda: [i.frame for i in link.rig.incoming][-1:] == [command])
     assert link.hub.clients()[0].bytes_garbage == 7
 
 
-async def test_a_changed_filter_applies_to_the_open_client(link: Link) -> None:
+async def test_changed_filter_applies_to_the_open_client(link: Link) -> None:
     before = link.hub.clients()[0].client_id
     settings = link.hub.settings
     changed = (f"{settings.endpoints[0]}?deny=RAW_IMU",)
@@ -283,7 +283,7 @@ async def test_a_changed_filter_applies_to_the_open_client(link: Link) -> None:
     assert 27 not in {frame[7] for frame in link.far.frames}
 
 
-async def test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link) -> None:
+async def test_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link) -> None:
     if link.kind not in NOTICES_THE_END:
         pytest.skip("a broadcast has no peer")
     link.far.shut()
@@ -310,7 +310,7 @@ async def test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link: L
     await link.until(is_served)
 
 
-async def test_a_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:
+async def test_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:
     link.hub.remove(link.far.url)
     link.far.poll()
     link.far.frames.clear()
@@ -321,7 +321,7 @@ async def test_a_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None
     assert (link.hub.clients(), link.hub.endpoints()) == ((), ())
 
 
-async def test_an_unexpected_error_closes_and_the_next_tick_opens_again(
+async def test_unexpected_error_closes_the_client_and_the_next_tick_opens_it(
     link: Link, caplog: pytest.LogCaptureFixture
 ) -> None:
     if link.kind in LISTENING:
@@ -338,7 +338,7 @@ async def test_an_unexpected_error_closes_and_the_next_tick_opens_again(
     await link.until(is_open)
 
 
-async def test_closing_leaves_no_reader_and_no_task_behind(link: Link) -> None:
+async def test_closed_hub_leaves_no_client_and_no_task(link: Link) -> None:
     link.hub.close()
     await link.rig.quiet()
     assert link.hub.clients() == ()
@@ -357,7 +357,7 @@ def test_uvloop_serves_every_transport_too(kind: str) -> None:
             await link.until_open()
             await test_frames_are_sent_and_received(link)
             if kind in NOTICES_THE_END:
-                await test_an_ended_peer_is_noticed_and_served_again_when_it_returns(link)
+                await test_ended_peer_is_noticed_and_served_again_when_it_returns(link)
         finally:
             rig.close()
             await asyncio.sleep(0)

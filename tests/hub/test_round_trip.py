@@ -26,7 +26,7 @@ def test_requests_are_numbered_and_sent_by_the_gateways_component() -> None:
     assert [frame.sequence for frame in frames] == [number % 256 for number in range(260)]
 
 
-def test_an_answer_gives_the_round_trip() -> None:
+def test_answer_gives_the_round_trip() -> None:
     probe = RoundTrip(FrameSigner())
     probe.ask(SYSTEM, 1_000_000)
     assert probe.read(pong(1_000_000), 1_001_500) == 1500

@@ -21,11 +21,11 @@ async def test_configured_client_gets_frames_and_answers_the_same_socket(rig: An
     hub.send(rig.out(heartbeat))
     data, station.target = await asyncio.get_running_loop().sock_recvfrom(station.socket, 100)
     assert data == heartbeat
-    said = station.sender.heartbeat()
-    station.send(said)
+    answer = station.sender.heartbeat()
+    station.send(answer)
     await rig.until(lambda: bool(rig.incoming))
     (client,) = hub.clients()
-    assert rig.incoming == [Incoming(client.client_id, said, trusted=True, forwarded=True)]
+    assert rig.incoming == [Incoming(client.client_id, answer, trusted=True, forwarded=True)]
     assert (client.name, client.sent, client.received) == ("laptop", 2, 1)
     assert client.bytes_sent == len(attitude) + len(heartbeat)
     assert client.systems == ((255, 190),)

@@ -173,14 +173,14 @@ class TestSite:
         far = site.visit("mavlink/field/*/out")
         await until_received(site, hub, far)
         assert far.got[0][0] == "mavlink/field/1/out"
-        said = site.sender(255, 190).command(1, 1)
-        far.session.put("mavlink/field/1/in", said)
+        command = site.sender(255, 190).command(1, 1)
+        far.session.put("mavlink/field/1/in", command)
         await until(site, hub, lambda: bool(site.incoming))
-        assert site.incoming[0].frame == said
+        assert site.incoming[0].frame == command
         assert not site.incoming[0].trusted
         far.session.put("mavlink/field/1/in", b"no MAVLink")
         await until(site, hub, lambda: hub.clients()[0].bytes_garbage == 10)
-        far.session.put("mavlink/other/1/in", said)
+        far.session.put("mavlink/other/1/in", command)
         far.session.put("mavlink/field/1/in", site.sender(255, 190).heartbeat())
         await until(site, hub, lambda: hub.clients()[0].received == 2)
 
@@ -193,20 +193,21 @@ class TestSite:
         far = site.visit("mavlink/field/*/out")
         autopilot = site.sender(7)
 
-        def heard() -> bool:
+        def received() -> bool:
             station.send(autopilot.heartbeat())
             hub.send(site.out(site.vehicle.command(1, 1)))
             hub.send(site.out(site.vehicle.heartbeat()))
             return far.marks.keys() >= {"mavlink/field/7/out"} and bool(far.messages(76))
 
-        await until(site, hub, heard)
+        await until(site, hub, received)
         assert far.marks == {"mavlink/field/7/out": {None}, "mavlink/field/1/out": {OWN}}
 
     async def test_filters_rates_and_packing_apply(self, site: Site) -> None:
         hub = await site.join("site=field&deny=RAW_IMU&pack=1100")
         far = site.visit("mavlink/field/*/out")
         await until_received(site, hub, far)
-        (packer,) = hub._clients[1]._packers.values()
+        client: Any = hub._clients[1]
+        (packer,) = client._packers.values()
         await until(site, hub, lambda: not packer._is_flush_due)
         for _ in range(5):
             hub.send(site.out(site.vehicle.raw_imu()))

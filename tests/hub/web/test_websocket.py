@@ -32,15 +32,15 @@ class TestPages:
         frames = await page.frames(2)
         assert [(message_id_of(frame), frame[4]) for frame in frames] == [(0, 0), (30, 1)]
         assert len(page.messages) == 2
-        said = rig.sender(255, 190).heartbeat()
-        page.send(said[:5])
-        page.send(said[5:])
+        sent = rig.sender(255, 190).heartbeat()
+        page.send(sent[:5])
+        page.send(sent[5:])
         await rig.until(lambda: bool(rig.incoming))
-        assert rig.incoming[0].frame == said
+        assert rig.incoming[0].frame == sent
         assert rig.incoming[0].trusted
         (client,) = hub.clients()
         assert (client.state, client.systems) == ("open", ((255, 190),))
-        assert (client.sent, client.received, client.bytes_received) == (2, 1, len(said))
+        assert (client.sent, client.received, client.bytes_received) == (2, 1, len(sent))
         assert client.remote.startswith("127.0.0.1:")
 
     async def test_text_message_is_counted_as_garbage(self, rig: Rig, visit: Visit) -> None:
