@@ -30,8 +30,8 @@ class RecorderStatus:
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """Distance and bearing to a location."""
+class RelativeLocation:
+    """A location, with its distance and bearing from the aircraft."""
 
     lat_deg: float
     lon_deg: float
@@ -48,8 +48,8 @@ class AircraftStatus:
     vehicle_id: int
     fix: GpsFix | None
     """The newest, good or not."""
-    home: Way | None
-    mark: Way | None
+    home: RelativeLocation | None
+    mark: RelativeLocation | None
     boards: tuple[NodeStatus, ...]
     """The newest report of each node about itself."""
 
@@ -92,20 +92,20 @@ def status_of(aircraft: Aircraft) -> AircraftStatus:
     return AircraftStatus(
         aircraft.vehicle_id,
         vehicle.telemetry.fix,
-        _way(here, None if home is None else home.location),
-        _way(here, vehicle.plan.mark.location),
+        _seen_from(here, None if home is None else home.location),
+        _seen_from(here, vehicle.plan.mark.location),
         vehicle.health.statuses,
     )
 
 
-def _way(here: Location | None, there: Location | None) -> Way | None:
+def _seen_from(here: Location | None, there: Location | None) -> RelativeLocation | None:
     if there is None:
         return None
     location = (there.lat_deg, there.lon_deg, there.alt_amsl_m)
     if here is None:
-        return Way(*location, None, None)
+        return RelativeLocation(*location, None, None)
     distance_m, bearing_rad = distance_and_bearing(here, there)
-    return Way(*location, distance_m, math.degrees(bearing_rad) % 360.0)
+    return RelativeLocation(*location, distance_m, math.degrees(bearing_rad) % 360.0)
 
 
 def summary_line(snapshot: Snapshot) -> str:

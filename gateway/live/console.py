@@ -23,7 +23,14 @@ from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
 from gateway.printable import PrintableFormatter
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.status import UNKNOWN, AircraftStatus, RecorderStatus, Snapshot, Way, figure_of
+from gateway.status import (
+    UNKNOWN,
+    AircraftStatus,
+    RecorderStatus,
+    RelativeLocation,
+    Snapshot,
+    figure_of,
+)
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 OUTAGE_US: Final = 2 * US_PER_S
@@ -242,8 +249,8 @@ def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) ->
         figure_of(math.hypot(north, east), ".1f"),
         figure_of(-down, "+.1f"),
         *_fix_cells(known.fix if known else None),
-        *_way_cells(known.home if known else None),
-        *_way_cells(known.mark if known else None),
+        *_distance_cells(known.home if known else None),
+        *_distance_cells(known.mark if known else None),
     )
     return grid
 
@@ -260,10 +267,10 @@ def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
     )
 
 
-def _way_cells(way: Way | None) -> tuple[str, str]:
-    if way is None or way.distance_m is None or way.bearing_deg is None:
+def _distance_cells(location: RelativeLocation | None) -> tuple[str, str]:
+    if location is None or location.distance_m is None or location.bearing_deg is None:
         return UNKNOWN, UNKNOWN
-    return figure_of(way.distance_m, ".0f"), figure_of(way.bearing_deg, ".0f")
+    return figure_of(location.distance_m, ".0f"), figure_of(location.bearing_deg, ".0f")
 
 
 def _flags(state: NavState) -> Text:

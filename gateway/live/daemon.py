@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -116,7 +117,6 @@ class Daemon:
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
-        self._write_metrics: Callable[[Snapshot], Iterator[str]] | None = None
         self._notifier = ServiceNotifier()
         self._sent: Counter[int] = Counter()
         self._lag = LoopLag()
@@ -247,17 +247,16 @@ class Daemon:
 
     def _serve_metrics(self) -> None:
         port = self._settings.hub.metrics_port
-        if port and self._write_metrics is None:
-            # Imported here: most gateways serve no metrics. Not at the first request either:
-            # loading the library then would stop the telemetry for 0.3 s.
-            from gateway.live.metrics import prometheus_text
-
-            self._write_metrics = prometheus_text
+        if port:
+            # Here, since most gateways serve no metrics. Not at the first request either: loading
+            # the library then would stop the telemetry for 0.3 s.
+            import_module("gateway.live.metrics")
         self._metrics.listen(port)
 
     def _metrics_text(self) -> Iterator[str]:
-        assert self._write_metrics is not None
-        return self._write_metrics(self.snapshot())
+        from gateway.live.metrics import prometheus_text
+
+        return prometheus_text(self.snapshot())
 
     def announce(self, text: str) -> None:
         """Announce an event that is not a problem to the ground stations."""

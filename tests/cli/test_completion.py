@@ -10,7 +10,7 @@ from gateway.cli.app import app
 @pytest.mark.parametrize(
     ("typed", "offered"), [("mavgate doc", "doctor"), ("mavgate check-config --he", "--help")]
 )
-def test_the_shell_completes_commands_and_options(
+def test_shell_completion_offers_commands_and_options(
     typed: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("_MAVGATE_COMPLETE", "complete_bash")

@@ -34,32 +34,28 @@ PROGRAM = """
 """
 
 
-@pytest.mark.parametrize("module", ["typer", "gateway.live.daemon"])
-def test_a_background_job_of_a_script_is_ended_while_it_starts(module: str) -> None:
-    """Such a job ignores Ctrl-C from the start on; what `kill` sends ends it at once."""
-    program = textwrap.dedent(PROGRAM).replace("SIGINT)", "SIGTERM)")
-    program = program.replace("signal.default_int_handler", "signal.SIG_IGN")
-    program = program.replace('"check-config"', '"demo"')
-    found = subprocess.run(
-        [sys.executable, "-c", program, module],
+def run(program: str, module: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(program), module],
         capture_output=True,
         text=True,
         timeout=240,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         check=False,
     )
+
+
+@pytest.mark.parametrize("module", ["typer", "gateway.live.daemon"])
+def test_sigterm_at_any_import_ends_a_background_job(module: str) -> None:
+    """Such a job ignores Ctrl-C from the start on; the signal of `kill` ends it at once."""
+    program = PROGRAM.replace("SIGINT)", "SIGTERM)")
+    program = program.replace("signal.default_int_handler", "signal.SIG_IGN")
+    found = run(program.replace('"check-config"', '"demo"'), module)
     assert (found.returncode, found.stdout, found.stderr) == (-signal.SIGTERM, "", "")
 
 
 @pytest.mark.parametrize("module", ["gateway.cli.app", "typer", "numpy", "gateway.config"])
-def test_ctrl_c_at_any_import_ends_it_without_a_traceback(module: str) -> None:
-    found = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(PROGRAM), module],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        check=False,
-    )
+def test_ctrl_c_at_any_import_ends_without_a_traceback(module: str) -> None:
+    found = run(PROGRAM, module)
     assert found.returncode == INTERRUPTED, found
     assert "Traceback" not in found.stderr

@@ -29,12 +29,12 @@ def run(*words: str, stdout: int | None = subprocess.PIPE, closed: int | None = 
 
 
 @pytest.mark.parametrize("closed", [0, 1, 2])
-def test_a_closed_stream_is_none_that_a_command_needs(closed: int) -> None:
+def test_command_succeeds_with_a_closed_stream(closed: int) -> None:
     done = run("check-config", closed=closed)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_full_disk_behind_the_output_is_said() -> None:
+def test_full_disk_behind_the_output_is_reported() -> None:
     full = os.open("/dev/full", os.O_WRONLY)
     done = run("check-config", stdout=full)
     os.close(full)
@@ -43,13 +43,13 @@ def test_a_full_disk_behind_the_output_is_said() -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_signs_that_the_output_lacks_are_written_as_numbers() -> None:
+def test_characters_missing_in_the_output_encoding_are_escaped() -> None:
     done = run("check-config", PYTHONIOENCODING="ascii")
     assert done.returncode == 0
     assert r"\u" in done.stdout or r"\x" in done.stdout
 
 
-def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
+def test_too_long_name_is_refused(tmp_path: Path) -> None:
     name = str(tmp_path / ("x" * 300))
     done = run("recover", name, "-o", str(tmp_path / "out.tlog"))
     assert done.returncode == 2
@@ -74,7 +74,7 @@ def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) ->
     assert before.getvalue() == ""
 
 
-def test_fonts_are_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_found_fonts_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first report of a machine collects them."""
     monkeypatch.setattr(logging.root, "handlers", [])
     monkeypatch.setattr(logging.root, "level", logging.WARNING)

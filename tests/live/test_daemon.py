@@ -147,7 +147,7 @@ async def test_thread_of_look_ups_is_started_before_the_first_one(daemon: Daemon
     assert len(begun) == 1
 
 
-@pytest.mark.parametrize("estimator", ["eskf"])
+@pytest.mark.parametrize("estimator", ["eskf", "paper"])
 async def test_reload_reports_settings_that_need_a_restart(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, estimator: str
 ) -> None:

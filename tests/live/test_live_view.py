@@ -23,7 +23,7 @@ from gateway.records import (
     PipeCounters,
     ReceiverStatus,
 )
-from gateway.status import AircraftStatus, RecorderStatus, Snapshot, Way, summary_line
+from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot, summary_line
 from tests.client_stats import TABLET
 from tests.kit.records import FIX
 
@@ -173,7 +173,10 @@ WELL_KNOWN = replace(
     SNAPSHOT,
     aircraft=(
         AircraftStatus(
-            1, FIX, Way(-7.76, 110.37, 150.0, 1234.4, 271.2), Way(-7.7, 110.3, 1.0, 88.0, 3.0),
+            1,
+            FIX,
+            RelativeLocation(-7.76, 110.37, 150.0, 1234.4, 271.2),
+            RelativeLocation(-7.7, 110.3, 1.0, 88.0, 3.0),
             (BOARD,),
         ),
     ),
@@ -227,7 +230,7 @@ def test_invalid_fix_is_red() -> None:
 
 
 def test_unknown_status_is_shown_as_dashes() -> None:
-    unknown = AircraftStatus(1, None, None, Way(1.0, 2.0, 3.0, None, None), ())
+    unknown = AircraftStatus(1, None, None, RelativeLocation(1.0, 2.0, 3.0, None, None), ())
     lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
     for head in ("supply", "fix", "home m", "mark m", "mark at°"):
         at = next(i for i, line in enumerate(lines) if head in line)

@@ -60,30 +60,6 @@ async def test_player_emits_every_frame_and_ends(tlog: Path) -> None:
     played.close()
 
 
-async def test_player_follows_each_command(tlog: Path, clock: ManualClock) -> None:
-    played = Played(tlog, clock)
-    played.edge.start()
-    assert played.frames == FRAMES[:1]
-    played.edge.pause()
-    played.edge.step(2)
-    assert played.frames == FRAMES[:3]
-    played.edge.seek("0.2")
-    assert played.edge.status().position_s == pytest.approx(10 * STEP_US / 1e6)
-    played.edge.seek("-0.1")
-    assert played.edge.status().position_s == pytest.approx(5 * STEP_US / 1e6)
-    played.edge.seek("2025-10-09T08:53:20.14Z")
-    assert played.edge.status().time_us == START_US + 7 * STEP_US
-    played.frames.clear()
-    played.edge.resume()
-    assert played.frames == FRAMES[7:8]
-    played.edge.set_speed(2.0)
-    played.edge.set_loop(True)
-    assert played.edge.status().loop
-    with pytest.raises(ValueError, match="speed"):
-        played.edge.set_speed(1000.0)
-    played.close()
-
-
 def test_file_is_indexed_and_read_at_any_position(tlog: Path) -> None:
     seen: list[int] = []
     file = TlogFile(tlog, seen.append)

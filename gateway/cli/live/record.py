@@ -14,6 +14,7 @@ from gateway.cli.support.options import (
     is_running,
     read_options,
     read_settings,
+    recordings_folder,
 )
 from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_json, table_of
 from gateway.live.session import SessionState
@@ -111,8 +112,7 @@ def delete(
 @group.command("list")
 def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
     """List the recordings, the newest last."""
-    is_asked = config is None and is_running()
-    folder = Path(ask("record.status")["folder"]) if is_asked else _folder(config)
+    folder = recordings_folder(config)
     found = list_recordings(folder)
     if json:
         figures = _figures(found) if found else {}

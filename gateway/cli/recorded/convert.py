@@ -6,7 +6,7 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from gateway.cli.support.options import ConfigOption, read_options, read_settings
+from gateway.cli.support.options import ConfigOption, read_options, read_settings, recordings_folder
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,
@@ -23,7 +23,6 @@ from gateway.cli.support.recording_options import (
     progress_of,
     read_range,
     read_sensors,
-    recordings_folder,
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.estimation.record import IntArray

@@ -19,6 +19,7 @@ from gateway.cli.support.options import (
     ask,
     read_options,
     read_settings,
+    recordings_folder,
     with_socket,
 )
 from gateway.cli.support.recording_options import (
@@ -32,7 +33,6 @@ from gateway.cli.support.recording_options import (
     print_remarks,
     progress_of,
     read_range,
-    recordings_folder,
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings

@@ -95,6 +95,13 @@ def is_running() -> bool:
     return _named.get() is not None or bool(live_sockets("run"))
 
 
+def recordings_folder(config: Path | None) -> Path:
+    """Return the folder of recordings: the running gateway's, unless settings are given."""
+    if config is None and is_running():
+        return Path(ask("record.status")["folder"])
+    return folder_of(read_settings(config))
+
+
 class AskingTyper(typer.Typer):
     """A group whose commands all have the option `--socket`."""
 

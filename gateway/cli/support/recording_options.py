@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from gateway.cli.support.options import ask, folder_of, is_running, read_settings
+from gateway.cli.support.options import folder_of
 from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
 from gateway.recordings.index import RecordingError, find_recording
@@ -108,13 +108,6 @@ def print_remarks(remarks: Iterable[str]) -> None:
 
 Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""
-
-
-def recordings_folder(config: Path | None) -> Path:
-    """Return the folder of recordings: the running gateway's, unless settings are given."""
-    if config is None and is_running():
-        return Path(ask("record.status")["folder"])
-    return folder_of(read_settings(config))
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:

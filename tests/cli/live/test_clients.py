@@ -24,7 +24,7 @@ from gateway.records import (
     NodeLink,
     NodeStatus,
 )
-from gateway.status import AircraftStatus, Snapshot, Way
+from gateway.status import AircraftStatus, RelativeLocation, Snapshot
 from tests.client_stats import TABLET
 from tests.kit.cli import invoke
 
@@ -78,8 +78,8 @@ SNAPSHOT = Snapshot(
         AircraftStatus(
             1,
             None,
-            Way(47.0, 8.0, 500.0, 1234.4, 271.2),
-            Way(47.0, 8.0, 1.0, None, None),
+            RelativeLocation(47.0, 8.0, 500.0, 1234.4, 271.2),
+            RelativeLocation(47.0, 8.0, 1.0, None, None),
             (NodeStatus(0, NodeId(1, 2), 0, (1, 4), 1, 7, 0, 12, 3, 450, 900, 100, 3290),),
         ),
     ),

@@ -40,12 +40,12 @@ def one(check: doctor.Check, settings: GatewaySettings) -> Diagnosis:
     return found
 
 
-def test_a_port_that_is_not_there(settings: GatewaySettings) -> None:
+def test_missing_port_is_wrong_with_a_hint(settings: GatewaySettings) -> None:
     found = one(doctor.check_receiver, settings)
     assert (found.grade, "`mavgate ports`" in found.text) == (Grade.WRONG, True)
 
 
-def test_a_port_that_may_not_be_opened(
+def test_port_without_access_rights_names_the_group(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path(settings.serial.port).touch()
@@ -59,7 +59,7 @@ def test_a_port_that_may_not_be_opened(
 
 
 @pytest.mark.parametrize(("latency_ms", "grade"), [(1, Grade.GOOD), (16, Grade.WRONG)])
-def test_an_adapter_that_holds_bytes_back(
+def test_long_latency_timer_of_an_adapter_is_wrong(
     settings: GatewaySettings, tmp_path: Path, latency_ms: int, grade: Grade
 ) -> None:
     Path(settings.serial.port).touch()
@@ -71,7 +71,7 @@ def test_an_adapter_that_holds_bytes_back(
     assert f"{latency_ms} ms" in timer.text
 
 
-def test_wrong_files_of_aircraft(settings: GatewaySettings) -> None:
+def test_invalid_aircraft_file_is_wrong(settings: GatewaySettings) -> None:
     folder = Path(settings.aircraft_folder)
     folder.mkdir()
     assert one(doctor.check_aircraft, settings).grade is Grade.GOOD
@@ -81,7 +81,7 @@ def test_wrong_files_of_aircraft(settings: GatewaySettings) -> None:
     assert "3.toml: vehicle.nope" in found.text
 
 
-def test_folders_that_cannot_be_written(
+def test_unwritable_folders_are_wrong(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
@@ -89,7 +89,7 @@ def test_folders_that_cannot_be_written(
     assert one(doctor.check_disk, settings).grade is Grade.WRONG
 
 
-def test_folders_below_a_file(settings: GatewaySettings, tmp_path: Path) -> None:
+def test_folder_below_a_file_is_wrong(settings: GatewaySettings, tmp_path: Path) -> None:
     (tmp_path / "aircraft").touch()
     below = replace(settings.recording, folder=str(tmp_path / "aircraft" / "recordings"))
     for check in (doctor.check_aircraft, doctor.check_disk):
@@ -98,7 +98,7 @@ def test_folders_below_a_file(settings: GatewaySettings, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("room_mb", "grade"), [(300, Grade.WRONG), (500, Grade.GOOD)])
-def test_room_for_recordings(
+def test_little_free_space_is_wrong(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, room_mb: int, grade: Grade
 ) -> None:
     free = (settings.recording.free_floor_mb + room_mb) * 1e6
@@ -109,7 +109,7 @@ def test_room_for_recordings(
 @pytest.mark.parametrize(
     ("kind", "make"), [("udp", socket.SOCK_DGRAM), ("tcp", socket.SOCK_STREAM)]
 )
-def test_a_port_that_another_program_has(
+def test_port_of_another_program_is_wrong(
     settings: GatewaySettings, kind: str, make: socket.SocketKind
 ) -> None:
     with socket.socket(socket.AF_INET, make) as other:
@@ -124,7 +124,7 @@ def test_a_port_that_another_program_has(
     assert one(doctor.check_ports, taken).grade is Grade.GOOD
 
 
-def test_a_gateway_that_runs_has_its_ports(
+def test_ports_of_a_running_gateway_are_good(
     settings: GatewaySettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     running = tmp_path / "mavgate" / "run.sock"
@@ -134,7 +134,7 @@ def test_a_gateway_that_runs_has_its_ports(
 
 
 @pytest.mark.parametrize(("said", "grade"), [("yes\n", Grade.GOOD), ("no\n", Grade.NOTE)])
-def test_the_clock(
+def test_unsynchronised_clock_is_noted(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, said: str, grade: Grade
 ) -> None:
     monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/timedatectl")
@@ -143,7 +143,7 @@ def test_the_clock(
 
 
 @pytest.mark.parametrize("missing", [False, True])
-def test_compiled_kernels(
+def test_missing_kernels_are_wrong_with_a_hint(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, missing: bool
 ) -> None:
     def load() -> None:
@@ -186,7 +186,7 @@ def test_exit_code_is_1_if_something_is_wrong(
         (300, Grade.GOOD, "valid until"),
     ],
 )
-def test_a_certificate_that_ends(
+def test_expiring_certificate_is_noted_and_expired_one_wrong(
     settings: GatewaySettings, tmp_path: Path, days: int, grade: Grade, word: str
 ) -> None:
     key, request, file = (tmp_path / name for name in ("key.pem", "request.pem", "panel.pem"))
@@ -200,7 +200,7 @@ def test_a_certificate_that_ends(
     assert (found.grade, word in found.text) == (grade, True)
 
 
-def test_a_certificate_that_is_none(settings: GatewaySettings, tmp_path: Path) -> None:
+def test_missing_or_broken_certificate_is_wrong(settings: GatewaySettings, tmp_path: Path) -> None:
     assert list(doctor.check_certificates(settings)) == []
     file = tmp_path / "hub.pem"
     hub = replace(settings.hub, tls_certificate=str(file))

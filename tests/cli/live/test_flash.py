@@ -1,5 +1,8 @@
 """`mavgate flash` without a board: images to files, and everything that it refuses."""
 
+import fcntl
+import os
+import pty
 from pathlib import Path
 
 import pytest
@@ -82,10 +85,6 @@ def test_wrong_option_ends_with_the_reason(
 
 
 def test_port_that_another_program_holds_is_left_alone(images: Path) -> None:
-    import fcntl
-    import os
-    import pty
-
     master, slave = pty.openpty()
     try:
         fcntl.flock(slave, fcntl.LOCK_EX)

@@ -19,58 +19,60 @@ async def control_socket() -> Path:
     return Path("no.sock")
 
 
+def panel_that_runs(code: str) -> PanelProcess:
+    """Return a panel whose child process runs some Python code instead."""
+    panel = PanelProcess(None)
+    panel._command = [sys.executable, "-c", code]
+    return panel
+
+
+async def link_of(panel: PanelProcess) -> str:
+    """Start a panel, and wait for the address that it prints."""
+    panel.start(control_socket)
+    async with asyncio.timeout(60.0):
+        while not panel.link:
+            await asyncio.sleep(0.01)
+    return panel.link
+
+
 @pytest.mark.io
 @pytest.mark.parametrize(("begin", "code"), [("", -15), (STUBBORN, -9)])
-async def test_it_has_ended_when_it_is_closed(
+async def test_closing_waits_for_the_end_of_the_process(
     begin: str, code: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(panel_command, "END_S", 0.2 if begin else 60.0)
-    panel = PanelProcess(None)
-    panel._command = [sys.executable, "-c", begin + SAYING]
-    panel.start(control_socket)
-    while not panel.link:
-        await asyncio.sleep(0.01)
+    panel = panel_that_runs(begin + SAYING)
+    await link_of(panel)
     await panel.close()
     assert panel._child is not None
     assert panel._child.returncode == code
 
 
 @pytest.mark.io
-async def test_a_line_of_any_length_leaves_the_next_to_be_read() -> None:
-    panel = PanelProcess(None)
-    panel._command = [sys.executable, "-c", "print('x' * 200_000); " + SAYING]
-    panel.start(control_socket)
-    async with asyncio.timeout(60.0):
-        while not panel.link:
-            await asyncio.sleep(0.01)
+async def test_too_long_line_is_skipped_and_the_next_read() -> None:
+    panel = panel_that_runs("print('x' * 200_000); " + SAYING)
+    assert await link_of(panel) == "here"
     await panel.close()
 
 
 @pytest.mark.io
 async def test_launched_panel_receives_the_path_of_the_control_socket() -> None:
-    panel = PanelProcess(None)
-    code = "print('panel: ' + input(), flush=True); input()"
-    panel._command = [sys.executable, "-c", code]
+    panel = panel_that_runs("print('panel: ' + input(), flush=True); input()")
     panel.launch()
-    panel.start(control_socket)
-    async with asyncio.timeout(60.0):
-        while not panel.link:
-            await asyncio.sleep(0.01)
-    assert panel.link == "no.sock"
+    assert await link_of(panel) == "no.sock"
     await panel.close()
 
 
 @pytest.mark.io
 async def test_panel_that_is_launched_but_not_started_ends_when_closed() -> None:
-    panel = PanelProcess(None)
-    panel._command = [sys.executable, "-c", SAYING]
+    panel = panel_that_runs(SAYING)
     panel.launch()
     await panel.close()
     assert panel._child is not None
     assert panel._child.returncode == -15
 
 
-async def test_it_is_closed_while_it_waits_for_the_gateway() -> None:
+async def test_panel_is_closed_while_it_waits_for_the_gateway() -> None:
     panel = PanelProcess(None)
     panel.start(asyncio.get_running_loop().create_future)
     await asyncio.sleep(0)
