@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from gateway.fleet.settings import FleetSettings
-from gateway.hub.endpoint import is_loopback
 from gateway.hub.transports.zenoh.session import (
     MAX_KEY,
     OWN,
@@ -23,6 +22,7 @@ from gateway.hub.transports.zenoh.session import (
     Payload,
     Publishers,
     Subscription,
+    is_local,
     off_loop,
     open_session,
     out_key,
@@ -50,8 +50,6 @@ ANSWER_OVERHEAD: Final = 64
 """Bytes counted for an answer in addition to its payload, so that empty ones are bounded too."""
 VERIFIED: Final = ("tls", "quic")
 """Protocols whose clients can be verified by their certificates."""
-LOCAL: Final = "unixsock-stream"
-"""The protocol that no other machine can reach."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,10 +222,9 @@ def key_pattern(site: str) -> str:
 
 def missing_authentication(locator: str, config: "zenoh.Config") -> str:
     """Return why a router that listens here would admit everyone; empty if it does not."""
-    protocol, _, rest = locator.partition("/")
-    host = rest.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-    if protocol == LOCAL or is_loopback(host):
+    if is_local(locator):
         return ""
+    protocol = locator.partition("/")[0]
     tls = msgspec.json.decode(config.get_json("transport/link/tls")) or {}
     login = (msgspec.json.decode(config.get_json("transport/auth")) or {}).get("usrpwd") or {}
     verifies = tls.get("enable_mtls") and tls.get("root_ca_certificate")

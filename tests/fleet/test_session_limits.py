@@ -74,7 +74,7 @@ async def test_insecure_fleet_warns_at_every_start(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     # No other machine can reach it: the address is only taken for one that is not loopback.
-    monkeypatch.setattr(fleet_session, "is_loopback", lambda _: False)
+    monkeypatch.setattr(fleet_session, "is_local", lambda _: False)
     settings = FleetSettings(
         listen=f"tcp/127.0.0.1:{free_port()}", insecure=True, ids_file=str(tmp_path / "ids.json")
     )

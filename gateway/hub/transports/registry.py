@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any, Final
 
-from gateway.hub.endpoint import ADDED_KINDS, Endpoint, EndpointKind
+from gateway.hub.endpoint import ADDED_KINDS, JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint, EndpointKind
 from gateway.hub.transports.base import Client, HubContext, Listener
 from gateway.hub.transports.serial_line import SerialClient
 from gateway.hub.transports.tcp import TcpClient, TcpListener
@@ -11,6 +11,8 @@ from gateway.hub.transports.udp import UdpClient
 from gateway.hub.transports.udp_group import GroupClient
 from gateway.hub.transports.udp_listen import UdpListener
 from gateway.hub.transports.zenoh.client import ZenohClient
+from gateway.hub.transports.zenoh.mavlink_server import ZenohJson, ZenohRaw
+from gateway.hub.transports.zenoh.site import ZenohSite
 
 ClientMaker = Callable[[HubContext, int, Endpoint], Client]
 
@@ -22,12 +24,21 @@ def _ws_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Clien
     return WsClient(context, client_id, endpoint)
 
 
+def _zenoh_client(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
+    return ZENOH[endpoint.keys](context, client_id, endpoint)
+
+
 def _ws_listener(context: HubContext, endpoint: Endpoint) -> Listener[Any]:
     from gateway.hub.transports.websocket_listen import WsListener
 
     return WsListener(context, endpoint)
 
 
+ZENOH: Final[dict[str, type[ZenohClient]]] = {
+    SITE_KEYS: ZenohSite,
+    RAW_KEYS: ZenohRaw,
+    JSON_KEYS: ZenohJson,
+}
 CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.UDP: UdpClient,
     EndpointKind.UDP_BROADCAST: GroupClient,
@@ -35,7 +46,7 @@ CLIENTS: Final[dict[str, ClientMaker]] = {
     EndpointKind.TCP: TcpClient,
     EndpointKind.WS: _ws_client,
     EndpointKind.WSS: _ws_client,
-    EndpointKind.ZENOH: ZenohClient,
+    EndpointKind.ZENOH: _zenoh_client,
     EndpointKind.SERIAL: SerialClient,
 }
 LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {

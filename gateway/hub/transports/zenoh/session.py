@@ -41,6 +41,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
 
+from gateway.hub.endpoint import is_loopback
 from gateway.hub.send_queue import BULK_IDS
 from gateway.printable import reason_of
 
@@ -120,6 +121,8 @@ TLS_FILES: Final = (
 )
 NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
 SECURED: Final = ("tls/", "quic/", "wss/")
+LOCAL: Final = "unixsock-stream"
+"""The protocol that no other machine can reach."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -141,6 +144,13 @@ def end_calls() -> bool:
     ending.start()
     ending.join(CLOSE_S)
     return not ending.is_alive()
+
+
+def is_local(locator: str) -> bool:
+    """Return whether no other machine reaches a locator."""
+    protocol, _, rest = locator.partition("/")
+    host = rest.partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    return protocol == LOCAL or is_loopback(host)
 
 
 def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Config":
