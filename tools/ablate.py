@@ -85,7 +85,7 @@ MECHANISMS: Final = (
     ),
     Mechanism(
         "heading from motion", "integrity", "FOUND_HEADING_RAD", 0.0,
-        ("alignment.heading_of_pairs", "alignment.along", "alignment.explained"),
+        ("alignment.heading_of_pairs", "alignment.moment_along", "alignment.explained_product"),
     ),
     Mechanism(
         "norm and dip of the field", "magnetometer", "field_weight", FULL_WEIGHT,
@@ -96,8 +96,11 @@ MECHANISMS: Final = (
         ("magnetometer.raise_hard_iron_by_dip",),
     ),
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
-    Mechanism("GPS latency from motion", "latency", "settle_latency", NOTHING, ("latency",)),
-    Mechanism("GPS glitches", "fixes", "note_glitch", NOTHING, ("fixes.note_glitch",)),
+    Mechanism("GPS latency from motion", "latency", "slew_latency", NOTHING, ("latency",)),
+    Mechanism(
+        "GPS glitches", "fixes", "raise_glitch_variance", NOTHING,
+        ("fixes.raise_glitch_variance",),
+    ),
     Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO, SENSORS),
 )  # fmt: skip
 FULL: Final = "full filter"

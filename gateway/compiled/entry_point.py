@@ -89,7 +89,7 @@ class EntryPoint(Generic[Parameters]):
     def bound(self, *arguments: int) -> Callable[[], None]:
         """Return a call with fixed integers, which are converted once, for steps in a hot loop.
 
-        Whoever calls it keeps the memory that is passed by address. Raises LibraryError as `load`.
+        The caller keeps the memory that is passed by address. Raises LibraryError as `load`.
         """
         if self._loaded is None:
             self.load()

@@ -48,14 +48,14 @@ from gateway.estimation.eskf.filter import (
     STATE_LAYOUT,
     move,
     row_at,
-    take_baro,
-    take_imu,
+    update_baro,
+    update_imu,
     write_output,
     write_position,
 )
-from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.fixes import update_gps
 from gateway.estimation.eskf.latency import begin_certain
-from gateway.estimation.eskf.predict import COVARIANCE_S, apply_transition, propagate
+from gateway.estimation.eskf.predict import COVARIANCE_INTERVAL_S, apply_transition, propagate
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
@@ -173,7 +173,7 @@ def move_copy(s: State, p: Gains, time_us: int, row: FloatArray, used: bool, F: 
     gyro, accel, _ = imu_vectors(row)
     dt, s.imu_s = s.time_s - s.imu_s, s.time_s
     move(s, p, gyro, accel, row[CLIPPED], dt)
-    if s.pending_s >= COVARIANCE_S:
+    if s.pending_s >= COVARIANCE_INTERVAL_S:
         predict_copy(s, p, F)
 
 
@@ -266,12 +266,12 @@ def run_forward(
         for i in range(nodes[k], nodes[k + 1]):
             now_us, row = imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS)
             while baros < baro_count and baro_time_us[baros] <= now_us:
-                take_baro(s, p, baro_alt_m[baros])
+                update_baro(s, p, baro_alt_m[baros])
                 baros += 1
             while fixes < gps_count and gps_time_us[fixes] <= now_us:
-                take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
+                update_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
                 fixes += 1
-            take_imu(s, p, now_us, row)
+            update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
             share_raised(s, copy)
             reset = is_reset(s, copy)

@@ -37,7 +37,7 @@ class SimulatedAircraft:
     start_unix_us : int
         UTC at the start of the simulation.
     motion : SensorMotion, optional
-        What it does; by default the planned flight.
+        Motion of the aircraft; by default the planned flight.
     """
 
     def __init__(

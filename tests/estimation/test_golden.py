@@ -1,4 +1,4 @@
-"""The change indicator: a fused golden flight differs from what is committed only on purpose."""
+"""The change indicator: a fused golden flight differs from the committed result only on purpose."""
 
 import csv
 from pathlib import Path

@@ -27,7 +27,7 @@ from gateway.estimation.columns import (
     NAV_VEL,
 )
 from gateway.estimation.eskf.filter import clear_times
-from gateway.estimation.eskf.fixes import is_zero_false
+from gateway.estimation.eskf.fixes import is_zero_velocity_wrong
 from gateway.estimation.eskf.state import State
 from gateway.estimation.kernel import SampleLog
 from gateway.estimation.record import new_record
@@ -244,11 +244,11 @@ def test_zero_velocity_is_accepted_at_rest_and_rejected_in_motion(rng: np.random
         if k >= 300:
             north_m += 1.5 * (k - 300)
         s.time_s = 0.2 * k
-        refuted.append(is_zero_false(s, (north_m, east_m, 0.0), zero))
+        refuted.append(is_zero_velocity_wrong(s, (north_m, east_m, 0.0), zero))
     assert not any(refuted[:300])
     assert all(refuted[330:])
-    assert not is_zero_false(s, zero, (0.1, 0.0, 0.0))
-    assert not is_zero_false(s, zero, zero)
+    assert not is_zero_velocity_wrong(s, zero, (0.1, 0.0, 0.0))
+    assert not is_zero_velocity_wrong(s, zero, zero)
 
 
 @pytest.mark.parametrize("has_velocity", [True, False])

@@ -1,4 +1,4 @@
-"""Payloads carry what the sensors read, at their moments."""
+"""Payloads contain the readings of the simulated sensors, at their times of sampling."""
 
 from itertools import takewhile
 

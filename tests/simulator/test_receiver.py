@@ -260,7 +260,7 @@ def test_memory_does_not_grow_with_flight_time() -> None:
 
 
 def _growth_bytes(kept: list[TimedFrame] | None) -> int:
-    """What the simulator's own lines hold after 40 s more than after 20 s.
+    """Return by how much the simulator's memory grows from 20 to 40 s.
 
     The libraries' caches, which fill whenever some test is the first to need them, do not count.
     """

@@ -58,7 +58,7 @@ ANY_HEADING_VAR: Final = 2.0
 """Mean squared chord of a uniformly distributed heading, rad2."""
 ENOUGH_PAIRS: Final = MEMORY_S / PAIR_S
 """Pairs of the whole memory."""
-FITTED: Final = 3.0
+FITTED_PARAMETERS: Final = 3.0
 """Pairs used up by the constant, the ramp and the noise of the heading fit."""
 
 R: Final = 0
@@ -118,7 +118,7 @@ def contradiction(s: State, reference: Vec3, force: Vec3, weight: float) -> floa
 
     Either GPS is wrong or the gyroscope has missed a turn, as in a blow.
     """
-    if s.pairs < FITTED + 1.0:
+    if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0
     q_ni, misfit = solve_rotation(s)
     north, east, down = rotate(q_ni, force)
@@ -238,7 +238,7 @@ def heading_of_pairs(s: State, q_ni: Quat, bias_radps: float) -> tuple[float, fl
     the noise the concentration of a von Mises distribution [2]_. The noise is the variance of what
     the turn leaves, in units of the assumed one, 1 or more; 0 while there are too few pairs.
     """
-    if s.pairs < FITTED + 1.0:
+    if s.pairs < FITTED_PARAMETERS + 1.0:
         return 0.0, UNKNOWN_RAD, 0.0
     x, y = rotate_inverse(q_ni, (1.0, 0.0, 0.0)), rotate_inverse(q_ni, (0.0, 1.0, 0.0))
     ramp = STANDARD_GRAVITY_MPS2 * max(bias_radps, 1e-4)
@@ -246,34 +246,36 @@ def heading_of_pairs(s: State, q_ni: Quat, bias_radps: float) -> tuple[float, fl
     M = s.moments
     north = (M[0, ONE], M[0, TIME])
     east = (M[1, ONE], M[1, TIME])
-    ahead = (along(s, x, ONE), along(s, x, TIME))
-    right = (along(s, y, ONE), along(s, y, TIME))
-    cosine = -explained(s, north, ahead, prior) - explained(s, east, right, prior)
-    sine = -explained(s, east, ahead, prior) + explained(s, north, right, prior)
-    squares = M[0, 0] + M[1, 1] - explained(s, north, north, prior)
-    squares -= explained(s, east, east, prior) + explained(s, ahead, ahead, prior)
-    squares -= explained(s, right, right, prior)
+    ahead = (moment_along(s, x, ONE), moment_along(s, x, TIME))
+    right = (moment_along(s, y, ONE), moment_along(s, y, TIME))
+    cosine = -explained_product(s, north, ahead, prior) - explained_product(s, east, right, prior)
+    sine = -explained_product(s, east, ahead, prior) + explained_product(s, north, right, prior)
+    squares = M[0, 0] + M[1, 1] - explained_product(s, north, north, prior)
+    squares -= explained_product(s, east, east, prior) + explained_product(s, ahead, ahead, prior)
+    squares -= explained_product(s, right, right, prior)
     for j in range(3):
         cosine += M[0, F + j] * x[j] + M[1, F + j] * y[j]
         sine += M[1, F + j] * x[j] - M[0, F + j] * y[j]
         for i in range(3):
             squares += M[F + i, F + j] * (x[i] * x[j] + y[i] * y[j])
     size = math.hypot(cosine, sine)
-    noise = max(1.0, (squares - 2.0 * size) / (2.0 * (s.pairs - FITTED)))
+    noise = max(1.0, (squares - 2.0 * size) / (2.0 * (s.pairs - FITTED_PARAMETERS)))
     variance = noise / max(size, 1e-9) + drift_variance(s)
     std = math.sqrt(min(variance, UNKNOWN_RAD * UNKNOWN_RAD))
     return math.atan2(sine, cosine), std, noise
 
 
 @compiled
-def along(s: State, axis: Vec3, row: int) -> float:
+def moment_along(s: State, axis: Vec3, row: int) -> float:
     """Return the moment of the force along an axis with 1 or the time."""
     M = s.moments
     return float(M[row, F] * axis[0] + M[row, F + 1] * axis[1] + M[row, F + 2] * axis[2])
 
 
 @compiled
-def explained(s: State, a: tuple[float, float], b: tuple[float, float], prior: float) -> float:
+def explained_product(
+    s: State, a: tuple[float, float], b: tuple[float, float], prior: float
+) -> float:
     """Return the part of a sum of products that a constant and a ramp explain."""
     M = s.moments
     one, time, square = M[ONE, ONE], M[ONE, TIME], M[TIME, TIME] + prior

@@ -45,12 +45,12 @@ HOLD_S: Final = 0.2
 USUAL_S: Final = 0.5
 """Time constant of the usual change from sample to sample."""
 TIMES_USUAL: Final = 6.0
-FASTEST: Final = ((2.0, 200.0), (10.0, 1000.0))
+LARGEST_CHANGE: Final = ((2.0, 200.0), (10.0, 1000.0))
 """Step and slope of an agile multirotor or a blow: rad/s and rad/s2, m/s2 and m/s3."""
-TIMES_USUAL_HOLD: Final = 5.0
-USUAL_HOLD_S: Final = 5.0
+TIMES_USUAL_REPEAT: Final = 5.0
+USUAL_REPEAT_S: Final = 5.0
 """Time constant of the usual time that both sensors repeat a sample."""
-UNKNOWN_HOLD_S: Final = 60.0
+UNKNOWN_REPEAT_S: Final = 60.0
 """Its initial value: a log may hold each sample until the next."""
 
 GAP_S: Final = 0.5
@@ -108,15 +108,15 @@ def is_hanging(s: State, gyro: Vec3, accel: Vec3, moving: bool, dt: float) -> bo
     A live sensor does not repeat six numbers, but a log may hold samples, and an input without
     noise is constant at rest.
     """
-    most_s = max(HOLD_S, TIMES_USUAL_HOLD * s.hold_s[1])
+    most_s = max(HOLD_S, TIMES_USUAL_REPEAT * s.usual_repeat_s)
     if change_of(gyro, s.imu_last, 0) == 0.0 and change_of(accel, s.imu_last, 3) == 0.0:
-        s.hold_s[0] += dt
+        s.repeat_s += dt
         at_rest = is_usual_bias(s, gyro) and not moving
-        return bool(s.hold_s[0] > most_s and not at_rest)
-    held_s = s.hold_s[0] + dt
-    if s.hold_s[0] <= most_s:
-        s.hold_s[1] += held_s / (USUAL_HOLD_S + held_s) * (held_s - s.hold_s[1])
-    s.hold_s[0] = 0.0
+        return bool(s.repeat_s > most_s and not at_rest)
+    held_s = s.repeat_s + dt
+    if s.repeat_s <= most_s:
+        s.usual_repeat_s += held_s / (USUAL_REPEAT_S + held_s) * (held_s - s.usual_repeat_s)
+    s.repeat_s = 0.0
     return False
 
 
@@ -134,9 +134,9 @@ def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: 
     s.stuck_s[k] = s.stuck_s[k] + repeated_s if same and not other_same else 0.0
     # A change that is real is there in the next sample too.
     change = min(from_last, from_held)
-    most = FASTEST[k][0] + FASTEST[k][1] * dt + TIMES_USUAL * s.imu_usual[k]
+    most = LARGEST_CHANGE[k][0] + LARGEST_CHANGE[k][1] * dt + TIMES_USUAL * s.usual_change[k]
     if math.isfinite(change):
-        s.imu_usual[k] += dt / (USUAL_S + dt) * (min(change, most) - s.imu_usual[k])
+        s.usual_change[k] += dt / (USUAL_S + dt) * (min(change, most) - s.usual_change[k])
     if not is_sound(v, limit) or s.stuck_s[k] >= STUCK_S:
         return 2
     return 1 if change > most else 0
@@ -214,7 +214,7 @@ def unseen_turn_var(s: State, before: Vec3, after: Vec3, steady: Vec3, unseen_s:
     for k in range(3):
         ends_sq += 0.5 * ((before[k] - steady[k]) ** 2 + (after[k] - steady[k]) ** 2)
     spread = 2.0 * RATE_TAU_S * (unseen_s - 2.0 * end_share_s(unseen_s))
-    return float(max(s.imu_usual[2], ends_sq) * spread)
+    return float(max(s.usual_rate_sq, ends_sq) * spread)
 
 
 @compiled
@@ -223,7 +223,7 @@ def follow_step(s: State, gyro: Vec3, dt: float) -> None:
     if s.usual_step_s == 0.0:
         s.usual_step_s = min(dt, SLOWEST_STEP_S)
     s.usual_step_s += STEP_SHARE * (min(dt, 2.0 * s.usual_step_s) - s.usual_step_s)
-    s.imu_usual[2] += min(dt / TURNING_S, 1.0) * (norm_sq(gyro) / 3.0 - s.imu_usual[2])
+    s.usual_rate_sq += min(dt / TURNING_S, 1.0) * (norm_sq(gyro) / 3.0 - s.usual_rate_sq)
 
 
 @compiled
@@ -232,7 +232,7 @@ def interpolate(
 ) -> tuple[Vec3, Vec3]:
     """Return the mean rate and force of an interval, and add noise where samples were lost.
 
-    A sample contains the usual interval before it; both change evenly over what is missing.
+    A sample contains the usual interval before it; both change evenly over the missing samples.
     """
     unseen_s = dt - s.usual_step_s
     if dt < LOST_STEPS * s.usual_step_s or s.sound_s <= dt:
@@ -325,7 +325,7 @@ def add_gap_variance(s: State, turned_var: float, flown_s: float) -> None:
 @compiled
 def close_gap(s: State) -> None:
     """Discard everything that needs an unbroken IMU."""
-    s.ring_count = 0
+    s.history_count = 0
     s.pair_s = NEVER_S
     s.sound_s = s.rest_s = 0.0
     s.at_rest = 0

@@ -40,7 +40,7 @@ from gateway.estimation.eskf.faults import (
     ACCEL_LIMIT_MPS2,
     GAP_S,
     GYRO_LIMIT_RADPS,
-    UNKNOWN_HOLD_S,
+    UNKNOWN_REPEAT_S,
     add_clipping_noise,
     bridge_gap,
     check_sensors,
@@ -55,16 +55,16 @@ from gateway.estimation.eskf.faults import (
     substitute_accel,
     substitute_gyro,
 )
-from gateway.estimation.eskf.fixes import take_gps
+from gateway.estimation.eskf.fixes import update_gps
 from gateway.estimation.eskf.integrity import (
     accel_bias_var,
     discard_calibration,
     end_aiding,
     gyro_bias_var,
+    level_by_gravity,
     lose_attitude,
     reset_accel_bias,
     reset_gyro_bias,
-    watch_gravity,
 )
 from gateway.estimation.eskf.latency import begin_latency, clear_velocities
 from gateway.estimation.eskf.magnetometer import (
@@ -72,10 +72,10 @@ from gateway.estimation.eskf.magnetometer import (
     hard_iron_var,
     is_sound_field,
     reset_hard_iron,
-    take_mag,
+    update_mag,
 )
 from gateway.estimation.eskf.predict import (
-    COVARIANCE_S,
+    COVARIANCE_INTERVAL_S,
     NO_HEADING_VAR,
     add_vibration,
     integrate,
@@ -119,13 +119,13 @@ from gateway.units import RAD_PER_DEG
 
 UNAIDED_SCALE: Final = 0.01
 """Gyroscope scale error before the first fix, a third of an MPU6050's tolerance."""
-HIGHEST_M: Final = 30_000.0
+MAX_ALTITUDE_M: Final = 30_000.0
 """Largest pressure altitude of a sound barometer."""
 LEVEL_VALID_RAD: Final = 0.1
 """A level is valid up to this standard deviation."""
 MOUNTING_RAD: Final = 1.0 * RAD_PER_DEG
 """Error of the declination, and of the compass axes on their board."""
-NO_HOLD_S: Final = 1.0
+UNAIDED_VALID_S: Final = 1.0
 """A position that is not estimated is valid for this time after its fix."""
 
 STATE_LAYOUT: Final = layout(State)
@@ -149,7 +149,7 @@ def start(s: State, p: Gains) -> None:
         s.P[GPS_ERROR + k, GPS_ERROR + k] = s.gps_error_var[k]
         s.rate_b[k] = NAN
     s.mag_latency_s = p.mag_latency_s
-    s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_late_sq
+    s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_var
     s.earth_field[0] = p.declination_rad
     s.earth_field[1] = NAN
     s.fix_excess = 1.0
@@ -162,19 +162,19 @@ def clear_times(s: State) -> None:
     """Discard everything that depends on the clock."""
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
     s.baro_s = s.reject_last[0] = s.track_from[0] = s.zero_from[0] = NEVER_S
-    s.reject_s, s.zero_false = 0.0, 0
+    s.reject_s, s.zero_velocity_wrong = 0.0, 0
     clear_velocities(s)
     close_gap(s)
 
 
 @compiled
-def take_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
+def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
     """Advance by one IMU sample; see `columns` for its row.
 
     A late sample is left out; a clock that went far back is a new clock.
     """
     gyro, accel, mag = imu_vectors(row)
-    note_calibration(s, p, row)
+    check_calibration(s, p, row)
     if s.started == 0:
         begin(s, p, time_us, gyro, accel)
         return
@@ -215,12 +215,12 @@ def advance(
     """Advance by one sample without a gap before it."""
     if move(s, p, gyro, accel, clipped, dt):
         detect_rest(s, p, gyro, accel, dt)
-    if s.pending_s >= COVARIANCE_S:
+    if s.pending_s >= COVARIANCE_INTERVAL_S:
         propagate(s, p)
     level(s, p)
     misplaced = s.mag_misplaced
     if is_sound_field(s, mag, dt):
-        take_mag(s, p, mag)
+        update_mag(s, p, mag)
     elif s.mag_misplaced > misplaced:
         # The heading, and the sensor errors estimated with it, came from wrong axes.
         discard_calibration(s, p)
@@ -238,7 +238,7 @@ def begin(s: State, p: Gains, time_us: int, gyro: Vec3, accel: Vec3) -> None:
         s.imu_held[k], s.imu_held[3 + k] = gyro[k], accel[k]
         s.force_lp_i[0, k] = s.force_lp_i[1, k] = accel[k]
     write_vec(s.rate_b, gyro)
-    s.hold_s[1] = UNKNOWN_HOLD_S
+    s.usual_repeat_s = UNKNOWN_REPEAT_S
     lose_attitude(s, p)
 
 
@@ -252,7 +252,7 @@ def restart_clock(s: State, time_us: int) -> None:
 
 
 @compiled
-def note_calibration(s: State, p: Gains, row: FloatArray) -> None:
+def check_calibration(s: State, p: Gains, row: FloatArray) -> None:
     """Discard the estimated errors of a sensor whose calibration has changed."""
     bits = 1 if row[GYRO_UNCALIBRATED] != 0.0 else 0
     bits |= 2 if row[ACCEL_UNCALIBRATED] != 0.0 else 0
@@ -298,7 +298,7 @@ def level(s: State, p: Gains) -> None:
     if s.aided == 1 and s.time_s - s.fix_s > p.dead_reckoning_s:
         end_dead_reckoning(s, p)
     if s.aided == 0:
-        watch_gravity(s, p, min(since_s, 1.0))
+        level_by_gravity(s, p, min(since_s, 1.0))
     if s.at_rest == 1:
         update_rest(s, p)
 
@@ -311,9 +311,9 @@ def end_dead_reckoning(s: State, p: Gains) -> None:
 
 
 @compiled
-def take_baro(s: State, p: Gains, alt_m: float) -> None:
+def update_baro(s: State, p: Gains, alt_m: float) -> None:
     """Use one pressure altitude, m, positive up."""
-    if s.started == 0 or not abs(alt_m) < HIGHEST_M:
+    if s.started == 0 or not abs(alt_m) < MAX_ALTITUDE_M:
         return
     s.baro_down_m = -alt_m
     if s.has_height == 0:
@@ -396,7 +396,7 @@ def flags_of(s: State, p: Gains) -> int:
         flags |= FLAG.ALTITUDE_VALID
     if s.fix_s == NEVER_S:
         return flags
-    hold_s = p.dead_reckoning_s if s.aided == 1 else NO_HOLD_S
+    hold_s = p.dead_reckoning_s if s.aided == 1 else UNAIDED_VALID_S
     return flags | gps_flags(s.time_s - s.fix_s, s.time_s - s.reject_last[0], hold_s)
 
 
@@ -420,21 +420,21 @@ def imu_steps(
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
     time_us = array_at(times_us, (count,), INT)
     for i in range(count):
-        take_imu(s, p, time_us[i], row_at(samples, i, IMU_COLUMNS))
+        update_imu(s, p, time_us[i], row_at(samples, i, IMU_COLUMNS))
         write_output(s, p, row_at(outputs, i, NAV_COLUMNS))
 
 
 @EntryPoint
 def baro_step(state: int, gains: int, alt_m: float) -> None:
     """Use one barometer sample."""
-    take_baro(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT), alt_m)
+    update_baro(record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT), alt_m)
 
 
 @EntryPoint
 def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
     """Use one fix."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
-    take_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
+    update_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
 
 
 @EntryPoint
@@ -461,10 +461,10 @@ def run(
     baros = fixes = 0
     for i in range(imu_count):
         while baros < baro_count and baro_time_us[baros] <= imu_time_us[i]:
-            take_baro(s, p, baro_alt_m[baros])
+            update_baro(s, p, baro_alt_m[baros])
             baros += 1
         while fixes < gps_count and gps_time_us[fixes] <= imu_time_us[i]:
-            take_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
+            update_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
             fixes += 1
-        take_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))
+        update_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))
         write_output(s, p, row_at(outputs, i, NAV_COLUMNS))

@@ -36,7 +36,7 @@ from gateway.estimation.eskf.alignment import (
 )
 from gateway.estimation.eskf.faults import gap_limit_s, is_sound
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
-from gateway.estimation.eskf.latency import watch_latency
+from gateway.estimation.eskf.latency import compare_latencies
 from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron_by_dip, turn_heading
 from gateway.estimation.eskf.predict import look_back, propagate
 from gateway.estimation.eskf.settings import Gains
@@ -53,7 +53,7 @@ from gateway.estimation.eskf.state import (
     reset_states,
 )
 from gateway.estimation.eskf.update import (
-    begin_row,
+    clear_row,
     inject,
     innovation_variance,
     restart_baro,
@@ -93,25 +93,25 @@ ERROR_SHARES: Final = (0.7, 0.7, 0.9)
 """Share of it that is slow error, north, east (of a radial accuracy) and down."""
 SPEED_SHARES: Final = (0.4, 0.4, 0.8)
 """Share of its speed accuracy that is noise of one axis."""
-SLOW_MPS: Final = 0.05
-SLOW_S: Final = 4.0
+SLOW_ERROR_MPS: Final = 0.05
+SLOW_ERROR_S: Final = 4.0
 """Slow error of GPS velocities where the receiver reports none, and its correlation time."""
-LEAST_S: Final = 0.05
+LEAST_FIX_INTERVAL_S: Final = 0.05
 """Fixes closer together count as that far apart."""
 LEAST_LAG_S: Final = 0.1
 """Over less, a mean acceleration is mostly vibration."""
 GLITCH_GATE_SQ: Final = (9.0, 16.0)
-MOST_GLITCH: Final = (5.0, 30.0)
+MAX_GLITCH: Final = (5.0, 30.0)
 """Gates of velocity and position beyond which an innovation is a glitch, and its largest size."""
 GLITCH_S: Final = 10.0
 """Fixes of this time share a glitch."""
 GLITCH_FADE_S: Final = 1.0
-LAG_S: Final = 0.2
+RECEIVER_LAG_S: Final = 0.2
 """Lag of the receiver's own filter in a manoeuvre."""
 
 
 @compiled
-def take_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
+def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     """Use one fix at its arrival; see `columns` for its row."""
     if s.started == 0 or not is_new_fix(s, row):
         return
@@ -120,10 +120,10 @@ def take_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     arrival_s = (arrival_us - s.base_us) * 1e-6
     reported = as_vec(row[GPS_VEL : GPS_VEL + 3])
     if is_sound(reported, FASTEST_MPS):
-        watch_latency(s, p.gps_latency_s, arrival_s, reported)
+        compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
     pos = position_of(s, row)
-    if is_zero_false(s, pos, reported):
+    if is_zero_velocity_wrong(s, pos, reported):
         reported = (NAN, NAN, NAN)
     vel, vel_s = complete_velocity(s, wanted_s, pos, reported)
     sound = is_sound(vel, FASTEST_MPS)
@@ -164,8 +164,8 @@ def use_fix(
 def is_new_fix(s: State, row: FloatArray) -> bool:
     """Return whether a row is a usable fix that does not repeat the last one.
 
-    A log may hold a fix until the next one, and a receiver may be stuck. What moves is nowhere
-    twice; at rest a repetition may be real.
+    A log may hold a fix until the next one, and a receiver may be stuck. A moving receiver is never
+    at the same position twice; at rest a repetition may be real.
     """
     lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
     if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
@@ -220,26 +220,26 @@ def is_level_sound(vel: Vec3) -> bool:
 
 
 @compiled
-def is_zero_false(s: State, pos: Vec3, vel: Vec3) -> bool:
+def is_zero_velocity_wrong(s: State, pos: Vec3, vel: Vec3) -> bool:
     """Return whether the positions contradict a velocity of exactly zero."""
     if vel[0] != 0.0 or vel[1] != 0.0 or vel[2] != 0.0:
-        s.zero_from[0], s.zero_false = NEVER_S, 0
+        s.zero_from[0], s.zero_velocity_wrong = NEVER_S, 0
         return False
     dt = s.time_s - s.zero_from[0]
     if not 0.0 <= dt < ZERO_S:
         if s.zero_from[0] != NEVER_S:
             way_m = math.hypot(pos[0] - s.zero_from[1], pos[1] - s.zero_from[2])
-            s.zero_false = 1 if way_m > ZERO_MPS * dt else 0
+            s.zero_velocity_wrong = 1 if way_m > ZERO_MPS * dt else 0
         s.zero_from[0] = s.time_s
         write_vec(s.zero_from[1:4], pos)
-    return s.zero_false == 1
+    return s.zero_velocity_wrong == 1
 
 
 @compiled
 def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[Vec3, float]:
     """Return the velocity of a fix, from two positions where it has none, and its time.
 
-    Without heights it does not climb; what is unknown is NaN.
+    Without heights it does not climb; unknown components are NaN.
     """
     f = s.track_from
     dt = valid_s - f[0]
@@ -262,7 +262,7 @@ def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[V
 
 @compiled
 def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float) -> None:
-    """Give the velocity of a fix to the alignment, and review the attitude."""
+    """Add the velocity of a fix to the alignment, and check the attitude by it."""
     unaided = s.aided == 0 and s.pairs == 0.0
     if unaided and s.lost == 0 and math.hypot(vel[0], vel[1]) > MOVING_MPS:
         # The level was found by gravity alone while turns and accelerations imitated it.
@@ -275,7 +275,7 @@ def pair_velocity(s: State, p: Gains, vel_s: float, vel: Vec3, noise_mps: float)
 
 @compiled
 def accept_fix(s: State) -> None:
-    """Note that a fix was used."""
+    """Record that a fix was used."""
     s.fix_s = s.time_s
     s.reject_s, s.reject_last[0] = 0.0, NEVER_S
 
@@ -311,7 +311,7 @@ def have_agreed(s: State, p: Gains, pos: Vec3, vel: Vec3) -> bool:
 
 @compiled
 def follow_fix(s: State, pos: Vec3, lag: float) -> None:
-    """Show a fix while it cannot be fused, without a heading; its velocity moves it on."""
+    """Set the position to a fix, moved on by its velocity, while no heading allows fusing it."""
     s.fix_s = s.time_s
     for k in range(3):
         moved = s.fix_vel[k] * lag
@@ -390,8 +390,9 @@ def set_error_variances(s: State, p: Gains, row: FloatArray) -> None:
         usual = p.gps_error_var if k < 2 else p.gps_height_error_var
         accuracy = row[GPS_H_ACC] if k < 2 else row[GPS_V_ACC]
         s.gps_error_var[k] = reported_variance(usual, accuracy, ERROR_SHARES[k])
-        slow = reported_variance(SLOW_MPS * SLOW_MPS, row[GPS_SPEED_ACC], SPEED_SHARES[k])
-        s.pos_density[k] = 2.0 * SLOW_S * slow
+        usual = SLOW_ERROR_MPS * SLOW_ERROR_MPS
+        slow = reported_variance(usual, row[GPS_SPEED_ACC], SPEED_SHARES[k])
+        s.pos_density[k] = 2.0 * SLOW_ERROR_S * slow
 
 
 @compiled
@@ -442,8 +443,8 @@ def mean_acceleration(s: State, lag: float) -> Vec3:
 @compiled
 def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
     """Write the row of one component of a late velocity."""
-    begin_row(s)
-    set_turned(s, k, scaled(once, -1.0))
+    clear_row(s)
+    set_attitude(s, k, scaled(once, -1.0))
     s.h[VEL + k] = 1.0
     set_accel_bias(s, k, lag)
 
@@ -451,8 +452,8 @@ def velocity_row(s: State, k: int, once: Vec3, lag: float) -> None:
 @compiled
 def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
     """Write the row of one component of a late position, which has the slow GPS error."""
-    begin_row(s)
-    set_turned(s, k, difference(scaled(once, lag), twice))
+    clear_row(s)
+    set_attitude(s, k, difference(scaled(once, lag), twice))
     s.h[VEL + k] = -lag
     s.h[POS + k] = 1.0
     s.h[GPS_ERROR + k] = 1.0
@@ -460,7 +461,7 @@ def position_row(s: State, k: int, once: Vec3, twice: Vec3, lag: float) -> None:
 
 
 @compiled
-def set_turned(s: State, k: int, w: Vec3) -> None:
+def set_attitude(s: State, k: int, w: Vec3) -> None:
     """Write how `(att x w)[k]` depends on the attitude error."""
     a, b = (k + 1) % 3, (k + 2) % 3
     s.h[ATT + a] = w[b]
@@ -489,14 +490,14 @@ def is_unlikely(s: State, p: Gains, row: FloatArray, off: Vec3, lag: float) -> b
 
 
 @compiled
-def note_glitch(s: State, k: int, off: float, variance: float, since_s: float) -> None:
+def raise_glitch_variance(s: State, k: int, off: float, variance: float, since_s: float) -> None:
     """Add the variance of a glitch: an innovation outside the gate is shared by several fixes.
 
     `k` is 0 for velocities and 1 for positions. Taken for errors that are new in each fix, a glitch
     would win over sound inertial sensors. The variance that errs as much in the long run is that of
     one error times the number of fixes that share it.
     """
-    off = min(abs(off), MOST_GLITCH[k])
+    off = min(abs(off), MAX_GLITCH[k])
     excess = off * off / GLITCH_GATE_SQ[k] - innovation_variance(s, variance)
     s.glitch[k] = max(s.glitch[k], excess * max(1.0, GLITCH_S / since_s))
 
@@ -507,24 +508,24 @@ def update_fix(
 ) -> None:
     """Update by velocity and position of a fix; components that are not finite are left out."""
     once, twice = lag_integrals(s, lag)
-    since_s = max(s.time_s - s.update_s, LEAST_S)
+    since_s = max(s.time_s - s.update_s, LEAST_FIX_INTERVAL_S)
     s.update_s = s.time_s
     accel_n = mean_acceleration(s, lag)
     faded = math.exp(-since_s / GLITCH_FADE_S)
     s.glitch[0] *= faded
     s.glitch[1] *= faded
     s.glitch[2] = max(norm_sq(accel_n), s.glitch[2] * faded)
-    late_var = LAG_S * LAG_S * s.glitch[2]
+    late_var = RECEIVER_LAG_S * RECEIVER_LAG_S * s.glitch[2]
     # The whole fix is checked before any of it is used: a glitch affects all components.
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)
             variance = velocity_variance(s, p, row, accel_n, k, since_s)
-            note_glitch(s, 0, off_vel[k], variance + late_var, since_s)
+            raise_glitch_variance(s, 0, off_vel[k], variance + late_var, since_s)
         if math.isfinite(off_pos[k]):
             position_row(s, k, once, twice, lag)
             variance = position_variance(s, p, row, k, since_s)
-            note_glitch(s, 1, off_pos[k], variance, since_s)
+            raise_glitch_variance(s, 1, off_pos[k], variance, since_s)
     for k in range(3):
         if math.isfinite(off_vel[k]):
             velocity_row(s, k, once, lag)

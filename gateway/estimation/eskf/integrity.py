@@ -86,7 +86,7 @@ def begin_attitude(s: State, p: Gains, level_var: float, heading_var: float) -> 
     reset_state(s, ATT + 2, heading_var if s.heading_known == 1 or s.lost == 1 else 0.0)
     end_aiding(s)
     # The integrals in NED contain the old attitude.
-    s.ring_count = 0
+    s.history_count = 0
 
 
 @compiled
@@ -98,7 +98,7 @@ def end_aiding(s: State) -> None:
 
 
 @compiled
-def watch_gravity(s: State, p: Gains, dt: float) -> None:
+def level_by_gravity(s: State, p: Gains, dt: float) -> None:
     """Level by gravity while GPS velocities do not; `dt` is the time since the last call."""
     if s.lost == 1:
         if s.time_s - s.pair_s > MAX_PAIR_S and s.force_lp_s > dt:
@@ -143,13 +143,13 @@ def check_attitude(s: State, p: Gains, dt: float, sound: bool) -> None:
     if s.lost == 1:
         s.lost_s += dt
         if level < FOUND_LEVEL_RAD * max(1.0, s.lost_s / PATIENCE_S):
-            take_alignment(s, p)
+            replace_attitude(s, p)
         return
     s.mismatch_s = s.mismatch_s + dt if differs_from_alignment(s) else 0.0
     if s.mismatch_s > MISMATCH_S:
         if s.was_aided == 1:
             discard_calibration(s, p)
-        take_alignment(s, p)
+        replace_attitude(s, p)
     elif s.heading_known == 0 and level < FOUND_LEVEL_RAD and heading < FOUND_HEADING_RAD:
         turn_heading(s, heading_difference(as_quat(s.aligned_q_nb), as_quat(s.q_nb)))
         reset_state(s, ATT + 2, heading * heading)
@@ -170,7 +170,7 @@ def differs_from_alignment(s: State) -> bool:
 
 
 @compiled
-def take_alignment(s: State, p: Gains) -> None:
+def replace_attitude(s: State, p: Gains) -> None:
     """Replace the attitude by the alignment's, the heading too where that is known."""
     found = as_quat(s.aligned_q_nb)
     heading_std = s.aligned_std[1]

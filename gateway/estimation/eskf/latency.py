@@ -77,7 +77,7 @@ def clear_velocities(s: State) -> None:
 
 
 @compiled
-def watch_latency(s: State, set_s: float, arrival_s: float, vel: Vec3) -> None:
+def compare_latencies(s: State, set_s: float, arrival_s: float, vel: Vec3) -> None:
     """Compare the change of velocity since the last fix with the force, and choose a latency."""
     dt = arrival_s - s.window_from[0]
     if 0.0 <= dt < LEAST_PAIR_S:
@@ -105,7 +105,7 @@ def watch_latency(s: State, set_s: float, arrival_s: float, vel: Vec3) -> None:
         for i in range(3):
             s.window_sums[1 + i] += change[i] / dt
         s.window_sums[4] += norm_sq(change) / (dt * dt)
-        settle_latency(s, set_s, dt)
+        slew_latency(s, set_s, dt)
     f[0], f[1], f[2], f[3] = arrival_s, vel[0], vel[1], vel[2]
 
 
@@ -220,7 +220,7 @@ def latency_to_use(found_s: float, set_s: float) -> float:
 
 
 @compiled
-def settle_latency(s: State, set_s: float, dt: float) -> None:
+def slew_latency(s: State, set_s: float, dt: float) -> None:
     """Move the latency in use towards the wanted one."""
     known = latency_std(s) < KNOWN_STD_S
     wanted = latency_to_use(s.latency_found[0], set_s) if known else set_s

@@ -29,7 +29,7 @@ from gateway.estimation.eskf.state import (
     reset_state,
     reset_states,
 )
-from gateway.estimation.eskf.update import begin_row, consider, inject, update_scalar
+from gateway.estimation.eskf.update import clear_row, consider, inject, update_scalar
 from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
@@ -67,8 +67,8 @@ FIRST_FIELD_S: Final = 5.0
 """The first candidate after this time, as in VQF."""
 TURNING_RADPS: Final = 0.35
 """Angular rate of a turn in this sense, 20 deg/s, as in VQF."""
-LIKE_NORM: Final = 0.04
-LIKE_DIP_RAD: Final = 0.035
+HALF_WEIGHT_NORM: Final = 0.04
+HALF_WEIGHT_DIP_RAD: Final = 0.035
 """A field that differs by this in norm or dip counts half: a third of the tolerances."""
 CORRELATION_S: Final = 1.0
 """Correlation time of compass errors: those of soft iron and currents change with the attitude."""
@@ -83,13 +83,13 @@ TURN_SHARE: Final = 0.2
 """A turn is evaluated once it has changed the field by this share of its norm."""
 TURNS_KEPT: Final = 0.99
 """Forgetting factor from turn to turn."""
-WRONG_SHARE: Final = 0.75
-RIGHT_SHARE: Final = 0.5
+MISPLACED_SHARE: Final = 0.75
+WELL_PLACED_SHARE: Final = 0.5
 """Unexplained share of the squared changes: swapped or reversed axes leave most of it."""
 NORM_SHARE: Final = 0.1
 """Hard iron changes the norm by more than this share of what it leaves unexplained."""
 
-UNTURNED_RAD: Final = 4.0 * math.pi
+BIAS_TURN_RAD: Final = 4.0 * math.pi
 """An apparent turn of two circles without a turn of anything else is a gyroscope bias."""
 
 
@@ -113,7 +113,7 @@ def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
 
 @compiled
 def begin_turn(s: State, mag_b: Vec3) -> None:
-    """Compare the following fields with this one; zero for with none."""
+    """Compare the following fields with this one; zero compares none."""
     write_vec(s.mag_from_b, mag_b)
     write_vec(s.mag_from_i, rotate(as_quat(s.q_ib), mag_b))
 
@@ -136,17 +136,17 @@ def check_placement(s: State, mag_b: Vec3) -> None:
         return
     changed_sq = norm_sq(difference(mag_b, begin))
     if changed_sq > NORM_SHARE * expected_sq:
-        s.spun_rad = 0.0
+        s.rest_turn_rad = 0.0
     else:
         # Only the gyroscope turns, so its bias is unknown.
-        s.rest_seen, s.spun_rad = 0, UNTURNED_RAD
+        s.rest_seen, s.rest_turn_rad = 0, BIAS_TURN_RAD
     change = math.sqrt(norm_sq(mag_b)) - math.sqrt(begin_sq)
     q = s.mag_squares
     # One such turn is assumed to have been explained, so that a few cannot decide.
     q[0] = TURNS_KEPT * (q[0] if q[0] > 0.0 else begin_sq) + changed_sq
     q[1] = TURNS_KEPT * q[1] + norm_sq(difference(mag_b, carried))
     q[2] = TURNS_KEPT * q[2] + change * change
-    most = RIGHT_SHARE if s.mag_misplaced == 1 else WRONG_SHARE
+    most = WELL_PLACED_SHARE if s.mag_misplaced == 1 else MISPLACED_SHARE
     s.mag_misplaced = 1 if q[1] > most * q[0] and q[2] < NORM_SHARE * q[1] else 0
 
 
@@ -158,20 +158,20 @@ def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> floa
         return 1.0
     norm_off, dip_off = norm / s.mag_ref[0] - 1.0, dip - s.mag_ref[1]
     usual = abs(norm_off) < p.field_norm_tolerance and abs(dip_off) < p.field_dip_tolerance_rad
-    s.mag_times[0] = s.mag_times[0] + dt if usual else 0.0
+    s.mag_usual_s = s.mag_usual_s + dt if usual else 0.0
     if not usual:
         s.mag_disturbed = 1
-    elif s.mag_times[0] >= SETTLE_S:
+    elif s.mag_usual_s >= SETTLE_S:
         s.mag_disturbed = 0
         s.mag_ref[0] += dt / FIELD_TAU_S * (norm - s.mag_ref[0])
         s.mag_ref[1] += dt / FIELD_TAU_S * (dip - s.mag_ref[1])
     learn_field(s, p, norm, dip, dt)
     if s.mag_disturbed == 0:
-        s.mag_times[1] = max(s.mag_times[1] - 2.0 * dt, 0.0)
-        unlike = (norm_off / LIKE_NORM) ** 2 + (dip_off / LIKE_DIP_RAD) ** 2
+        s.mag_rejected_s = max(s.mag_rejected_s - 2.0 * dt, 0.0)
+        unlike = (norm_off / HALF_WEIGHT_NORM) ** 2 + (dip_off / HALF_WEIGHT_DIP_RAD) ** 2
         return float(1.0 / (1.0 + unlike))
-    s.mag_times[1] = min(s.mag_times[1] + dt, REJECT_MAX_S)
-    return 0.0 if s.mag_times[1] < REJECT_MAX_S else 0.5
+    s.mag_rejected_s = min(s.mag_rejected_s + dt, REJECT_MAX_S)
+    return 0.0 if s.mag_rejected_s < REJECT_MAX_S else 0.5
 
 
 @compiled
@@ -180,20 +180,20 @@ def learn_field(s: State, p: Gains, norm: float, dip: float, dt: float) -> None:
     new = s.mag_new
     like = abs(norm - new[0]) < p.field_norm_tolerance * new[0]
     if not like or abs(dip - new[1]) > p.field_dip_tolerance_rad:
-        new[0], new[1], s.mag_times[2] = norm, dip, 0.0
+        new[0], new[1], s.mag_candidate_s = norm, dip, 0.0
         return
     first = s.mag_ref[0] == 0.0
     if first or norm_sq(as_vec(s.rate_b)) > TURNING_RADPS * TURNING_RADPS:
-        s.mag_times[2] += dt
+        s.mag_candidate_s += dt
     new[0] += dt / FIELD_TAU_S * (norm - new[0])
     new[1] += dt / FIELD_TAU_S * (dip - new[1])
     needed_s = FIRST_FIELD_S if first else NEW_FIELD_S
-    if (first or s.mag_disturbed == 1) and s.mag_times[2] >= needed_s:
+    if (first or s.mag_disturbed == 1) and s.mag_candidate_s >= needed_s:
         s.mag_ref[0], s.mag_ref[1], s.mag_disturbed = new[0], new[1], 0
 
 
 @compiled
-def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
+def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
     """Use one sound reading of the calibrated field in body FRD, uT."""
     if s.lost == 1:
         return
@@ -222,11 +222,13 @@ def take_mag(s: State, p: Gains, mag_b: Vec3) -> None:
 
 @compiled
 def heading_row(s: State, field_n: Vec3) -> None:
-    """Write the row of a magnetic heading.
+    """Write the row of a magnetic heading, `declination - atan2(east, north)` of the field in NED.
 
-    The heading itself, the tilt through the field's dip, and hard iron across the horizontal field.
+    By the errors it is `att_d - down (north att_n + east att_e) / level^2` (a tilt turns the
+    heading through the dip), plus `(east x_n - north x_e) / level^2` for hard iron on a body axis
+    `x`, plus the turn in the latency of the sample.
     """
-    begin_row(s)
+    clear_row(s)
     north, east, down = field_n
     level_sq = north * north + east * east
     s.h[ATT] = -down * north / level_sq
@@ -327,4 +329,4 @@ def turn_heading(s: State, turn_rad: float) -> None:
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
     s.resets[ATT + 2] += 1.0
     # The integrals in NED contain the old heading.
-    s.ring_count = 0
+    s.history_count = 0

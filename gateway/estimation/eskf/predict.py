@@ -1,4 +1,4 @@
-"""Prediction: the nominal state by each IMU sample, the covariance every `COVARIANCE_S`.
+"""Prediction: the nominal state by each IMU sample, the covariance every `COVARIANCE_INTERVAL_S`.
 
 With the attitude error in NED, `R` the integral of `R_nb`, `f` that of the specific force in NED
 and `dt` the time, the error state obeys [1]_
@@ -33,10 +33,10 @@ from gateway.estimation.eskf.state import (
     GYRO_BIAS,
     GYRO_SCALE,
     HARD_IRON,
+    HISTORY_LENGTH,
     INTEGRALS,
     MOVING_STATES,
     POS,
-    SLOTS,
     STATES,
     VEL,
     State,
@@ -58,9 +58,9 @@ from gateway.geometry.quaternion import (
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-COVARIANCE_S: Final = 0.02
+COVARIANCE_INTERVAL_S: Final = 0.02
 """Interval of the covariance's propagation; measurements propagate it in between."""
-SCALE_S: Final = 1.0
+ACCELERATION_S: Final = 1.0
 """An acceleration keeps its body axis for about this time, and its scale error the sign."""
 NO_HEADING_VAR: Final = 3.0
 """Variance of an unknown heading: that of a uniform angle, `pi^2 / 3`, rad2."""
@@ -72,7 +72,7 @@ BIAS_RAISE_S: Final = 0.3
 """Time in which the rest is added to the variance of the bias."""
 STEP_LIMIT: Final = 1e4
 """A larger squared change from sample to sample is a fault, and NaN compares false."""
-SPACING_S: Final = 0.005
+HISTORY_INTERVAL_S: Final = 0.005
 """Samples that come faster share a slot; between slots the integrals are interpolated."""
 CLIMB_DENSITY: Final = 4.0
 """Random walk of the height without GPS, m2/s: a climb of 2 m/s that lasts for a second."""
@@ -109,12 +109,12 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     for k in range(3):
         force = x[k] * f[0] + y[k] * f[1] + z[k] * f[2]
         s.pending_force_n[k] += force * dt
-        s.pending_turn[k, 0] += x[k] * dt
-        s.pending_turn[k, 1] += y[k] * dt
-        s.pending_turn[k, 2] += z[k] * dt
-        s.pending_scaled[k, 0] += x[k] * gyro[0] * dt
-        s.pending_scaled[k, 1] += y[k] * gyro[1] * dt
-        s.pending_scaled[k, 2] += z[k] * gyro[2] * dt
+        s.pending_rotation[k, 0] += x[k] * dt
+        s.pending_rotation[k, 1] += y[k] * dt
+        s.pending_rotation[k, 2] += z[k] * dt
+        s.pending_rotation_gyro[k, 0] += x[k] * gyro[0] * dt
+        s.pending_rotation_gyro[k, 1] += y[k] * gyro[1] * dt
+        s.pending_rotation_gyro[k, 2] += z[k] * gyro[2] * dt
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         accel_sq += a * a
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
@@ -124,7 +124,7 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
             s.vel_n[k] += a * dt
     s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(norm_sq(rate)))
-    s.pending_noise[1] += p.accel_scale_sq * SCALE_S * accel_sq * dt
+    s.pending_noise[1] += p.accel_scale_sq * ACCELERATION_S * accel_sq * dt
     s.pending_s += dt
     follow_gravity(s, p, force_i, dt)
 
@@ -171,43 +171,43 @@ def follow_gravity(s: State, p: Gains, force_i: Vec3, dt: float) -> None:
 @compiled
 def store_integrals(s: State) -> None:
     """Store the present integrals."""
-    newest = (s.ring_count - 1) % SLOTS
-    if s.ring_count > 0 and s.time_s - s.ring[newest, 0] < SPACING_S:
+    newest = (s.history_count - 1) % HISTORY_LENGTH
+    if s.history_count > 0 and s.time_s - s.history[newest, 0] < HISTORY_INTERVAL_S:
         return
-    slot = s.ring_count % SLOTS
-    s.ring[slot, 0] = s.time_s
+    slot = s.history_count % HISTORY_LENGTH
+    s.history[slot, 0] = s.time_s
     for k in range(INTEGRALS):
-        s.ring[slot, 1 + k] = s.integrals[k]
-    s.ring_count += 1
+        s.history[slot, 1 + k] = s.integrals[k]
+    s.history_count += 1
 
 
 @compiled
 def look_back(s: State, time_s: float) -> float:
     """Interpolate the integrals of a past time into `then`; return the time they hold for."""
-    count = s.ring_count
+    count = s.history_count
     if time_s >= s.time_s or count == 0:
         for k in range(INTEGRALS):
             s.then[k] = s.integrals[k]
         return float(s.time_s)
-    oldest = max(0, count - SLOTS)
+    oldest = max(0, count - HISTORY_LENGTH)
     low, high = oldest, count
     while low < high:
         middle = (low + high) // 2
-        if s.ring[middle % SLOTS, 0] <= time_s:
+        if s.history[middle % HISTORY_LENGTH, 0] <= time_s:
             low = middle + 1
         else:
             high = middle
     if low == oldest:
         for k in range(INTEGRALS):
-            s.then[k] = s.ring[oldest % SLOTS, 1 + k]
-        return float(s.ring[oldest % SLOTS, 0])
-    before, after = (low - 1) % SLOTS, low % SLOTS
-    t0 = s.ring[before, 0]
-    t1 = s.time_s if low == count else s.ring[after, 0]
+            s.then[k] = s.history[oldest % HISTORY_LENGTH, 1 + k]
+        return float(s.history[oldest % HISTORY_LENGTH, 0])
+    before, after = (low - 1) % HISTORY_LENGTH, low % HISTORY_LENGTH
+    t0 = s.history[before, 0]
+    t1 = s.time_s if low == count else s.history[after, 0]
     share = (time_s - t0) / (t1 - t0) if t1 > t0 else 0.0
     for k in range(INTEGRALS):
-        end = s.integrals[k] if low == count else s.ring[after, 1 + k]
-        s.then[k] = s.ring[before, 1 + k] + share * (end - s.ring[before, 1 + k])
+        end = s.integrals[k] if low == count else s.history[after, 1 + k]
+        s.then[k] = s.history[before, 1 + k] + share * (end - s.history[before, 1 + k])
     return time_s
 
 
@@ -245,7 +245,7 @@ def propagate(s: State, p: Gains) -> None:
     fill(s.pending_force_n, 0.0)
     for k in range(3):
         for j in range(3):
-            s.pending_turn[k, j] = s.pending_scaled[k, j] = 0.0
+            s.pending_rotation[k, j] = s.pending_rotation_gyro[k, j] = 0.0
 
 
 @compiled
@@ -258,7 +258,7 @@ def raise_bias_variance(s: State, p: Gains, k: int, more: float) -> None:
 @compiled
 def apply_transition(s: State, P: FloatArray, columns: int) -> None:
     """Multiply the first columns of `P` by the transition matrix from the left."""
-    R, W, dt, f = s.pending_turn, s.pending_scaled, s.pending_s, s.pending_force_n
+    R, W, dt, f = s.pending_rotation, s.pending_rotation_gyro, s.pending_s, s.pending_force_n
     if s.aided == 1:
         for k in range(3):
             add_row(P, POS + k, dt, VEL + k, columns)

@@ -11,7 +11,7 @@ from typing import Final
 from gateway.compiled import compiled
 from gateway.estimation.columns import FRESH_GPS_S
 from gateway.estimation.eskf.integrity import lose_attitude, require_bias_variance
-from gateway.estimation.eskf.magnetometer import UNTURNED_RAD, begin_turn, reset_hard_iron
+from gateway.estimation.eskf.magnetometer import BIAS_TURN_RAD, begin_turn, reset_hard_iron
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import GYRO_BIAS, VEL, State, reset_states
 from gateway.estimation.record import as_vec, write_vec
@@ -27,8 +27,8 @@ REST_FORCE_MPS2: Final = 0.35
 """Changes of the means that end a rest: 2 deg of tilt."""
 USUAL_BIAS_RADPS: Final = 6.0 * RAD_PER_DEG
 """A larger constant rate is more often a turn than a bias."""
-STATIONARY_UNTURNED_RAD: Final = 1.0
-"""The same as `UNTURNED_RAD` while GPS shows no speed."""
+STATIONARY_BIAS_TURN_RAD: Final = 1.0
+"""The same as `BIAS_TURN_RAD` while GPS shows no speed."""
 GRAVITY_SHARE: Final = 0.2
 """Error of an uncalibrated accelerometer at rest, as a share of gravity."""
 
@@ -111,12 +111,12 @@ def is_likely_bias(s: State, quiet: bool, dt: float) -> bool:
         norm_sq += s.imu_mean[3 + k] ** 2
     force = math.sqrt(norm_sq)
     upright = abs(upright) / force if force > 0.0 else 0.0
-    s.spun_rad = s.spun_rad + upright * dt if quiet else 0.0
+    s.rest_turn_rad = s.rest_turn_rad + upright * dt if quiet else 0.0
     if is_usual_bias(s, (s.imu_mean[0], s.imu_mean[1], s.imu_mean[2])):
         return True
     fresh = s.time_s - s.fix_s < FRESH_GPS_S
     unturned = upright < USUAL_BIAS_RADPS
-    unturned = unturned or s.spun_rad > (STATIONARY_UNTURNED_RAD if fresh else UNTURNED_RAD)
+    unturned = unturned or s.rest_turn_rad > (STATIONARY_BIAS_TURN_RAD if fresh else BIAS_TURN_RAD)
     return bool(unturned and abs(force / STANDARD_GRAVITY_MPS2 - 1.0) < GRAVITY_SHARE)
 
 

@@ -244,7 +244,7 @@ class Gains:
     gps_relock_s: float
     mag_var: float
     mag_latency_s: float
-    mag_late_sq: float
+    mag_latency_var: float
     hard_iron_var: float
     hard_iron_uncalibrated_var: float
     hard_iron_density: float
@@ -298,7 +298,7 @@ def _variances(s: EskfSettings, reference: ReferenceSettings) -> dict[str, float
         "gps_climb_var": s.gps_climb_mps**2,
         "gps_jitter_sq": s.gps_jitter_s**2,
         "mag_var": (s.mag_noise_deg * RAD_PER_DEG) ** 2,
-        "mag_late_sq": s.mag_latency_std_s**2,
+        "mag_latency_var": s.mag_latency_std_s**2,
         "hard_iron_var": s.hard_iron_ut**2,
         "hard_iron_uncalibrated_var": s.hard_iron_uncalibrated_ut**2,
         "hard_iron_density": s.hard_iron_walk_utprs**2,

@@ -1,5 +1,7 @@
 """State of the filter: the nominal state, the error covariance, and the memory of each part.
 
+The true state is the nominal one with the error added; the true attitude is `q(att) * q_nb`.
+
 The error state, in the order of the covariance's rows:
 
 | rows | error | frame, unit |
@@ -39,8 +41,8 @@ MOVING_STATES: Final = 9
 INTEGRALS: Final = 9
 """Force in the gyroscope frame, acceleration in NED, and the integral of that: three numbers each,
 each integrated once more over time."""
-SLOTS: Final = 512
-"""Past integrals that are kept: 2.5 s at `predict.SPACING_S`, more than the longest latency."""
+HISTORY_LENGTH: Final = 512
+"""Past integrals that are kept: 2.5 s at `predict.HISTORY_INTERVAL_S`, more than any latency."""
 LATENCIES: Final = 13
 """Latencies that are compared at once, see `latency`."""
 MOMENTS: Final = 8
@@ -92,9 +94,9 @@ class State:
     pending_s: float
     pending_force_n: Annotated[FloatArray, (3,)]
     """Specific force."""
-    pending_turn: Annotated[FloatArray, (3, 3)]
+    pending_rotation: Annotated[FloatArray, (3, 3)]
     """`R_nb`."""
-    pending_scaled: Annotated[FloatArray, (3, 3)]
+    pending_rotation_gyro: Annotated[FloatArray, (3, 3)]
     """`R_nb diag(gyro)`."""
     pending_noise: Annotated[FloatArray, (2,)]
     """Variances of angle and velocity beyond the sensors' noise densities."""
@@ -123,8 +125,8 @@ class State:
     integrals: Annotated[FloatArray, (INTEGRALS,)]
     then: Annotated[FloatArray, (INTEGRALS,)]
     """Work space: the integrals at the time of a fix."""
-    ring: Annotated[FloatArray, (SLOTS, 1 + INTEGRALS)]
-    ring_count: int
+    history: Annotated[FloatArray, (HISTORY_LENGTH, 1 + INTEGRALS)]
+    history_count: int
 
     # GPS.
     origin: Annotated[FloatArray, (2,)]
@@ -148,7 +150,7 @@ class State:
     """Time and position from which a velocity is derived where fixes have none."""
     zero_from: Annotated[FloatArray, (4,)]
     """The same for velocities of exactly zero."""
-    zero_false: int
+    zero_velocity_wrong: int
     """1 while positions contradict a velocity of exactly zero."""
     gps_error_var: Annotated[FloatArray, (3,)]
     pos_density: Annotated[FloatArray, (3,)]
@@ -204,7 +206,7 @@ class State:
     """Bias measured at the last rest, rad/s; zero before."""
     rest_seen: int
     """1 once a rest has measured the bias, 2 once the aircraft has moved since."""
-    spun_rad: float
+    rest_turn_rad: float
     """Angle of an apparent turn about the vertical at rest, since the compass last turned too."""
 
     # Magnetometer.
@@ -217,8 +219,10 @@ class State:
     """Norm in uT and dip in rad of the usual field; zero before one is known."""
     mag_new: Annotated[FloatArray, (2,)]
     """The same of a candidate for it."""
-    mag_times: Annotated[FloatArray, (3,)]
-    """For how long the field has been usual, been rejected, and agreed with the candidate, s."""
+    mag_usual_s: float
+    mag_rejected_s: float
+    mag_candidate_s: float
+    """For how long the field has been usual, been rejected, and agreed with the candidate."""
     mag_disturbed: int
     mag_last: Annotated[FloatArray, (3,)]
     mag_turned: Annotated[FloatArray, (3,)]
@@ -257,11 +261,14 @@ class State:
     imu_last: Annotated[FloatArray, (6,)]
     imu_held: Annotated[FloatArray, (6,)]
     """Newest sound values of rate and force."""
-    imu_usual: Annotated[FloatArray, (3,)]
-    """Average change of rate and force from sample to sample, and mean square of the rate."""
+    usual_change: Annotated[FloatArray, (2,)]
+    """Average change of rate and force from sample to sample, rad/s and m/s2."""
+    usual_rate_sq: float
+    """Mean square of the rate, (rad/s)2."""
     stuck_s: Annotated[FloatArray, (2,)]
     missing_s: Annotated[FloatArray, (2,)]
-    hold_s: Annotated[FloatArray, (2,)]
+    repeat_s: float
+    usual_repeat_s: float
     """For how long both sensors have repeated a sample, and for how long they usually do."""
     uncalibrated: int
     """Bits: 1 gyroscope, 2 accelerometer, 4 magnetometer."""
@@ -297,7 +304,7 @@ def reset_state(s: State, k: int, variance: float) -> None:
 
 @compiled
 def reset_states(s: State, first: int, variance: float) -> None:
-    """Do the same for the three states of a vector."""
+    """Give the three states of a vector a new variance, uncorrelated with the others."""
     for k in range(3):
         reset_state(s, first + k, variance)
 

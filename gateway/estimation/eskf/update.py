@@ -1,16 +1,22 @@
 """The measurement update, and the measurements other than GPS and compass.
 
-An update is one number at a time, gated, with the states that must not change.
+A measurement of several numbers is a group of scalar updates, so no matrix is inverted. For each
+number the row `h` of the measurement matrix is written, `update_scalar` adds the correction to the
+error `dx` of the group, and at the end `inject` moves that into the nominal state.
 
-A measurement of several numbers is several scalar updates, so no matrix is inverted. `h` is the row
-of the measurement matrix; innovations are reduced by what earlier rows of the same group have
-explained, and `inject` moves the group's corrections into the nominal state.
+| measurement | model | function |
+| --- | --- | --- |
+| gravity, without GPS | `0 = (f_n + att x f_n - R accel_bias)` north, east | `update_gravity` |
+| rest | `mean gyro = gyro_bias`, `0 = vel` | `update_rest` |
+| barometer | `baro_down + baro_offset = pos_down` | `update_height` |
+| fix | see `fixes` | `fixes.update_fix` |
+| magnetic heading | see `magnetometer.heading_row` | `magnetometer.update_heading` |
 
 References
 ----------
 .. [1] J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017, chapters 6 and 7
    (global attitude error).
-.. [2] D. Simon, "Optimal State Estimation", 2006, section 9.1 (Schmidt-Kalman filter).
+.. [2] D. Simon, "Optimal State Estimation", 2006, section 10.3 (Schmidt-Kalman filter).
 """
 
 import math
@@ -58,7 +64,7 @@ REST_RATE_VAR: Final = 0.002**2
 
 
 @compiled
-def begin_row(s: State) -> None:
+def clear_row(s: State) -> None:
     """Clear the row of the measurement matrix and the considered states."""
     fill(s.h, 0.0)
     fill(s.considered, 0.0)
@@ -90,7 +96,12 @@ def innovation_variance(s: State, variance: float) -> float:
 def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) -> None:
     """Update by one number, measured minus predicted.
 
-    An innovation outside the gate inflates the measurement's variance until it is on the gate: an
+    With the innovation `e`, less `h dx` of the group's earlier rows, and its variance
+    `S = h P h^T + variance`, the gain is `K = P h^T / S`; then `dx' = dx + K e` and
+    `P' = P - K S K^T` ([1]_, section 6.1). Considered states have no gain, and among themselves
+    keep their covariance [2]_.
+
+    An innovation outside the gate inflates `S` until it is on the gate, `e^2 = gate_sq S`: an
     outlier has little effect, while a lasting difference is followed in the end.
     """
     for j in range(STATES):
@@ -117,7 +128,7 @@ def update_scalar(s: State, innovation: float, variance: float, gate_sq: float) 
 
 @compiled
 def inject(s: State) -> None:
-    """Move the corrections of a group of updates into the nominal state."""
+    """Move the corrections of a group of updates into the nominal state: `q(att) * q_nb` [1]_."""
     d = s.dx
     turn = from_rotation_vector((d[ATT], d[ATT + 1], d[ATT + 2]))
     write_quat(s.q_nb, normalise(multiply(turn, as_quat(s.q_nb))))
@@ -164,15 +175,16 @@ def gravity_variance(s: State, p: Gains) -> float:
 def update_gravity(s: State, p: Gains, dt: float) -> None:
     """Level by the direction of the filtered force, whose errors last for its time constants.
 
-    The bias of the accelerometer cannot be separated from tilt here, so it is only considered: the
-    covariance of the level contains it, and the first fixes resolve both.
+    Without acceleration the true force in NED, `f_n + att x f_n - R accel_bias`, has no horizontal
+    part. The bias of the accelerometer cannot be separated from tilt here, so it is only
+    considered: the covariance of the level contains it, and the first fixes resolve both.
     """
     propagate(s, p)
     north, east, down = gravity_force_n(s)
     variance = gravity_variance(s, p) * max(1.0, 2.0 * p.gravity_tau_s / dt)
     x, y, z = body_axes(as_quat(s.q_nb))
     for k in range(2):
-        begin_row(s)
+        clear_row(s)
         consider(s, ACCEL_BIAS, 3)
         consider(s, ATT + 2, 1)
         s.h[ATT + 1 - k] = down if k == 0 else -down
@@ -188,12 +200,12 @@ def update_rest(s: State, p: Gains) -> None:
     """Update by rest: the mean rate is the gyroscope's bias, and the velocity is zero."""
     propagate(s, p)
     for k in range(3):
-        begin_row(s)
+        clear_row(s)
         s.h[GYRO_BIAS + k] = 1.0
         update_scalar(s, s.gyro_mean[k] - s.gyro_bias_b[k], REST_RATE_VAR, NO_GATE_SQ)
     if s.aided == 1:
         for k in range(3):
-            begin_row(s)
+            clear_row(s)
             s.h[VEL + k] = 1.0
             update_scalar(s, -s.vel_n[k], REST_VELOCITY_VAR, p.gate_sq)
     inject(s)
@@ -201,9 +213,9 @@ def update_rest(s: State, p: Gains) -> None:
 
 @compiled
 def update_height(s: State, p: Gains) -> None:
-    """Update by the barometer's depth."""
+    """Update by the barometer: its depth plus the offset is the position below the origin."""
     propagate(s, p)
-    begin_row(s)
+    clear_row(s)
     s.h[POS + 2] = 1.0
     s.h[BARO_OFFSET] = -1.0
     update_scalar(s, s.baro_down_m + s.baro_offset_m - s.pos_n[2], p.baro_var, p.gate_sq)
