@@ -16,7 +16,6 @@ from gateway.records import (
     UNKNOWN_VEC3,
     LinkReport,
     NavFlags,
-    NavState,
     NodeId,
     NodeLink,
     NodeStatus,
@@ -25,24 +24,21 @@ from gateway.records import (
 )
 from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot, summary_line
 from tests.client_stats import TABLET
-from tests.kit.records import FIX
+from tests.kit.records import FIX, NOTHING
 
 NODE = NodeLink(NodeId(1, 0), 0, 990, 10, 3, 0, 1, 99.6, 9_900_000, -42.0)
 RECEIVER = ReceiverStatus(9_000_000, 9_000_000, 76, 4, 0, 1, (PipeCounters(0, 0, 0),) * 6)
 REPORT = LinkReport(
     10_000_000, True, "/dev/ttyUSB0", 40_000, 1000, 2, (("crc", 7),), (NODE,), RECEIVER
 )
-FLYING = NavState(
+FLYING = msgspec.structs.replace(
+    NOTHING,
     time_us=9_990_000,
     q_nb=from_euler(math.radians(-12.0), math.radians(3.0), math.radians(-90.0)),
-    rate_b_radps=(0.0, 0.0, 0.0),
     lat_deg=-7.765612,
     lon_deg=110.372834,
     alt_amsl_m=171.5,
     vel_n_mps=(3.0, -4.0, -1.5),
-    attitude_std_rad=UNKNOWN_VEC3,
-    vel_std_mps=UNKNOWN_VEC3,
-    pos_std_m=UNKNOWN_VEC3,
     flags=NavFlags.ATTITUDE_VALID | NavFlags.POSITION_VALID | NavFlags.GPS_REJECTED,
 )
 LOST = msgspec.structs.replace(

@@ -15,22 +15,14 @@ from gateway.cli.live import clients
 from gateway.config import load
 from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
-from gateway.records import (
-    LinkReport,
-    LoggedRequest,
-    NavFlags,
-    NavState,
-    NodeId,
-    NodeLink,
-    NodeStatus,
-)
+from gateway.records import LinkReport, LoggedRequest, NodeId, NodeLink, NodeStatus
 from gateway.status import AircraftStatus, RelativeLocation, Snapshot
 from tests.client_stats import TABLET
 from tests.kit.cli import invoke
+from tests.kit.records import NOTHING
 
 pytestmark = pytest.mark.io
 
-NAN = float("nan")
 CLIENT = dataclasses.replace(
     TABLET,
     endpoint="udp:10.0.0.7:14550?name=tablet",
@@ -53,24 +45,7 @@ NODE = NodeLink(NodeId(1, 2), 0, 100, 7, 0, 0, 1, 60.0, 0, 0.0)
 SNAPSHOT = Snapshot(
     time_us=3_723_000_000,
     report=LinkReport(0, True, "/dev/ttyUSB0", 0, 103, 4, (), (NODE,), None),
-    states=(
-        (
-            1,
-            NavState(
-                time_us=0,
-                q_nb=(1.0, 0.0, 0.0, 0.0),
-                rate_b_radps=(0.0, 0.0, 0.0),
-                lat_deg=47.5,
-                lon_deg=NAN,
-                alt_amsl_m=NAN,
-                vel_n_mps=(NAN, NAN, NAN),
-                attitude_std_rad=(NAN, NAN, NAN),
-                vel_std_mps=(NAN, NAN, NAN),
-                pos_std_m=(NAN, NAN, NAN),
-                flags=NavFlags.ATTITUDE_VALID | NavFlags.AT_REST,
-            ),
-        ),
-    ),
+    states=((1, msgspec.structs.replace(NOTHING, lat_deg=47.5)),),
     clients=(CLIENT, RADIO),
     sent=((30, 9),),
     hub=HubCounters(published=9, looped=1),
