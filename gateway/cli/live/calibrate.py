@@ -13,14 +13,8 @@ import msgspec
 import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
-from gateway.cli.support.options import (
-    ConfigOption,
-    ask,
-    folder_of,
-    is_running,
-    read_options,
-    read_settings,
-)
+from gateway.cli.support.control import ask, is_running
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock

@@ -9,7 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.support.options import USER_CONFIG, AskingTyper, ConfigOption, ask
+from gateway.cli.support.control import AskingTyper, ask
+from gateway.cli.support.options import USER_CONFIG, ConfigOption
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     UNKNOWN,

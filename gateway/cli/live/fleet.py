@@ -23,14 +23,8 @@ import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.options import (
-    AskingTyper,
-    ConfigOption,
-    ask,
-    read_settings,
-    socket_of,
-    with_socket,
-)
+from gateway.cli.support.control import AskingTyper, ask, socket_of, with_socket
+from gateway.cli.support.options import ConfigOption, read_settings
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,

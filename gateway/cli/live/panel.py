@@ -14,7 +14,8 @@ from typing import Annotated, Final
 import typer
 from msgspec.structs import replace
 
-from gateway.cli.support.options import ConfigOption, SocketOption, folder_of, read_settings
+from gateway.cli.support.control import SocketOption
+from gateway.cli.support.options import ConfigOption, folder_of, read_settings
 from gateway.cli.support.terminal import how_to_add, refuse
 from gateway.hub.endpoint import parse_endpoint
 from gateway.live.terminal import own_command

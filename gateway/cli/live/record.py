@@ -6,16 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from gateway.cli.support.options import (
-    AskingTyper,
-    ConfigOption,
-    ask,
-    folder_of,
-    is_running,
-    read_options,
-    read_settings,
-    recordings_folder,
-)
+from gateway.cli.support.control import AskingTyper, ask, is_running, recordings_folder
+from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
 from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_json, table_of
 from gateway.live.session import SessionState
 from gateway.recordings.index import (

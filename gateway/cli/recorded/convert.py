@@ -6,7 +6,8 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from gateway.cli.support.options import ConfigOption, read_options, read_settings, recordings_folder
+from gateway.cli.support.control import recordings_folder
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,

@@ -10,7 +10,8 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.support.options import ConfigOption, read_options, read_settings, recordings_folder
+from gateway.cli.support.control import recordings_folder
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, ForceOption, files_of, progress_of
 from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new

@@ -13,15 +13,8 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.options import (
-    AskingTyper,
-    ConfigOption,
-    ask,
-    read_options,
-    read_settings,
-    recordings_folder,
-    with_socket,
-)
+from gateway.cli.support.control import AskingTyper, ask, recordings_folder, with_socket
+from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,

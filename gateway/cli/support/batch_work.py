@@ -12,7 +12,8 @@ import typer
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses, has_dask
 from gateway.batch.storage import BatchItem, has_fsspec, is_url, items_of
 from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_season, without_secrets
-from gateway.cli.support.options import read_options, read_settings, recordings_folder
+from gateway.cli.support.control import recordings_folder
+from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import Wanted, files_of
 from gateway.cli.support.terminal import console_of, how_to_add, progress_bar, refuse
 from gateway.printable import printable
