@@ -6,7 +6,8 @@ A site is one client of that hub, with its vehicles behind it under ids of this 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -24,7 +25,7 @@ from gateway.hub.endpoint import SITE_NAME, Endpoint
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.transports.base import Client
-from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, Publishers, in_key
+from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, in_key
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
@@ -42,30 +43,20 @@ CAUSES: Final = ("unknown", "signed", "unsigned", "forged", "replayed", "looped"
 """Why frames of a site are dropped; see `FrameTranslation.counters`."""
 
 
+@dataclass(eq=False, kw_only=True)
 class SiteClient(Client):
     """One site of the fleet."""
 
-    publishers: Callable[[], Publishers | None]
+    session: FleetSession
     translation: FrameTranslation
-    tokens: set[str]
+    tokens: set[str] = field(default_factory=set)
     """Its sessions by Zenoh's liveliness; more than one are sites of the same name."""
+    may_return = False
 
     @property
     def is_here(self) -> bool:
         """Whether a session of it is present."""
         return bool(self.tokens)
-
-    may_return = False
-
-    def set_up(
-        self, translation: FrameTranslation, publishers: Callable[[], Publishers | None]
-    ) -> "SiteClient":
-        """Set the translation of its frames, and where frames for it are published."""
-        self.tokens = set()
-        self.translation = translation
-        self.publishers = publishers
-        self.become("connecting")
-        return self
 
     def handle_presence(self, token: str, is_here: bool) -> bool:
         """Update its sessions; return whether the site has appeared or disappeared."""
@@ -95,7 +86,7 @@ class SiteClient(Client):
 
     def transmit(self, frame: MavFrame) -> None:
         """Publish a frame for a vehicle of the site."""
-        publishers = self.publishers()
+        publishers = self.session.publishers
         found = self.translation.to_site(frame, self.context.now_us())
         if publishers is None or found is None:
             self.counters.dropped += 1
@@ -136,7 +127,7 @@ class SiteClient(Client):
     @property
     def queued(self) -> int:
         """Frames of all sites that wait for a congested link."""
-        publishers = self.publishers()
+        publishers = self.session.publishers
         return 0 if publishers is None else publishers.queued
 
 
@@ -312,9 +303,13 @@ class FleetServer:
         if not SITE_NAME.fullmatch(name) or len(self._sites) >= MAX_SITES:
             self._bad_names += 1
             return None
-        client = SiteClient(self._hub, self._hub.new_client_id(), site_endpoint(name))
-        translation = FrameTranslation(name, self._ids, self._signatures.get(name), self._loops)
-        site = self._sites[name] = client.set_up(translation, lambda: self._session.publishers)
+        site = self._sites[name] = SiteClient(
+            self._hub,
+            self._hub.new_client_id(),
+            site_endpoint(name),
+            session=self._session,
+            translation=FrameTranslation(name, self._ids, self._signatures.get(name), self._loops),
+        )
         self._hub.appear(site)
         return site
 

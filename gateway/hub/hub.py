@@ -119,7 +119,7 @@ class Hub:
         self._round_trip = RoundTrip(signer)
         self._vehicles = OwnVehicles()
         self._router = Router(
-            settings,
+            self,
             self._clients,
             self._fanout,
             self._vehicles,
@@ -127,7 +127,6 @@ class Hub:
             on_frame,
             on_foreign,
             rejects,
-            now_us,
         )
         self.deliver = self._router.deliver
         self._ping_us = self._alerts_us = 0
@@ -276,7 +275,6 @@ class Hub:
         before = {parse_endpoint(url).location for url in self.settings.endpoints}
         after = {parse_endpoint(url).location: url for url in settings.endpoints}
         self.settings = settings
-        self._router.settings = settings
         for location in before - after.keys():
             if location in self._endpoints:
                 self.remove(location)

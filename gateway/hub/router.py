@@ -25,9 +25,8 @@ from gateway.hub.routing_table import (
     RoutingTable,
     SystemPath,
 )
-from gateway.hub.settings import HubSettings
 from gateway.hub.stats import HubCounters
-from gateway.hub.transports.base import Client
+from gateway.hub.transports.base import Client, HubContext
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
@@ -48,7 +47,7 @@ class Router:
 
     def __init__(
         self,
-        settings: HubSettings,
+        context: HubContext,
         clients: Mapping[int, Client],
         fanout: Fanout,
         vehicles: OwnVehicles,
@@ -56,11 +55,10 @@ class Router:
         on_frame: Callable[[Incoming], None],
         on_foreign: Callable[[bytes], None] | None,
         rejects: Callable[[bytes, int], bool] | None,
-        now_us: Callable[[], int],
     ) -> None:
-        self.settings = settings
         self.counters = HubCounters()
         self.links = RedundantLinks()
+        self._context = context
         self._clients = clients
         self._fanout = fanout
         self._vehicles = vehicles
@@ -68,7 +66,6 @@ class Router:
         self._on_frame = on_frame
         self._on_foreign = on_foreign
         self._rejects = rejects
-        self._now_us = now_us
         self._table = RoutingTable(fanout.clear)
         self._untrusted = RoutingTable(max_origins=MAX_UNTRUSTED_SYSTEMS)
         self._duplicates = DuplicateFilter()
@@ -144,7 +141,7 @@ class Router:
         if not self._table.is_shared(frame.origin, now_us):
             path.stream.accept(frame.sequence, client_id, now_us)
             return False
-        late_us = round(self.settings.late_after_s * US_PER_S)
+        late_us = round(self._context.settings.late_after_s * US_PER_S)
         first = self._duplicates.check(frame, client_id, path, now_us, late_us)
         if first == NEW:
             return False
@@ -221,7 +218,7 @@ class Router:
     def _ask(self, client: Client, frame: MavFrame, *, forwarded: bool) -> None:
         """Queue a request to our vehicles."""
         incoming = Incoming(client.client_id, frame.data, client.trusted, forwarded)
-        if not self._requests.offer(incoming, self._now_us()):
+        if not self._requests.offer(incoming, self._context.now_us()):
             self.counters.unserved += 1
         elif self._turn is None:
             self._serve()
@@ -232,7 +229,7 @@ class Router:
         if self._pause is not None:
             self._pause.cancel()
             self._pause = None
-        now_us, loop = self._now_us(), asyncio.get_running_loop()
+        now_us, loop = self._context.now_us(), asyncio.get_running_loop()
         incoming = self._requests.take(now_us)
         if incoming is None:
             wait_us = self._requests.wait_us(now_us)

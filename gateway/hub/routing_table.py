@@ -233,13 +233,11 @@ class FrameMemory(Generic[Note]):
         self._older: dict[Hashable, Note] = {}
         self._turned_us = 0
 
-    def turn(self, now_us: int) -> bool:
-        """Start another generation if it is due, and return whether it was."""
-        if now_us - self._turned_us < self._span_us and len(self._recent) < self._most:
-            return False
-        self._older, self._recent = self._recent, {}
-        self._turned_us = now_us
-        return True
+    def turn(self, now_us: int) -> None:
+        """Start another generation if it is due."""
+        if now_us - self._turned_us >= self._span_us or len(self._recent) >= self._most:
+            self._older, self._recent = self._recent, {}
+            self._turned_us = now_us
 
     def get(self, frame: Hashable) -> Note | None:
         """Return the note on a frame."""
