@@ -2,7 +2,7 @@
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import msgspec
@@ -27,6 +27,7 @@ from gateway.estimation.record import (
     IntArray,
     Packed,
     copy_record,
+    filled_record,
     new_record,
     pack_record,
     unpack_record,
@@ -54,6 +55,20 @@ class SampleLog:
     """Arrival."""
     gps: FloatArray
     """Shape (m, GPS_COLUMNS)."""
+
+
+def contiguous(log: SampleLog) -> SampleLog:
+    """Return the log with contiguous arrays; those that are so are not copied."""
+    return SampleLog(*(np.ascontiguousarray(getattr(log, field.name)) for field in fields(log)))
+
+
+def log_arrays(log: SampleLog) -> kernels.LogArrays:
+    """Return where the contiguous arrays of a log lie; valid as long as these live."""
+    numbers = {field.name: address_of(getattr(log, field.name)) for field in fields(log)}
+    numbers["imu_count"] = len(log.imu_time_us)
+    numbers["baro_count"] = len(log.baro_time_us)
+    numbers["gps_count"] = len(log.gps_time_us)
+    return filled_record(kernels.LogArrays, numbers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,15 +223,9 @@ class KernelEstimator:
             One row per IMU sample.
         """
         out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
-        kinds = (
-            (log.imu_time_us, log.imu),
-            (log.baro_time_us, log.baro_alt_m),
-            (log.gps_time_us, log.gps),
-        )
-        # Their addresses hold only while the arrays are kept.
-        arrays = [[*map(np.ascontiguousarray, kind)] for kind in kinds]
-        arguments = [number for kind in arrays for number in (len(kind[0]), *map(address_of, kind))]
-        kernels.run(self._at, self._gains_at, *arguments, address_of(out))  # type: ignore[call-arg]
+        log = contiguous(log)
+        arrays = log_arrays(log)
+        kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
         return out
 
     def run_in_arrival_order(

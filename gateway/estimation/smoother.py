@@ -25,7 +25,6 @@ from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
     CLIPPED,
     FLAG,
-    GPS_COLUMNS,
     HEADING_VALID_RAD,
     IMU_COLUMNS,
     NAV_ALT,
@@ -45,15 +44,15 @@ from gateway.estimation.eskf.filter import (
     GAINS_LAYOUT,
     INT,
     LEVEL_VALID_RAD,
+    LOG_LAYOUT,
     STATE_LAYOUT,
     move,
     row_at,
-    update_baro,
+    update_aiding,
     update_imu,
     write_output,
     write_position,
 )
-from gateway.estimation.eskf.fixes import update_gps
 from gateway.estimation.eskf.latency import begin_certain
 from gateway.estimation.eskf.predict import COVARIANCE_INTERVAL_S, apply_transition, propagate
 from gateway.estimation.eskf.settings import Gains
@@ -72,7 +71,7 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.kernel import KernelEstimator, SampleLog
+from gateway.estimation.kernel import KernelEstimator, SampleLog, contiguous, log_arrays
 from gateway.estimation.record import FloatArray, IntArray, as_quat, copy_record
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import displacement_m, radii_m
@@ -218,17 +217,9 @@ def beyond(std: float, variance: float) -> float:
 def run_forward(
     states: int,
     gains: int,
+    log_at: int,
     node_count: int,
     nodes_at: int,
-    imu_count: int,
-    imu_times_us: int,
-    imu_rows: int,
-    baro_count: int,
-    baro_times_us: int,
-    baro_alts_m: int,
-    gps_count: int,
-    gps_times_us: int,
-    gps_rows: int,
     outputs: int,
     covariances: int,
     transitions: int,
@@ -246,12 +237,10 @@ def run_forward(
     copy = record_at(states + STATE_SIZE, STATE_LAYOUT)
     both = array_at(states, (2, STATE_SIZE), BYTE)
     p = record_at(gains, GAINS_LAYOUT)
+    log = record_at(log_at, LOG_LAYOUT)
     nodes = array_at(nodes_at, (node_count,), INT)
-    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
-    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
-    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
-    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
-    was_reset = array_at(resets, (imu_count,), BYTE)
+    imu_time_us = array_at(log.imu_time_us, (log.imu_count,), INT)
+    was_reset = array_at(resets, (log.imu_count,), BYTE)
     baros = fixes = 0
     for k in range(node_count - 1):
         P = array_at(covariances + 8 * k * MATRIX, (STATES, STATES), FLOAT)
@@ -264,13 +253,8 @@ def run_forward(
         for i in range(STATE_SIZE):
             both[1, i] = both[0, i]
         for i in range(nodes[k], nodes[k + 1]):
-            now_us, row = imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS)
-            while baros < baro_count and baro_time_us[baros] <= now_us:
-                update_baro(s, p, baro_alt_m[baros])
-                baros += 1
-            while fixes < gps_count and gps_time_us[fixes] <= now_us:
-                update_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
-                fixes += 1
+            now_us, row = imu_time_us[i], row_at(log.imu, i, IMU_COLUMNS)
+            baros, fixes = update_aiding(s, p, log, now_us, baros, fixes)
             update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
             share_raised(s, copy)
@@ -316,16 +300,15 @@ def smooth(estimator: KernelEstimator, log: SampleLog) -> tuple[FloatArray, floa
     out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
     P, F, predicted = (np.empty((count, STATES, STATES)) for _ in range(3))
     d, reset = np.empty((count, STATES)), np.zeros(len(out), np.uint8)
-    inputs = [
-        nodes, log.imu_time_us, log.imu, log.baro_time_us, log.baro_alt_m, log.gps_time_us, log.gps,
-    ]  # fmt: skip
-    inputs = [np.ascontiguousarray(array) for array in inputs]
-    at = [address_of(array) for array in inputs]
+    log = contiguous(log)
+    arrays = log_arrays(log)
     run_forward(
-        address_of(states), address_of(gains), len(nodes), at[0],
-        len(inputs[1]), at[1], at[2], len(inputs[3]), at[3], at[4], len(inputs[5]), at[5], at[6],
-        *map(address_of, (out, P, F, predicted, d, reset)),
-    )  # fmt: skip
+        address_of(states),
+        address_of(gains),
+        address_of(arrays),
+        len(nodes),
+        *map(address_of, (nodes, out, P, F, predicted, d, reset)),
+    )
     begins, ends, variances = _backward(P, F, predicted, d, states[0]["P"])
     _correct(out, log.imu_time_us, nodes, begins, ends, variances, reset != 0)
     return out, latency_s

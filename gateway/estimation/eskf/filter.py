@@ -437,34 +437,48 @@ def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
     update_gps(s, p, arrival_us, row_at(fix, 0, GPS_COLUMNS))
 
 
+class LogArrays:
+    """Lengths and addresses of the arrays of a `SampleLog`, by its names."""
+
+    imu_count: int
+    imu_time_us: int
+    imu: int
+    baro_count: int
+    baro_time_us: int
+    baro_alt_m: int
+    gps_count: int
+    gps_time_us: int
+    gps: int
+
+
+LOG_LAYOUT: Final = layout(LogArrays)
+
+
+@compiled
+def update_aiding(
+    s: State, p: Gains, log: LogArrays, until_us: int, baros: int, fixes: int
+) -> tuple[int, int]:
+    """Use the heights, then the fixes up to a time, and return how many have been used so far."""
+    baro_time_us = array_at(log.baro_time_us, (log.baro_count,), INT)
+    baro_alt_m = array_at(log.baro_alt_m, (log.baro_count,), FLOAT)
+    gps_time_us = array_at(log.gps_time_us, (log.gps_count,), INT)
+    while baros < log.baro_count and baro_time_us[baros] <= until_us:
+        update_baro(s, p, baro_alt_m[baros])
+        baros += 1
+    while fixes < log.gps_count and gps_time_us[fixes] <= until_us:
+        update_gps(s, p, gps_time_us[fixes], row_at(log.gps, fixes, GPS_COLUMNS))
+        fixes += 1
+    return baros, fixes
+
+
 @EntryPoint
-def run(
-    state: int,
-    gains: int,
-    imu_count: int,
-    imu_times_us: int,
-    imu_rows: int,
-    baro_count: int,
-    baro_times_us: int,
-    baro_alts_m: int,
-    gps_count: int,
-    gps_times_us: int,
-    gps_rows: int,
-    outputs: int,
-) -> None:
+def run(state: int, gains: int, log_at: int, outputs: int) -> None:
     """Advance over a log: before each IMU sample the heights, then the fixes not later than it."""
     s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
-    imu_time_us = array_at(imu_times_us, (imu_count,), INT)
-    baro_time_us = array_at(baro_times_us, (baro_count,), INT)
-    baro_alt_m = array_at(baro_alts_m, (baro_count,), FLOAT)
-    gps_time_us = array_at(gps_times_us, (gps_count,), INT)
+    log = record_at(log_at, LOG_LAYOUT)
+    imu_time_us = array_at(log.imu_time_us, (log.imu_count,), INT)
     baros = fixes = 0
-    for i in range(imu_count):
-        while baros < baro_count and baro_time_us[baros] <= imu_time_us[i]:
-            update_baro(s, p, baro_alt_m[baros])
-            baros += 1
-        while fixes < gps_count and gps_time_us[fixes] <= imu_time_us[i]:
-            update_gps(s, p, gps_time_us[fixes], row_at(gps_rows, fixes, GPS_COLUMNS))
-            fixes += 1
-        update_imu(s, p, imu_time_us[i], row_at(imu_rows, i, IMU_COLUMNS))
+    for i in range(log.imu_count):
+        baros, fixes = update_aiding(s, p, log, imu_time_us[i], baros, fixes)
+        update_imu(s, p, imu_time_us[i], row_at(log.imu, i, IMU_COLUMNS))
         write_output(s, p, row_at(outputs, i, NAV_COLUMNS))
