@@ -91,19 +91,6 @@ def test_no_fix_is_reported_and_sent_on(bench: MakeBench) -> None:
     assert rig.last(NodeStatusPayload).sensors_failed == 0
 
 
-def test_receiver_that_fell_back_to_9600_is_found_again(bench: MakeBench) -> None:
-    rig = bench()
-    node = rig.gps_node()
-    rig.run(CONFIGURED_S + 0.5)
-    node.gps.reset(baud=9600)
-    lost_s = rig.now_s
-    rig.run(4.0)
-    found = [t for t, f in rig.frames if isinstance(f.payload, GpsFixPayload) and t > lost_s + 0.5]
-    assert found[0] - lost_s < 3.0
-    assert node.gps.dynamic_model == 8
-    assert node.mcu.resets == 0
-
-
 def test_restarted_node_uses_a_receiver_that_is_already_configured(bench: MakeBench) -> None:
     rig = bench()
     node = rig.gps_node()

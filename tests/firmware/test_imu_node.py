@@ -139,14 +139,6 @@ def test_strong_field_overflows_the_magnetometer(bench: MakeBench) -> None:
     assert rig.last(ImuPayload).mag == (218, -4096, 436)
 
 
-def test_failed_self_test_is_reported_and_samples_continue(bench: MakeBench) -> None:
-    rig = bench()
-    rig.imu_node().imu.self_test_works = False
-    rig.run(START_S + 0.3)
-    assert ImuFlags.SELF_TEST_FAILED in rig.last(ImuPayload).flags
-    assert rig.last(NodeStatusPayload).sensors_failed == IMU
-
-
 @pytest.mark.parametrize(
     ("absent", "flag", "bits"),
     [
@@ -195,19 +187,6 @@ def test_imu_that_falls_asleep_in_flight_is_woken(bench: MakeBench) -> None:
     rig.run(0.5)
     assert len(rig.payloads(ImuPayload, since_s=1.15)) > 30
     assert not rig.last(ImuPayload).flags & ImuFlags.MAG_ABSENT
-
-
-def test_magnetometer_that_lost_its_set_up_is_set_up_again(bench: MakeBench) -> None:
-    rig = bench(world=World(moment=lambda time_s: Moment(mag_ut=(22.0 + 10.0 * time_s, 1.5, 42.0))))
-    node = rig.imu_node()
-    rig.run(0.8)
-    node.compass.power_cycle()
-    rig.run(0.6)
-    last = rig.last(ImuPayload)
-    assert last.mag[0] == pytest.approx(10.9 * (22.0 + 10.0 * rig.now_s), abs=5)
-    assert ImuFlags.MAG_ABSENT not in last.flags
-    stale = [p for p in rig.payloads(ImuPayload, since_s=0.85) if p.mag[0] < 10.9 * 30.5]
-    assert not any(ImuFlags.MAG_NEW in p.flags for p in stale)
 
 
 def test_imu_without_its_interrupt_is_polled_and_reported(bench: MakeBench) -> None:

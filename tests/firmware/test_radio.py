@@ -138,14 +138,6 @@ def test_node_without_its_radio_waits_for_it(bench: MakeBench) -> None:
     assert len(rig.payloads(ImuPayload)) > 20
 
 
-def test_receiver_without_its_radio_still_reports(bench: MakeBench) -> None:
-    rig = bench()
-    rig.receiver.radio.absent = True
-    rig.run(2.2)
-    assert len(rig.statuses) == 2
-    assert rig.receiver.mcu.resets == 0
-
-
 def test_only_the_right_address_and_channel_are_heard(
     bench: MakeBench, build: Callable[..., Path]
 ) -> None:
