@@ -26,7 +26,7 @@ from fastcrc.crc16 import mcrf4xx
 
 from gateway.recordings.tlog import Batch, fields_of, payload_of, readdress
 from gateway.recordings.tlog_scan import IntArray
-from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, TARGET_OFFSETS
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import START_V2, frame_of, message_id_of, origin_of
 
 FIRST_GROUND_STATION: Final = 250
@@ -34,41 +34,35 @@ FIRST_GROUND_STATION: Final = 250
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1."""
 
-_REPORTS: Final = {
-    MESSAGE_IDS[name]
-    for name in (
-        "COMMAND_ACK", "MISSION_ACK", "PARAM_ERROR", "MOUNT_STATUS", "CAMERA_STATUS",
-        "CAMERA_FEEDBACK", "GIMBAL_REPORT", "GIMBAL_TORQUE_CMD_REPORT",
-        "GIMBAL_DEVICE_ATTITUDE_STATUS", "OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION",
-        "OPEN_DRONE_ID_AUTHENTICATION", "OPEN_DRONE_ID_SELF_ID", "OPEN_DRONE_ID_SYSTEM",
-        "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
-    )
-}  # fmt: skip
+
+def _ids(*names: str) -> frozenset[int]:
+    return frozenset(MESSAGE_IDS[name] for name in names)
+
+
+_REPORTS: Final = _ids(
+    "COMMAND_ACK", "MISSION_ACK", "PARAM_ERROR", "MOUNT_STATUS", "CAMERA_STATUS",
+    "CAMERA_FEEDBACK", "GIMBAL_REPORT", "GIMBAL_TORQUE_CMD_REPORT",
+    "GIMBAL_DEVICE_ATTITUDE_STATUS", "OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION",
+    "OPEN_DRONE_ID_AUTHENTICATION", "OPEN_DRONE_ID_SELF_ID", "OPEN_DRONE_ID_SYSTEM",
+    "OPEN_DRONE_ID_OPERATOR_ID", "OPEN_DRONE_ID_MESSAGE_PACK",
+)  # fmt: skip
 """Messages with a target that request nothing of it."""
-_ASKING: Final = frozenset(TARGET_OFFSETS.keys() - _REPORTS)
-_FEEDING: Final = frozenset(
-    MESSAGE_IDS[name]
-    for name in (
-        "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
-        "HIL_GPS", "HIL_OPTICAL_FLOW", "HIL_ACTUATOR_CONTROLS", "HIL_STATE_QUATERNION",
-        "GLOBAL_VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE",
-        "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LANDING_TARGET",
-        "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D", "DISTANCE_SENSOR", "OPTICAL_FLOW",
-        "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
-    )
+_ASKING: Final = TARGET_OFFSETS.keys() - _REPORTS
+_FEEDING: Final = _ids(
+    "GPS_RTCM_DATA", "GPS_INPUT", "HIL_CONTROLS", "HIL_RC_INPUTS_RAW", "HIL_SENSOR",
+    "HIL_GPS", "HIL_OPTICAL_FLOW", "HIL_ACTUATOR_CONTROLS", "HIL_STATE_QUATERNION",
+    "GLOBAL_VISION_POSITION_ESTIMATE", "VISION_POSITION_ESTIMATE", "VISION_SPEED_ESTIMATE",
+    "VICON_POSITION_ESTIMATE", "ATT_POS_MOCAP", "ODOMETRY", "LANDING_TARGET",
+    "OBSTACLE_DISTANCE", "OBSTACLE_DISTANCE_3D", "DISTANCE_SENSOR", "OPTICAL_FLOW",
+    "OPTICAL_FLOW_RAD", "FOLLOW_TARGET", "TERRAIN_DATA",
 )  # fmt: skip
 """Inputs of an autopilot from other components; when it sends them itself they are telemetry."""
-ANSWERS: Final = np.array(
-    [
-        MESSAGE_IDS[name]
-        for name in (
-            "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
-            "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
-            "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
-            "PING", "TIMESYNC",
-        )
-    ]
-)  # fmt: skip
+ANSWERS: Final = np.array(sorted(_ids(
+    "COMMAND_ACK", "MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM", "MISSION_ITEM_INT",
+    "MISSION_REQUEST", "MISSION_REQUEST_INT", "PARAM_VALUE", "PARAM_ERROR",
+    "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "FILE_TRANSFER_PROTOCOL", "LOG_ENTRY", "LOG_DATA",
+    "PING", "TIMESYNC",
+)))  # fmt: skip
 """Answers to a station that asked in flight: one of today could take them for its own."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
@@ -108,31 +102,22 @@ def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
     return found
 
 
-PARAM_VALUE_ID: Final = 22
-GPS_GLOBAL_ORIGIN_ID: Final = 49
-AUTOPILOT_VERSION_ID: Final = 148
-HOME_POSITION_ID: Final = 242
-PROTOCOL_VERSION_ID: Final = 300
-AVAILABLE_MODES_ID: Final = 435
-MISSION_ITEM_ID: Final = 39
-MISSION_COUNT_ID: Final = 44
-MISSION_CLEAR_ALL_ID: Final = 45
-MISSION_ACK_ID: Final = 47
-MISSION_ITEM_INT_ID: Final = 73
+PARAM_VALUE_ID: Final = MESSAGE_IDS["PARAM_VALUE"]
+AUTOPILOT_VERSION_ID: Final = MESSAGE_IDS["AUTOPILOT_VERSION"]
+HOME_POSITION_ID: Final = MESSAGE_IDS["HOME_POSITION"]
+AVAILABLE_MODES_ID: Final = MESSAGE_IDS["AVAILABLE_MODES"]
 
 _VALUE: Final = struct.Struct("<4sHH16sB")
 """PARAM_VALUE: value, count, index, name, type."""
 
 _SAME: Final = {HOME_POSITION_ID: 52}
 """How much of the payload must be equal to be no change; the rest is the time of sending."""
-_KEPT: Final = frozenset(
-    {
-        PARAM_VALUE_ID, GPS_GLOBAL_ORIGIN_ID, AUTOPILOT_VERSION_ID, HOME_POSITION_ID,
-        PROTOCOL_VERSION_ID, AVAILABLE_MODES_ID,
-    }
+_KEPT: Final = _ids(
+    "PARAM_VALUE", "GPS_GLOBAL_ORIGIN", "AUTOPILOT_VERSION", "HOME_POSITION", "PROTOCOL_VERSION",
+    "AVAILABLE_MODES",
 )  # fmt: skip
-_MISSION: Final = frozenset(
-    {MISSION_ITEM_ID, MISSION_COUNT_ID, MISSION_CLEAR_ALL_ID, MISSION_ACK_ID, MISSION_ITEM_INT_ID}
+_MISSION: Final = _ids(
+    "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_ACK"
 )
 _READ: Final = np.array(sorted(_KEPT | _MISSION))
 
@@ -206,27 +191,27 @@ class LogAnswers:
 
     def _note_mission(self, frame: bytes, time_us: int, is_upload: bool) -> None:
         vehicle = frame_of(frame).target[0] if is_upload else origin_of(frame)[0]
-        message_id, message = message_id_of(frame), fields_of(frame)
+        name, message = MESSAGE_NAMES[message_id_of(frame)], fields_of(frame)
         kind = message["mission_type"]
         kinds = KINDS if kind == ALL_KINDS else (kind,)
-        if message_id == MISSION_COUNT_ID:
-            self._begin(vehicle, kind, is_upload, message["count"], time_us)
-        elif message_id == MISSION_CLEAR_ALL_ID and is_upload:
-            for each in kinds:
-                self._begin(vehicle, each, is_upload, 0, time_us)
-        elif message_id == MISSION_ACK_ID and not is_upload:
-            for each in kinds:
-                transfer = self._transfers.pop((vehicle, each, True), None)
-                if transfer is not None and not message["type"]:
-                    self._store(vehicle, each, transfer, time_us)
-        elif message_id in (MISSION_ITEM_ID, MISSION_ITEM_INT_ID):
-            sequence = message["seq"]
-            transfer = self._transfers.get((vehicle, kind, is_upload))
-            if transfer is not None and sequence < transfer.count:
-                self._kept += sequence not in transfer.items
-                transfer.items[sequence] = frame
-                if not is_upload:
-                    self._store(vehicle, kind, transfer, time_us)
+        match name:
+            case "MISSION_COUNT":
+                self._begin(vehicle, kind, is_upload, message["count"], time_us)
+            case "MISSION_CLEAR_ALL" if is_upload:
+                for each in kinds:
+                    self._begin(vehicle, each, is_upload, 0, time_us)
+            case "MISSION_ACK" if not is_upload:
+                for each in kinds:
+                    transfer = self._transfers.pop((vehicle, each, True), None)
+                    if transfer is not None and not message["type"]:
+                        self._store(vehicle, each, transfer, time_us)
+            case "MISSION_ITEM" | "MISSION_ITEM_INT":
+                transfer = self._transfers.get((vehicle, kind, is_upload))
+                if transfer is not None and message["seq"] < transfer.count:
+                    self._kept += message["seq"] not in transfer.items
+                    transfer.items[message["seq"]] = frame
+                    if not is_upload:
+                        self._store(vehicle, kind, transfer, time_us)
 
     def _begin(self, vehicle: int, kind: int, is_upload: bool, count: int, time_us: int) -> None:
         transfer = self._transfers[vehicle, kind, is_upload] = _Transfer(count)

@@ -37,6 +37,7 @@ from gateway.recordings.tlog import (
 )
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of, renumbered
 
 BLOCK_BYTES: Final = 1 << 18
@@ -44,9 +45,15 @@ BLOCK_BYTES: Final = 1 << 18
 
 CONTEXT_RECORDS: Final = 20 * STRIDE
 """How far back a seek looks for frames that a ground station needs: a minute and more."""
-CONTEXT_IDS: Final = (0, 1, 24, 30, 31, 33, 49, 74, 148, 242, 245)
-"""HEARTBEAT, SYS_STATUS, GPS_RAW_INT, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION,
-HOME_POSITION, EXTENDED_SYS_STATE, and the newest position and attitude."""
+CONTEXT_IDS: Final = [
+    MESSAGE_IDS[name]
+    for name in (
+        "HEARTBEAT", "SYS_STATUS", "GPS_RAW_INT", "ATTITUDE", "ATTITUDE_QUATERNION",
+        "GLOBAL_POSITION_INT", "GPS_GLOBAL_ORIGIN", "VFR_HUD", "AUTOPILOT_VERSION",
+        "HOME_POSITION", "EXTENDED_SYS_STATE",
+    )
+]  # fmt: skip
+"""The messages that show the state of a vehicle."""
 
 
 class Source(Protocol):
