@@ -112,7 +112,7 @@ class Recorder:
     def start(self) -> None:
         """Start; needs a running event loop."""
         clear_copies(self.folder)
-        self._civil.hear_machine(self._machine_us(), self._clock())
+        self._civil.update_machine(self._machine_us(), self._clock())
         if self._session.wanted:
             # Nothing runs yet that could be delayed, and a table should begin with the estimator's
             # first sample.
@@ -219,7 +219,7 @@ class Recorder:
         else:
             vehicle_id = record.node.vehicle_id
             if isinstance(record, GpsFix) and record.utc_us is not None:
-                self._civil.hear_gps(vehicle_id, record.utc_us, record.time_us)
+                self._civil.update_gps(vehicle_id, record.utc_us, record.time_us)
         if part is not None and part.introduces(vehicle_id):
             for frame in self._introduction_of(vehicle_id):
                 self.frame(frame)
@@ -268,7 +268,7 @@ class Recorder:
 
     async def _turn(self) -> None:
         """Write the buffered bytes, then let the session decide."""
-        self._civil.hear_machine(self._machine_us(), self._clock())
+        self._civil.update_machine(self._machine_us(), self._clock())
         actions = await self._flush()
         if not actions:
             now_us, disk = self._clock(), self._disk

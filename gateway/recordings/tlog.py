@@ -405,12 +405,12 @@ class CivilClock:
         """Civil time of gateway time zero in µs since 1970; None before the first time is known."""
         return self._offset_us
 
-    def hear_machine(self, unix_us: int, now_us: int) -> None:
+    def update_machine(self, unix_us: int, now_us: int) -> None:
         """Note the machine's civil time; it counts until GPS time is known."""
         if not self._from_gps:
             self._offset_us = unix_us - now_us
 
-    def hear_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
+    def update_gps(self, vehicle_id: int, utc_us: int, time_us: int) -> None:
         """Note the time of an aircraft's fix and when it arrived.
 
         A machine that agrees within `JUMP_US` keeps its own, finer time.

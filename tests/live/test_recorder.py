@@ -259,7 +259,7 @@ async def test_gps_time_corrects_the_times_of_a_recording_and_its_name_stays(
     bench.recorder.flight(make_fused(rng, 1000))
     await bench.turn()
     for _ in range(ENOUGH):
-        bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock(), bench.clock())
+        bench.recorder._civil.update_gps(1, UNIX_US + bench.clock(), bench.clock())
     await bench.turn()
     bench.send(FRAMES[5:])
     bench.recorder.close()
@@ -288,7 +288,7 @@ async def test_differing_times_of_two_aircraft_split_a_session_once_at_most(
         bench.send(FRAMES[:2])
         wrong_us = 5_000_000 * (1 + n % 2)
         for _ in range(20):
-            bench.recorder._civil.hear_gps(1, UNIX_US + bench.clock() + wrong_us, bench.clock())
+            bench.recorder._civil.update_gps(1, UNIX_US + bench.clock() + wrong_us, bench.clock())
         await bench.turn()
     bench.recorder.close()
     assert len(list(bench.recorder.folder.glob("*.tlog"))) <= 2

@@ -232,48 +232,48 @@ MINUTE_US = 60_000_000
 def test_machine_clock_is_used_until_gps_time_is_confirmed() -> None:
     clock = CivilClock()
     assert clock.offset_us is None
-    clock.hear_machine(5_000_000, 1_000_000)
+    clock.update_machine(5_000_000, 1_000_000)
     assert clock.offset_us == 4_000_000
     for second in range(ENOUGH):
         assert clock.offset_us == 4_000_000
-        clock.hear_gps(1, UTC_US + second * 1_000_000, (3 + second) * 1_000_000)
-    clock.hear_machine(9_000_000, 4_000_000)
+        clock.update_gps(1, UTC_US + second * 1_000_000, (3 + second) * 1_000_000)
+    clock.update_machine(9_000_000, 4_000_000)
     assert clock.offset_us == UTC_US - 3_000_000
 
 
 def test_correct_machine_clock_is_kept_over_gps_time() -> None:
     clock = CivilClock()
-    clock.hear_machine(UTC_US, 0)
+    clock.update_machine(UTC_US, 0)
     for _ in range(ENOUGH):
-        clock.hear_gps(1, UTC_US + 800_000, 1_000_000)
+        clock.update_gps(1, UTC_US + 800_000, 1_000_000)
     assert clock.offset_us == UTC_US
 
 
 @pytest.mark.parametrize("jump_us", [-MINUTE_US, -JUMP_US - 1, JUMP_US + 1, 50 * MINUTE_US])
 def test_jump_of_civil_time_is_reported(jump_us: int) -> None:
     clock = CivilClock()
-    clock.hear_machine(UTC_US, 0)
+    clock.update_machine(UTC_US, 0)
     stamper = Stamper(UTC_US)
     assert not stamper.has_jumped(clock)
     for _ in range(ENOUGH):
-        clock.hear_gps(1, UTC_US + jump_us, 0)
+        clock.update_gps(1, UTC_US + jump_us, 0)
     assert stamper.has_jumped(clock)
 
 
 def test_wrong_time_of_one_aircraft_in_three_is_ignored() -> None:
     clock = CivilClock()
-    clock.hear_machine(UTC_US, 0)
+    clock.update_machine(UTC_US, 0)
     for n in range(30):
         for vehicle_id, error_us in ((1, 3_600_000_000), (2, 0), (3, 100_000)):
-            clock.hear_gps(vehicle_id, UTC_US + n * 200_000 + error_us, n * 200_000)
+            clock.update_gps(vehicle_id, UTC_US + n * 200_000 + error_us, n * 200_000)
         assert clock.offset_us == UTC_US
 
 
 def test_single_wrong_fixes_are_ignored() -> None:
     clock = CivilClock()
-    clock.hear_machine(UTC_US, 0)
+    clock.update_machine(UTC_US, 0)
     for n in range(60):
-        clock.hear_gps(1, UTC_US + n * 200_000 + 7_000_000 * (n % 3 == 2), n * 200_000)
+        clock.update_gps(1, UTC_US + n * 200_000 + 7_000_000 * (n % 3 == 2), n * 200_000)
         assert clock.offset_us == UTC_US
 
 
@@ -291,10 +291,10 @@ def test_suspend_is_distinguished_from_a_set_clock(
 ) -> None:
     clocks = sleepless(monkeypatch)
     now_us, clock = GatewayClock(), CivilClock()
-    clock.hear_machine(UTC_US, now_us())
+    clock.update_machine(UTC_US, now_us())
     stamper = Stamper(UTC_US)
     clocks[time.CLOCK_BOOTTIME] += 3_600 * 10**9
-    clock.hear_machine(UTC_US + 3_600_000_000 + set_by_us, now_us())
+    clock.update_machine(UTC_US + 3_600_000_000 + set_by_us, now_us())
     assert stamper.has_jumped(clock) == bool(set_by_us)
 
 

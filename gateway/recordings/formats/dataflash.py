@@ -111,8 +111,9 @@ class ArdupilotReader:
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
         """The newest fix, which waits for its accuracies."""
-        self._fused_position: tuple[int, float, float, float] | None = None
-        self._motion: tuple[int, Vec3] | None = None
+        self._fused_position: tuple[int, Vec3 | None] = (0, None)
+        """When it was estimated; latitude and longitude in degrees, height in m."""
+        self._motion: tuple[int, Vec3 | None] = (0, None)
         self._handlers: dict[str, Callable[[Message, int], list[Imported]]] = {
             "IMU": self._imu, "MAG": self._magnetometer, "BARO": self._baro,
             "GPS": self._gps, "GPA": self._accuracies,
@@ -246,7 +247,7 @@ class ArdupilotReader:
         return self._flush_fix()
 
     def _position(self, m: Message, time_us: int) -> list[Imported]:
-        self._fused_position = (time_us, m.Lat, m.Lng, m.Alt)
+        self._fused_position = (time_us, (m.Lat, m.Lng, m.Alt))
         return []
 
     def _kalman(self, m: Message, time_us: int) -> list[Imported]:
@@ -255,17 +256,14 @@ class ArdupilotReader:
 
     def _attitude(self, m: Message, time_us: int) -> list[Imported]:
         """Take the autopilot's own solution, for comparison."""
-        position: tuple[float, float, float] | None = None
-        vel = UNKNOWN_VEC3
-        if (
-            self._fused_position is not None
-            and time_us - self._fused_position[0] <= VELOCITY_AGE_US
-        ):
-            position = self._fused_position[1:]
-        if self._motion is not None and time_us - self._motion[0] <= VELOCITY_AGE_US:
-            _, vel = self._motion
+        position, vel_n_mps = (
+            value if time_us - newest_us <= VELOCITY_AGE_US else None
+            for newest_us, value in (self._fused_position, self._motion)
+        )
         angles_rad = (math.radians(degrees) for degrees in (m.Roll, m.Pitch, m.Yaw))
-        return [autopilot_state(time_us, from_euler(*angles_rad), position, vel)]
+        return [
+            autopilot_state(time_us, from_euler(*angles_rad), position, vel_n_mps or UNKNOWN_VEC3)
+        ]
 
 
 MAGIC: Final = b"\xa3\x95"
@@ -276,42 +274,42 @@ _AS_TEXT: Final = bytes(range(128)) + b"?" * 128
 _SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
-class _Complaints(io.TextIOBase):
+class _PrintedDamage(io.TextIOBase):
     """Count the damage that pymavlink prints to the terminal."""
 
     def __init__(self) -> None:
         self.bytes = self.messages = 0
-        self.spoken = False
+        self.was_printed = False
 
     def write(self, text: str) -> int:
-        self.spoken = True
+        self.was_printed = True
         self.bytes += sum(map(int, _SKIPPED.findall(text)))
         return len(text)
 
-    def quietly(self, call: Callable[[], Any]) -> Any:
-        """Call while counting what is printed."""
+    def counting(self, call: Callable[[], Any]) -> Any:
+        """Call while counting the damage that is printed."""
         with contextlib.redirect_stdout(self), contextlib.redirect_stderr(self):
             return call()
 
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
-    heard = _Complaints()
-    log = _open(path, options, heard)
+    damage = _PrintedDamage()
+    log = _open(path, options, damage)
     named = (log.params.get(name) for name in SYSTEM_IDS)
     known = next((int(value) for value in named if value is not None), 1)
     vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
-    sensors = _sensors_of(log, heard) | dict(options.sensors)
+    sensors = _sensors_of(log, damage) | dict(options.sensors)
     reader = ArdupilotReader(vehicle_id, sensors)
     remarks = [f"{path}: uses {kind} {number + 1}" for kind, number in sensors.items() if number]
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
         with contextlib.closing(log):
-            for record in _records(log, heard, reader):
+            for record in _records(log, damage, reader):
                 yield from builder.add(record)
             yield from builder.flush()
-            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, heard, reader))
+            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, damage, reader))
 
     stream = rows()
     first = next((row for row in stream if row.imu is not None), None)
@@ -325,13 +323,13 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     return table
 
 
-def _sensors_of(log: Any, heard: _Complaints) -> dict[str, int]:
+def _sensors_of(log: Any, damage: _PrintedDamage) -> dict[str, int]:
     """Find the first sensor of each kind that has data; a GPS that has a fix."""
     found: dict[str, int] = {}
     for kind in SENSORS:
         names = {name for name, of in KINDS.items() if of == kind}
         seen: set[int] = set()
-        for message in islice(_each(log, heard, names), MAX_LOOKED_AT):
+        for message in islice(_each(log, damage, names), MAX_LOOKED_AT):
             if kind != "GPS" or getattr(message, "Status", 0) >= FIX_2D:
                 seen.add(sensor_of(message.get_type(), message))
             if 0 in seen:
@@ -340,11 +338,11 @@ def _sensors_of(log: Any, heard: _Complaints) -> dict[str, int]:
     return found
 
 
-def _each(log: Any, heard: _Complaints, names: set[str]) -> Iterator[Any]:
+def _each(log: Any, damage: _PrintedDamage, names: set[str]) -> Iterator[Any]:
     """Yield the messages of these names up to the first damage, and go back to the begin."""
     log.type_list = None
     try:
-        while message := heard.quietly(lambda: log.recv_match(type=names, strict=True)):
+        while message := damage.counting(lambda: log.recv_match(type=names, strict=True)):
             yield message
     except Exception:  # noqa: BLE001 - as for `_open`
         return
@@ -352,7 +350,7 @@ def _each(log: Any, heard: _Complaints, names: set[str]) -> Iterator[Any]:
         log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
 
 
-def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
+def _open(path: Path, options: ReadOptions, damage: _PrintedDamage) -> Any:
     """Open a temporary copy of a log, unpacked.
 
     pymavlink maps a log into the memory, where one that shrinks would end the process.
@@ -372,7 +370,7 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
         # The fast indexer prints to the terminal directly, not through Python.
         log.init_arrays_fast = log.init_arrays
         try:
-            heard.quietly(lambda: kind.__init__(log, plain.name))
+            damage.counting(lambda: kind.__init__(log, plain.name))
         except Exception as error:
             # Damage makes pymavlink raise anything, bare exceptions included.
             log.close()
@@ -380,7 +378,7 @@ def _open(path: Path, options: ReadOptions, heard: _Complaints) -> Any:
         return log
 
 
-def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[Imported]:
+def _records(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Iterator[Imported]:
     """Read the whole log; a message that cannot be decoded is counted.
 
     Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
@@ -390,17 +388,17 @@ def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[
     def wanted() -> Any:
         return log.recv_match(type=reader.names, strict=True)
 
-    take = log.recv_msg if heard.spoken else wanted
+    take = log.recv_msg if damage.was_printed else wanted
     lines, end = 0, -1
     while True:
         begin = log.offset
         try:
-            message = heard.quietly(take)
+            message = damage.counting(take)
             # For a line that is no message it gives the next one, and that again in its turn.
             is_again, end = log.offset == end, log.offset
             found = [] if message is None or is_again else reader.feed(message.get_type(), message)
         except Exception:  # noqa: BLE001 - as above
-            heard.messages += 1
+            damage.messages += 1
             log.offset = max(log.offset, begin + 1)
             continue
         if message is None:
@@ -409,7 +407,7 @@ def _records(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[
         lines += not is_again
         yield from found
     if isinstance(log, DFReader_text):
-        heard.messages = _lines_of(log, reader.names) - lines
+        damage.messages = _lines_of(log, reader.names) - lines
 
 
 def _lines_of(log: Any, names: set[str]) -> int:
@@ -418,12 +416,12 @@ def _lines_of(log: Any, names: set[str]) -> int:
     return sum(log.counts.get(name, 0) for name in names | odd)
 
 
-def _remarks(log: Any, heard: _Complaints, reader: ArdupilotReader) -> Iterator[str]:
-    if heard.bytes:
-        yield f"is damaged: left out {counted(heard.bytes, 'byte')} without a message"
+def _remarks(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Iterator[str]:
+    if damage.bytes:
+        yield f"is damaged: left out {counted(damage.bytes, 'byte')} without a message"
     if log.offset < log.data_len:
         yield f"ends within a message: left out {counted(log.data_len - log.offset, 'byte')}"
-    if broken := reader.dropped + heard.messages:
+    if broken := reader.dropped + damage.messages:
         yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
     if reader.leaps:
         yield f"its clock jumped forward {counted(reader.leaps, 'time')}"
