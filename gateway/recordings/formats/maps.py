@@ -18,9 +18,9 @@ from gateway.recordings.reading import RecordedTable
 from gateway.recordings.summary import GLOBAL_POSITION_INT_ID
 from gateway.recordings.table import REMARK, TableMark
 from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, fields_of
-from gateway.records import FusionState, NavFlags, Quat
+from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
-from gateway.vehicle.plan import is_good_enough, location_of
+from gateway.vehicle.plan import is_good_enough
 from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
@@ -387,14 +387,7 @@ def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[Ve
                 limits = aircraft.vehicle
                 has_home = is_good_enough(row.gps, limits.home_accuracy_m, limits.home_satellites)
                 if has_home:
-                    position = location_of(row.gps)
-                    at = TrackPoint(
-                        zero_us + row.gps.time_us,
-                        position.lat_deg,
-                        position.lon_deg,
-                        position.alt_amsl_m,
-                    )
-                    one.put(MarkerKind.HOME, "Home", at)
+                    one.put(MarkerKind.HOME, "Home", _point_of_fix(row.gps, zero_us))
             if (point := _point_of(row, zero_us)) is not None:
                 one.add(point)
     return [one.track] if one.track.points else []
@@ -407,9 +400,13 @@ def _point_of(row: TableRow, zero_us: int) -> TrackPoint | None:
         position = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
         return TrackPoint(zero_us + row.time_us, *position, attitude_deg)
     if state is None and fix is not None and fix.fix_ok:
-        lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
-        return TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
+        return _point_of_fix(fix, zero_us)
     return None
+
+
+def _point_of_fix(fix: GpsFix, zero_us: int) -> TrackPoint:
+    lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
+    return TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
 
 
 def _point(
