@@ -259,12 +259,12 @@ class Fusion:
         *,
         follow: bool,
         played: FusedStates | None = None,
+        correct: Correct | None = None,
     ) -> None:
         self._aircraft = Aircraft(vehicle_id, settings)
         self._follow = follow
         self._played = played
-        self.correct: Correct | None = None
-        """Applied to the states."""
+        self._correct = correct
         self.refused: list[str] = []
         """Why states of the file were not restored; then the estimator starts cold."""
 
@@ -313,8 +313,8 @@ class Fusion:
                 played.latencies.append(latency_in_use(estimator))
 
         states = fuse(samples, estimator, on_fix=None if played is None else on_fix).states
-        if self.correct is not None:
-            states = self.correct(log.time_us, states)
+        if self._correct is not None:
+            states = self._correct(log.time_us, states)
         if played is not None:
             played.states.extend(states)
         # A row without an IMU sample has the time of its newest record.

@@ -320,8 +320,10 @@ class RecordedFusion:
 
     def _fusion(self, *, follow: bool, played: FusedStates | None = None) -> Fusion:
         vehicle_id = self._table.header.vehicle_id
-        fusion = Fusion(vehicle_id, self.aircraft, follow=follow, played=played)
-        fusion.correct, fusion.refused = self._correct, self._refused
+        fusion = Fusion(
+            vehicle_id, self.aircraft, follow=follow, played=played, correct=self._correct
+        )
+        self._refused = fusion.refused
         return fusion
 
     def frames(self) -> Iterator[TlogRecord]:
