@@ -17,6 +17,7 @@ forward, left, up: with these the view is upright in Foxglove's 3D panel.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Final
 
 import msgspec
@@ -127,17 +128,18 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
 _NUMBERS: Final = {"float": "number", "double": "number", "char": "string"}
 
 
-def schema_of_message(message: Any) -> dict[str, Any]:
-    """Describe a MAVLink message's fields, with their units, as a JSON schema."""
+@cache
+def schema_of_message(kind: Any) -> dict[str, Any]:
+    """Describe the fields of a MAVLink message, with their units, as a JSON schema."""
     fields: dict[str, Any] = {}
-    for name, kind in zip(message.fieldnames, message.fieldtypes, strict=True):
-        one: dict[str, Any] = {"type": _NUMBERS.get(kind, "integer")}
-        length = message.array_lengths[message.ordered_fieldnames.index(name)]
-        fields[name] = {"type": "array", "items": one} if length and kind != "char" else one
-        unit = message.fieldunits_by_name.get(name)
+    for name, written in zip(kind.fieldnames, kind.fieldtypes, strict=True):
+        one: dict[str, Any] = {"type": _NUMBERS.get(written, "integer")}
+        length = kind.array_lengths[kind.ordered_fieldnames.index(name)]
+        fields[name] = {"type": "array", "items": one} if length and written != "char" else one
+        unit = kind.fieldunits_by_name.get(name)
         if unit:
             fields[name]["description"] = f"unit: {unit}"
-    return {"title": f"mavlink.{message.msgname}", "type": "object", "properties": fields}
+    return {"title": f"mavlink.{kind.msgname}", "type": "object", "properties": fields}
 
 
 def fields_of_message(message: Any) -> dict[str, Any]:
@@ -383,8 +385,8 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
         if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT and frame.is_station_heartbeat:
             stations.add(origin)
         topic = f"/mavlink/{system}/{component}/{message.msgname}"
-        fields = fields_of_message(message)
-        topics.add(topic, schema_of_message(message), fields, time_us, frame.sequence)
+        kind, fields = mavlink.mavlink_map[frame.message_id], fields_of_message(message)
+        topics.add(topic, schema_of_message(kind), fields, time_us, frame.sequence)
         if not is_station(origin, stations):
             for shown in view.feed(system, component, message, time_us):
                 topics.add(shown.topic, SCHEMAS[shown.schema], shown.content, time_us)
