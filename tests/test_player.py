@@ -14,20 +14,18 @@ from pymavlink.dialects.v20 import common as mavlink
 from gateway.cli.recorded.play import steer
 from gateway.config import GatewaySettings
 from gateway.hub.hub import SENDS_AT_ONCE
-from gateway.pipeline import PipelineSettings
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.recordings.opening import lay_out, open_flights
-from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
 from gateway.wire.mavlink_splitter import frame_of, renumbered
 from tests.kit.mavlink import STATION, Sender
+from tests.recordings.flights import OPTIONS
 from tests.recordings.frames import START_US, make_tlog
 
 pytestmark = pytest.mark.io
 
 PARAMETERS = 26
-OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 LIMIT_S = 60
 
 

@@ -13,7 +13,7 @@ from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S
 from tests.kit.mavlink import packed
-from tests.recordings.test_replay import fly, make_flight, read
+from tests.recordings.flights import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 

@@ -1,13 +1,17 @@
 """Random records of every kind, seeded."""
 
+from collections.abc import Iterable
+
 import numpy as np
 
+from gateway.recordings.columns import RowBuilder, TableRow
 from gateway.records import (
     NAN,
     BaroRaw,
     FusedSample,
     GpsFix,
     GpsFixType,
+    ImuCalibrated,
     ImuFlags,
     ImuRaw,
     ImuSample,
@@ -101,3 +105,13 @@ def make_flight(rng: np.random.Generator, count: int) -> list[Recorded]:
     """Make records of all kinds in a random order."""
     makers = (make_fused, make_fused, make_baro, make_fix)
     return [makers[int(rng.integers(4))](rng, 10_000 * i) for i in range(count)]
+
+
+def rows_of(records: Iterable[Recorded | ImuCalibrated]) -> list[TableRow]:
+    builder = RowBuilder()
+    rows = [row for record in records for row in builder.add(record)]
+    return rows + builder.flush()
+
+
+def make_rows(seed: int, count: int = 20) -> list[TableRow]:
+    return rows_of(make_flight(np.random.default_rng(seed), count))

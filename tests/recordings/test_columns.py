@@ -32,15 +32,15 @@ from gateway.recordings.table import (
     encode_line,
 )
 from gateway.records import FusedSample
-from tests.recordings.samples import make_baro, make_fix, make_flight, make_fused
-from tests.recordings.test_table import make_rows
+from tests.recordings.samples import (
+    make_baro,
+    make_fix,
+    make_flight,
+    make_fused,
+    make_rows,
+    rows_of,
+)
 from tools.document_columns import PAGE, with_table
-
-
-def rows_of(records: list[object]) -> list[TableRow]:
-    builder = RowBuilder()
-    rows = [row for record in records for row in builder.add(record)]
-    return rows + builder.flush()
 
 
 def read(line: str) -> TableEvent:
@@ -56,7 +56,7 @@ def test_columns_are_distinct() -> None:
 def test_rows_keep_the_order_of_records(seed: int) -> None:
     records = make_flight(np.random.default_rng(seed), 50)
     flat: list[object] = []
-    for row in rows_of(list(records)):
+    for row in rows_of(records):
         flat += [record for record in (row.baro, row.gps, row.raw) if record is not None]
     assert flat == [r.imu if isinstance(r, FusedSample) else r for r in records]
 
@@ -64,7 +64,7 @@ def test_rows_keep_the_order_of_records(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_line_keeps_every_digit(seed: int) -> None:
     records = make_flight(np.random.default_rng(seed), 20)
-    for row in rows_of(list(records)):
+    for row in rows_of(records):
         line = row_to_line(row)
         assert len(line.split(",")) == len(COLUMNS)
         again = read(line)

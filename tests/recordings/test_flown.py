@@ -7,19 +7,15 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import ReadOptions
 from gateway.recordings.table import encode_head
 from gateway.recordings.tlog import encode_record
+from tests.recordings.flights import OPTIONS, fly, make_flight, read
 from tests.recordings.frames import START_US, make_records, make_tlog
-from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
-
-OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 
 
 def test_recording_of_two_parts_is_opened_as_one_flight(

@@ -15,6 +15,7 @@ from gateway.recordings.play import Player, Track
 from gateway.recordings.tlog import TlogRecord
 from tests.conftest import ManualClock
 from tests.recordings.frames import START_US, STEP_US, make_records
+from tests.recordings.test_track import play_all
 
 pytestmark = pytest.mark.io
 
@@ -44,13 +45,6 @@ def tlog(making: Making) -> Iterator[FusedTlog]:
     opened = FusedTlog(iter(making), END_US)
     yield opened
     opened.close()
-
-
-def play_all(track: Track) -> list[TlogRecord]:
-    found = []
-    while (time_us := track.peek_us()) is not None:
-        found.append(TlogRecord(time_us, track.take()))
-    return found
 
 
 def test_frames_are_made_on_demand(making: Making, tlog: FusedTlog) -> None:

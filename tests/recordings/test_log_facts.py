@@ -17,6 +17,7 @@ from gateway.recordings.flown import open_flown
 from gateway.recordings.reading import ReadOptions, open_rows, settings_of
 from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
 from tests.kit.cli import invoke
+from tests.recordings.flights import OPTIONS
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
@@ -24,7 +25,6 @@ TODAY = GatewaySettings()
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "take_off.csv.gz"
 SETTINGS = GatewaySettings().default_aircraft
-OPTIONS = ReadOptions(PipelineSettings(SETTINGS))
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_recording_fused_with_another_latency_is_reported(
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"
     config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
     convert = ["convert", str(without_latency), "-o", str(own), "--fuse", "--config", str(config)]
-    assert invoke(*convert).exit_code == 0
+    invoke(*convert, code=0)
     assert load_flight(own, TODAY, read_options(TODAY)).latency_s == set_s
     words = " ".join(capsys.readouterr().err.split())
     assert ("its manoeuvres show a GPS latency of 0.1" in words) == (set_s == 0.4)

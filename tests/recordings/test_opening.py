@@ -9,21 +9,19 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.pipeline import PipelineSettings
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
-from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.reading import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
+from tests.recordings.flights import OPTIONS, fly, make_flight, read
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
-from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
 RECORDS = make_records(300)
-OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 
 
 def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:

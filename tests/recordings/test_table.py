@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gateway.recordings.columns import COLUMNS, RowBuilder, TableRow, row_to_line
+from gateway.recordings.columns import COLUMNS, TableRow, row_to_line
 from gateway.recordings.table import (
     MAX_LINE,
     TableEvent,
@@ -16,7 +16,7 @@ from gateway.recordings.table import (
     encode_line,
 )
 from gateway.records import NodeId, NodeStatus
-from tests.recordings.samples import make_flight
+from tests.recordings.samples import make_rows
 
 HEADER = TableHeader(
     mavgate_version="0.1.0",
@@ -26,12 +26,6 @@ HEADER = TableHeader(
     settings={"sensing": {"accel_cutoff_hz": 10.0}},
     calibration={"accel_bias_mps2": [0.1, 0.2, 0.3]},
 )
-
-
-def make_rows(seed: int, count: int = 20) -> list[TableRow]:
-    builder = RowBuilder()
-    records = make_flight(np.random.default_rng(seed), count)
-    return [row for record in records for row in builder.add(record)] + builder.flush()
 
 
 def make_table(rows: list[TableRow]) -> bytes:

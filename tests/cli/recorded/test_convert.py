@@ -17,8 +17,8 @@ from gateway.recordings.table import TableFault, TableHeader, TableReader
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.wire.mavlink_splitter import origin_of
 from tests.kit.cli import run
+from tests.recordings.flights import fly, make_flight
 from tests.recordings.frames import START_US, make_records, make_tlog
-from tests.recordings.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 

@@ -14,7 +14,7 @@ from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableReader, encode_head, encode_line
 from tests.kit.cli import invoke
 from tests.kit.cli import run as run_words
-from tests.recordings.test_replay import fly_from_the_middle
+from tests.recordings.flights import fly_from_the_middle
 from tools.make_golden import GOLDEN
 
 pytestmark = pytest.mark.io

@@ -20,8 +20,8 @@ from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.table import encode_head
 from tests.kit.cli import invoke
+from tests.recordings.flights import fly, make_flight, read
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
-from tests.recordings.test_replay import fly, make_flight, read
 
 pytestmark = pytest.mark.io
 
@@ -133,8 +133,7 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
 
 
 def test_unknown_name_is_refused(config: Path) -> None:
-    result = invoke("info", "sea", "--config", config)
-    assert result.exit_code == 2
+    result = invoke("info", "sea", "--config", config, code=2)
     assert "record list" in result.output
 
 

@@ -12,8 +12,7 @@ pytestmark = pytest.mark.io
 def test_playing_commands_beyond_this_machine_needs_a_confirmation(tmp_path: Path) -> None:
     file = str(tmp_path / "missing.tlog")
     away = ("--endpoint", "udp:tablet.example:14550")
-    asked = invoke("play", file, "--with-commands", *away, answers="n\n")
-    assert asked.exit_code == 1
+    asked = invoke("play", file, "--with-commands", *away, answers="n\n", code=1)
     assert "udp:tablet.example:14550" in asked.output
     for options in (("--yes", *away), ("--endpoint", "udp:127.0.0.1:14550")):
         # They get as far as the file.
@@ -26,6 +25,5 @@ def test_playing_commands_beyond_this_machine_needs_a_confirmation(tmp_path: Pat
 @pytest.mark.parametrize("speed", ["0", "nan", "101", "fast", ""])
 @pytest.mark.parametrize("words", [["play", "x.tlog", "--speed"], ["player", "speed"]])
 def test_speed_out_of_range_is_refused(words: list[str], speed: str) -> None:
-    done = invoke(*words, speed)
-    assert done.exit_code == 2
+    done = invoke(*words, speed, code=2)
     assert f"speed {speed!r}: write 0.1 to 100, or max" in done.output

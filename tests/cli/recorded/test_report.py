@@ -26,8 +26,7 @@ def test_recording_is_compared_with_other_settings(
     other.write_text('[estimation]\nestimator = "paper"\n')
     folder = tmp_path / "out"
     arguments = ["--against-config", str(other), "--reference", str(recording), "-o", str(folder)]
-    result = invoke("report", recording, *arguments)
-    assert result.exit_code == 0, result.output
+    invoke("report", recording, *arguments, code=0)
     page = (folder / "index.html").read_text(encoding="utf-8")
     assert "Flight report: flight.csv" in page
     assert "Comparison" in page
@@ -38,8 +37,7 @@ def test_recording_is_compared_with_other_settings(
 def test_file_without_rows_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.csv"
     empty.write_text(encode_head(TableHeader()))
-    result = invoke("report", empty, "-o", tmp_path / "out")
-    assert result.exit_code == 2
+    result = invoke("report", empty, "-o", tmp_path / "out", code=2)
     assert "holds no row" in result.output
     assert not (tmp_path / "out").exists()
 
@@ -49,8 +47,7 @@ def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         return None if name == "jinja2" else find_spec(name)
 
     monkeypatch.setattr(report, "find_spec", without)
-    result = invoke("report")
-    assert result.exit_code == 2
+    result = invoke("report", code=2)
     assert "needs jinja2, the extra mavgate[plot]" in result.output
     assert "-m pip install 'mavgate[plot]'\n" in result.output
 
@@ -66,14 +63,12 @@ def test_full_disk_is_reported_with_its_folder(
     monkeypatch.setattr("gateway.analysis.reporting.compose.make_report", lambda *_: empty)
     monkeypatch.setattr("gateway.analysis.case.make_case", lambda *_, **__: None)
     monkeypatch.setattr(report, "load_flight", lambda *_: None)
-    result = invoke("report", "-o", tmp_path / "page")
-    assert result.exit_code == 2
+    result = invoke("report", "-o", tmp_path / "page", code=2)
     assert f"{tmp_path / 'page'}: No space left" in result.output
 
 
 def test_folder_that_is_not_empty_needs_force(tmp_path: Path) -> None:
     (tmp_path / "index.html").write_text("mine")
-    result = invoke("report", "-o", tmp_path)
-    assert result.exit_code == 2
+    result = invoke("report", "-o", tmp_path, code=2)
     assert "use --force to overwrite" in result.output
     assert (tmp_path / "index.html").read_text() == "mine"

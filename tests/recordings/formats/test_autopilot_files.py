@@ -17,22 +17,21 @@ from gateway.analysis.metrics import rms, rotation_error, total_error_rad
 from gateway.cli.support.options import read_options
 from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
-from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import FlightError
 from gateway.recordings.flown import open_flown
 from gateway.recordings.opening import open_flights
-from gateway.recordings.reading import ReadOptions, RecordedTable, open_rows
+from gateway.recordings.reading import RecordedTable, open_rows
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.kit.cli import run
+from tests.recordings.flights import OPTIONS
 from tests.recordings.formats import flown
 
 pytestmark = pytest.mark.io
 
 TODAY = GatewaySettings()
 
-OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 MAKERS: dict[str, tuple[Callable[[], bytes], int]] = {
     "new.ulg": (flown.make_ulog, 7),
     "old.ulg": (lambda: flown.make_ulog(old=True), 7),

@@ -9,19 +9,16 @@ import pyarrow.parquet as pq
 import pytest
 
 from gateway.config import GatewaySettings
-from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
-from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.reading import header_for
 from gateway.recordings.table import TableMark, encode_line
 from tests.kit.cli import run
+from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
-from tests.recordings.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
-
-OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
 
 
 @pytest.fixture

@@ -21,25 +21,23 @@ from mcap.reader import make_reader
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.config import GatewaySettings
-from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_frames, tracks_of_table
-from gateway.recordings.reading import ReadOptions, aircraft_of, header_for, open_rows
+from gateway.recordings.reading import aircraft_of, header_for, open_rows
 from gateway.recordings.table import TableMark, encode_line
 from gateway.recordings.tlog import TlogRecord, encode_record
 from gateway.records import NodeId, NodeStatus
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from tests.recordings.flights import OPTIONS, fly, make_flight
 from tests.recordings.formats import flown
 from tests.recordings.frames import START_US
-from tests.recordings.test_replay import fly, make_flight
 
 pytestmark = pytest.mark.io
 
 AIRCRAFT = GatewaySettings().default_aircraft
-OPTIONS = ReadOptions(PipelineSettings(AIRCRAFT))
 SECONDS = 20
 """Of the autopilots' logs."""
 

@@ -1,0 +1,126 @@
+"""Flights fused live and recorded, for the tests of recordings."""
+
+import math
+
+import msgspec
+import numpy as np
+
+from gateway.aircraft import AircraftSettings
+from gateway.config import GatewaySettings
+from gateway.estimation.select import EstimationSettings
+from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
+from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
+from gateway.records import (
+    BaroRaw,
+    FusedSample,
+    FusionState,
+    GpsFix,
+    ImuFlags,
+    ImuRaw,
+    NavState,
+    NodeId,
+    RawRecord,
+)
+from gateway.sensing.calibration import NodeCalibration
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.kit.records import fix_at
+
+OPTIONS = ReadOptions(PipelineSettings(GatewaySettings().default_aircraft))
+"""Files are read and fused with the default settings."""
+IMU_US = 16_000
+CALIBRATION = NodeCalibration(
+    accel_bias_mps2=(0.1, -0.2, 1 / 3), gyro_bias_radps=(0.01, 0.02, -0.03)
+)
+
+
+def make_settings(estimator: str) -> AircraftSettings:
+    return AircraftSettings(
+        estimation=msgspec.convert(
+            {"estimator": estimator, "paper": {"accel_cutoff_hz": 7.3}}, EstimationSettings
+        ),
+        vehicle=VehicleSettings(signing_passphrase="secret"),
+        calibration=CALIBRATION,
+    )
+
+
+def make_flight(rng: np.random.Generator, seconds: float) -> list[RawRecord]:
+    """Fly a circle, with fixes and pressures that sometimes bunch up or come out of step."""
+    records: list[RawRecord] = []
+    node, count = NodeId(1, 0), int(seconds * 1e6 / IMU_US)
+    for i in range(count):
+        t = i * IMU_US + int(rng.integers(2000))
+        if i % 6 == 0 or rng.random() < 0.02:
+            records.append(BaroRaw(t, node, t, 100_000.0 - 0.1 * i + rng.normal(), 20.1))
+        if i % 12 == 3 or rng.random() < 0.02:
+            records.append(make_fix(t, rng))
+        accel = (rng.normal(size=3) * 40 + (0, 600, 4096)).astype(int).tolist()
+        gyro = (rng.normal(size=3) * 10 + (0, 0, 600)).astype(int).tolist()
+        mag = (rng.normal(size=3) * 3 + (200, 30, -400)).astype(int).tolist()
+        flags = ImuFlags.MAG_NEW if i % 4 == 0 else ImuFlags(0)
+        records.append(
+            ImuRaw(t, node, t, tuple(accel), tuple(gyro), tuple(mag), 500, 8, 500, 1090, flags)
+        )
+    return records
+
+
+def make_fix(time_us: int, rng: np.random.Generator) -> GpsFix:
+    angle = time_us * 1e-6 * 0.2
+    return fix_at(
+        time_us,
+        node_time_us=time_us,
+        itow_ms=time_us // 1000,
+        lat_dege7=471_234_567 + round(9000 * math.sin(angle)),
+        lon_dege7=85_678_901 + round(13_000 * math.cos(angle)),
+        alt_amsl_m=430.123 + float(rng.normal()),
+        vel_n_mps=(20 * math.cos(angle), -20 * math.sin(angle), 0.1),
+        alt_ellipsoid_m=math.nan,
+        utc_us=1_781_187_930_000_000 + time_us,
+    )
+
+
+def fly(settings: AircraftSettings, records: list[RawRecord]) -> tuple[bytes, list[NavState]]:
+    """Fuse live, and record as the recorder does."""
+    pipeline, rows = Pipeline(PipelineSettings(settings)), RowBuilder()
+    lines, states = [encode_head(header_for(settings, 1))], []
+    for record in records:
+        for action in pipeline.take(record, record.time_us).records:
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                lines += map(row_to_line, rows.add(action))
+            if isinstance(action, FusedSample):
+                states.append(action.state)
+    return "".join(lines).encode(), states
+
+
+def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:
+    reader = TableReader()
+    rows = [row for row in reader.feed(table, final=True) if isinstance(row, TableRow)]
+    assert reader.header is not None
+    return reader.header, rows
+
+
+def fly_from_the_middle(
+    estimator: str, rng: np.random.Generator
+) -> tuple[AircraftSettings, FusionState, list[TableRow]]:
+    """Fly, and keep only what was remembered in the middle and the rows behind it."""
+    settings = make_settings(estimator)
+    pipeline, builder = Pipeline(PipelineSettings(settings)), RowBuilder()
+    records = make_flight(rng, 30)
+    state: FusionState | None = None
+    rows: list[TableRow] = []
+    for number, record in enumerate(records):
+        if number == len(records) // 2:
+            state = pipeline.aircraft[1].fusion_state
+            builder.flush()
+            rows.clear()
+        for action in pipeline.take(record, record.time_us).records:
+            if isinstance(action, FusedSample | BaroRaw | GpsFix):
+                rows += builder.add(action)
+    assert state is not None
+    text = encode_head(header_for(settings, 1)) + encode_line(state)
+    text += "".join(map(row_to_line, rows))
+    found, *again = TableReader().feed(text.encode(), final=True)
+    assert isinstance(found, FusionState)
+    assert repr(again) == repr(rows)
+    return settings, found, rows
