@@ -12,22 +12,11 @@ from typing import Literal
 from playwright.sync_api import Page, ViewportSize, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from tests.panel.browsing import Process, launch
+from tests.panel.browsing import CONFIG_WITHOUT_MAP, Process, launch
 
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 START_S = 180.0
 AIRBORNE_M = 60.0
-CONFIG = """
-aircraft_folder = "{folder}/aircraft"
-[hub]
-endpoints = []
-[recording]
-folder = "{folder}/recordings"
-[panel]
-port = 0
-tiles_folder = "{folder}/tiles"
-map_styles = []
-"""
 SHOTS: tuple[tuple[str, Literal["dark", "light"]], ...] = (("flight", "dark"), ("map", "light"))
 AS_WITH_A_GRAPHICS_CARD = """
 const extension = WebGLRenderingContext.prototype.getExtension;
@@ -77,7 +66,7 @@ def main() -> None:
     draw_flight_page()
     with (
         tempfile.TemporaryDirectory() as folder,
-        Process(Path(folder), "demo", "--plain", config=CONFIG) as demo,
+        Process(Path(folder), "demo", "--plain", config=CONFIG_WITHOUT_MAP) as demo,
         sync_playwright() as playwright,
     ):
         link, browser = demo.link(), launch(playwright)

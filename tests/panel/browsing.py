@@ -59,6 +59,17 @@ map_styles = [
   {{name = "Other", url = "{folder}/other.mbtiles", max_zoom = 18}},
 ]
 """
+CONFIG_WITHOUT_MAP = """
+aircraft_folder = "{folder}/aircraft"
+[hub]
+endpoints = []
+[recording]
+folder = "{folder}/recordings"
+[panel]
+port = 0
+tiles_folder = "{folder}/tiles"
+map_styles = []
+"""
 
 needs_chromium = pytest.mark.skipif(
     not CHROMIUM.exists(),
