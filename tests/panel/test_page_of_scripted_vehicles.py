@@ -10,21 +10,20 @@ from playwright.sync_api import Browser, Locator, Page, expect
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import to_euler
-from tests.panel.browsing import WAIT_MS, Process, needs_chromium, open_page, show
+from tests.panel.browsing import (
+    CONFIG_WITHOUT_MAP,
+    WAIT_MS,
+    Process,
+    needs_chromium,
+    open_page,
+    show,
+)
 from tests.panel.scripted_vehicle import HOSTILE_MARKUP, HOSTILE_NAMES, ScriptedVehicle
 from tests.panel.test_recording_files import flight
 
 pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 expect.set_options(timeout=WAIT_MS)
 
-CONFIG = """
-[recording]
-folder = "{folder}/recordings"
-[panel]
-port = 0
-tiles_folder = "{folder}/tiles"
-map_styles = []
-"""
 VIEWS = (
     "flight", "map", "link", "recordings", "calibration", "tuning", "plots", "events",
 )  # fmt: skip
@@ -81,7 +80,7 @@ def page(
         with contextlib.suppress(OSError):
             (folder / "recordings" / f"{name.replace('/', '')}_01.tlog").write_bytes(flight())
     connect = f"udp-listen:127.0.0.1:{vehicle.port}"
-    panel = Process(folder, "panel", "--connect", connect, config=CONFIG)
+    panel = Process(folder, "panel", "--connect", connect, config=CONFIG_WITHOUT_MAP)
     opened = open_page(browser, panel.link(), script=LISTEN)
     opened.on("console", lambda message: message.type == "error" and troubles.append(message.text))
     opened.on("pageerror", lambda error: troubles.append(str(error)))
@@ -196,6 +195,25 @@ def test_hostile_names_and_texts_do_not_run_as_scripts(page: Page, troubles: lis
     page.keyboard.press("Escape")
     assert page.evaluate("typeof q") == "undefined"
     assert troubles == []
+
+
+def test_parameter_keeps_focus_and_typed_text_when_the_list_grows(
+    page: Page, vehicle: ScriptedVehicle
+) -> None:
+    page.get_by_label("Aircraft", exact=True).click()
+    page.get_by_role("option", name="Plane 2").click()
+    show(page, "tuning")
+    field = page.get_by_label("{{q=1}}", exact=True)
+    field.fill("7.5")
+    vehicle.hostile_names = [*HOSTILE_NAMES, "LATE"]
+    count = f"{len(vehicle.hostile_names)} parameters"
+    expect(page.locator("section[data-view='tuning'] .tools").get_by_text(count)).to_be_visible()
+    expect(field).to_be_focused()
+    expect(field).to_have_value("7.5")
+    late = page.locator(".parameter[data-name='LATE']")
+    expect(late).to_have_count(0)
+    page.get_by_label("Search", exact=True).click()
+    expect(late).to_be_visible()
 
 
 def test_policy_of_the_page_stops_an_injected_script(page: Page) -> None:

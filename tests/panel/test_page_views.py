@@ -159,7 +159,7 @@ def test_selected_orientation_of_the_board_is_stored(desk: Desk) -> None:
     picture = view.locator(".mounting-picture")
     desk.page.wait_for_function("document.querySelector('.mounting-picture')?.naturalWidth > 0")
     expect(picture).to_be_visible()
-    # The step is built again once the parameters are loaded.
+    # Once the parameters are loaded.
     expect(view.get_by_role("button", name="Use it")).to_be_enabled()
     choice = view.get_by_label("Orientation of the board")
     expect(choice).to_have_value("face up, arrow to the nose")
@@ -195,8 +195,11 @@ def test_magnetometer_calibration_is_drawn_and_undone(desk: Desk) -> None:
     expect(view.locator(".figures")).to_contain_text("directions uncovered")
     # One that turns about a single axis sees no more than a ring of these.
     desk.page.wait_for_function("document.querySelector('canvas.field-sphere').dataset.seen > 22")
+    sphere.evaluate("(element) => { window.turned = element; }")
     view.get_by_role("button", name="Cancel").click()
     expect(view.locator(".now")).to_contain_text("Nothing has changed")
+    # The same element, which the user may have turned or focused.
+    assert sphere.evaluate("(element) => element === window.turned")
     desk.receiver.is_turned = False
     assert desk.kept == kept
 

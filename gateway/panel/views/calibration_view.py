@@ -102,7 +102,7 @@ class CalibrationView:
         self._refresh()
 
     def _refresh(self) -> None:
-        """Rebuild the guide if its structure changed; otherwise only update values."""
+        """Show the present state; the guide is built again for another step or another run."""
         if self._context.system_id is not None:
             self._context.parts.dialogues.load(self._context.system_id)
         run, dialogue = self._run(), self._context.dialogue
@@ -117,12 +117,14 @@ class CalibrationView:
                 card.props(remove="aria-current")
             outcome, look = self._outcomes.get(step, ("", ""))
             state.classes(look, replace="state").set_text(outcome)
-        guide = (self._step, run, run and run.state, ready)
-        if guide != self._drawn:
-            self._drawn = guide
-            self._build_guide(run, ready=ready)
-        if run is not None:
-            self._move(run)
+        # Not for each state of a run: buttons that are replaced would lose clicks and the focus.
+        if (self._step, run) != self._drawn:
+            self._drawn = (self._step, run)
+            self._build_guide()
+        if self._step is CalibrationStep.MOUNTING:
+            self._refresh_mounting(ready=ready)
+        else:
+            self._refresh_guide(run, ready=ready)
 
     def _build_step(self, step: CalibrationStep) -> tuple[ui.element, ui.label]:
         """Build a button once: one that is replaced would lose clicks and the focus."""
@@ -144,29 +146,50 @@ class CalibrationView:
         self._step = step
         self._refresh()
 
-    def _build_guide(self, run: CalibrationRun | None, *, ready: bool) -> None:
+    def _build_guide(self) -> None:
         self._guide.clear()
         with self._guide:
             heading(TITLES[self._step][0])
             if self._step is CalibrationStep.MOUNTING:
-                self._build_mounting(ready=ready)
-                return
-            self._now = ui.label(self._what_now(run, ready=ready)).classes("now")
-            if run is not None and run.state.is_over:
-                self._now.classes("good" if run.state is RunState.DONE else "bad")
-            self._progress = ui.linear_progress(0.0, show_value=False)
-            self._progress.props('aria-label="Progress" instant-feedback')
-            self._progress.set_visibility(run is not None and not run.state.is_over)
-            if self._step is CalibrationStep.ACCEL:
-                self._build_poses()
-            if self._step is CalibrationStep.MAG:
-                self._build_cloud()
-            self._build_buttons(run, ready=ready)
-            if run is not None and run.state is RunState.DONE:
-                self._build_residuals(run)
+                self._build_mounting()
+            else:
+                self._now = ui.label()
+                self._progress = ui.linear_progress(0.0, show_value=False)
+                self._progress.props('aria-label="Progress" instant-feedback')
+                if self._step is CalibrationStep.ACCEL:
+                    self._build_poses()
+                if self._step is CalibrationStep.MAG:
+                    self._build_cloud()
+                with ui.element("div").classes("buttons"):
+                    self._buttons = {
+                        "cancel": _button("Cancel", None, self._cancel, quiet=True),
+                        "store": _button("Store it", "save", self._store),
+                        "undo": _button("Undo it", "undo", self._undo, quiet=True),
+                        "start": _button("Start", "play_arrow", self._start),
+                    }
+                self._residuals = DataTable(("", "before", "after")).classes("residuals")
+                self._residuals.set_visibility(False)
             ui.label(GUIDE[self._step]).classes("soft guide-note")
 
-    def _build_mounting(self, *, ready: bool) -> None:
+    def _refresh_guide(self, run: CalibrationRun | None, *, ready: bool) -> None:
+        runs = run is not None and not run.state.is_over
+        done = run is not None and run.state is RunState.DONE
+        look = "good" if done else "" if run is None or runs else "bad"
+        self._now.classes(look, replace="now").set_text(self._what_now(run, ready=ready))
+        self._progress.set_visibility(runs)
+        for name, shown in (("cancel", runs), ("store", done), ("undo", done), ("start", not runs)):
+            self._buttons[name].set_visibility(shown)
+        start = self._buttons["start"]
+        start.set_enabled(self._may_calibrate and ready)
+        start.set_text("Start" if run is None else "Again")
+        start.classes("" if run is None else "quiet")
+        if run is not None:
+            self._move(run)
+            if done and not self._residuals.visible:
+                self._show_residuals(run)
+        self._residuals.set_visibility(done)
+
+    def _build_mounting(self) -> None:
         ui.label(
             "Choose how the board lies in the aircraft, seen from above. Its x arrow is printed "
             "next to the chips; both the IMU and the compass are set."
@@ -175,14 +198,20 @@ class CalibrationView:
             picture = ui.element("img").classes("mounting-picture")
         picture.props["src"] = "/web/mounting.svg"
         picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
-        # Set here alone: a refresh must not change a choice that is not used yet.
-        self._choice = ui.select([*ORIENTATIONS, MEASURED], value=self._orientation())
+        self._choice = ui.select([*ORIENTATIONS, MEASURED])
         self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
         with ui.element("div").classes("buttons"):
-            may = self._may_calibrate and ready
-            _button("Use it", "check", self._mount, enabled=may)
-            _button("Store it", "save", self._store, quiet=True, enabled=may)
-        ui.label(GUIDE[self._step]).classes("soft guide-note")
+            self._buttons = {
+                "use": _button("Use it", "check", self._mount),
+                "store": _button("Store it", "save", self._store, quiet=True),
+            }
+
+    def _refresh_mounting(self, *, ready: bool) -> None:
+        # Set once alone: a refresh must not change a choice that is not used yet.
+        if ready and self._choice.value is None:
+            self._choice.set_value(self._orientation())
+        for button in self._buttons.values():
+            button.set_enabled(self._may_calibrate and ready)
 
     def _orientation(self) -> str:
         """Return which of the orientations the parameters have."""
@@ -262,28 +291,14 @@ class CalibrationView:
                     with ui.element("dd"):
                         self._figures[name] = ui.label()
 
-    def _build_buttons(self, run: CalibrationRun | None, *, ready: bool) -> None:
-        may = self._may_calibrate
-        with ui.element("div").classes("buttons"):
-            if run is not None and not run.state.is_over:
-                _button("Cancel", None, self._cancel, quiet=True)
-                return
-            if run is not None and run.state is RunState.DONE:
-                _button("Store it", "save", self._store)
-                _button("Undo it", "undo", self._undo, quiet=True)
-            again = run is not None
-            text = "Again" if again else "Start"
-            _button(text, "play_arrow", self._start, quiet=again, enabled=may and ready)
-
-    def _build_residuals(self, run: CalibrationRun) -> None:
+    def _show_residuals(self, run: CalibrationRun) -> None:
         found = [(f"{r.name} ({r.unit})", r.before, r.after) for r in run.residuals()]
         metas = self._context.dialogue.metas if self._context.dialogue else {}
         for name, (old, new) in self._changes().items():
             meta = metas.get(name)
             words = f"{meta.short} ({unit_text(meta.unit)}), {name}" if meta else name
             found.append((words, old, new))
-        table = DataTable(("", "before", "after")).classes("residuals")
-        table.show({name: (name, _figure(old), _figure(new)) for name, old, new in found})
+        self._residuals.show({name: (name, _figure(old), _figure(new)) for name, old, new in found})
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         """Return the parameters that the calibration changed."""
@@ -375,11 +390,9 @@ class CalibrationView:
         self._refresh()
 
 
-def _button(
-    text: str, icon: str | None, act: Any, *, quiet: bool = False, enabled: bool = True
-) -> None:
+def _button(text: str, icon: str | None, act: Any, *, quiet: bool = False) -> ui.button:
     button = ui.button(text, icon=icon, on_click=act).props("no-caps unelevated")
-    button.classes("quiet" if quiet else "").set_enabled(enabled)
+    return button.classes("quiet" if quiet else "")
 
 
 def _figure(value: float) -> str:

@@ -188,6 +188,9 @@ class RecordingsView:
         folder = self._context.parts.recordings_folder
         with ongoing(f"Opening {name} …"):
             await self._play(self._playback.open, folder, name, fused_again=fused_again)
+        if self._playback.status is not None:
+            # The new player does not know the speed that was chosen for another.
+            self._speed.set_value(1)
 
     async def _on_fused_again(self, event: Any) -> None:
         if self._playback.name and event.value != self._playback.has_fused_again:

@@ -32,6 +32,7 @@ class ParameterRow:
         value = dialogue.parameters.entries[meta.name].value
         self._settled: float | None = value
         """Value of the field while nothing else is typed."""
+        self.has_focus = False
         with ui.element("div").classes("parameter") as self._row:
             self._row.props["data-name"] = meta.name
             with ui.element("div"):
@@ -78,6 +79,8 @@ class ParameterRow:
             # Only a finished value is sent, not each typed digit.
             field.on("keydown.enter", lambda: self._set(field.value))
             field.on("blur", lambda: self._set(field.value))
+        field.on("focus", lambda: setattr(self, "has_focus", True))
+        field.on("blur", lambda: setattr(self, "has_focus", False))
         field.props["aria-label"] = meta.name
         field.set_enabled(may)
         return field
@@ -303,7 +306,9 @@ class TuningView:
         self._state.set_text(_state_of(dialogue))
         complete = dialogue.parameters.state is ListState.COMPLETE
         state = (system_id, len(dialogue.parameters.entries), len(dialogue.metas))
-        if complete and state != self._grouped:
+        # The list waits while a field is edited, which would lose its text and the focus.
+        is_edited = any(row.has_focus for row in self._rows.values())
+        if complete and state != self._grouped and not is_edited:
             self._grouped = state
             groups = sorted(
                 {_group_of(name, dialogue.metas) for name in dialogue.parameters.entries}
