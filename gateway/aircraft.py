@@ -85,20 +85,8 @@ class AircraftSettings(Settings, frozen=True):
 class Aircraft:
     """The stages of one aircraft, from its raw records on.
 
-    Parameters
-    ----------
-    vehicle_id : int
-        Id in the frames of its nodes; MAVLink system id.
-    settings : AircraftSettings
-        Of all stages.
-    clock : SigningClock, optional
-        Civil time.
-    timestamps : SigningTimestamps, optional
-        The signing timestamps accepted before.
-    stored : StoredPlan, optional
-        Missions, mark and home kept from an earlier run.
-    fused : FusedStates, optional
-        The states of a recording, in place of an estimator.
+    Its id is that in the frames of its nodes, and its MAVLink system id. The states of a recording
+    that was fused already take the place of the estimator.
     """
 
     def __init__(
@@ -237,24 +225,9 @@ class Aircraft:
 def make_fusion(
     settings: AircraftSettings, state: FusionState | None = None
 ) -> tuple[SensorChain, Estimator]:
-    """Build the two stages that turn raw records into navigation states.
+    """Build the two stages that turn raw records into navigation states, and restore their state.
 
-    Parameters
-    ----------
-    settings : AircraftSettings
-        Of the aircraft.
-    state : FusionState, optional
-        To restore; without it they start fresh.
-
-    Returns
-    -------
-    chain : SensorChain
-    estimator : Estimator
-
-    Raises
-    ------
-    ValueError
-        If the state is of another version or other settings, or damaged.
+    Raises ValueError if the state is of another version or other settings, or damaged.
     """
     chain = SensorChain(settings.calibration)
     estimator = make_estimator(settings.estimation)

@@ -25,17 +25,9 @@ class ExtensionError(UserError):
 
 
 def load_extensions() -> tuple[str, ...]:
-    """Call the function of every installed extension.
+    """Call the function of every installed extension, and return their names.
 
-    Returns
-    -------
-    tuple of str
-        Their names.
-
-    Raises
-    ------
-    ExtensionError
-        If one cannot be imported, or an addition is refused.
+    Raises ExtensionError if one cannot be imported, or an addition is refused.
     """
     found = []
     for entry in entry_points(group=GROUP):

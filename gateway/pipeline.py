@@ -40,7 +40,7 @@ from gateway.wire.timesync import GpsTime
 
 REPORT_INTERVAL_US: Final = US_PER_S
 GONE_US: Final = 600 * US_PER_S
-"""An aircraft that was silent for so long disappears; longer than a change of batteries."""
+"""Timeout after which an aircraft disappears; longer than a change of batteries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,13 +61,7 @@ class PipelineSettings:
 
 
 class Pipeline:
-    """All stages between the source's bytes and the clients' frames.
-
-    Parameters
-    ----------
-    settings : PipelineSettings
-        The settings of all stages.
-    """
+    """All stages between the source's bytes and the clients' frames."""
 
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
@@ -144,7 +138,7 @@ class Pipeline:
             self.signer.keys[aircraft.vehicle_id] = key
 
     def find(self, vehicle_id: int) -> Aircraft:
-        """Return an aircraft that was ever heard; raises KeyError for another."""
+        """Return an aircraft that was ever received; raises KeyError for another."""
         found = self.aircraft.get(vehicle_id)
         return self._gone[vehicle_id] if found is None else found
 
@@ -163,20 +157,9 @@ class Pipeline:
         self._aircraft_of(state.vehicle_id).restore(state)
 
     def sign_by(self, common: str, own: Mapping[int, str], now_us: int) -> Outputs:
-        """Sign, and check signatures, with other passphrases from now on.
+        """Sign, and check signatures, with other passphrases from now on; empty is none.
 
-        Parameters
-        ----------
-        common : str
-            Of every aircraft without its own; empty for none.
-        own : mapping of int to str
-            By vehicle id.
-        now_us : int
-            Gateway clock.
-
-        Returns
-        -------
-        Outputs
+        `common` is that of every aircraft without its own.
         """
         known = self._settings
         aircraft = {
@@ -234,10 +217,7 @@ class Pipeline:
     def mark(self, location: Location | None, vehicle_id: int | None, now_us: int) -> Outputs:
         """Mark a location for one aircraft, or for all, or clear the mark.
 
-        Raises
-        ------
-        ValueError
-            If the position is invalid, or the aircraft was never heard.
+        Raises ValueError if the position is invalid, or the aircraft is not known.
         """
         wanted = [a for a in self.aircraft.values() if vehicle_id in (None, a.vehicle_id)]
         if not wanted:

@@ -404,8 +404,8 @@ def calibrate_accelerometer(
     samples: Sequence[NodeSamples], calibration: NodeCalibration
 ) -> NodeCalibration:
     """Fit the accelerometer to the poses in the samples, each part one or more of them."""
-    poses = [distinct_poses(s.accel, still_windows(s)) for s in samples]
-    fit = solve_accelerometer(_distinct(np.vstack([np.empty((0, 3)), *poses])))
+    poses = _poses_of(samples)
+    fit = solve_accelerometer(distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))]))
     return msgspec.structs.replace(
         calibration,
         accel_bias_mps2=fit.bias,
@@ -517,9 +517,8 @@ _PARTS: Final = (
 
 def sides_of(samples: Sequence[NodeSamples]) -> set[int]:
     """Return the sides on which it lay: 0 to 5 where +x, -x, +y, -y, +z, -z reads gravity."""
-    means = [distinct_poses(s.accel, still_windows(s)) for s in samples]
     seen = set()
-    for mean in np.vstack([np.empty((0, 3)), *means]):
+    for mean in _poses_of(samples):
         axis = int(np.abs(mean).argmax())
         if abs(mean[axis]) > SIDE_SHARE * STANDARD_GRAVITY_MPS2:
             seen.add(2 * axis + int(mean[axis] < 0.0))
@@ -545,8 +544,10 @@ def field_sides(samples: NodeSamples) -> int:
     return int(sides * min(1.0, spread / FIELD_SPREAD))
 
 
-def _distinct(poses: FloatArray) -> FloatArray:
-    return distinct_poses(poses, [slice(k, k + 1) for k in range(len(poses))])
+def _poses_of(samples: Sequence[NodeSamples]) -> FloatArray:
+    """Average the specific force of each pose in each part of the samples."""
+    poses = [distinct_poses(part.accel, still_windows(part)) for part in samples]
+    return np.vstack([np.empty((0, 3)), *poses])
 
 
 def _force(samples: NodeSamples, calibration: NodeCalibration) -> Vec3:

@@ -135,12 +135,8 @@ class ControlStatus(_Extra):
 class MessagePacker:
     """Packs one kind of message from its values, without pymavlink's message object.
 
-    Building and packing that object takes three times as long.
-
-    Parameters
-    ----------
-    kind : type
-        Class of pymavlink's dialect whose fields are all numbers or arrays of numbers.
+    Building and packing that object takes three times as long. All fields of the message must be
+    numbers or arrays of numbers.
     """
 
     __slots__ = ("crc_extra", "has_target", "message_id", "name", "pack", "types", "wire_order")

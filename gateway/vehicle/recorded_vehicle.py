@@ -142,16 +142,9 @@ class _Commands(Service):
 
 
 class RecordedVehicle:
-    """One vehicle of a recording.
+    """One vehicle of a recording, under the system id with which it is played.
 
-    Parameters
-    ----------
-    system_id : int
-        Its MAVLink system id, as it is played.
-    answers : Answers
-        The contents of its log.
-    metadata : Metadata, optional
-        Of the parameters, used where the recorded ones are those.
+    Metadata of the parameters is used where the recorded ones are those that it describes.
     """
 
     def __init__(self, system_id: int, answers: Answers, metadata: Metadata | None = None) -> None:

@@ -55,7 +55,7 @@ from gateway.vehicle.services.commands import (
 )
 from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.operator_control import REQUEST_OPERATOR_CONTROL, OperatorControl
-from gateway.vehicle.services.parameter_service import PACKED_PATH, ParameterService
+from gateway.vehicle.services.parameter_service import HOME_SECTION, PACKED_PATH, ParameterService
 from gateway.vehicle.services.parameters import Metadata, ParameterTable
 from gateway.vehicle.services.plan_service import PlanService
 from gateway.vehicle.telemetry.announcements import Announcements, Announcer
@@ -64,7 +64,6 @@ from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 OWN_SECTION: Final = "vehicle"
-HOME_SECTION: Final = "home"
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
 """A refusal is announced to all at most this often: enough as a warning, without a flood."""
@@ -88,18 +87,9 @@ class Vehicle:
     ) -> None:
         """Start without any data.
 
-        Parameters
-        ----------
-        settings : VehicleSettings
-        system_id : int
-            MAVLink system id, 1 to 250, which is also the id in the radio payloads.
-        sections : mapping of str to Settings, optional
-            Other settings of this aircraft that ground stations may change as parameters, by the
-            key under which the change comes back.
-        clock, timestamps : optional
-            Civil time and the timestamps accepted before; needed for signing only.
-        stored : StoredPlan, optional
-            The plan of an earlier run.
+        The system id, 1 to 250, is also the id in the radio payloads. The sections are other
+        settings of this aircraft that ground stations may change as parameters, by the key under
+        which the change comes back. Clock and timestamps are needed for signing only.
         """
         self.system_id = system_id
         self.refusals = 0
@@ -128,9 +118,7 @@ class Vehicle:
 
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
         self._intervals = IntervalService(self.system_id, self.telemetry)
-        self._parameters = ParameterService(
-            self.system_id, ParameterTable(sections), {HOME_SECTION: self.plan}
-        )
+        self._parameters = ParameterService(self.system_id, ParameterTable(sections), self.plan)
         self.metadata = Metadata(self._parameters.table)
         """Descriptions of the parameters."""
         self._ftp = FtpService({**self.metadata.files, PACKED_PATH: self._parameters.packed})

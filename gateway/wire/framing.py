@@ -55,22 +55,9 @@ def crc16(content: bytes) -> int:
 
 
 def encode_frame(content: bytes) -> bytes:
-    """Build the bytes of one frame, delimiter included.
+    """Build one frame: COBS-encoded content and CRC (little-endian), then a zero.
 
-    Parameters
-    ----------
-    content : bytes
-        At most `MAX_CONTENT` bytes.
-
-    Returns
-    -------
-    bytes
-        COBS-encoded content and CRC (little-endian), then a zero.
-
-    Raises
-    ------
-    ValueError
-        If the content is too long for a receiver to accept.
+    Raises ValueError if the content is too long for a receiver to accept.
     """
     if len(content) > MAX_CONTENT:
         raise ValueError(f"content of {len(content)} bytes; at most {MAX_CONTENT} fit a frame")
@@ -88,18 +75,9 @@ class FrameDecoder:
         """Bytes of it that were dropped, because it is too long."""
 
     def feed(self, data: bytes) -> list[bytes | Fault]:
-        """Take the next bytes from the line.
+        """Take any chunk of the line, and return the contents of the frames that it completes.
 
-        Parameters
-        ----------
-        data : bytes
-            Any chunk, from one byte to all of a recording.
-
-        Returns
-        -------
-        list of bytes or Fault
-            The content of every frame that the chunk completes, without its CRC, and every fault
-            it reveals, in order. Never raises on data.
+        They are without CRC, and in order with every fault. Never raises on data.
         """
         pieces = (self._partial + data).split(DELIMITER)
         rest = self._partial = pieces.pop()

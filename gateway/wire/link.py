@@ -150,20 +150,10 @@ class Link:
         self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
-        """Take the next bytes from the line.
+        """Take any chunk of the line, read at a time of the gateway clock, and return its records.
 
-        Parameters
-        ----------
-        data : bytes
-            Any chunk.
-        arrival_us : int
-            When the chunk was read, on the gateway clock.
-
-        Returns
-        -------
-        list of ImuRaw, BaroRaw, GpsFix or NodeStatus
-            In the order of their arrival, without duplicates; the times of one node's IMU records
-            strictly grow. Never raises on data: faults are counted.
+        They are in the order of their arrival, without duplicates; the times of one node's IMU
+        records strictly grow. Never raises on data: faults are counted.
         """
         self._bytes_received += len(data)
         records: list[RawRecord] = []

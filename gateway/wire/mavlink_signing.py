@@ -37,13 +37,7 @@ class Clock(Protocol):
 
 
 class FrameSigner:
-    """Number our own frames, and sign those of systems that have a key.
-
-    Parameters
-    ----------
-    clock : Clock, optional
-        Needed once there is a key.
-    """
+    """Number our own frames, and sign those of systems that have a key, which needs a clock."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         self.keys: dict[int, bytes] = {}
@@ -53,22 +47,10 @@ class FrameSigner:
         """Each timestamp is later than the one before."""
 
     def sequence_and_sign(self, frame: MavFrame, sequence: int, now_us: int) -> MavFrame:
-        """Return a frame with this sequence number, signed if its system has a key.
+        """Return a frame with this sequence number, signed again if its system has a key.
 
-        Parameters
-        ----------
-        frame : MavFrame
-            Signed already or not. A frame of an unknown message is returned as it is; one of
-            version 1 is numbered and never signed.
-        sequence : int
-            0 to 255.
-        now_us : int
-            Gateway time.
-
-        Returns
-        -------
-        MavFrame
-            The frame to send instead.
+        A frame of an unknown message is returned as it is; one of version 1 is numbered and never
+        signed.
         """
         key = self.keys.get(frame.origin[0]) if self.keys else None
         if key is None or self._clock is None:
@@ -80,22 +62,8 @@ class FrameSigner:
 def sign(data: bytes, sequence: int, key: bytes, timestamp: int) -> bytes:
     """Return a frame of MAVLink 2 with this sequence number and a new signature.
 
-    Parameters
-    ----------
-    data : bytes
-        A complete frame, signed or not. One of version 1 or of an unknown message is returned as
-        it is.
-    sequence : int
-        0 to 255.
-    key : bytes
-        32 bytes.
-    timestamp : int
-        Time in units of 10 us since 2015.
-
-    Returns
-    -------
-    bytes
-        The frame to send instead.
+    One of version 1 or of an unknown message is returned as it is. The key has 32 bytes; the
+    timestamp is in units of 10 us since 2015.
     """
     frame = frame_of(data)
     extra = CRC_EXTRA.get(frame.message_id)

@@ -77,18 +77,9 @@ class MavlinkSplitter:
         self._rest = b""
 
     def feed(self, data: bytes) -> list[Event]:
-        """Process the next bytes of the stream.
+        """Take any chunk of the stream, and return the frames and runs of dropped bytes it ends.
 
-        Parameters
-        ----------
-        data : bytes
-            Any chunk, from one byte on.
-
-        Returns
-        -------
-        list of MavFrame or SplitFault
-            Every complete frame, byte for byte, and every run of dropped bytes. Never raises on
-            data.
+        Frames are byte for byte as received. Never raises on data.
         """
         events, consumed = _split(self._rest + data, final=False)
         self._rest = (self._rest + data)[consumed:]
@@ -100,18 +91,7 @@ class MavlinkSplitter:
 
 
 def split_datagram(data: bytes) -> list[Event]:
-    """Cut one datagram into its frames; nothing carries over to the next.
-
-    Parameters
-    ----------
-    data : bytes
-        The whole datagram; empty gives nothing.
-
-    Returns
-    -------
-    list of MavFrame or SplitFault
-        Frames byte for byte, and runs of dropped bytes, in order.
-    """
+    """Cut one datagram into frames and runs of dropped bytes; nothing carries over to the next."""
     return _split(data, final=True)[0]
 
 
@@ -127,15 +107,7 @@ def read_datagram(data: bytes) -> MavFrame | None:
 
 
 def is_whole_frame(data: bytes, extra: bytes) -> bool:
-    """Return whether a datagram is exactly one unsigned version 2 frame of a known kind.
-
-    Parameters
-    ----------
-    data : bytes
-        The datagram.
-    extra : bytes
-        CRC_EXTRA of its message.
-    """
+    """Return whether a datagram is one unsigned version 2 frame of the kind of a CRC_EXTRA."""
     return (
         data[0] == START_V2
         and data[1] + OVERHEAD_V2 == len(data)
@@ -192,17 +164,9 @@ def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
 
 
 def to_mavlink1(frame: bytes) -> bytes | None:
-    """Encode a frame as MAVLink 1, which has neither extension fields nor signatures [1]_.
+    """Encode a frame of either version as MAVLink 1, without extension fields and signature [1]_.
 
-    Parameters
-    ----------
-    frame : bytes
-        A whole frame of either version.
-
-    Returns
-    -------
-    bytes or None
-        None if MAVLink 1 cannot carry the message, or its definition is not known.
+    Returns None if MAVLink 1 cannot carry the message, or its definition is not known.
 
     References
     ----------

@@ -70,18 +70,9 @@ class Chips(msgspec.Struct, frozen=True, gc=False):
 
 
 def chip_names(chips: Chips, sensors_present: int) -> tuple[str, ...]:
-    """Name the chips that a node has seen since its start.
+    """Name the chips that a node has found, such as `"QMC5883L"` or `"u-blox M10 at 57600 baud"`.
 
-    Parameters
-    ----------
-    chips : Chips
-    sensors_present : int
-        The node's bits: an identification of 0 is one, too, if the sensor is there.
-
-    Returns
-    -------
-    tuple of str
-        One text for each sensor, such as `"QMC5883L"` or `"u-blox M10 at 57600 baud"`.
+    An identification of 0 is one, too, if the bit of the sensor is set.
     """
     names = []
     if sensors_present & SENSOR_IMU:
@@ -269,10 +260,7 @@ class ReceiverStatusFrame(msgspec.Struct, frozen=True, gc=False):
 def encode_payload(header: Header, payload: Payload) -> bytes:
     """Build the bytes of one radio payload, at most `MAX_PAYLOAD`.
 
-    Raises
-    ------
-    struct.error
-        If a value does not fit its field.
+    Raises struct.error if a value does not fit its field.
     """
     kind, body = _encode_body(payload)
     address = header.node.vehicle_id << 3 | header.node.node_id
@@ -297,17 +285,9 @@ def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
 
 
 def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | Fault:
-    """Read the content of one checked serial frame.
+    """Read the content of one checked serial frame, without COBS and CRC.
 
-    Parameters
-    ----------
-    content : bytes
-        A frame without COBS and CRC.
-
-    Returns
-    -------
-    RadioFrame, ReceiverStatusFrame or Fault
-        The fault names what does not fit: version, kind, length or a value.
+    A fault names what does not fit: version, kind, length or a value.
     """
     size = len(content)
     if size < _RADIO_HEAD.size or content[0] != _RADIO_FIRST:

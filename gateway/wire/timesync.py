@@ -257,23 +257,10 @@ class GpsTime:
         self._offsets_us: dict[int, deque[int]] = {}
 
     def update(self, vehicle_id: int, utc_us: int, time_us: int) -> int | None:
-        """Note the time of a fix.
+        """Take in the UTC of a fix and its arrival on the gateway clock.
 
         The arrival is used as the time of the fix: late by the latency, so never in the future.
-
-        Parameters
-        ----------
-        vehicle_id : int
-            Whose fix it is.
-        utc_us : int
-            Time of the fix in µs since 1970.
-        time_us : int
-            Its arrival on the gateway clock.
-
-        Returns
-        -------
-        int or None
-            Civil time of gateway time zero in µs since 1970; None while there are too few fixes.
+        Returns UTC at the zero of the gateway clock; None while there are too few fixes.
         """
         offsets_us = self._offsets_us.setdefault(vehicle_id, deque(maxlen=RECENT))
         offsets_us.append(utc_us - time_us)

@@ -281,15 +281,7 @@ def _is_faster(requested_us: int, common_us: int) -> bool:
 
 
 class CommandService(Service):
-    """Dispatch commands by number; one without a handler is UNSUPPORTED.
-
-    Parameters
-    ----------
-    telemetry : Telemetry
-        Builds the messages that clients request.
-    explain : callable
-        Announces to all why something was refused.
-    """
+    """Dispatch commands by number; one without a handler is UNSUPPORTED."""
 
     types = ("COMMAND_LONG", "COMMAND_INT", "SET_MODE")
 
@@ -349,13 +341,7 @@ MAX_WAITING: Final = 16
 
 
 class RecordingService(Service):
-    """Start and stop the recording.
-
-    Parameters
-    ----------
-    explain : callable
-        Announces to all why something was refused.
-    """
+    """Start and stop the recording."""
 
     def __init__(self, explain: Explain) -> None:
         self._explain = explain
@@ -456,13 +442,6 @@ class QueryService(Service):
 
     A ground station that gets no answer repeats its request for seconds, so a request of something
     that does not exist here is answered too.
-
-    Parameters
-    ----------
-    build : callable
-        Builds a message, for requests of a single message.
-    explain : callable
-        Announces to all why something was refused.
     """
 
     types = ("PING", "TIMESYNC", "SETUP_SIGNING", *SINGLE, *NOTHING)

@@ -110,17 +110,11 @@ class _Session:
 
 
 File = bytes | Callable[[Request, str], bytes]
+"""The content, or a function of the request and the query of its path, such as `withdefaults=1`."""
 
 
 class FtpService(TransferService):
-    """Files of one vehicle.
-
-    Parameters
-    ----------
-    files : mapping of str to bytes or callable
-        Absolute paths, and their content, or the functions that generate it from the request and
-        the query of its path, such as `withdefaults=1`.
-    """
+    """Files of one vehicle, by their absolute paths."""
 
     types = ("FILE_TRANSFER_PROTOCOL",)
 

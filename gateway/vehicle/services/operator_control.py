@@ -63,15 +63,7 @@ class _Operator:
 
 
 class OperatorControl(Service):
-    """The ground station that controls one vehicle.
-
-    Parameters
-    ----------
-    explain : callable
-        Announces to all who has control.
-    exclusive : bool
-        Whether only the station in control may change things.
-    """
+    """The ground station that controls one vehicle; if exclusive, only that may change things."""
 
     types = ("CHANGE_OPERATOR_CONTROL",)
 

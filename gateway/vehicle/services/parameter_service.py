@@ -8,12 +8,11 @@ the metadata.
 
 from collections.abc import Mapping
 from itertools import islice
-from typing import Any, Final, Generic, Protocol, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
-from gateway.settings import Settings
 from gateway.vehicle.requests import (
     Answer,
     Reply,
@@ -36,6 +35,7 @@ from gateway.vehicle.services.parameters import (
     decode_value,
     packed_parameters,
 )
+from gateway.vehicle.services.plan_service import PlanService
 
 MAX_LISTENERS: Final = 512
 """Clients that are sent changes."""
@@ -49,6 +49,7 @@ RESET_CALIBRATION: Final = 3
 """PREFLIGHT_STORAGE_PARAMETER_ACTION."""
 CALIBRATION: Final = "calibration"
 """The section that holds the sensors' errors."""
+HOME_SECTION: Final = "home"
 
 UNKNOWN: Final = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
 BAD_VALUE: Final = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
@@ -110,37 +111,16 @@ class ReadOnlyParameters(TransferService, Generic[Entry]):
         return [_error(request, error), self.value(entry, request.client_id)]
 
 
-class OwnSection(Protocol):
-    """Parameters that are not settings: the vehicle itself applies a change."""
-
-    def change(self, settings: Settings, key: str, now_us: int) -> list[Answer]:
-        """Apply the change of one of them; ValueError refuses it."""
-        ...
-
-    def store(self) -> list[Answer]:
-        """Keep the present values over a restart."""
-        ...
-
-
 class ParameterService(ReadOnlyParameters[Parameter]):
     """Parameters of one vehicle.
 
-    Parameters
-    ----------
-    vehicle_id : int
-        Id in the radio payloads.
-    table : ParameterTable
-        All of them.
-    own : mapping of str to OwnSection
-        Sections of the table that are not settings. They have no defaults.
+    Those of home are no settings and have no defaults: the plan applies and keeps their changes.
     """
 
-    def __init__(
-        self, vehicle_id: int, table: ParameterTable, own: Mapping[str, OwnSection]
-    ) -> None:
+    def __init__(self, vehicle_id: int, table: ParameterTable, plan: PlanService) -> None:
         super().__init__()
         self.table = table
-        self._own = own
+        self._plan = plan
         self._vehicle_id = vehicle_id
         self._listeners: dict[int, None] = {}
         """Clients that have requested parameters, and are sent changes."""
@@ -185,13 +165,13 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         """
         asked = whole(command.params[0])
         if asked == WRITE:
-            own = [answer for section in self._own.values() for answer in section.store()]
-            return IN_PROGRESS, [SaveSettings(self._vehicle_id, command.request), *own]
+            save = SaveSettings(self._vehicle_id, command.request)
+            return IN_PROGRESS, [save, *self._plan.store()]
         if asked not in (RESET, RESET_CALIBRATION):
             return UNSUPPORTED, []
         before = self._numbers()
         answers: list[Answer] = []
-        for key in [key for key in self.table.sections if key not in self._own]:
+        for key in [key for key in self.table.sections if key != HOME_SECTION]:
             if (key == CALIBRATION) == (asked == RESET_CALIBRATION):
                 fresh = self.table.reset(key)
                 answers.append(SettingsChange(key, fresh))
@@ -239,8 +219,8 @@ class ParameterService(ReadOnlyParameters[Parameter]):
         try:
             settings = self.table.change(parameter, number)
             answers: list[Answer] = [SettingsChange(section, settings)]
-            if (own := self._own.get(section)) is not None:
-                answers = own.change(settings, parameter.path[0], now_us)
+            if section == HOME_SECTION:
+                answers = self._plan.change(settings, parameter.path[0], now_us)
         except ValueError:
             self.table.sections[section] = before
             return self._reject(request, BAD_VALUE)

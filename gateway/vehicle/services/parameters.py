@@ -199,10 +199,7 @@ class Parameter:
 class ParameterTable:
     """All parameters of one vehicle, in an order that never changes.
 
-    Parameters
-    ----------
-    sections : mapping of str to Settings
-        The trees of settings that may be changed live, by key.
+    The sections are the trees of settings that may be changed live, by key.
     """
 
     def __init__(self, sections: Mapping[str, Settings]) -> None:

@@ -113,17 +113,6 @@ class PlanService:
     A home that the GPS measured is measured again at every start, which may be at another field;
     one that an operator set is kept. A command keeps it at once, a parameter when the parameters
     are stored.
-
-    Parameters
-    ----------
-    vehicle_id : int
-        Id in the radio payloads.
-    telemetry : Telemetry
-        Knows where the vehicle is, and sends home and the way to the mark.
-    say : callable
-        Announces an event to all.
-    stored : StoredPlan
-        The plan kept from the last run.
     """
 
     def __init__(self, vehicle_id: int, telemetry: Telemetry, say: Say, stored: StoredPlan) -> None:

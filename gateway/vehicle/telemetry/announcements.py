@@ -117,7 +117,10 @@ def chunks(text: StatusText, number: int = 1) -> list[Answer]:
     ]
 
 
-FLAG_TEXTS: Final = (
+FlagTexts = tuple[tuple[NavFlags | ImuFlags, str, str], ...]
+"""A flag, the text when it rises, and the text when it falls."""
+
+FLAG_TEXTS: Final[FlagTexts] = (
     (NavFlags.ATTITUDE_VALID, "Attitude valid", "Attitude not valid"),
     (NavFlags.HEADING_VALID, "Heading valid", "Heading not valid"),
     (NavFlags.DEAD_RECKONING, "Position is dead-reckoned", "Position follows GPS again"),
@@ -131,16 +134,16 @@ FLAG_TEXTS: Final = (
     (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
     (NavFlags.DEGRADED, "Estimator degraded", "Estimator OK again"),
 )
-"""A flag of the estimator, the text when it rises, and the text when it falls."""
-GOOD_FLAGS: Final = NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID
-CRITICAL_FLAGS: Final = NavFlags.SENSOR_FAULT
+"""Of the estimator."""
+GOOD_FLAGS: Final = (NavFlags.ATTITUDE_VALID, NavFlags.HEADING_VALID)
 GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
 GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
-UNCALIBRATED_SENSORS: Final = (
-    (ImuFlags.MAG_UNCALIBRATED, "Compass"),
-    (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer"),
+CALIBRATION_TEXTS: Final[FlagTexts] = (
+    (ImuFlags.MAG_UNCALIBRATED, "Compass not calibrated", "Compass calibrated"),
+    (ImuFlags.ACCEL_UNCALIBRATED, "Accelerometer not calibrated", "Accelerometer calibrated"),
 )
-UNCALIBRATED: Final = sum(int(flag) for flag, _ in UNCALIBRATED_SENSORS)
+"""Of the sensors."""
+UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
 INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
 
 LATENCY_SETTLED_US: Final = 5_000_000
@@ -169,32 +172,25 @@ class Announcements(Announcer):
         if changed and sample.mag_b_ut is None:
             # The compass only once it has measured a field.
             changed &= INERTIAL
-        found = self._on_uncalibrated(changed, now_us) if changed else []
+        found: list[Answer] = []
+        if changed:
+            self._uncalibrated ^= changed
+            found += self._on_flags(CALIBRATION_TEXTS, changed, self._uncalibrated, now_us)
         if state.flags != self._flags:
-            found += self._on_flags(state.flags, now_us)
+            changed, self._flags = state.flags ^ self._flags, state.flags
+            found += self._on_flags(FLAG_TEXTS, changed, state.flags, now_us)
         return found
 
-    def _on_flags(self, flags: NavFlags, now_us: int) -> list[Answer]:
-        changed, self._flags = flags ^ self._flags, flags
+    def _on_flags(self, texts: FlagTexts, changed: int, flags: int, now_us: int) -> list[Answer]:
+        """Announce the flags that changed."""
         found = []
-        for flag, raised, fallen in FLAG_TEXTS:
+        for flag, raised, fallen in texts:
             if changed & flag:
-                is_raised, is_good = bool(flags & flag), bool(GOOD_FLAGS & flag)
-                severity = CRITICAL if CRITICAL_FLAGS & flag else WARNING
+                is_raised, is_good = bool(flags & flag), flag in GOOD_FLAGS
+                severity = CRITICAL if flag is NavFlags.SENSOR_FAULT else WARNING
                 bad, good = (fallen, raised) if is_good else (raised, fallen)
                 text = status_text(is_raised != is_good, bad, good, severity)
                 found.append(Finding(str(flag.name), is_raised, text))
-        return self.on_findings(found, now_us)
-
-    def _on_uncalibrated(self, changed: int, now_us: int) -> list[Answer]:
-        """Announce sensors that were never calibrated."""
-        self._uncalibrated ^= changed
-        found = []
-        for flag, sensor in UNCALIBRATED_SENSORS:
-            if changed & flag:
-                is_bad = bool(self._uncalibrated & flag)
-                text = status_text(is_bad, f"{sensor} not calibrated", f"{sensor} calibrated")
-                found.append(Finding(sensor, is_bad, text))
         return self.on_findings(found, now_us)
 
     def on_fix(self, now_us: int) -> list[Answer]:

@@ -307,10 +307,11 @@ class Health:
         overruns.
         """
         bus, failed, retries, overruns = self._error_counts()
+        lowest = self._lowest_supply()
         return mavlink.MAVLink_sys_status_message(
             *self.sensors(now_us),
             load=min(1000, self._load_permille),
-            voltage_battery=self.lowest_supply_mv or encoding.UINT16_MAX,
+            voltage_battery=lowest.supply_mv if lowest else encoding.UINT16_MAX,
             current_battery=-1,
             battery_remaining=-1,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
@@ -332,15 +333,15 @@ class Health:
         )
         return [encoding.uint16(count, unknown=0) for count in counts]
 
-    @property
-    def lowest_supply_mv(self) -> int | None:
-        """The lowest supply of the nodes; None if none measures it."""
-        return min((s.supply_mv for s in self.statuses if s.supply_mv), default=None)
+    def _lowest_supply(self) -> NodeStatus | None:
+        """Return the report with the lowest supply; None if no node measures it."""
+        measured = (status for status in self.statuses if status.supply_mv)
+        return min(measured, key=lambda status: status.supply_mv, default=None)
 
-    def lowest(self) -> Any:
+    def lowest_battery(self) -> Any:
         """Encode BATTERY_STATUS of the node with the lowest supply; None if none measures it."""
-        measured = [s for s in self.statuses if s.supply_mv]
-        return self.battery(min(measured, key=lambda s: s.supply_mv)) if measured else None
+        lowest = self._lowest_supply()
+        return None if lowest is None else self.battery(lowest)
 
     def battery(self, status: NodeStatus) -> Any:
         """Encode a node's supply as BATTERY_STATUS; None if it does not measure it."""

@@ -193,7 +193,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.lowest(),
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.lowest_battery(),
             mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._of_sample(messages.scaled_imu),
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._of_sample(messages.raw_imu),
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._of_origin(messages.local_position_ned),
