@@ -24,10 +24,10 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     finally:
-        _leave_what_hangs()
+        _exit_without_hanging_threads()
 
 
-def _leave_what_hangs() -> None:
+def _exit_without_hanging_threads() -> None:
     """Exit here if a thread still waits for Zenoh: Python would wait for it too."""
     link = sys.modules.get("gateway.hub.transports.zenoh.session")
     if link is None or link.end_calls():

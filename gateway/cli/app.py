@@ -205,7 +205,7 @@ def _options(
         from rich.logging import RichHandler
 
         form = "%(message)s"
-        shown = Console(file=cast(IO[str], _StderrNow()))
+        shown = Console(file=cast(IO[str], _CurrentStderr()))
         handler = RichHandler(console=shown, show_path=False)
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
@@ -214,7 +214,7 @@ def _options(
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
-class _StderrNow:
+class _CurrentStderr:
     """`sys.stderr` as it is at each moment: a progress bar replaces it, to stay below the lines."""
 
     def write(self, text: str) -> int:

@@ -38,7 +38,7 @@ SERVICE_FOLDER: Final = Path("/run/mavgate")
 """Created by systemd for the unit."""
 GROUP: Final = "mavgate"
 """Group whose members may control the service."""
-MOST_GATEWAYS: Final = 9
+MAX_GATEWAYS: Final = 9
 """Gateways of one user: `run.sock`, `run-2.sock`, …"""
 REQUEST_TIMEOUT_S: Final = 10.0
 STARTERS: Final = {
@@ -102,7 +102,7 @@ class ControlServer:
     async def start(self) -> None:
         """Create the socket and listen.
 
-        Raises ControlError if the socket cannot be created, or `MOST_GATEWAYS` run already.
+        Raises ControlError if the socket cannot be created, or `MAX_GATEWAYS` run already.
         """
         check_length(self.path)
         try:
@@ -231,7 +231,7 @@ def peer_of(writer: asyncio.StreamWriter) -> tuple[int, tuple[int, ...]]:
 
 def numbered(path: Path) -> list[Path]:
     """List the socket paths of one user's gateways."""
-    others = [path.with_stem(f"{path.stem}-{n}") for n in range(2, MOST_GATEWAYS + 1)]
+    others = [path.with_stem(f"{path.stem}-{n}") for n in range(2, MAX_GATEWAYS + 1)]
     return [path, *others]
 
 
@@ -246,7 +246,7 @@ def _first_free(path: Path) -> Path:
             except ConnectionRefusedError:
                 candidate.unlink(missing_ok=True)
                 return candidate
-    raise ControlError(f"control socket {path}: {MOST_GATEWAYS} gateways listen there already")
+    raise ControlError(f"control socket {path}: {MAX_GATEWAYS} gateways listen there already")
 
 
 def check_length(path: Path) -> None:

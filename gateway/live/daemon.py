@@ -111,8 +111,8 @@ class Daemon:
         )
         self._recorder = self._make_recorder()
         self._budget = RecordingBudget()
-        heard = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
-        self._serial = SerialPort(serial, *heard, self.now_us)
+        callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
+        self._serial = SerialPort(serial, *callbacks, self.now_us)
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")

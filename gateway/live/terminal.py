@@ -60,7 +60,7 @@ def own_command(*words: str) -> list[str]:
 
 MAX_TEXTS: Final = 256
 """Lines of the log, or pictures of the live view, that wait: at most about a megabyte."""
-LAST_WORDS_S: Final = 1.0
+FLUSH_TIMEOUT_S: Final = 1.0
 """Longest that the end waits for what is still to be written."""
 
 
@@ -104,7 +104,7 @@ class DetachedStream(io.TextIOBase):
             self._waiting.put_nowait(None)
         except queue.Full:
             return
-        self._thread.join(LAST_WORDS_S)
+        self._thread.join(FLUSH_TIMEOUT_S)
 
     def _write_all(self) -> None:
         while (data := self._waiting.get()) is not None:

@@ -35,7 +35,7 @@ def test_small_commands_import_little(module: str) -> None:
     assert imported_by(module) & (NEVER | HEAVY | {"importlib.metadata"}) == set()
 
 
-def test_the_gateway_imports_nothing_that_it_may_not_need() -> None:
+def test_gateway_imports_no_optional_part() -> None:
     found = imported_by("gateway.cli.app", "gateway.cli.live.run")
     assert found & (NEVER | RUN_MAY_NOT) == set()
     assert {name for name in found if name.startswith("gateway.simulator")} <= {
@@ -45,13 +45,13 @@ def test_the_gateway_imports_nothing_that_it_may_not_need() -> None:
     }
 
 
-def test_a_summary_of_a_recording_needs_neither_settings_nor_stages() -> None:
+def test_recording_summary_imports_neither_settings_nor_stages() -> None:
     found = imported_by("gateway.cli.app", "gateway.cli.recorded.info")
     assert found & (NEVER | {"numba", "scipy"}) == set()
     assert not {"gateway.config", "gateway.aircraft", "gateway.recordings.reading"} & found
 
 
-def test_a_listing_of_commands_loads_no_extension() -> None:
+def test_list_of_commands_loads_no_extension() -> None:
     code = "from gateway.cli.app import app; app(['--help'], standalone_mode=False)"
     code = f"import sys; {code}; print('gateway.extensions' in sys.modules, 'numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True)

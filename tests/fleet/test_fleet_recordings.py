@@ -312,7 +312,7 @@ class TestFetch:
     def test_site_that_never_answers_is_an_error(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(fleet_command, "PATIENCE_S", -1.0)
+        monkeypatch.setattr(fleet_command, "SITE_TIMEOUT_S", -1.0)
         with pytest.raises(FetchError, match="continues from here"):
             self.fetch(tmp_path, lambda *_: {"data": None})
 

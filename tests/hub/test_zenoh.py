@@ -490,7 +490,7 @@ class TestSubscription:
 
 SITE = """
 import asyncio, sys
-from gateway.cli.__main__ import _leave_what_hangs
+from gateway.cli.__main__ import _exit_without_hanging_threads
 from gateway.clock import GatewayClock
 from gateway.hub.transports.zenoh import session as zenoh_session
 from gateway.hub.hub import Hub
@@ -518,7 +518,7 @@ try:
     asyncio.run(main())
     raise SystemExit(7)
 finally:
-    _leave_what_hangs()
+    _exit_without_hanging_threads()
 """
 
 

@@ -85,7 +85,7 @@ async def test_ignored_hangup_stays_ignored(is_ignored: bool) -> None:
 @pytest.fixture
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the end wait for output as long as a busy machine needs."""
-    monkeypatch.setattr(terminal_module, "LAST_WORDS_S", LIMIT_S)
+    monkeypatch.setattr(terminal_module, "FLUSH_TIMEOUT_S", LIMIT_S)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from gateway.wire.payloads import SENSOR_IMU
 
 POLL_S: Final = 0.5
 """Interval of the requests to a running gateway."""
-PATIENCE_S: Final = 10.0
+SAMPLE_TIMEOUT_S: Final = 10.0
 """Without a sample for so long, give up."""
 POSE_S: Final = 3.0
 REST_S: Final = 5.0
@@ -270,7 +270,7 @@ def capture_from(serial: SerialSettings, vehicle: int) -> Capture:
     def capture(seconds: float, *, turned: bool = False) -> NodeSamples:
         nonlocal shown
         collecting = _Collecting(vehicle, seconds, turned=turned)
-        limit_s = collecting.limit_s + PATIENCE_S
+        limit_s = collecting.limit_s + SAMPLE_TIMEOUT_S
         with collecting.bar:
             _, is_done = asyncio.run(listen(serial, collecting.add, limit_s))
         if not is_done:
@@ -361,7 +361,7 @@ def _capture_live(vehicle: int) -> Capture:
                 time.sleep(POLL_S)
                 found = ask("imu.samples", {"vehicle_id": vehicle})
                 idle_s = 0.0 if found else idle_s + POLL_S
-                if idle_s > PATIENCE_S:
+                if idle_s > SAMPLE_TIMEOUT_S:
                     refuse(f"no samples of vehicle {vehicle}: is it on?")
                 is_done = collecting.add(raw_of(tuple(values), vehicle) for values in found)
         return node_samples(collecting.raws)

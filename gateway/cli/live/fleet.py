@@ -54,7 +54,7 @@ LARGEST: Final = 128 << 10
 FAST_S: Final = 0.05
 SLOW_S: Final = 0.2
 RETRY_S: Final = 1.0
-PATIENCE_S: Final = 60.0
+SITE_TIMEOUT_S: Final = 60.0
 """Longest wait for a disconnected site."""
 DIGEST_WAIT_S: Final = 330.0
 PIECE_WAIT_S: Final = 20.0
@@ -161,7 +161,7 @@ class RecordingFetch:
 
     def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
         """Retry until there is an answer: links break and come back."""
-        end_s = time.monotonic() + PATIENCE_S
+        end_s = time.monotonic() + SITE_TIMEOUT_S
         while True:
             answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]
             if answer is not None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
 
-ENDLESS: Final = 1000
+UNLIMITED_WIDTH: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
@@ -52,7 +52,7 @@ def console_of(*, stderr: bool = False) -> Console:
         stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False
     )
     if not console.is_terminal:
-        console.width = ENDLESS
+        console.width = UNLIMITED_WIDTH
     return console
 
 
