@@ -121,14 +121,8 @@ class KernelEstimator:
 
     @property
     def state(self) -> State:
-        """A copy of the whole state; may be restored."""
+        """A copy of the state, to be read."""
         return copy_record(self._state)
-
-    @state.setter
-    def state(self, state: State) -> None:
-        if getattr(state, "dtype", None) != getattr(self._state, "dtype", None):
-            raise TypeError(f"not a state of this estimator: {type(state)}")
-        self._use(copy_record(state))
 
     @property
     def gps_latency_s(self) -> tuple[float, float]:
@@ -139,7 +133,7 @@ class KernelEstimator:
     def latency_of(self, log: SampleLog) -> float:
         """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
         other = KernelEstimator(self._gains, self._reference)
-        other.state = self._state
+        other.restore(self.snapshot())
         other.run(log)
         found, set_s = other.found_latency(), self._reference.gps_latency_s
         return set_s if found is None else latency_to_use(found.latency_s, set_s)

@@ -93,12 +93,11 @@ class EarthField:
             return math.radians(self._settings.declination_deg)
         return math.nan if self.state is None else self.state[2].declination_rad
 
-    def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> bool:
-        """Look up the field at a position and Unix time; return False if it is near the last."""
+    def update(self, lat_deg: float, lon_deg: float, alt_m: float, utc_us: int | None) -> None:
+        """Look up the field at a position and Unix time, unless the last position is near."""
         if self.state is not None:
             north_m, east_m = displacement_m(*self.state[:2], lat_deg, lon_deg, alt_m)
             if math.hypot(north_m, east_m) < FIELD_RENEWAL_M:
-                return False
+                return
         field = magnetic_field(lat_deg, lon_deg, alt_m, year_of(utc_us))
         self.state = (lat_deg, lon_deg, field)
-        return True

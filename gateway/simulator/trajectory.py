@@ -29,6 +29,7 @@ from scipy.optimize import lsq_linear
 from scipy.spatial.transform import Rotation
 
 from gateway.geometry.geodesy import radii_m
+from gateway.geometry.quaternion import from_euler_array
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -173,7 +174,7 @@ class Trajectory:
         t = np.asarray(time_s, dtype=np.float64)
         phase = t % FLIGHT_S
         pos, accel, angles = self._pos(phase), self._accel(phase), self._angles(phase)
-        q_nb = euler_quaternions(angles)
+        q_nb = from_euler_array(angles)
         force_n = accel - (0.0, 0.0, STANDARD_GRAVITY_MPS2)
         home = self._settings
         ellipsoid_m = home.home_alt_m + home.geoid_separation_m
@@ -194,7 +195,7 @@ class Trajectory:
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
         """Return `q_nb` alone, shape (N, 4), at times as in `truth_at`."""
-        return euler_quaternions(self._angles(time_s % FLIGHT_S))
+        return from_euler_array(self._angles(time_s % FLIGHT_S))
 
     def _close(self, gusts: FloatArray) -> FloatArray:
         """Find leg durations that end the flight at home and in time, by Gauss-Newton steps.
@@ -327,19 +328,6 @@ def _attitude(commands: _Commands) -> FloatArray:
     return np.column_stack([yaw_pitch_roll[:, 2], yaw_pitch_roll[:, 1], yaw])
 
 
-def euler_quaternions(angles: FloatArray) -> FloatArray:
-    """Build `q_nb` from roll, pitch and yaw; unlike SciPy's, its sign never jumps."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(0.5 * angles.T), np.sin(0.5 * angles.T)
-    return np.column_stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
-
-
 def body_rates(angles: FloatArray, rates: FloatArray) -> FloatArray:
     """Turn Euler angle rates into the body rate: the exact derivative of the quaternion."""
     roll, pitch, _ = angles.T
@@ -402,7 +390,7 @@ class Workbench:
         t = np.asarray(time_s, dtype=np.float64)
         self._sampled_s = max(self._sampled_s, float(t.max(initial=0.0)))
         angles, rates = self._angles(t)
-        q_nb = euler_quaternions(angles)
+        q_nb = from_euler_array(angles)
         home, still = self._settings, np.zeros((len(t), 3))
         return Truth(
             time_s=t,
@@ -420,7 +408,7 @@ class Workbench:
 
     def attitude_at(self, time_s: FloatArray) -> FloatArray:
         """Return `q_nb` alone, shape (N, 4)."""
-        return euler_quaternions(self._angles(time_s)[0])
+        return from_euler_array(self._angles(time_s)[0])
 
     def _angles(self, time_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return roll, pitch and yaw and their rates, shape (N, 3)."""

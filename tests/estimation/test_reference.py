@@ -31,10 +31,13 @@ def test_invalid_fix_is_unusable(change: dict[str, object]) -> None:
 def test_field_is_looked_up_once_and_again_far_away() -> None:
     earth = EarthField(ReferenceSettings())
     assert math.isnan(earth.declination_rad)
-    assert earth.update(LAT_DEG, LON_DEG, ALT_M, None)
+    earth.update(LAT_DEG, LON_DEG, ALT_M, None)
+    first = earth.field
     assert math.degrees(earth.declination_rad) == pytest.approx(3.5, abs=0.5)
-    assert not earth.update(LAT_DEG + 0.01, LON_DEG, ALT_M, None)
-    assert earth.update(LAT_DEG + 1.0, LON_DEG, ALT_M, None)
+    earth.update(LAT_DEG + 0.01, LON_DEG, ALT_M, None)
+    assert earth.field == first
+    earth.update(LAT_DEG + 1.0, LON_DEG, ALT_M, None)
+    assert earth.field != first
     earth.reset()
     assert earth.field is None
 
