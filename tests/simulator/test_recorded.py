@@ -64,7 +64,9 @@ def records(flight: RecordedFlight) -> list[RawRecord]:
 
 
 class TestThroughTheWire:
-    def test_inertial_samples(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
+    def test_inertial_samples_agree_within_half_a_count(
+        self, flight: RecordedFlight, records: list[RawRecord]
+    ) -> None:
         imu = [r for r in records if isinstance(r, ImuRaw)]
         assert len(imu) == ROWS
         accel_scale = imu[0].accel_range_g * 9.80665 / 32768
@@ -94,7 +96,9 @@ class TestThroughTheWire:
         recorded = flight.baro_alt_m[np.isfinite(flight.baro_alt_m)]
         np.testing.assert_allclose(heights, recorded, atol=0.002)
 
-    def test_fixes(self, flight: RecordedFlight, records: list[RawRecord]) -> None:
+    def test_fixes_agree_with_the_recording(
+        self, flight: RecordedFlight, records: list[RawRecord]
+    ) -> None:
         fixes = [r for r in records if isinstance(r, GpsFix)]
         lat = [r.lat_dege7 * 1e-7 for r in fixes]
         np.testing.assert_allclose(lat, flight.gps_lat_deg, atol=1e-7)
@@ -125,7 +129,9 @@ class TestRanges:
     @pytest.mark.parametrize(
         ("peak_mps2", "range_g"), [(15.0, 2), (25.0, 4), (60.0, 8), (150.0, 16), (900.0, 16)]
     )
-    def test_finest_that_holds(self, peak_mps2: float, range_g: int) -> None:
+    def test_finest_range_that_holds_the_peak_is_chosen(
+        self, peak_mps2: float, range_g: int
+    ) -> None:
         calm = np.zeros(ROWS)
         ax = calm.copy()
         ax[10] = -peak_mps2
@@ -159,17 +165,17 @@ class TestGpsGaps:
 
 
 class TestRefusals:
-    def test_missing_columns(self) -> None:
+    def test_missing_columns_are_named_in_the_error(self) -> None:
         with pytest.raises(ValueError, match="columns missing: ay, gz"):
             RecordedFlight.from_columns(columns(ay=None, gz=None))
 
-    def test_time_that_goes_back(self) -> None:
+    def test_time_that_goes_back_is_refused(self) -> None:
         time_s = columns()["time_s"]
         time_s[20] = time_s[18]
         with pytest.raises(ValueError, match=r"goes back at 100\.36 s"):
             RecordedFlight.from_columns(columns(time_s=time_s))
 
-    def test_too_short(self) -> None:
+    def test_flight_without_samples_is_refused(self) -> None:
         with pytest.raises(ValueError, match="0 rows"):
             RecordedFlight.from_columns(columns(ax=np.full(ROWS, NAN)))
 

@@ -54,7 +54,7 @@ class TestMpu6050:
         gyro_s = np.radians(counts.gyro / 32.8)
         np.testing.assert_allclose(gyro_s.mean(axis=0), errors.gyro_bias_radps, atol=3e-3)
 
-    def test_noise_has_its_density(self, rng: np.random.Generator) -> None:
+    def test_noise_has_the_density_of_the_data_sheet(self, rng: np.random.Generator) -> None:
         counts = Mpu6050(SETTINGS, rng).sample(still(3000))
         # 100 Hz see 50 Hz of noise; the walk adds little in 30 s, rounding 0.3 counts.
         accel_sigma = np.diff(counts.accel, axis=0).std(axis=0) / np.sqrt(2.0)
@@ -62,13 +62,13 @@ class TestMpu6050:
         np.testing.assert_allclose(accel_sigma, 400e-6 * np.sqrt(50.0) * 4096, rtol=0.05)
         np.testing.assert_allclose(gyro_sigma, 0.005 * np.sqrt(50.0) * 32.8, rtol=0.08)
 
-    def test_clips_at_its_range(self, rng: np.random.Generator) -> None:
+    def test_readings_beyond_the_range_are_clipped(self, rng: np.random.Generator) -> None:
         counts = Mpu6050(SETTINGS, rng).sample(still(100, (200.0, 0.0, -9.8)))
         assert (counts.accel[:, 0] == 32767).all()
         assert counts.accel_clipped.all()
         assert not counts.gyro_clipped.any()
 
-    def test_warms_up(self, rng: np.random.Generator) -> None:
+    def test_temperature_rises_after_the_start(self, rng: np.random.Generator) -> None:
         counts = Mpu6050(SETTINGS, rng).sample(still())
         degc = counts.temperature / 340 + 36.53
         assert degc[0] == pytest.approx(29.0, abs=0.01)
@@ -87,20 +87,20 @@ class TestHmc5883l:
         assert np.abs(off.mean(axis=0)).max() < 0.05
         assert 0.2 < off.std() < 0.35
 
-    def test_field_is_that_of_java(self, rng: np.random.Generator) -> None:
+    def test_field_of_the_default_home_is_that_of_java(self, rng: np.random.Generator) -> None:
         north, east, down = Hmc5883l(SETTINGS, rng).field_n_ut
         assert np.degrees(np.arctan2(east, north)) == pytest.approx(0.8, abs=0.3)
         assert down < -15.0, "the field points up south of the magnetic equator"
         assert np.linalg.norm([north, east, down]) == pytest.approx(45.0, abs=1.5)
 
-    def test_marks_an_overflow(self) -> None:
+    def test_field_beyond_the_range_reads_as_overflow(self) -> None:
         assert mag_counts(np.array([[187.0, -190.0, 190.0]]), 1).tolist() == [
             [2038, MAG_OVERFLOW, MAG_OVERFLOW]
         ]
 
 
 class TestBmp180:
-    def test_reads_the_height(self, rng: np.random.Generator) -> None:
+    def test_pressure_corresponds_to_the_height(self, rng: np.random.Generator) -> None:
         baro = Bmp180(SETTINGS, rng)
         pressure_pa, temperature_degc = baro.sample(still(2000))
         expected = pressure_at(np.array([110.0]), baro.sea_level_pa)[0]
@@ -112,7 +112,9 @@ class TestBmp180:
     @pytest.mark.parametrize(
         ("alt_m", "pressure_pa"), [(0, 101325), (1000, 89874.6), (5000, 54019.9)]
     )
-    def test_standard_atmosphere(self, alt_m: float, pressure_pa: float) -> None:
+    def test_pressure_is_that_of_the_standard_atmosphere(
+        self, alt_m: float, pressure_pa: float
+    ) -> None:
         assert pressure_at(np.array([alt_m]), 101325.0)[0] == pytest.approx(pressure_pa, rel=2e-5)
 
 

@@ -87,16 +87,16 @@ class TestFlight:
         gravity = np.broadcast_to((0.0, 0.0, -STANDARD_GRAVITY_MPS2), (resting.sum(), 3))
         np.testing.assert_allclose(truth.accel_b_mps2[resting], gravity, atol=1e-6)
 
-    def test_comes_home(self, truth: Truth) -> None:
+    def test_flight_ends_at_home(self, truth: Truth) -> None:
         np.testing.assert_allclose(truth.pos_n_m[-1], 0.0, atol=1e-4)
 
-    def test_repeats(self, trajectory: Trajectory) -> None:
+    def test_second_flight_equals_the_first(self, trajectory: Trajectory) -> None:
         times = np.linspace(0.0, FLIGHT_S, 40, endpoint=False)
         first, second = trajectory.truth_at(times), trajectory.truth_at(times + FLIGHT_S)
         np.testing.assert_allclose(second.pos_n_m, first.pos_n_m, atol=1e-9)
         np.testing.assert_array_equal(second.time_s, times + FLIGHT_S)
 
-    def test_is_flyable(self, truth: Truth) -> None:
+    def test_loads_speeds_and_angles_suit_a_small_aircraft(self, truth: Truth) -> None:
         roll, pitch, _ = euler_deg(truth).T
         airborne = -truth.pos_n_m[:, 2] > 5.0
         load = np.linalg.norm(truth.accel_b_mps2, axis=1) / STANDARD_GRAVITY_MPS2
@@ -126,14 +126,14 @@ class TestFlight:
 
     @pytest.mark.parametrize("wind_from_deg", [0.0, 100.0, 250.0])
     @pytest.mark.parametrize("wind_mps", [0.0, 5.0])
-    def test_finds_home_in_any_wind(self, wind_mps: float, wind_from_deg: float) -> None:
+    def test_flight_ends_at_home_in_any_wind(self, wind_mps: float, wind_from_deg: float) -> None:
         windy = fly(
             int(wind_from_deg), wind_mps=wind_mps, wind_from_deg=wind_from_deg, gust_mps=1.5
         )
         end = windy.truth_at(np.array([FLIGHT_S - 1e-6]))
         np.testing.assert_allclose(end.pos_n_m, 0.0, atol=1e-3)
 
-    def test_seeds(self) -> None:
+    def test_equal_seeds_give_equal_flights(self) -> None:
         times = np.arange(0.0, FLIGHT_S, 1.0)
         one, same, other = (fly(seed).truth_at(times).pos_n_m for seed in (5, 5, 6))
         np.testing.assert_array_equal(one, same)
