@@ -2,7 +2,6 @@
 
 import logging
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -19,7 +18,6 @@ from gateway.fleet.session import (
 )
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
-from gateway.hub.transports.zenoh.session import MAX_MESSAGE, MAX_WAITING, Subscription
 from tests.fleet.conftest import World
 from tests.ports import free_port
 
@@ -134,19 +132,6 @@ def test_endless_answers_are_cut_off(monkeypatch: pytest.MonkeyPatch, payload: b
         assert sum(map(len, found.values())) <= 10_000
     except NoAnswerError:
         assert not payload
-
-
-async def test_oversized_messages_are_not_queued() -> None:
-    """A queue of messages is bounded in bytes, too."""
-    waiting = [SimpleNamespace(payload=bytes(MAX_MESSAGE + 1))] * (2 * MAX_WAITING)
-    subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
-    subscriber.__iter__.return_value = iter(())
-    session = MagicMock(declare_subscriber=lambda *_: subscriber)
-    handled: list[Any] = []
-    subscription = Subscription(session, "flood", handled.append)
-    subscription._drain()
-    assert not subscription._waiting
-    assert len(handled) == 2 * MAX_WAITING
 
 
 async def test_forged_sessions_and_keys_of_a_site_are_bounded(world: World) -> None:

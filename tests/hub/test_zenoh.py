@@ -9,6 +9,7 @@ import threading
 from collections import defaultdict
 from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -434,14 +435,22 @@ class TestFlood:
 
 
 class TestSubscription:
-    async def test_large_messages_are_handled_a_few_a_turn(self) -> None:
-        waiting = [MagicMock(payload=bytes(MAX_MESSAGE)) for _ in range(100)]
+    @pytest.mark.parametrize(
+        ("size", "count", "handled"),
+        [
+            pytest.param(MAX_MESSAGE, 100, BYTES_AT_ONCE // MAX_MESSAGE, id="a few a turn"),
+            pytest.param(MAX_MESSAGE + 1, 2 * MAX_WAITING, 2 * MAX_WAITING, id="never queued"),
+        ],
+    )
+    async def test_queue_is_bounded_in_bytes(self, size: int, count: int, handled: int) -> None:
+        waiting = [SimpleNamespace(payload=bytes(size))] * count
         subscriber = MagicMock(try_recv=lambda: waiting.pop() if waiting else None)
         subscriber.__iter__.return_value = iter(())
         session = MagicMock(declare_subscriber=lambda *_: subscriber)
         taken: list[Any] = []
-        Subscription(session, "flood", taken.append)._drain()
-        assert len(taken) == BYTES_AT_ONCE // MAX_MESSAGE
+        subscription = Subscription(session, "flood", taken.append)
+        subscription._drain()
+        assert (len(taken), len(subscription._waiting)) == (handled, count - handled)
 
     async def test_flood_is_handled_in_turns_and_the_oldest_telemetry_is_dropped(
         self, site: Site, monkeypatch: pytest.MonkeyPatch
