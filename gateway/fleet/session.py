@@ -90,7 +90,7 @@ class FleetSession:
         mode = "router" if self.is_router else "client"
         self._config = session_config(self.locator, settings.zenoh_config, mode)
         self.warning = ""
-        """What is unsafe about the way it listens; empty if nothing is."""
+        """Why it is unsafe to listen as configured; empty if it is safe."""
         if self.is_router and (lack := missing_authentication(self.locator, self._config)):
             if not settings.insecure:
                 raise ValueError(

@@ -28,7 +28,7 @@ Origin = tuple[int, int]
 MAX_ORIGINS: Final = 256
 """Per client: every system there can be, or fewer with several components each."""
 ROUTE_FRESH_US: Final = 10 * US_PER_S
-"""A path on which a system was received this recently is preferred to silent ones."""
+"""A path on which a system was received this recently is preferred to stale ones."""
 MEMORY_US: Final = 30 * US_PER_S
 """Duplicates are recognised for this long: longer than a congested mobile network delays them."""
 REPEAT_US: Final = US_PER_S
@@ -182,7 +182,7 @@ class RoutingTable:
     def clients_to(self, target: Origin, source_id: int, now_us: int) -> list[int]:
         """Return the clients that recently brought exactly this component, else this system.
 
-        Silent ones only if there is no other, and never the sender. Component 0 is all of it.
+        Stale ones only if there is no other, and never the sender. Component 0 is all of it.
         """
         system, component = target
         exact = self._to.get(target, {}) if component else {}

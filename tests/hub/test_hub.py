@@ -452,7 +452,7 @@ class TestListeningPorts:
         (port,) = hub.listeners()
         assert (port.state, port.reason, port.port) == ("open", "", taken.port)
 
-    async def test_full_port_counts_refused_clients_and_looks_for_a_silent_one_only_when_due(
+    async def test_full_port_counts_refused_clients_and_looks_for_a_stale_one_only_when_due(
         self, rig: Any, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         search = Mock(wraps=base.client_to_remove)
@@ -468,7 +468,7 @@ class TestListeningPorts:
         for turned_away in (0, 1, 2, 3):
             await call(turned_away)
         assert search.call_count == 1
-        rig.clock.us += base.SILENT_AFTER_US
+        rig.clock.us += base.STALE_AFTER_US
         await call(3)
         await rig.until(lambda: [client.client_id for client in hub.clients()] == [2])
         assert search.call_count == 2

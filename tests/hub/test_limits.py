@@ -13,7 +13,7 @@ from gateway.hub.limits import (
     UNTRUSTED_RATE,
     RequestQueue,
 )
-from gateway.hub.transports.base import SILENT_AFTER_US, client_to_remove
+from gateway.hub.transports.base import STALE_AFTER_US, client_to_remove
 from gateway.hub.transports.datagram import gone_clients
 from gateway.records import Incoming
 from gateway.units import US_PER_S
@@ -130,8 +130,8 @@ class Present:
     [
         pytest.param([("a", 0, GCS)], 30 * S - 1, [], id="before the timeout"),
         pytest.param([("a", 0, GCS)], 30 * S, [0], id="timeout"),
-        pytest.param([("a", 0, GCS), ("a", S, GCS)], SILENT_AFTER_US, [0], id="another port"),
-        pytest.param([("a", 0, GCS), ("a", S, GCS)], SILENT_AFTER_US - 1, [], id="both alive"),
+        pytest.param([("a", 0, GCS), ("a", S, GCS)], STALE_AFTER_US, [0], id="another port"),
+        pytest.param([("a", 0, GCS), ("a", S, GCS)], STALE_AFTER_US - 1, [], id="both alive"),
         pytest.param([("a", 0, GCS), ("a", S, (254, 190))], 6 * S, [], id="another system"),
         pytest.param([("a", 0, GCS), ("b", S, GCS)], 6 * S, [], id="another host"),
     ],
@@ -151,8 +151,8 @@ def removed(hosts: list[str], newcomer: str) -> int | None:
 
 def test_full_port_gives_up_the_client_that_sent_nothing_for_longest() -> None:
     present = [Present("a", S), Present("a", 0), Present("a", S)]
-    assert client_to_remove(present, "b", 3, SILENT_AFTER_US) is present[1]
-    assert client_to_remove(present, "b", 3, SILENT_AFTER_US - 1) is None
+    assert client_to_remove(present, "b", 3, STALE_AFTER_US) is present[1]
+    assert client_to_remove(present, "b", 3, STALE_AFTER_US - 1) is None
 
 
 def test_host_with_all_of_a_port_makes_room_down_to_its_share() -> None:

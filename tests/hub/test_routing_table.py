@@ -56,7 +56,7 @@ def test_target_selects_the_clients_that_lead_to_it(
     assert table.clients_to(target, source, 0) == clients
 
 
-def test_fresh_path_is_preferred_to_a_silent_one(table: RoutingTable) -> None:
+def test_fresh_path_is_preferred_to_a_stale_one(table: RoutingTable) -> None:
     table.register(4, (20, 1), ROUTE_FRESH_US + 1)
     assert table.clients_to((20, 1), 9, ROUTE_FRESH_US + 1) == [4]
     assert table.clients_to((20, 1), 4, ROUTE_FRESH_US + 1) == [3]

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from gateway.hub.transports.base import SILENT_AFTER_US
+from gateway.hub.transports.base import STALE_AFTER_US
 from gateway.hub.transports.stream import UNSENT_BYTES
 from gateway.wire.mavlink_splitter import MavlinkSplitter, message_id_of
 from tests.hub.conftest import LIMIT_S
@@ -250,7 +250,7 @@ class TestSerial:
         os.close(far)
 
 
-async def test_silent_readers_make_room_for_newcomers(rig: Any) -> None:
+async def test_stale_readers_make_room_for_new_clients(rig: Any) -> None:
     hub = rig.hub("tcp-listen:127.0.0.1:0", max_clients=2)
     (port,) = hub.listening_ports()
     readers = [rig.station(port, socket.SOCK_STREAM) for _ in range(2)]
@@ -259,7 +259,7 @@ async def test_silent_readers_make_room_for_newcomers(rig: Any) -> None:
         await rig.until(lambda count=count: len(hub.clients()) == count)
     assert await receive(await rig.connect(port)) == b"", "while all are alive"
     assert hub.listeners()[0].turned_away == 1
-    rig.clock.us += SILENT_AFTER_US
+    rig.clock.us += STALE_AFTER_US
     readers[1].socket.send(readers[1].sender.heartbeat())
     await rig.until(lambda: hub.clients()[1].received == 1)
     late = rig.station(port, socket.SOCK_STREAM)

@@ -428,7 +428,7 @@ class Client:
 Peer = TypeVar("Peer", bound=Client)
 
 
-SILENT_AFTER_US: Final = 3 * US_PER_S
+STALE_AFTER_US: Final = 3 * US_PER_S
 """Three missed heartbeats: a client that has sent nothing for so long may be replaced."""
 SHARE: Final = 4
 """Divisor: one host keeps a quarter of a full port's clients when others connect."""
@@ -445,7 +445,7 @@ def client_to_remove(
     than its share; None if all are alive and no host, or only the new client's, holds more.
     """
     stalest = min(present, key=lambda client: client.last_us)
-    if now_us - stalest.last_us >= SILENT_AFTER_US:
+    if now_us - stalest.last_us >= STALE_AFTER_US:
         return stalest
     crowded = crowded_host(present, max_clients)
     if crowded in (None, host):

@@ -13,7 +13,7 @@ from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import (
     RETRY_US,
-    SILENT_AFTER_US,
+    STALE_AFTER_US,
     Client,
     Write,
     new_socket,
@@ -278,10 +278,10 @@ class DatagramPeer(DatagramClient):
             self.write = self._direct
 
     def has_died(self, now_us: int) -> bool:
-        """Return whether it failed, or is silent and its machine reports a closed port."""
+        """Return whether it failed, or is stale and its machine reports a closed port."""
         if self._socket is None:
             return True
-        return self.refused_us is not None and now_us - self.last_us >= SILENT_AFTER_US
+        return self.refused_us is not None and now_us - self.last_us >= STALE_AFTER_US
 
 
 def gone_clients(
@@ -297,7 +297,7 @@ def gone_clients(
         client
         for client in present
         if (idle_us := now_us - client.last_us) >= idle_timeout_us
-        or (idle_us >= SILENT_AFTER_US and newest[client.host, client.identity] is not client)
+        or (idle_us >= STALE_AFTER_US and newest[client.host, client.identity] is not client)
     ]
 
 

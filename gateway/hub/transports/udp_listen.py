@@ -17,7 +17,7 @@ from gateway.hub.endpoint import Endpoint, host_and_port
 from gateway.hub.transports.base import (
     READ_BYTES,
     RETRY_US,
-    SILENT_AFTER_US,
+    STALE_AFTER_US,
     Client,
     HubContext,
     Listener,
@@ -48,7 +48,7 @@ class UdpListener(Listener[DatagramPeer]):
         super().__init__(context, endpoint)
         self._by_address: dict[Address, DatagramPeer] = {}
         self._full_until_us = 0
-        """Until then no client of a full port can have been silent for long enough."""
+        """Until then no client of a full port can have become stale."""
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
@@ -134,7 +134,7 @@ class UdpListener(Listener[DatagramPeer]):
         has_room = super()._has_room(host, now_us)
         if not has_room and crowded_host(self._clients.values(), most) is None:
             stalest_us = min(client.last_us for client in self._clients.values())
-            self._full_until_us = stalest_us + SILENT_AFTER_US
+            self._full_until_us = stalest_us + STALE_AFTER_US
         return has_room
 
     def _pass_on_others(self, sock: socket.socket, peer: Address, local_host: str) -> None:

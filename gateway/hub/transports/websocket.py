@@ -1,6 +1,6 @@
 """WebSocket, with or without TLS, on the sockets and queues of TCP clients.
 
-A page that stalls fills its own queue and loses its own oldest telemetry. A silent peer is pinged:
+A page that stalls fills its own queue and loses its own oldest telemetry. An idle peer is pinged:
 one that has answered before and stops is gone; one that never answers, as simple programs do, is
 left to the kernel, which closes a connection that acknowledges nothing.
 """
@@ -121,7 +121,7 @@ class WebStream(StreamClient):
         return self._socket is not None
 
     def tick(self, now_us: int) -> None:
-        """Ping a silent peer, and drop one that does not answer."""
+        """Ping an idle peer, and drop one that does not answer."""
         super().tick(now_us)
         if self._socket is None:
             return
@@ -129,11 +129,11 @@ class WebStream(StreamClient):
             if now_us - self._connected_us >= HANDSHAKE_US:
                 self.give_up("no handshake")
             return
-        idle_us = round(self.context.settings.idle_timeout_s * US_PER_S)
-        silent_us = now_us - self._received_us
-        if self._answers and silent_us >= idle_us:
+        timeout_us = round(self.context.settings.idle_timeout_s * US_PER_S)
+        idle_us = now_us - self._received_us
+        if self._answers and idle_us >= timeout_us:
             self.give_up("no answer to pings")
-        elif min(silent_us, now_us - self._pinged_us) >= idle_us // PINGS:
+        elif min(idle_us, now_us - self._pinged_us) >= timeout_us // PINGS:
             self._pinged_us = now_us
             self._send_control(self._web.ping())
 
