@@ -86,10 +86,10 @@ class _Page:
         """Note that the browser shows a view; fill it at the first time."""
         if key not in self._views:
             return
-        self._context.show(key)
+        self._context.shown = key
         if key not in self._built:
             self._built.add(key)
-            self._context.building(key)
+            self._context.building = key
             with self._panels[key]:
                 self._views[key].build(self._context)
 

@@ -96,9 +96,9 @@ class ViewContext:
     """Key of the view that is shown."""
     system_id: int | None = None
     """The selected aircraft."""
-    _building: str = ""
+    building: str = ""
+    """Key of the view that was built last."""
     _on_select: list[Callable[[], None]] = field(default_factory=list)
-    _on_show: dict[str, list[Callable[[], None]]] = field(default_factory=dict)
 
     @property
     def fleet(self) -> FleetState:
@@ -170,25 +170,16 @@ class ViewContext:
 
     def every(self, seconds: float, callback: Callable[[], Any]) -> None:
         """Call a function periodically while the view that is being built is shown."""
-        key = self._building
+        key = self.building
 
         def tick() -> Any:
             return callback() if key in ("", self.shown) else None
 
         ui.timer(seconds, tick)
-        self._on_show.setdefault(key, []).append(callback)
 
     def on_select(self, callback: Callable[[], None]) -> None:
         """Call a function whenever another aircraft is selected."""
         self._on_select.append(callback)
-
-    def building(self, key: str) -> None:
-        """Note which view is being built."""
-        self._building = key
-
-    def show(self, key: str) -> None:
-        """Note which view is shown now."""
-        self.shown = key
 
     def select(self, system_id: int | None) -> None:
         """Select another aircraft."""
