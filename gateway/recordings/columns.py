@@ -413,8 +413,8 @@ def read_cells(line: bytes, width: int, indices: Sequence[int] | None) -> list[f
     return [float(text) if text else np.nan for text in texts]
 
 
-def settle(cells: FloatArray) -> dict[int, str]:
-    """Clear in place what no group holds; return why rows are invalid, by their numbers."""
+def normalise(cells: FloatArray) -> dict[int, str]:
+    """Clear cells of absent groups in place; return why rows are invalid, by their numbers."""
     for group in (RAW, SI, MAG, BARO, GPS, NAV):
         cells[np.isnan(cells[:, group.start]), group] = np.nan
     has_raw, has_si = has_group(cells, RAW), has_group(cells, SI)

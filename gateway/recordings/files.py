@@ -428,9 +428,9 @@ def _jumps_in_words(timeline: Timeline) -> Iterator[str]:
         step_s = jump.step_us / US_PER_S
         days = abs(step_s) / _DAY_S
         size = f"{days:.1f} days" if days >= 1 else f"{abs(step_s):.0f} s"
-        way = "forward" if step_s > 0 else "back"
+        direction = "forward" if step_s > 0 else "back"
         yield (
-            f"its clock jumped {way} by {size} at {jump.offset_us / US_PER_S:.1f} s; "
+            f"its clock jumped {direction} by {size} at {jump.offset_us / US_PER_S:.1f} s; "
             "its times run on without the jump"
         )
     if (more := len(timeline.jumps) - SHOWN_JUMPS) > 0:

@@ -282,12 +282,12 @@ class Fusion:
             if isinstance(comment, TableHeader | FusionState):
                 fused.append(self._fused(cells[begin:end]))
                 begin = end
-            if self._goes_on(comment):
+            if self._handle(comment):
                 comments.append((end, comment))
         fused.append(self._fused(cells[begin:]))
         return TableBlock(np.concatenate(fused), tuple(comments))
 
-    def _goes_on(self, comment: TableComment) -> bool:
+    def _handle(self, comment: TableComment) -> bool:
         """Handle a line that is not a row; return whether it stays in the file."""
         if isinstance(comment, TableHeader):
             if self._follow:

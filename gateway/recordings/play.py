@@ -371,10 +371,10 @@ class Player:
         time_us = track.peek_us() or 0
         gap_us = time_us - self.position_us
         longest_us = CLOCK_JUMP_US if self.max_gap_us is None else self.max_gap_us
-        fell = gap_us < -US_PER_S
-        if gap_us <= longest_us and not fell:
+        went_back = gap_us < -US_PER_S
+        if gap_us <= longest_us and not went_back:
             return
-        kept_us = 0 if fell or self.max_gap_us is None else self.max_gap_us
+        kept_us = 0 if went_back or self.max_gap_us is None else self.max_gap_us
         due_last_us = self._anchor[0] + math.ceil((self.position_us - self._anchor[1]) / self.speed)
-        self._anchor = (max(due_last_us, now_us) if fell else due_last_us, time_us - kept_us)
+        self._anchor = (max(due_last_us, now_us) if went_back else due_last_us, time_us - kept_us)
         self.position_us = time_us - kept_us

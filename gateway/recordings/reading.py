@@ -289,11 +289,11 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
 
     remarks: list[str] = []
     header = _header_of_today(options, options.system_id or 1, None)
-    return RecordedTable(header, _going_on(counting(), path, remarks), remarks)
+    return RecordedTable(header, _monotone(counting(), path, remarks), remarks)
 
 
-def _going_on(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
-    """Let a clock that goes back, as after a restart, go on from where it was."""
+def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> Iterator[TableBlock]:
+    """Shift times behind each step back of the clock, as after a restart, so that they increase."""
     last_us, shift_us, restarts = -math.inf, 0.0, 0
     for block in blocks:
         times_us = block.cells[:, 0]

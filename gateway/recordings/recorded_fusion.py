@@ -253,7 +253,7 @@ def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> I
         yield write_lines(table[begin : begin + LINES], IS_WHOLE)
 
 
-SETTLES: Final = "the state stored at the start is not used: {}; the estimator has to converge"
+NOT_RESTORED: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
 class RecordedFusion:
@@ -306,7 +306,7 @@ class RecordedFusion:
     @property
     def remarks(self) -> list[str]:
         """Remarks about the states for the user, as far as the rows were read."""
-        return [*map(SETTLES.format, self._refused), *self._table.remarks]
+        return [*map(NOT_RESTORED.format, self._refused), *self._table.remarks]
 
     @property
     def header(self) -> TableHeader:

@@ -146,11 +146,11 @@ class GroundDistance:
 
 def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
     """Return the distance over ground along positions; unknown ones are NaN."""
-    way, known = GroundDistance(), np.isfinite(lat_deg)
+    distance, known = GroundDistance(), np.isfinite(lat_deg)
     columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
     for at_us, lat, lon in zip(*columns, strict=True):
-        way.add(at_us, lat, lon)
-    return way.distance_m
+        distance.add(at_us, lat, lon)
+    return distance.distance_m
 
 
 @dataclass(slots=True)
@@ -204,7 +204,7 @@ class TlogSummary:
         self._index = TlogIndex()
         self._counts: Counter[tuple[int, int]] = Counter()
         self._kinds: dict[int, tuple[int, int]] = {}
-        self._ways: dict[int, GroundDistance] = {}
+        self._distances: dict[int, GroundDistance] = {}
         self._span = TimesSpan()
 
     def add(self, batch: Batch) -> None:
@@ -247,13 +247,13 @@ class TlogSummary:
         )
 
     def _add_position(self, batch: Batch, i: int) -> None:
-        way = self._ways.setdefault(int(batch.origins[i]) >> 8, GroundDistance())
+        distance = self._distances.setdefault(int(batch.origins[i]) >> 8, GroundDistance())
         time_us = int(batch.time_us[i])
-        if not way.is_due(time_us):
+        if not distance.is_due(time_us):
             return
         m = fields_of(batch.frame(i))
         if m["lat"] or m["lon"]:
-            way.add(time_us, m["lat"] * DEG_PER_DEGE7, m["lon"] * DEG_PER_DEGE7)
+            distance.add(time_us, m["lat"] * DEG_PER_DEGE7, m["lon"] * DEG_PER_DEGE7)
 
     def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
         mav_type, autopilot = self._kinds.get(system_id, (None, None))
@@ -262,7 +262,7 @@ class TlogSummary:
             system_id=system_id,
             mav_type=mav_type,
             autopilot=autopilot,
-            distance_m=self._ways.get(system_id, GroundDistance()).distance_m,
+            distance_m=self._distances.get(system_id, GroundDistance()).distance_m,
             rates=tuple(
                 _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
                 for key in sorted(counts)

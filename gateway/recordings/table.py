@@ -30,11 +30,11 @@ from gateway.recordings.columns import (
     FloatArray,
     TableRow,
     cells_of,
+    normalise,
     read_cells,
     read_lines,
     row_of_cells,
     row_to_line,
-    settle,
     write_lines,
 )
 from gateway.records import FusionState, NodeStatus
@@ -231,7 +231,7 @@ class TableReader:
         """Take whole lines: all at once where they are rows alone."""
         if self._width and not self._skipped and b"#" not in text:
             cells = self._read(text)
-            if cells is not None and not settle(cells):
+            if cells is not None and not normalise(cells):
                 self.lines += len(cells)
                 return TableBlock(cells)
         rows: list[bytes] = []
@@ -260,7 +260,7 @@ class TableReader:
         faults: dict[int, str] = {}
         if cells is None:
             cells, faults = self._read_singly(rows)
-        faults = {**settle(cells), **faults}
+        faults = {**normalise(cells), **faults}
         for row, reason in faults.items():
             number = int(lines[row])
             comments.append((number, TableFault(number, len(rows[row]) + 1, reason)))

@@ -30,9 +30,9 @@ def write(folder: Path, name: str, records: list[TlogRecord]) -> Path:
     return path
 
 
-def laid_out(files: list[Path], *wished: int) -> list[PlayedFlight]:
+def laid_out(files: list[Path], *wanted_ids: int) -> list[PlayedFlight]:
     with ExitStack() as opened:
-        return lay_out(open_flights(files, OPTIONS, opened), wished, with_commands=False)
+        return lay_out(open_flights(files, OPTIONS, opened), wanted_ids, with_commands=False)
 
 
 def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A recording whose clock is not always in order is smoothed, or refused with words that help."""
+"""A recording whose clock is not always in order is smoothed, or refused with advice."""
 
 import gzip
 from pathlib import Path

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
-from gateway.recordings.columns import BARO, COLUMNS, GPS, NAV, RAW, SI, FloatArray, settle
+from gateway.recordings.columns import BARO, COLUMNS, GPS, NAV, RAW, SI, FloatArray, normalise
 from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
 from gateway.recordings.tlog import is_damaged
 from gateway.records import NAN, GpsFixType, ImuFlags
@@ -90,7 +90,7 @@ class CsvReader:
         before_us: float | None = None
         while lines_of_block := [*islice(values, BLOCK_ROWS)]:
             cells = _cells(dict(zip(self._columns, np.array(lines_of_block).T, strict=True)))
-            faults = settle(cells)
+            faults = normalise(cells)
             self.faults += len(faults)
             cells = np.concatenate([held, np.delete(cells, [*faults], axis=0)])
             sound = []

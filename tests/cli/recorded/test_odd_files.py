@@ -1,4 +1,4 @@
-"""Odd input to the commands: what is wrong is said with the file, the line and what to do."""
+"""Invalid input to the commands: the message states file, line, fault and remedy."""
 
 import gzip
 import os
