@@ -164,16 +164,16 @@ class Link:
                 self._faults[frame.kind] += 1
                 continue
             restarts = clock.restarts
-            heard_us = clock.observe(frame.receiver_time_us, arrival_us)
+            received_us = clock.observe(frame.receiver_time_us, arrival_us)
             if frame.frame_seq != self._next_frame_seq:
                 self._count_gap(frame.frame_seq, is_known=clock.restarts == restarts)
             self._next_frame_seq = frame.frame_seq + 1 & FRAME_SEQ_MASK
             self._frames += 1
             if isinstance(frame, payloads.ReceiverStatusFrame):
-                self._receiver_status = _receiver_status(frame, heard_us)
+                self._receiver_status = _receiver_status(frame, received_us)
             elif (node := self._nodes.get(frame.header.node)) is None:
-                records += self._receive_new_node(frame, heard_us, arrival_us)
-            elif (record := _receive(node, frame, heard_us, arrival_us)) is not None:
+                records += self._receive_new_node(frame, received_us, arrival_us)
+            elif (record := _receive(node, frame, received_us, arrival_us)) is not None:
                 records.append(record)
         return records
 
@@ -206,16 +206,16 @@ class Link:
         return sum((node.faults for node in nodes), self._faults)
 
     def _receive_new_node(
-        self, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
+        self, frame: payloads.RadioFrame, received_us: int, arrival_us: int
     ) -> list[RawRecord]:
         """Return a payload's records; a node is accepted from the second one that agrees."""
         header = frame.header
         node, first = self._unproven.pop(header.node, (_Node(), None))
-        second = _receive(node, frame, heard_us, arrival_us)
+        second = _receive(node, frame, received_us, arrival_us)
         if node.clock.restarts:
             # Their stamps do not agree with their arrivals: the first was false, or this one is.
             node = _Node()
-            first, second = None, _receive(node, frame, heard_us, arrival_us)
+            first, second = None, _receive(node, frame, received_us, arrival_us)
         elif node.sequence.received > 1:
             self._nodes[header.node] = node
             return [record for record in (first, second) if record is not None]
@@ -224,12 +224,12 @@ class Link:
 
 
 def _receive(
-    node: _Node, frame: payloads.RadioFrame, heard_us: int, arrival_us: int
+    node: _Node, frame: payloads.RadioFrame, received_us: int, arrival_us: int
 ) -> RawRecord | None:
     """Count a payload of a node, and return its record if it is new."""
     header, payload, clock = frame.header, frame.payload, node.clock
     stamp_us, runs = header.node_time_us, clock.runs
-    time_us = clock.observe(stamp_us, heard_us)
+    time_us = clock.observe(stamp_us, received_us)
     if clock.runs != runs:
         node.begin_run()
     # A late payload is counted but not used: every stage behind relies on growing times.

@@ -89,8 +89,8 @@ def chip_names(chips: Chips, sensors_present: int) -> tuple[str, ...]:
 def _gps_name(chips: Chips) -> str:
     kind = chips.gps & 0x0F
     name = f"{_GPS_NAMES.get(kind, 'u-blox')} at {100 * chips.gps_baud_hundreds} baud"
-    unheard = kind != GPS_NMEA and not chips.gps & GPS_ACKNOWLEDGES
-    return f"{name}, acknowledges nothing" if unheard else name
+    ignores_settings = kind != GPS_NMEA and not chips.gps & GPS_ACKNOWLEDGES
+    return f"{name}, acknowledges nothing" if ignores_settings else name
 
 
 PROTOCOL_VERSION: Final = 1

@@ -54,21 +54,21 @@ FRAMES = {
 
 @pytest.mark.parametrize("frame", FRAMES.values(), ids=FRAMES.keys())
 class TestOneFrame:
-    def test_datagram_with_one_frame(self, frame: bytes) -> None:
+    def test_datagram_with_one_frame_gives_it(self, frame: bytes) -> None:
         assert frames_in(frame) == [frame]
 
-    def test_stream_whole_and_byte_by_byte(self, frame: bytes) -> None:
+    def test_stream_gives_it_whole_and_byte_by_byte(self, frame: bytes) -> None:
         assert frames_of(MavlinkSplitter().feed(frame)) == [frame]
         splitter = MavlinkSplitter()
         events = [event for byte in frame for event in splitter.feed(bytes((byte,)))]
         assert frames_of(events) == [frame]
         assert len(events) == 1
 
-    def test_next_frame_follows_at_once(self, frame: bytes) -> None:
+    def test_next_frame_is_found_directly_behind(self, frame: bytes) -> None:
         assert frames_in(frame + V2) == [frame, V2]
         assert frames_of(MavlinkSplitter().feed(frame + V2 + V1[:5])) == [frame, V2]
 
-    def test_garbage_before_is_one_fault(self, frame: bytes) -> None:
+    def test_garbage_before_it_is_one_fault(self, frame: bytes) -> None:
         events = split_datagram(b"hello" + frame)
         assert events[0] == SplitFault(SplitFaultKind.GARBAGE, 5)
         assert frames_of(events) == [frame]
@@ -106,7 +106,7 @@ LARGE_IDS = {
 
 
 @pytest.mark.parametrize("number", LARGE_IDS)
-def test_message_ids_of_two_bytes(number: int) -> None:
+def test_message_ids_of_two_bytes_are_read(number: int) -> None:
     frame = bytes(LARGE_IDS[number].pack(link()))
     assert number > 0xFF
     assert read_datagram(frame)
@@ -167,7 +167,7 @@ def test_reset_discards_a_half_frame() -> None:
 
 
 @pytest.mark.parametrize("frame", [V2, V1, V2_SIGNED], ids=["v2", "v1", "signed"])
-def test_header_fields(frame: bytes) -> None:
+def test_header_has_the_fields_of_the_frame(frame: bytes) -> None:
     assert (origin_of(frame), message_id_of(frame)) == ((7, 1), 0)
     (found,) = split_datagram(frame)
     assert isinstance(found, MavFrame)
@@ -204,34 +204,27 @@ def dialect_v1_station() -> bytes:
     return bytes(message.pack(dialect_v1.MAVLink(None, 7, 1)))
 
 
-class TestTarget:
-    def test_addressee_of_a_command(self) -> None:
-        assert frame_of(V2_COMMAND).target == (9, 3)
+def addressed(name: str) -> dialect.MAVLink_message:
+    """Build a message to system 5, component 6."""
+    kind = dialect.mavlink_map[MESSAGE_IDS[name]]
+    values = dict.fromkeys(kind.fieldnames, 1) | {"target_system": 5, "target_component": 6}
+    return kind(**values | ({"payload": [1] * 251} if "payload" in values else {}))
 
-    def test_cut_zeros_mean_everybody(self) -> None:
-        command = dialect.MAVLink_command_long_message(0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0)
-        assert frame_of(bytes(command.pack(link()))).target == (0, 0)
 
-    def test_no_component_field(self) -> None:
-        mode = dialect.MAVLink_set_mode_message(9, 1, 77)
-        assert frame_of(bytes(mode.pack(link()))).target == (9, 0)
+TARGETS = {
+    "command": (COMMAND, (9, 3)),
+    "cut zeros": (dialect.MAVLink_command_long_message(0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0), (0, 0)),
+    "no component field": (dialect.MAVLink_set_mode_message(9, 1, 77), (9, 0)),
+    "parameter list": (addressed("PARAM_REQUEST_LIST"), (5, 6)),
+    "mission item": (addressed("MISSION_ITEM_INT"), (5, 6)),
+    "file transfer": (addressed("FILE_TRANSFER_PROTOCOL"), (5, 6)),
+}
 
-    @pytest.mark.parametrize(
-        "name", ["PARAM_REQUEST_LIST", "MISSION_ITEM_INT", "FILE_TRANSFER_PROTOCOL"]
-    )
-    def test_against_pymavlink(self, name: str) -> None:
-        message_class = dialect.mavlink_map[MESSAGE_IDS[name]]
-        values = {
-            field: 5
-            if field == "target_system"
-            else 6
-            if field == "target_component"
-            else [1] * 251
-            if field == "payload"
-            else 1
-            for field in message_class.fieldnames
-        }
-        assert frame_of(bytes(message_class(**values).pack(link()))).target == (5, 6)
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_target_is_that_of_the_message(name: str) -> None:
+    message, target = TARGETS[name]
+    assert frame_of(bytes(message.pack(link()))).target == target
 
 
 class TestSequence:

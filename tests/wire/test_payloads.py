@@ -80,14 +80,14 @@ class TestRadioVectors:
 
 
 @pytest.mark.parametrize("vector", STATUS, ids=lambda v: v["name"])
-def test_receiver_status(vector: dict) -> None:
+def test_receiver_status_equals_its_vector(vector: dict) -> None:
     frame = decode_content(bytes.fromhex(vector["content_hex"]))
     assert isinstance(frame, ReceiverStatusFrame)
     assert as_json(frame) == vector["fields"]
     assert encode_receiver_status(frame).hex() == vector["content_hex"]
 
 
-def test_imu_layout_by_hand() -> None:
+def test_imu_payload_has_the_layout_of_the_protocol() -> None:
     """Every offset of PROTOCOL.md, written out without the codec."""
     packet = bytes.fromhex(
         "11 15 3412 78563412"  # version and kind, vehicle 2 node 5, sequence, node time
@@ -172,27 +172,20 @@ HEADER = Header(NodeId(1, 1), 1, 1)
     ],
     ids=["version", "kind", "vehicle 0", "latitude", "longitude", "fix type"],
 )
-def test_values_that_cannot_be(offset: int, value: int, kind: FaultKind) -> None:
+def test_impossible_value_is_a_fault(offset: int, value: int, kind: FaultKind) -> None:
     packet = bytearray(encode_payload(HEADER, FIX))
     packet[offset] = value
     assert decode_payload(bytes(packet)) == Fault(kind, len(packet))
 
 
-def test_month_13_is_a_fault() -> None:
-    packet = bytearray.fromhex(
-        next(v for v in RADIO if v["name"] == "gps_quality_utc")["payload_hex"]
-    )
-    packet[26] = 13
-    assert decode_payload(bytes(packet)) == Fault(FaultKind.VALUE, len(packet))
-
-
-def test_leap_second_is_a_time() -> None:
-    packet = bytearray.fromhex(
-        next(v for v in RADIO if v["name"] == "gps_quality_utc")["payload_hex"]
-    )
+def test_month_13_is_a_fault_and_a_leap_second_a_time() -> None:
+    [vector] = (v for v in RADIO if v["name"] == "gps_quality_utc")
+    packet = bytearray.fromhex(vector["payload_hex"])
     packet[30] = 60
     _, quality = decode_payload(bytes(packet))
     assert (quality.utc.second, quality.utc.microsecond) == (59, 990_000)
+    packet[26] = 13
+    assert decode_payload(bytes(packet)) == Fault(FaultKind.VALUE, len(packet))
 
 
 def test_pipe_above_five_is_a_fault() -> None:
