@@ -1,15 +1,14 @@
-"""Draw docs/pictures/panel_*.png and flight_page.png, in a real Chromium.
+"""Draw docs/pictures/panel_flight.png and flight_page.png, in a real Chromium.
 
-The first show the panel on the simulated flight, the last a flight as one file.
+The first shows the panel on the simulated flight, the second a flight as one file.
 """
 
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Literal
 
-from playwright.sync_api import Page, ViewportSize, sync_playwright
+from playwright.sync_api import ViewportSize, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from tests.panel.browsing import CONFIG_WITHOUT_MAP, Process, launch
@@ -17,27 +16,14 @@ from tests.panel.browsing import CONFIG_WITHOUT_MAP, Process, launch
 PICTURES = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 START_S = 180.0
 AIRBORNE_M = 60.0
-SHOTS: tuple[tuple[str, Literal["dark", "light"]], ...] = (("flight", "dark"), ("map", "light"))
 AS_WITH_A_GRAPHICS_CARD = """
 const extension = WebGLRenderingContext.prototype.getExtension;
 WebGLRenderingContext.prototype.getExtension = function (name) {
   return name === "WEBGL_debug_renderer_info" ? null : extension.call(this, name);
 };
 """
-"""Hides who draws, since the page draws the 3D coarser where the processor does."""
+"""Hides the renderer's name: the page draws 3D coarser where the processor renders it."""
 SIZE: ViewportSize = {"width": 1440, "height": 900}
-
-
-def draw(page: Page, view: str) -> None:
-    """Wait until something flies, and photograph a view."""
-    page.wait_for_function(
-        f"mavgate.state && mavgate.state.alt_home_m > {AIRBORNE_M}", timeout=START_S * 1000
-    )
-    page.locator(f".rail button[data-view='{view}']").click()
-    page.wait_for_timeout(4000)
-    target = PICTURES / f"panel_{view}.png"
-    page.screenshot(path=target)
-    print(target)
 
 
 def draw_flight_page() -> None:
@@ -61,23 +47,28 @@ def draw_flight_page() -> None:
     print(target)
 
 
-def main() -> None:
-    """Start the demo, draw, end it."""
-    draw_flight_page()
+def draw_panel() -> None:
+    """Wait until an aircraft of the demo is airborne, and photograph the panel's flight view."""
+    target = PICTURES / "panel_flight.png"
     with (
         tempfile.TemporaryDirectory() as folder,
         Process(Path(folder), "demo", "--plain", config=CONFIG_WITHOUT_MAP) as demo,
         sync_playwright() as playwright,
     ):
-        link, browser = demo.link(), launch(playwright)
-        for view, scheme in SHOTS:
-            page = browser.new_page(viewport=SIZE, color_scheme=scheme)
-            page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
-            page.goto(link)
-            draw(page, view)
-            page.close()
+        browser = launch(playwright)
+        page = browser.new_page(viewport=SIZE, color_scheme="dark")
+        page.add_init_script(AS_WITH_A_GRAPHICS_CARD)
+        page.goto(demo.link())
+        page.wait_for_function(
+            f"mavgate.state && mavgate.state.alt_home_m > {AIRBORNE_M}", timeout=START_S * 1000
+        )
+        page.locator(".rail button[data-view='flight']").click()
+        page.wait_for_timeout(4000)
+        page.screenshot(path=target)
         browser.close()
+    print(target)
 
 
 if __name__ == "__main__":
-    main()
+    draw_flight_page()
+    draw_panel()
