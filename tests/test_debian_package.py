@@ -53,7 +53,7 @@ def dpkg(root: Path, *words: object) -> str:
     os.geteuid() != 0 or not shutil.which("systemd-sysusers"),
     reason="needs root, and systemd-sysusers",
 )
-def test_installed_and_purged(package: Path, tmp_path: Path) -> None:
+def test_package_installs_and_purge_keeps_flights(package: Path, tmp_path: Path) -> None:
     root = tmp_path / "root"
     (root / "var/lib/dpkg/info").mkdir(parents=True)
     (root / "var/lib/dpkg/updates").mkdir()
@@ -110,7 +110,7 @@ runpy.run_path({program!r}, run_name="__main__")
     assert done.stdout.splitlines()[1].startswith(str(unpacked))
 
 
-def test_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None:
+def test_settings_of_the_service_name_its_state_directory(unpacked: Path) -> None:
     settings = load(unpacked / "etc/mavgate/gateway.toml")
     unit = (unpacked / UNIT).read_text()
     assert "StateDirectory=mavgate" in unit
@@ -119,7 +119,7 @@ def test_services_settings_are_right_and_writable_for_it(unpacked: Path) -> None
         assert folder.is_relative_to("/var/lib/mavgate")
 
 
-def test_unit_starts_what_the_package_brings(unpacked: Path) -> None:
+def test_unit_starts_the_installed_program(unpacked: Path) -> None:
     lines = (unpacked / UNIT).read_text().splitlines()
     [start] = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
     program = unpacked / start.split()[0].lstrip("/")
@@ -134,7 +134,7 @@ def test_unit_starts_what_the_package_brings(unpacked: Path) -> None:
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="needs systemd-analyze")
-def test_systemd_understands_the_unit(unpacked: Path, tmp_path: Path) -> None:
+def test_systemd_accepts_the_unit(unpacked: Path, tmp_path: Path) -> None:
     """With a program in place of ours, which is not installed here."""
     unit = tmp_path / "mavgate.service"
     text = (unpacked / UNIT).read_text()
@@ -161,7 +161,7 @@ def test_every_known_adapter_has_its_rule(unpacked: Path) -> None:
     assert 'ATTR{latency_timer}="1"' in rules
 
 
-def test_documents_and_completion_come_along(unpacked: Path) -> None:
+def test_documents_and_completion_are_installed(unpacked: Path) -> None:
     documents = unpacked / "usr/share/doc/mavgate"
     shipped = {path.name for path in documents.glob("*.md")}
     assert shipped >= {path.name for path in (ROOT / "docs").glob("*.md")}

@@ -32,9 +32,11 @@ from typing import Any, ParamSpec, TypeVar
 
 import msgspec
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import cores
-from gateway.analysis.simulated import ideal_calibration
+from gateway.analysis.simulated import ideal_calibration, received
 from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
@@ -49,16 +51,13 @@ from gateway.batch.tasks import (
     run_season,
 )
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
-from gateway.records import BaroRaw, GpsFix, ImuRaw
 from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S
 from gateway.units import US_PER_S
-from gateway.wire.link import Link
+from tests.batch.season_flights import line_of
 
 SEEDS = 4
 """Different flights; the others are these under another aircraft and day."""
@@ -282,22 +281,10 @@ def _name(number: int) -> str:
 
 
 def simulated_rows(seed: int, duration_s: float) -> tuple[TableHeader, str]:
-    """Fly the simulated tracker, and lay what was received out as the rows of a table."""
+    """Return the header and the rows of a table of the simulated flight."""
     settings = SimulatorSettings(seed=seed)
     calibration = ideal_calibration(SimulatedAircraft(settings).errors)
-    columns = {BaroRaw: "baro", GpsFix: "gps", ImuRaw: "raw"}
-    link = Link()
-    records = (
-        record
-        for frame in simulate(settings).frames(duration_s)
-        for record in link.feed(frame.data, round(frame.time_s * US_PER_S))
-    )
-    known: Iterator[tuple[int, dict[str, Any]]] = (
-        (record.time_us, {columns[type(record)]: record})
-        for record in records
-        if type(record) in columns
-    )
-    rows = "".join(row_to_line(TableRow(time_us, **cells)) for time_us, cells in known)
+    rows = "".join(map(line_of, received(settings, duration_s)))
     return header_for(AircraftSettings(calibration=calibration), 1), rows
 
 

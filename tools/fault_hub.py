@@ -15,7 +15,6 @@ import json
 import os
 import shutil
 import signal
-import socket
 import statistics
 import subprocess
 import sys
@@ -30,6 +29,7 @@ from rich.console import Console
 from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from tests.ports import free_ports
 from tools.bench_hub import HANDSHAKE, Bench, Latency, source_frames
 
 HEALTHY = 4
@@ -142,16 +142,7 @@ class FaultBench(Bench):
 
     def __init__(self, *, cable: bool) -> None:
         self._far = FAR_PLACE if cable else ""
-        with (
-            socket.socket() as probe,
-            socket.socket() as web,
-            socket.socket(type=socket.SOCK_DGRAM) as closed,
-        ):
-            for sock in (probe, web, closed):
-                sock.bind(("127.0.0.1", 0))
-            self.tcp_port: int = probe.getsockname()[1]
-            self.web_port: int = web.getsockname()[1]
-            self._closed_port: int = closed.getsockname()[1]
+        self.tcp_port, self.web_port, self._closed_port = free_ports(3)
         super().__init__(self._command, HEALTHY, source_frames())
 
     def _command(self, port: int, clients: list[int]) -> list[str]:

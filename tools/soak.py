@@ -15,7 +15,6 @@ import contextlib
 import os
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
@@ -35,6 +34,7 @@ from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from tests.kit.process import Process
+from tests.ports import free_port
 
 MAX_GAP_S = 7.0
 MAX_UNEXPLAINED_S = 2.0
@@ -236,9 +236,7 @@ class Gateway:
 async def soak(options: argparse.Namespace) -> int:
     """Run, print the gaps, and return the exit status."""
     rng = np.random.default_rng(options.seed)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     begin_s = time.monotonic()
     listener = Listener(begin_s)
     transport, _ = await asyncio.get_running_loop().create_datagram_endpoint(

@@ -5,11 +5,9 @@ That favours a filter that copies the GPS; so here it is also measured against w
 the reference if there is one.
 """
 
-import itertools
 from dataclasses import dataclass
 from typing import Final
 
-import msgspec
 import numpy as np
 import pandas as pd
 
@@ -21,7 +19,6 @@ from gateway.analysis.flight import (
     FloatArray,
     IntArray,
     fixes_of,
-    fuse_track,
 )
 from gateway.analysis.metrics import (
     mean_abs,
@@ -33,7 +30,6 @@ from gateway.analysis.metrics import (
 from gateway.estimation.reference import is_usable
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
-from gateway.recordings.fuse import FusionSettings
 from gateway.units import US_PER_S
 
 MAX_GAP_S: Final = 2.0
@@ -98,8 +94,6 @@ def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:
     )
 
 
-WEIGHTS: Final = (0.1, 0.5, 0.9)
-
 PAPER_TABLE: Final = pd.DataFrame(
     [
         (0.1, 0.1, 2.036, 2.652),
@@ -163,24 +157,6 @@ def score(track: FlightTrack, judge: Judge) -> dict[str, float]:
         found["reference_m"] = rms(np.hypot(error[:, 0], error[:, 1]))
         found["attitude_deg"] = rms(np.degrees(turned[flight.scored]))
     return found
-
-
-def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> pd.DataFrame:
-    """Fuse a flight with every pair of weights, as in Table I."""
-    judge = make_judge(flight, thin(flight, interval_s))
-    rows = []
-    for alpha, beta in itertools.product(WEIGHTS, repeat=2):
-        track = fuse_track(judge.fused, with_weights(fusion, alpha, beta))
-        rows.append({"alpha": alpha, "beta": beta, **score(track, judge)})
-    return pd.DataFrame(rows)
-
-
-def with_weights(fusion: FusionSettings, alpha: float, beta: float) -> FusionSettings:
-    """Choose the paper's estimator with these weights."""
-    estimation = fusion.estimation
-    paper = msgspec.structs.replace(estimation.paper, alpha_accel=alpha, beta_velocity=beta)
-    estimation = msgspec.structs.replace(estimation, estimator="paper", paper=paper)
-    return msgspec.structs.replace(fusion, estimation=estimation)
 
 
 def grows(table: pd.DataFrame, column: str) -> bool:

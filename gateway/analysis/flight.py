@@ -73,7 +73,7 @@ class Reference:
     track: FlightTrack
     is_exact: bool
     """Whether it is the exact truth and not another estimate."""
-    story: str
+    description: str
     """One sentence: where it comes from."""
 
 
@@ -82,7 +82,7 @@ class Flight:
     """One flight's samples."""
 
     name: str
-    story: str
+    description: str
     """One sentence: where it comes from."""
     fusion: FusionSettings
     """The settings that belong to it, such as its GPS latency."""
@@ -219,7 +219,7 @@ def flight_of_files(
     options: ReadOptions,
     *,
     name: str,
-    story: str = "",
+    description: str = "",
     checked: bool = False,
 ) -> tuple[Flight, RecordedTable, AircraftSettings]:
     """Read the parts of a recording as one flight; also return its table and its settings.
@@ -232,7 +232,9 @@ def flight_of_files(
     if checked and is_table(files[0]):
         check_latency(files[0], table, aircraft)
     fusion = FusionSettings(estimation=aircraft.estimation)
-    flight = flight_of_blocks(table.blocks, aircraft.calibration, fusion, name=name, story=story)
+    flight = flight_of_blocks(
+        table.blocks, aircraft.calibration, fusion, name=name, description=description
+    )
     return flight, table, aircraft
 
 
@@ -242,7 +244,7 @@ def flight_of_blocks(
     fusion: FusionSettings,
     *,
     name: str,
-    story: str,
+    description: str,
 ) -> Flight:
     """Build a flight from rows; ValueError if there are fewer than two IMU samples."""
     counts: list[FloatArray] = []
@@ -258,7 +260,7 @@ def flight_of_blocks(
     samples = samples_of(noted(), calibration)
     if len(samples.imu) < 2:
         raise ValueError(f"{name}: {len(samples.imu)} IMU samples are no flight")
-    flight = Flight(name, story, fusion, samples, np.ones(len(samples.imu), np.bool_))
+    flight = Flight(name, description, fusion, samples, np.ones(len(samples.imu), np.bool_))
     flight = replace(flight, scored=_settled(flight))
     raw = np.concatenate(counts)
     if not np.isnan(raw).any():
@@ -341,7 +343,7 @@ def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight
         raise ValueError(f"{name}: holds no states to judge by")
     track = at_times(_track_of_cells(np.concatenate(states)), flight.time_us)
     return replace(
-        flight, reference=Reference(track, is_exact=False, story=f"the states in {name}")
+        flight, reference=Reference(track, is_exact=False, description=f"the states in {name}")
     )
 
 

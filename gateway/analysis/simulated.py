@@ -3,6 +3,7 @@
 Apart from `flight`: the simulator loads all of SciPy, which the panel does not need.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Final
 
@@ -23,12 +24,12 @@ from gateway.simulator.trajectory import FLIGHT_S, Trajectory
 from gateway.units import US_PER_S
 from gateway.wire.link import Link
 
-SIMULATED_STORY: Final = (
+SIMULATED_DESCRIPTION: Final = (
     "The built-in simulated flight of a small fixed-wing aircraft, 218 s like the paper's own: "
     "rest, take-off, a circuit with a figure of eight, landing. GPS is lost for 10 s and for 3 s, "
     "and some payloads are lost on the radio."
 )
-TRUTH_STORY: Final = "the simulation's exact truth"
+TRUTH_DESCRIPTION: Final = "the simulation's exact truth"
 
 
 def simulated_flight(
@@ -39,26 +40,25 @@ def simulated_flight(
     """Fly the built-in flight, with losses and jitter of radio and serial line as live."""
     settings = msgspec.structs.replace(settings or SimulatorSettings(), vehicles=1)
     aircraft = SimulatedAircraft(settings)
-    link, builder = Link(), RowBuilder()
-    records = (
-        record
-        for frame in simulate(settings).frames(duration_s)
-        for record in link.feed(frame.data, round(frame.time_s * US_PER_S))
-    )
-    rows = [
-        row
-        for record in records
-        if isinstance(record, ImuRaw | BaroRaw | GpsFix)
-        for row in builder.add(record)
-    ]
+    builder = RowBuilder()
+    rows = [row for record in received(settings, duration_s) for row in builder.add(record)]
     flight = flight_of_blocks(
         [block_of([*rows, *builder.flush()])],
         ideal_calibration(aircraft.errors),
         with_reference(fusion or FusionSettings(), gps_latency_s=settings.gps_latency_s),
         name="simulated flight",
-        story=SIMULATED_STORY,
+        description=SIMULATED_DESCRIPTION,
     )
     return replace(flight, reference=_truth_of(aircraft.trajectory, flight))
+
+
+def received(settings: SimulatorSettings, duration_s: float) -> Iterator[ImuRaw | BaroRaw | GpsFix]:
+    """Yield the samples and fixes of a simulated flight as the gateway receives them."""
+    link = Link()
+    for frame in simulate(settings).frames(duration_s):
+        for record in link.feed(frame.data, round(frame.time_s * US_PER_S)):
+            if isinstance(record, ImuRaw | BaroRaw | GpsFix):
+                yield record
 
 
 def ideal_calibration(errors: SensorErrors) -> NodeCalibration:
@@ -70,4 +70,4 @@ def _truth_of(trajectory: Trajectory, flight: Flight) -> Reference:
     truth = trajectory.truth_at(flight.time_us.astype(np.float64) * 1e-6)
     columns = (truth.q_nb, truth.lat_deg, truth.lon_deg, truth.alt_amsl_m, truth.vel_n_mps)
     track = FlightTrack(flight.time_us, *columns)
-    return Reference(track, is_exact=True, story=TRUTH_STORY)
+    return Reference(track, is_exact=True, description=TRUTH_DESCRIPTION)

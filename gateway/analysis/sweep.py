@@ -200,6 +200,21 @@ def run_trial(contest: Contest, values: Sequence[Value]) -> Scores:
     return score_of(contest, with_values(contest.fusion, contest.keys, values))
 
 
+WEIGHTS: Final = (0.1, 0.5, 0.9)
+"""Values of alpha and of beta in Table I of the paper."""
+
+
+def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> pd.DataFrame:
+    """Fuse a flight with every pair of the paper's weights, as in Table I."""
+    contest = make_contest(flight, fusion, [*SHORT.values()], hold_out=0, interval_s=interval_s)
+    return pd.DataFrame(
+        [
+            {"alpha": alpha, "beta": beta, **run_trial(contest, (alpha, beta))}
+            for alpha, beta in itertools.product(WEIGHTS, repeat=2)
+        ]
+    )
+
+
 def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
     """Return trials as a table, the best first."""
     rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]

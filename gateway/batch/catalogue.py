@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import sha256
+from hashlib import file_digest
 from pathlib import Path
 from typing import Any, Final, get_type_hints
 from urllib.parse import quote
@@ -17,18 +17,9 @@ from urllib.parse import quote
 import msgspec
 
 from gateway.batch.executors import Executor, WorkFailed
-from gateway.batch.facts import (
-    FlightFacts,
-    Flown,
-    Position,
-    TableTally,
-    TlogTally,
-    feature,
-    feature_collection,
-)
+from gateway.batch.facts import FlightFacts, Flown, Position, TableTally, TlogTally, feature
 from gateway.printable import UserError
 from gateway.recordings.files import (
-    CHUNK,
     GZIP,
     NO_RECORDING,
     OTHER_FORMATS,
@@ -250,9 +241,8 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
             (row[0], dict(zip(COLUMNS, row[1:], strict=True)))
             for row in _select(db, f"id, {', '.join(COLUMNS)}", where)
         ]
-    return feature_collection(
-        feature(_unpacked(packed[number]), row) for number, row in found if number in packed
-    )
+    tracks = [feature(_unpacked(packed[number]), row) for number, row in found if number in packed]
+    return {"type": "FeatureCollection", "features": tracks}
 
 
 @contextmanager
@@ -424,11 +414,8 @@ def read_file(folder: Path, options: ReadOptions, wanted: Wanted) -> CataloguedF
 
 def digest_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes; raises OSError."""
-    digest = sha256()
     with open_recording(path) as file:
-        while data := file.read(CHUNK):
-            digest.update(data)
-    return digest.hexdigest()
+        return file_digest(file, "sha256").hexdigest()
 
 
 def _read_all(

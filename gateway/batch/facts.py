@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from typing import Any, Final
 
@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.analysis.flight import LocalFrame
 from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
 from gateway.geometry.angle import wrap_180
-from gateway.geometry.geodesy import radii_m
 from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID, is_station
 from gateway.recordings.columns import (
     COLUMNS,
@@ -44,7 +44,8 @@ def simplified(positions: Sequence[Position]) -> list[Position]:
     """Leave out positions that the straight lines between the others pass within a few metres."""
     if len(positions) < 3:
         return list(positions)
-    plane, tolerance_m = _in_metres(positions), TOLERANCE_M
+    lat_deg, lon_deg, _ = np.array(positions, np.float64).T
+    plane, tolerance_m = LocalFrame(*positions[0]).local_m(lat_deg, lon_deg), TOLERANCE_M
     while np.count_nonzero(kept := _kept(plane, tolerance_m)) > MAX_POSITIONS:
         tolerance_m *= 2.0
     return [position for position, keep in zip(positions, kept.tolist(), strict=True) if keep]
@@ -63,18 +64,6 @@ def feature(positions: Sequence[Position], properties: Mapping[str, Any]) -> dic
         "geometry": {"type": "MultiLineString", "coordinates": lines} if lines else None,
         "properties": dict(properties),
     }
-
-
-def feature_collection(features: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Put features together as one GeoJSON document."""
-    return {"type": "FeatureCollection", "features": list(features)}
-
-
-def _in_metres(positions: Sequence[Position]) -> NDArray[np.float64]:
-    lat, lon, alt = np.array(positions, np.float64).T
-    meridian, parallel = radii_m(float(lat[0]), float(alt[0]))
-    east_deg = wrap_180(lon - lon[0])
-    return np.column_stack([np.radians(lat - lat[0]) * meridian, np.radians(east_deg) * parallel])
 
 
 def _kept(plane: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:

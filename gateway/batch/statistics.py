@@ -273,8 +273,8 @@ def write_season_page(
         Fact(str(len({result.vehicle for result in judged})), "aircraft"),
         Fact(str(len(broken)), "recordings that failed"),
     ]
-    story = "All flights of a season, fused again by every estimator."
-    return write_report(Report("Season", story, facts, sections), folder, jobs=1)
+    description = "All flights of a season, fused again by every estimator."
+    return write_report(Report("Season", description, facts, sections), folder, jobs=1)
 
 
 def _file_name(place: str) -> str:

@@ -201,7 +201,9 @@ class ReadFlight:
 
 def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -> ReadFlight:
     """Read the parts of a recording as one flight; raises as `FlightTask.do`."""
-    flight, table, aircraft = flight_of_files(files, options, name=name, story="One of a season.")
+    flight, table, aircraft = flight_of_files(
+        files, options, name=name, description="One of a season."
+    )
     known = table.header
     header = header_of_states(known, aircraft)
     zero_us = known.unix_us_at_zero
@@ -209,10 +211,15 @@ def read_season_flight(files: Sequence[Path], options: ReadOptions, name: str) -
     return ReadFlight(flight, header, known.vehicle_id, began_text(began))
 
 
-def work_on(task: FlightTask, known: tuple[BatchItem, str, str, str]) -> tuple[FlightResult, Files]:
-    """Do a task on one recording; the `error` of the result is the reason of a failure."""
-    item, stamp, key, name = known
-    result = _blank(task, item, stamp, key)
+def work_on(
+    task: FlightTask, wanted: tuple[BatchItem, str, FlightResult]
+) -> tuple[FlightResult, Files]:
+    """Do a task on one recording of that name, and complete its result.
+
+    The `error` of the result is the reason of a failure.
+    """
+    item, name, result = wanted
+    result = msgspec.structs.replace(result, version=__version__)
     with local_files(item) as files:
         if item.is_fetched:
             result = msgspec.structs.replace(result, digest=digest_of_files(files))
@@ -378,35 +385,32 @@ def run_season(
 ) -> list[FlightResult]:
     """Do a task on every recording that it is not done on yet."""
     found: list[FlightResult | None] = [None] * len(items)
-    todo: list[tuple[BatchItem, str, str, str]] = []
-    numbers: list[int] = []
+    todo: dict[int, tuple[BatchItem, str, FlightResult]] = {}
     stamps = _stamps(items, executor, report)
     names = _names(items, stamps)
     for number, (item, stamp) in enumerate(zip(items, stamps, strict=True)):
         if isinstance(stamp, WorkFailed):
-            found[number] = _failed(task, item, "", "", stamp)
+            found[number] = _failed(_blank(task, item, "", ""), stamp.reason)
             continue
         key = _key(task, stamp)
         kept = folder.find(key) if folder is not None else None
         if kept is not None:
             found[number] = msgspec.structs.replace(kept, place=as_text(item.location))
         else:
-            todo.append((item, stamp, key, names[number]))
-            numbers.append(number)
-    done = len(items) - len(todo)
-    for index, outcome in executor.run(partial(work_on, task), todo):
-        item, stamp, key, _ = todo[index]
+            todo[number] = (item, names[number], _blank(task, item, stamp, key))
+    numbers = list(todo)
+    outcomes = executor.run(partial(work_on, task), list(todo.values()))
+    for done, (index, outcome) in enumerate(outcomes, len(items) - len(todo) + 1):
+        item, _, blank = todo[numbers[index]]
         if isinstance(outcome, WorkFailed):
-            result = _failed(task, item, stamp, key, outcome)
+            result = _failed(blank, outcome.reason)
         else:
             result, files = outcome
             if result.version != __version__:
-                reason = WorkFailed(f"done by mavgate {result.version}; here is {__version__}")
-                result = _failed(task, item, stamp, key, reason)
+                result = _failed(blank, f"done by mavgate {result.version}; here is {__version__}")
             elif folder is not None:
                 folder.keep(result, files)
         found[numbers[index]] = result
-        done += 1
         report(item.location, done, len(items))
     return [result for result in found if result is not None]
 
@@ -442,7 +446,5 @@ def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightRes
     )
 
 
-def _failed(
-    task: FlightTask, item: BatchItem, stamp: str, key: str, failure: WorkFailed
-) -> FlightResult:
-    return msgspec.structs.replace(_blank(task, item, stamp, key), error=failure.reason)
+def _failed(blank: FlightResult, reason: str) -> FlightResult:
+    return msgspec.structs.replace(blank, error=reason)

@@ -103,7 +103,7 @@ def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, i
     rows = reader.feed(TlogScanner(strict=True).feed(data, final=True))
     try:
         flight = flight_of_blocks(
-            [TableBlock(rows)], NodeCalibration(), settings, name="the last minutes", story=""
+            [TableBlock(rows)], NodeCalibration(), settings, name="the last minutes", description=""
         )
     except ValueError as error:
         raise ComparisonError("no sensor samples came yet") from error

@@ -10,19 +10,17 @@ import pytest
 
 from gateway.analysis.blending import (
     PAPER_TABLE,
-    blend_table,
     error_at_fixes_m,
     grows,
     interpolate,
     make_judge,
     score,
     thin,
-    with_weights,
     withhold,
 )
 from gateway.analysis.flight import Fixes, fixes_of, flight_of_blocks
 from gateway.analysis.reporting.estimators import weights
-from gateway.analysis.sweep import with_value
+from gateway.analysis.sweep import blend_table, with_value
 from gateway.recordings.files import read_chunks
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.fuse import FusionSettings
@@ -133,13 +131,6 @@ def test_truth_scores_zero_against_itself() -> None:
     assert np.isnan(found["held_m"])
 
 
-def test_weights_select_paper_estimator() -> None:
-    changed = with_weights(FusionSettings(), 0.3, 0.7).estimation
-    assert (changed.estimator, changed.paper.alpha_accel, changed.paper.beta_velocity) == (
-        "paper", 0.3, 0.7,
-    )  # fmt: skip
-
-
 def test_flight_without_scored_samples_has_no_weight_table() -> None:
     case = short_case()
     blind = replace(case.flight, scored=np.zeros(len(case.flight.time_us), dtype=bool))
@@ -163,7 +154,7 @@ def test_errors_of_real_flight_grow_with_both_weights(data_dir: Path) -> None:
         fusion = with_value(fusion, f"estimation.reference.{name}", value)
     flight = flight_of_blocks(
         CsvReader(columns).blocks([*lines[:2], *lines[IN_FLIGHT]]),
-        NodeCalibration(), fusion, name="arduplane", story="",
+        NodeCalibration(), fusion, name="arduplane", description="",
     )  # fmt: skip
     table = blend_table(flight, fusion, 1.0)
     for error in ("north_m", "east_m", "held_m"):

@@ -83,7 +83,9 @@ def test_single_imu_sample_is_rejected() -> None:
     zero = (0.0, 0.0, 0.0)
     row = TableRow(0, imu=ImuCalibrated(0, NodeId(1, 0), zero, zero, None, 20.0, ImuFlags(0)))
     with pytest.raises(ValueError, match="1 IMU samples are no flight"):
-        flight_of_blocks([block_of([row])], NodeCalibration(), FusionSettings(), name="x", story="")
+        flight_of_blocks(
+            [block_of([row])], NodeCalibration(), FusionSettings(), name="x", description=""
+        )
 
 
 SIMULATED: SimulatedFlight = fly(
@@ -123,7 +125,7 @@ def test_recorded_rows_give_samples_and_states_of_simulated_flight(raw: bool) ->
         ideal_calibration(SIMULATED.errors),
         short_case().fusion,
         name="a",
-        story="",
+        description="",
     )
     chain = SensorChain(ideal_calibration(SIMULATED.errors))
     samples = [chain.imu(record) for record in SIMULATED.records() if isinstance(record, ImuRaw)]
@@ -153,7 +155,7 @@ def test_report_without_reference_compares_recorded_states() -> None:
         NodeCalibration(),
         short_case().fusion,
         name="log.csv",
-        story="A log.",
+        description="A log.",
     )
     assert flight.reference is None
     report = make_report(make_case(flight))
@@ -169,7 +171,7 @@ def test_states_of_another_recording_serve_as_reference() -> None:
     judged = judged_by(plain, [block_of(rows(raw=False))], "ref.csv")
     assert judged.reference is not None
     assert not judged.reference.is_exact
-    assert "ref.csv" in judged.reference.story
+    assert "ref.csv" in judged.reference.description
     known = np.isfinite(judged.reference.track.lat_deg)
     assert 20.0 < known.sum() / 50.0 < 30.0
 

@@ -1,5 +1,6 @@
 """The gateway as its users start it: a process of its own, and a bare client of it."""
 
+import asyncio
 import fcntl
 import os
 import re
@@ -9,9 +10,11 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 
+from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.kit.process import START_LIMIT_S, Process
@@ -132,3 +135,16 @@ class MavProxy:
             if ready:
                 self.output += os.read(self.process.stdout.fileno(), 65_536).decode()
         return found
+
+
+@asynccontextmanager
+async def mavsdk_system(
+    port: int, kind: ComponentType = ComponentType.GROUND_STATION
+) -> AsyncIterator[System]:
+    """Connect MAVSDK to a port; yield the first vehicle, to be used within the time limit."""
+    configuration = Configuration.create_with_component_type(kind)
+    async with Mavsdk(configuration) as mavsdk:
+        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
+        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+        async with asyncio.timeout(START_LIMIT_S):
+            yield system

@@ -1,17 +1,14 @@
 """`mavgate demo` as a ground station meets it."""
 
-import asyncio
 import math
 from collections.abc import Callable
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import Client, Gateway, MavProxy
-from tests.kit.process import START_LIMIT_S
+from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
 
 HOME = SimulatorSettings()
 NEAR_DEG = 0.004
@@ -34,11 +31,11 @@ def test_every_message_arrives_and_stopping_is_clean(
 ) -> None:
     gateway = start_gateway("demo")
     seen = connect(gateway.port).until(lambda seen: set(seen) >= EXPECTED)
-    heartbeat, place = seen["HEARTBEAT"], seen["GLOBAL_POSITION_INT"]
+    heartbeat, position = seen["HEARTBEAT"], seen["GLOBAL_POSITION_INT"]
     assert (heartbeat.get_srcSystem(), heartbeat.get_srcComponent()) == (1, 1)
     assert heartbeat.autopilot == mavlink.MAV_AUTOPILOT_GENERIC
-    assert place.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-    assert place.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    assert position.lat / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert position.lon / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
     assert gateway.end() == 0
     assert "Traceback" not in gateway.log.read_text()
 
@@ -60,20 +57,16 @@ async def test_mavsdk_sees_vehicle_attitude_and_position(
     start_gateway: Callable[..., Gateway],
 ) -> None:
     gateway = start_gateway("demo")
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
-        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+    async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
-        async with asyncio.timeout(START_LIMIT_S):
-            async for place in telemetry.subscribe_position():
-                if math.isfinite(place.latitude_deg):
-                    break
-            attitude = await anext(telemetry.subscribe_attitude_euler())
-            speeds = await anext(telemetry.subscribe_fixedwing_metrics())
-    assert place.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-    assert place.longitude_deg == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
-    assert place.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=HIGH_M)
+        async for position in telemetry.subscribe_position():
+            if math.isfinite(position.latitude_deg):
+                break
+        attitude = await anext(telemetry.subscribe_attitude_euler())
+        speeds = await anext(telemetry.subscribe_fixedwing_metrics())
+    assert position.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert position.longitude_deg == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    assert position.absolute_altitude_m == pytest.approx(HOME.home_alt_m, abs=HIGH_M)
     assert abs(attitude.roll_deg) < STEEPEST_DEG
     assert abs(speeds.climb_rate_m_s) < FASTEST_CLIMB_MPS
 
@@ -85,9 +78,9 @@ def test_mavproxy_sees_vehicle_attitude_and_position(
     proxy = start_mavproxy(gateway.port)
     proxy.until(r"Detected vehicle 1:1")
     proxy.until(r"Home set by GPS")
-    place = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),", "status")
-    assert int(place[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-    assert int(place[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+    position = proxy.until(r"GLOBAL_POSITION_INT \{.*?lat : (-?\d+), lon : (-?\d+),", "status")
+    assert int(position[1]) / 1e7 == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert int(position[2]) / 1e7 == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
     attitude = proxy.until(r"ATTITUDE \{.*?roll : (\S+), pitch : (\S+),")
     assert abs(float(attitude[1])) < math.radians(STEEPEST_DEG)
     assert abs(float(attitude[2])) < math.radians(STEEPEST_DEG)

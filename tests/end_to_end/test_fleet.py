@@ -120,7 +120,9 @@ async def seen(mavsdk: Mavsdk) -> dict[int, System]:
             await asyncio.sleep(0.1)
 
 
-async def test_three_aircraft_1(fleet: Fleet, tmp_path: Path) -> None:
+async def test_aircraft_with_one_system_id_at_three_sites_are_kept_apart(
+    fleet: Fleet, tmp_path: Path
+) -> None:
     (tmp_path / "way.txt").write_text(WAYPOINTS)
     mavproxy = MavProxy(fleet.ports[1], tmp_path)
     try:
@@ -169,10 +171,9 @@ def times_reported(client: Client) -> dict[int, float]:
     raise AssertionError(f"only {sorted(time_s)} report the time, {sorted(fused)} the position")
 
 
-def test_clocks_that_are_wrong_by_years(
+def test_sites_with_wrong_civil_clocks_are_fused_recorded_and_fetched(
     fleet: Fleet, wrong_clock: Path | None, tmp_path: Path
 ) -> None:
-    """Fused, recorded, fetched, and ended in time."""
     if wrong_clock is None:
         pytest.skip("no C compiler")
     client, now_s = Client(fleet.ports[2]), time.time()

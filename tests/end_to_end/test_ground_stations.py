@@ -1,4 +1,4 @@
-"""The questions of real ground stations, answered by a running gateway."""
+"""Requests of real ground stations to a running gateway."""
 
 import asyncio
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk, System
+from mavsdk.asyncio import ComponentType
 from mavsdk.asyncio.plugins.component_metadata import (
     ComponentMetadataAsync,
     ComponentMetadataError,
@@ -26,7 +26,7 @@ from mavsdk.plugins.param import ParamError, ParamResult
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import Gateway, MavProxy
+from tests.end_to_end.processes import Gateway, MavProxy, mavsdk_system
 from tests.end_to_end.station import Station
 from tests.kit.ground_station import qgroundcontrol
 from tests.kit.process import START_LIMIT_S
@@ -61,7 +61,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 
 async def answered(ask: Callable[..., Awaitable[Any]], *words: Any) -> Any:
-    """Ask by MAVSDK until there is an answer: it gives up sooner than a busy machine answers."""
+    """Ask by MAVSDK until there is an answer: its timeouts are too short for a busy machine."""
     while True:
         try:
             return await ask(*words)
@@ -73,7 +73,7 @@ async def answered(ask: Callable[..., Awaitable[Any]], *words: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
-    """One gateway for all of them: each start takes seconds, and none leaves it changed."""
+    """Start one gateway for all tests: each start takes seconds, and no test changes it."""
     running = Gateway(tmp_path_factory.mktemp("gateway"), "demo", config=CONFIG)
     yield running
     running.end()
@@ -107,19 +107,8 @@ def test_qgroundcontrol_start_up_is_answered(stations: Callable[..., Station]) -
             qgroundcontrol(stations(kind, version))
 
 
-async def with_mavsdk(
-    gateway: Gateway, use: Callable, kind: ComponentType = ComponentType.GROUND_STATION
-) -> None:
-    configuration = Configuration.create_with_component_type(kind)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{gateway.port}")
-        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
-        async with asyncio.timeout(START_LIMIT_S):
-            await use(system)
-
-
-async def test_mavsdk_telemetry(gateway: Gateway) -> None:
-    async def use(system: System) -> None:
+async def test_mavsdk_reads_health_home_and_attitude(gateway: Gateway) -> None:
+    async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         async for health in telemetry.subscribe_health():
             if (
@@ -140,13 +129,11 @@ async def test_mavsdk_telemetry(gateway: Gateway) -> None:
         assert metrics.airspeed_m_s == metrics.groundspeed_m_s, "nothing measures the airspeed"
         assert math.isfinite(metrics.climb_rate_m_s)
 
-    await with_mavsdk(gateway, use)
 
-
-async def test_mavsdk_rates(gateway: Gateway) -> None:
+async def test_mavsdk_sets_stream_rates_above_those_of_the_settings(gateway: Gateway) -> None:
     """Every set_rate is acknowledged, and a client gets more than the settings' 50 Hz."""
 
-    async def use(system: System) -> None:
+    async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         for set_rate in (
             telemetry.set_rate_position,
@@ -164,11 +151,9 @@ async def test_mavsdk_rates(gateway: Gateway) -> None:
             if all(0 < b - a <= 12_000 for a, b in pairwise(stamps)):
                 break
 
-    await with_mavsdk(gateway, use)
 
-
-async def test_mavsdk_derived_streams(gateway: Gateway) -> None:
-    async def use(system: System) -> None:
+async def test_mavsdk_reads_local_position_altitude_odometry_and_imu(gateway: Gateway) -> None:
+    async with mavsdk_system(gateway.port) as system:
         telemetry = TelemetryAsync(system)
         for set_rate in (
             telemetry.set_rate_position_velocity_ned,
@@ -190,18 +175,14 @@ async def test_mavsdk_derived_streams(gateway: Gateway) -> None:
         origin = await answered(telemetry.get_gps_global_origin)
         assert origin.latitude_deg == pytest.approx(HOME.home_lat_deg, abs=1e-3)
 
-    await with_mavsdk(gateway, use)
 
-
-async def test_mavsdk_companion_that_shares_the_system_id(gateway: Gateway) -> None:
+async def test_mavsdk_companion_with_the_same_system_id_is_answered(gateway: Gateway) -> None:
     """A companion computer is 1/191: the vehicle answers it as any other client."""
 
-    async def use(system: System) -> None:
+    async with mavsdk_system(gateway.port, ComponentType.COMPANION_COMPUTER) as system:
         version = await answered(InfoAsync(system).get_version)
         assert version.flight_sw_minor > 0
         await answered(TelemetryAsync(system).set_rate_altitude, 5.0)
-
-    await with_mavsdk(gateway, use, ComponentType.COMPANION_COMPUTER)
 
 
 def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
@@ -229,8 +210,8 @@ def test_dronekit_uploads_and_downloads_a_mission(gateway: Gateway) -> None:
         vehicle.close()
 
 
-async def test_mavsdk_parameters(gateway: Gateway) -> None:
-    async def use(system: System) -> None:
+async def test_mavsdk_reads_and_sets_parameters_within_their_ranges(gateway: Gateway) -> None:
+    async with mavsdk_system(gateway.port) as system:
         version = await answered(InfoAsync(system).get_version)
         assert version.flight_sw_minor > 0
         param = ParamAsync(system)
@@ -246,11 +227,9 @@ async def test_mavsdk_parameters(gateway: Gateway) -> None:
         with pytest.raises(ParamError):
             await answered(param.get_param_float, "NO_SUCH")
 
-    await with_mavsdk(gateway, use)
-
 
 async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
-    async def use(system: System) -> None:
+    async with mavsdk_system(gateway.port) as system:
         param = ParamAsync(system)
         homes = TelemetryAsync(system).subscribe_home()
         before = await anext(homes)
@@ -264,11 +243,9 @@ async def test_mavsdk_moves_home_by_a_parameter(gateway: Gateway) -> None:
             if home.absolute_altitude_m != pytest.approx(432.5, abs=1.0):
                 break
 
-    await with_mavsdk(gateway, use)
-
 
 async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -> None:
-    async def use(system: System) -> None:
+    async with mavsdk_system(gateway.port) as system:
         metadata = ComponentMetadataAsync(system)
         await metadata.request_autopilot_component()
         while True:
@@ -281,10 +258,8 @@ async def test_mavsdk_reads_the_parameters_metadata_over_ftp(gateway: Gateway) -
         described = {p["name"]: p for p in json.loads(found.json_metadata)["parameters"]}
         assert described["PAPER_ACC_CUTOFF"]["units"] == "Hz"
 
-    await with_mavsdk(gateway, use)
 
-
-async def test_mavsdk_mission_up_and_down(gateway: Gateway) -> None:
+async def test_mavsdk_uploads_downloads_and_clears_a_mission(gateway: Gateway) -> None:
     def item(seq: int) -> MissionItem:
         return MissionItem(
             seq=seq,
@@ -297,7 +272,7 @@ async def test_mavsdk_mission_up_and_down(gateway: Gateway) -> None:
             z=50.0 + seq,
         )
 
-    async def use(system: System) -> None:
+    async with mavsdk_system(gateway.port) as system:
         missions = MissionRawAsync(system)
         items = [item(seq) for seq in range(25)]
         await answered(missions.upload_mission, items)
@@ -307,10 +282,8 @@ async def test_mavsdk_mission_up_and_down(gateway: Gateway) -> None:
         await answered(missions.clear_mission)
         assert await answered(missions.download_mission) == []
 
-    await with_mavsdk(gateway, use)
 
-
-def test_mavproxy(gateway: Gateway, tmp_path: Path) -> None:
+def test_mavproxy_loads_parameters_and_uploads_a_mission(gateway: Gateway, tmp_path: Path) -> None:
     """Load the parameters, set one, upload waypoints and see the way to them."""
     (tmp_path / "way.txt").write_text(WAYPOINTS)
     mavproxy = MavProxy(gateway.port, tmp_path)

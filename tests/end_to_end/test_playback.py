@@ -1,25 +1,22 @@
-"""Recordings in other people's hands: mavlogdump, MAVProxy, MAVSDK and a bare client."""
+"""Recordings read and played to mavlogdump, MAVProxy, MAVSDK and a bare client."""
 
-import asyncio
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from mavsdk.asyncio import ComponentType, Configuration, Mavsdk
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.live.control_socket import request
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from gateway.simulator.simulator_settings import SimulatorSettings
-from tests.end_to_end.processes import Client, Gateway, MavProxy
+from tests.end_to_end.processes import Client, Gateway, MavProxy, mavsdk_system
 from tests.end_to_end.test_demo import NEAR_DEG
 from tests.kit.cli import invoke
 from tests.kit.mavlink import Sender
-from tests.kit.process import START_LIMIT_S
+from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_port
 from tests.recordings.frames import START_US, make_tlog
 
@@ -62,22 +59,14 @@ def tlog(tmp_path: Path) -> Path:
     return path
 
 
-class Playing:
+class Playing(Process):
     """A running `mavgate play`."""
 
     def __init__(self, folder: Path, *arguments: str, port: int = 0) -> None:
         self.port = port or free_port()
         self.socket = folder / "mavgate" / "play.sock"
-        environment = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
-        self.process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "gateway.cli", "play", *arguments),
-                *("--endpoint", f"udp:127.0.0.1:{self.port}"),
-            ],
-            env=environment,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-        )
+        endpoint = ("--endpoint", f"udp:127.0.0.1:{self.port}")
+        super().__init__(folder, "play", *arguments, *endpoint, config="", stdin=subprocess.PIPE)
 
 
 @pytest.fixture
@@ -119,7 +108,7 @@ def test_attached_player_ends_when_its_parent_ends(
     assert playing.process.wait(START_LIMIT_S) == 0
 
 
-def test_paused_player_obeys_its_control_socket(
+def test_control_socket_pauses_and_seeks_player(
     tlog: Path, play: Callable[..., Playing], connect: Callable[..., Client]
 ) -> None:
     port = free_port()
@@ -207,15 +196,11 @@ def test_mavproxy_sees_the_recorded_vehicle(
 
 async def test_mavsdk_sees_the_recorded_vehicle(tlog: Path, play: Callable[..., Playing]) -> None:
     playing = play(str(tlog), "--loop")
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
-        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
+    async with mavsdk_system(playing.port) as system:
         telemetry = TelemetryAsync(system)
-        async with asyncio.timeout(START_LIMIT_S):
-            place = await anext(telemetry.subscribe_position())
-            home = await anext(telemetry.subscribe_home())
-    assert place.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
+        position = await anext(telemetry.subscribe_position())
+        home = await anext(telemetry.subscribe_home())
+    assert position.latitude_deg == pytest.approx(LAT_DEG, abs=0.01)
     assert home.longitude_deg == pytest.approx(LON_DEG, abs=0.01)
 
 
@@ -236,16 +221,12 @@ async def test_mavproxy_recording_is_seen_by_mavproxy_and_mavsdk(
     recorder.process.communicate(timeout=START_LIMIT_S)
     gateway.end()
     playing = play(str(tmp_path / "mav.tlog"), "--loop")
-    configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
-    async with Mavsdk(configuration) as mavsdk:
-        await mavsdk.add_any_connection(f"udpin://127.0.0.1:{playing.port}")
-        system = await mavsdk.first_autopilot(timeout_s=START_LIMIT_S)
-        async with asyncio.timeout(START_LIMIT_S):
-            place = await anext(TelemetryAsync(system).subscribe_position())
+    async with mavsdk_system(playing.port) as system:
+        telemetry = TelemetryAsync(system)
+        position = await anext(telemetry.subscribe_position())
     home = SimulatorSettings()
-    assert place.latitude_deg == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
-    playing.process.terminate()
-    playing.process.wait(START_LIMIT_S)
+    assert position.latitude_deg == pytest.approx(home.home_lat_deg, abs=NEAR_DEG)
+    playing.end()
     viewing = play(str(tmp_path / "mav.tlog"), "--loop")
     folder = tmp_path / "viewer"
     folder.mkdir()

@@ -5,7 +5,6 @@ The JSON of the WebSocket API is also compared with the messages that UDP client
 
 import json
 import math
-import os
 import re
 import shutil
 import subprocess
@@ -14,7 +13,7 @@ import threading
 import time
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from websockets.sync.client import connect as follow
 from gateway.wire.mavlink_json import template
 from tests.end_to_end.processes import Client, Gateway
 from tests.end_to_end.test_demo import EXPECTED, HOME, NEAR_DEG, STEEPEST_DEG
-from tests.kit.process import START_LIMIT_S
+from tests.kit.process import START_LIMIT_S, Process
 from tests.ports import free_port
 from tests.wire.test_mavlink_json import as_pymavlink_reads
 
@@ -54,44 +53,26 @@ class Apis:
     panel: str
 
 
-@contextmanager
-def panel(listen_port: int, folder: Path) -> Iterator[str]:
-    """Start the panel's process; yield its host and port."""
-    command = [
-        *(sys.executable, "-m", "gateway.cli", "panel", "--port", "0"),
-        *("--connect", f"udp:127.0.0.1:{listen_port}"),
-    ]
-    env = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder)}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, env=env, text=True)
-    try:
-        assert process.stdout is not None
-        link = next(line for line in process.stdout if "http://" in line)
-        yield link.split("http://")[1].strip().rstrip("/")
-    finally:
-        process.terminate()
-        process.wait(START_LIMIT_S)
-        process.stdout.close()
-
-
 @pytest.fixture(scope="module")
 def apis(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Apis]:
-    """Both once for all of them: each start takes seconds, and none leaves them changed."""
-    folder = tmp_path_factory.mktemp("apis")
+    """Start both once for all tests: each start takes seconds, and no test changes them."""
+    folder, panel_folder = tmp_path_factory.mktemp("gateway"), tmp_path_factory.mktemp("panel")
     web = free_port()
     gateway = Gateway(folder, "demo", config=CONFIG.format(web=web))
     station = Client(gateway.port)
+    connect = ("--connect", f"udp:127.0.0.1:{gateway.listen_port}")
     try:
         station.until(lambda seen: "GLOBAL_POSITION_INT" in seen)
-        with panel(gateway.listen_port, folder) as place:
-            listen = f"127.0.0.1:{gateway.listen_port}"
-            yield Apis(station, listen, f"127.0.0.1:{web}", place)
+        with Process(panel_folder, "panel", "--port", "0", *connect, config="") as panel:
+            address = panel.link().partition("//")[2].rstrip("/")
+            yield Apis(station, connect[1].removeprefix("udp:"), f"127.0.0.1:{web}", address)
     finally:
         station.sock.close()
         gateway.end()
 
 
 def requests() -> list[dict[str, Any]]:
-    """Return what a ground station asks at first, and one that is refused with a text to all."""
+    """Return a ground station's first requests, and one that is refused with a text to all."""
     header = {"system_id": 255, "component_id": 0, "sequence": 0}
     target = {"target_system": 1, "target_component": 1}
     version = {"command": {"type": "MAV_CMD_REQUEST_MESSAGE"}, "param1": 148.0}
@@ -104,7 +85,7 @@ def requests() -> list[dict[str, Any]]:
     return [{"header": header, "message": message} for message in messages]
 
 
-class Ear:
+class UdpReader:
     """The messages that a UDP client decodes, in the form of the API."""
 
     def __init__(self, client: Client) -> None:
@@ -113,7 +94,7 @@ class Ear:
         self.decoded: set[str] = set()
 
     def read(self, wait_s: float) -> None:
-        """Take what there is; return once nothing comes for so long."""
+        """Decode what was received; return once nothing comes for that time."""
         self._sock.settimeout(wait_s)
         with suppress(TimeoutError, BlockingIOError):
             for _ in range(500):
@@ -121,26 +102,26 @@ class Ear:
                     self.decoded.add(json.dumps(as_pymavlink_reads(message)))
 
 
-def hear(stream: Any, ear: Ear) -> dict[str, list[dict[str, Any]]]:
-    """Follow the vehicle until every kind of message has come."""
+def receive_all(stream: Any, reader: UdpReader) -> dict[str, list[dict[str, Any]]]:
+    """Receive from the vehicle until every kind of message has come."""
     received: dict[str, list[dict[str, Any]]] = {}
     while not received.keys() >= EXPECTED | ASKED:
         text = str(stream.recv(timeout=START_LIMIT_S))
-        ear.read(0)
+        reader.read(0)
         if text.startswith("{"):
-            heard = json.loads(text)
-            if heard["header"]["system_id"] == 1:
-                received.setdefault(heard["message"]["type"], []).append(heard["message"])
+            frame = json.loads(text)
+            if frame["header"]["system_id"] == 1:
+                received.setdefault(frame["message"]["type"], []).append(frame["message"])
     return received
 
 
 def test_json_equals_messages_of_pymavlink(apis: Apis) -> None:
-    ear = Ear(apis.station)
-    ear.read(0)
+    reader = UdpReader(apis.station)
+    reader.read(0)
     with follow(f"ws://{apis.panel}/v1/ws/mavlink") as stream:
         for request in requests():
             stream.send(json.dumps(request))
-        received = hear(stream, ear)
+        received = receive_all(stream, reader)
     path = "/v1/mavlink/vehicles/1/components/1/messages/PARAM_VALUE/message/param_count"
     with urllib.request.urlopen(f"http://{apis.panel}{path}") as answer:
         count = json.load(answer)
@@ -148,20 +129,20 @@ def test_json_equals_messages_of_pymavlink(apis: Apis) -> None:
     to_one_client = ASKED | {"HOME_POSITION", "TIMESYNC", "PING"}
     compared = [fields for kind in received.keys() - to_one_client for fields in received[kind]]
     assert len(compared) > len(EXPECTED)
-    # What was said in the last moment may be on its way to the other client.
+    # The latest messages may still be on their way to the other client.
     deadline_s = time.monotonic() + START_LIMIT_S
-    while missing := [fields for fields in compared if json.dumps(fields) not in ear.decoded]:
+    while missing := [fields for fields in compared if json.dumps(fields) not in reader.decoded]:
         assert time.monotonic() < deadline_s, missing
-        ear.read(0.5)
+        reader.read(0.5)
 
 
 def block(heading: str, apis: Apis) -> str:
-    """Return the code below a heading as it stands there, for ports of ours."""
+    """Return the code below a heading, with the ports of this test."""
     section = re.search(rf"^## {heading}\n(.*?)^## ", PROGRAMS.read_text(), re.M | re.S)
     assert section is not None
     code = "\n".join(re.findall(r"^```\w+\n(.*?)^```$", section[1], re.M | re.S))
-    places = {"14551": apis.udp, "56781": apis.web, "14590": apis.panel}
-    for port, ours in places.items():
+    addresses = {"14551": apis.udp, "56781": apis.web, "14590": apis.panel}
+    for port, ours in addresses.items():
         code = code.replace(f"127.0.0.1:{port}", ours)
     return code
 
@@ -190,18 +171,18 @@ def run_until(code: str, pattern: str) -> re.Match[str]:
     raise AssertionError(f"no {pattern!r} in:\n{printed}")
 
 
-def test_mavsdk(apis: Apis) -> None:
-    place = run_until(block("MAVSDK", apis), r"^(-?\d+\.\d+) (-?\d+\.\d+) (-?\d+\.\d+)$")
-    assert float(place[1]) == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
-    assert float(place[2]) == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
+def test_mavsdk_program_prints_home_position(apis: Apis) -> None:
+    position = run_until(block("MAVSDK", apis), r"^(-?\d+\.\d+) (-?\d+\.\d+) (-?\d+\.\d+)$")
+    assert float(position[1]) == pytest.approx(HOME.home_lat_deg, abs=NEAR_DEG)
+    assert float(position[2]) == pytest.approx(HOME.home_lon_deg, abs=NEAR_DEG)
 
 
-def test_pymavlink(apis: Apis) -> None:
+def test_pymavlink_program_prints_parameter(apis: Apis) -> None:
     assert run_until(block("pymavlink", apis), r"PARAM_VALUE {param_id : PAPER_ACC_CUTOFF,")
 
 
 @pytest.mark.skipif(shutil.which("curl") is None, reason="there is no curl on this machine")
-def test_curl(apis: Apis, tmp_path: Path) -> None:
+def test_curl_commands_get_attitude_and_send_command(apis: Apis, tmp_path: Path) -> None:
     script = "set -e\n" + block("curl", apis).replace("curl ", "curl --fail-with-body -sS ")
     done = subprocess.run(
         ["bash", "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
@@ -215,8 +196,8 @@ def test_curl(apis: Apis, tmp_path: Path) -> None:
     asked = json.loads((tmp_path / "command.json").read_text())["message"]
     assert asked["command"] == {"type": "MAV_CMD_REQUEST_MESSAGE"}
     messages = f"http://{apis.panel}/v1/mavlink/vehicles/1/components/1/messages"
-    place = f"{messages}/AUTOPILOT_VERSION/message/type"
+    url = f"{messages}/AUTOPILOT_VERSION/message/type"
     deadline_s = time.monotonic() + START_LIMIT_S
-    while urllib.request.urlopen(place).read() != b'"AUTOPILOT_VERSION"':
+    while urllib.request.urlopen(url).read() != b'"AUTOPILOT_VERSION"':
         assert time.monotonic() < deadline_s
         time.sleep(0.05)

@@ -30,7 +30,7 @@ def store(port: int) -> None:
     station = Station.connect(socket.SOCK_STREAM, port, 2)
     station.until_heard()
     for items, kind in ((ITEMS, MISSION), (RALLY_ITEMS, RALLY)):
-        # The aircraft gives up a station that stays silent for some seconds.
+        # The aircraft ends the transfer of a station that sends nothing for some seconds.
         results = (upload(station, items, kind) for _ in range(10))
         assert mavlink.MAV_MISSION_ACCEPTED in results
     number, place = mavlink.MAV_CMD_DO_SET_HOME, (47.5, 8.5, 400.0)
@@ -51,8 +51,8 @@ def find(port: int) -> tuple[int, int, int]:
     return home.latitude, home.longitude, home.altitude
 
 
-def hear_of_trouble(client: Client) -> list[str]:
-    """Return what is said up to the trouble, its texts in words."""
+def texts_until_file_is_named(client: Client) -> list[str]:
+    """Return texts and message names up to the text that names the file."""
     texts = [""]
     while "1.places.json" not in texts[-1]:
         assert len(texts) < 20_000, texts
@@ -62,7 +62,7 @@ def hear_of_trouble(client: Client) -> list[str]:
 
 
 async def run(folder: Path, use: Callable[[int], Any], *others: str) -> Any:
-    """Let the gateway run for as long as somebody uses its TCP port, or another endpoint."""
+    """Run the gateway while `use` works with its TCP port, or with another endpoint."""
     port = free_port()
     settings = GatewaySettings(
         hub=HubSettings(endpoints=(f"tcp-listen:127.0.0.1:{port}", *others)),
@@ -74,7 +74,7 @@ async def run(folder: Path, use: Callable[[int], Any], *others: str) -> Any:
     begin, daemon._receiver.start = daemon._receiver.start, lambda: None
     daemon.start()
     try:
-        # Endpoints open off the loop: no aircraft is heard before all of them listen.
+        # Endpoints open off the loop: no aircraft sends before all of them listen.
         async with asyncio.timeout(START_LIMIT_S):
             while any(client.state != "open" for client in daemon._hub.clients()):
                 await asyncio.sleep(0.01)
@@ -98,11 +98,11 @@ async def test_broken_file_is_reported_when_the_aircraft_appears(
     file = folder / "aircraft" / "1.places.json"
     file.parent.mkdir()
     file.write_text("{")
-    # It listens before the gateway begins: who connects later may miss the text.
+    # It listens before the gateway begins: a later client may miss the text.
     client = connect(port := free_port())
-    texts = await run(folder, lambda _: hear_of_trouble(client), f"udp:127.0.0.1:{port}")
+    texts = await run(folder, lambda _: texts_until_file_is_named(client), f"udp:127.0.0.1:{port}")
     assert texts[-1].startswith("Mission, mark and home not kept: 1.places.json")
-    assert "HEARTBEAT" in texts, "before which ground stations hear nothing"
+    assert "HEARTBEAT" in texts, "ground stations show no text before it"
     assert file.read_text() == "{"
 
 

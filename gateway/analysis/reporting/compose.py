@@ -194,7 +194,7 @@ def make_report(case: Case, other: Case | None = None) -> Report:
     sections = compared + [section for build in SECTIONS if (section := build(case)) is not None]
     return Report(
         title=f"Flight report: {case.flight.name}",
-        story=case.flight.story,
+        description=case.flight.description,
         facts=_facts(case),
         sections=sections,
     )

@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from gateway.analysis.blending import PAPER_TABLE, WEIGHTS, blend_table, grows, interpolate
+from gateway.analysis.blending import PAPER_TABLE, grows, interpolate
 from gateway.analysis.case import HOLD_OUT, Case, changed_settings, summarise, withheld_error_m
 from gateway.analysis.flight import BoolArray, FlightTrack, Reference
 from gateway.analysis.metrics import (
@@ -19,21 +19,23 @@ from gateway.analysis.metrics import (
     worst,
 )
 from gateway.analysis.reporting import style
+from gateway.analysis.reporting.ground_track import draw_path
 from gateway.analysis.reporting.page import Picture, ReportTable, Section
+from gateway.analysis.sweep import WEIGHTS, blend_table
 from gateway.geometry.angle import wrap_180
 
 COLOURS: Final = {"paper": style.ORANGE, "eskf": style.PINK}
-STORY: Final = (
+DESCRIPTION: Final = (
     "Every estimator fused the same samples, and is compared with {}. `paper` is the paper's "
     "fusion with its equations corrected: in a turn its accelerometer takes the bank for level "
     "flight and slowly tilts the horizon. `eskf` uses the GPS velocity to distinguish the "
     "manoeuvre from gravity."
 )
-SMOOTHED_STORY: Final = (
+SMOOTHED_DESCRIPTION: Final = (
     " `smoothed` uses the whole flight for each state: `eskf` from both ends, which only a "
     "recording can be."
 )
-LATENCY_STORY: Final = (
+LATENCY_DESCRIPTION: Final = (
     " The manoeuvres contradict the GPS latency set, {:.2f} s: `smoothed` uses the {:.2f} s "
     "they show, from the beginning."
 )
@@ -71,7 +73,7 @@ def estimators(case: Case) -> Section | None:
         table["withheld fixes, m"] = table["estimator"].map(withheld)
     return Section(
         "Estimators compared",
-        STORY.format(reference.story) + _smoothed_story(case),
+        DESCRIPTION.format(reference.description) + _smoothed_description(case),
         [
             Picture(
                 "estimator_errors",
@@ -113,15 +115,17 @@ def _reference(case: Case) -> Reference | None:
     if case.frame is None:
         return None
     track = interpolate(case.fixes, case.flight.time_us)
-    return Reference(track, is_exact=False, story=OWN_GPS)
+    return Reference(track, is_exact=False, description=OWN_GPS)
 
 
-def _smoothed_story(case: Case) -> str:
+def _smoothed_description(case: Case) -> str:
     """Describe the origin of the smoothed track, if there is one."""
     set_s, used_s = case.fusion.estimation.reference.gps_latency_s, case.smoothed_latency_s
     if used_s is None:
         return ""
-    return SMOOTHED_STORY + (LATENCY_STORY.format(set_s, used_s) if used_s != set_s else "")
+    return SMOOTHED_DESCRIPTION + (
+        LATENCY_DESCRIPTION.format(set_s, used_s) if used_s != set_s else ""
+    )
 
 
 def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
@@ -235,9 +239,7 @@ def _draw_map(a: Case, b: Case, width_in: float) -> Figure:
     frame = a.frame
     for case, name, colour, width in zip((a, b), NAMES, AB_COLOURS, (2.6, 1.0), strict=True):
         if frame is not None:
-            pos_m = frame.local_m(case.track.lat_deg, case.track.lon_deg)
-            step = max(1, len(pos_m) // 4000)
-            axes.plot(pos_m[::step, 1], pos_m[::step, 0], color=colour, lw=width, label=name)
+            draw_path(axes, frame, case.track, colour, name, lw=width)
     axes.set_aspect("equal", adjustable="datalim")
     axes.set(xlabel="east of A's first fix (m)", ylabel="north of A's first fix (m)")
     style.legend_above(axes)

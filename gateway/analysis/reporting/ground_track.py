@@ -53,7 +53,11 @@ def orientation(case: Case) -> Section | None:
                 "scalar part w first. The sign is chosen so that no part jumps.",
             ),
         ],
-        [ReportTable("yaw", _yaw_table(lines), f"Yaw error against {lines.story}.", digits=1)],
+        [
+            ReportTable(
+                "yaw", _yaw_table(lines), f"Yaw error against {lines.description}.", digits=1
+            )
+        ],
     )
 
 
@@ -65,7 +69,7 @@ class YawLines:
     """Shape (N,) each, by name in the legend."""
     reference_deg: FloatArray
     """The reference."""
-    story: str
+    description: str
     """Description of the reference."""
 
     def error_deg(self, name: str) -> FloatArray:
@@ -99,8 +103,8 @@ def yaw_lines(case: Case) -> YawLines:
         both = np.flatnonzero(np.isfinite(line) & np.isfinite(reference_deg))
         turns = np.round((line[both[:1]] - reference_deg[both[:1]]) / 360.0)
         yaw[name] = line - 360.0 * (turns[0] if len(turns) else 0.0)
-    story = reference.story if reference else f"the estimator {case.chosen}"
-    return YawLines(yaw, reference_deg, story)
+    description = reference.description if reference else f"the estimator {case.chosen}"
+    return YawLines(yaw, reference_deg, description)
 
 
 def continuous_yaw_deg(q_nb: FloatArray) -> FloatArray:
@@ -235,10 +239,12 @@ def _draw_map(case: Case, width_in: float) -> Figure:
     axes = figure.subplots()
     reference = case.flight.reference
     if reference is not None:
-        _path(axes, frame, reference.track, style.REFERENCE, case.truth_name, lw=4.0, alpha=0.25)
+        draw_path(
+            axes, frame, reference.track, style.REFERENCE, case.truth_name, lw=4.0, alpha=0.25
+        )
     north_m, east_m = frame.north_m(fixes.lat_deg), frame.east_m(fixes.lon_deg)
     axes.plot(east_m, north_m, ".", color=style.ORANGE, ms=3.2, label="GPS fixes")
-    _path(axes, frame, case.track, style.BLUE, "fused", lw=1.2)
+    draw_path(axes, frame, case.track, style.BLUE, "fused", lw=1.2)
     axes.plot(east_m[0], north_m[0], "^", color=style.GREEN, ms=7, label="start")
     axes.plot(east_m[-1], north_m[-1], "s", color=style.RED, ms=6, label="end", mfc="none")
     axes.set_aspect("equal", adjustable="datalim")
@@ -250,9 +256,10 @@ def _draw_map(case: Case, width_in: float) -> Figure:
     return figure
 
 
-def _path(
+def draw_path(
     axes: Axes, frame: LocalFrame, track: FlightTrack, colour: str, label: str, **style_of: float
 ) -> None:
+    """Draw a track from above, thinned."""
     step = max(1, len(track.lat_deg) // 4000)
     pos_m = frame.local_m(track.lat_deg[::step], track.lon_deg[::step])
     axes.plot(pos_m[:, 1], pos_m[:, 0], color=colour, label=label, **style_of)

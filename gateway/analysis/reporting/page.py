@@ -91,7 +91,7 @@ class Report:
     """The whole page."""
 
     title: str
-    story: str
+    description: str
     facts: list[Fact]
     sections: list[Section]
 

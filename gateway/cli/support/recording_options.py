@@ -150,8 +150,8 @@ SystemOption = Annotated[
     int | None, typer.Option("--system", min=1, max=255, help="Vehicle of a tlog to use.")
 ]
 
-OTHER_STORY: Final = "Recorded by another program; its samples count as calibrated."
-STORIES: Final = {
+OTHER_DESCRIPTION: Final = "Recorded by another program; its samples count as calibrated."
+DESCRIPTIONS: Final = {
     TABLE: "Recorded by mavgate.",
     TLOG: "Read out of an autopilot's MAVLink log; its samples count as calibrated.",
 }
@@ -181,10 +181,12 @@ def load_flight(
     parts = files_of([path], folder_of(settings), "tables")
     with progress_of([*parts, reference] if reference else parts) as advance:
         options = replace(options, progress=advance)
-        story = STORIES.get(TABLE if is_table(parts[0]) else format_of(parts[0]), OTHER_STORY)
+        description = DESCRIPTIONS.get(
+            TABLE if is_table(parts[0]) else format_of(parts[0]), OTHER_DESCRIPTION
+        )
         try:
             flight, table, _ = flight_of_files(
-                parts, options, name=path.name, story=story, checked=True
+                parts, options, name=path.name, description=description, checked=True
             )
         except ValueError as error:
             raise FlightError(str(error)) from error

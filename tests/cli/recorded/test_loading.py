@@ -6,7 +6,7 @@ import pytest
 
 from gateway.aircraft import AircraftSettings
 from gateway.cli.support.options import read_options
-from gateway.cli.support.recording_options import STORIES, load_flight
+from gateway.cli.support.recording_options import DESCRIPTIONS, load_flight
 from gateway.config import GatewaySettings
 from gateway.estimation.kernel import FoundLatency
 from gateway.estimation.select import EstimationSettings
@@ -37,7 +37,7 @@ def recording(path: Path, samples: int) -> Path:
 def test_recording_is_loaded_with_its_recorded_settings(tmp_path: Path) -> None:
     flight = load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
     assert flight.fusion.estimation == RECORDED.estimation
-    assert flight.story == STORIES[TABLE]
+    assert flight.description == DESCRIPTIONS[TABLE]
     today = load_flight(tmp_path / "flight.csv", TODAY, read_options(TODAY, choice="current"))
     assert today.fusion.estimation == TODAY.default_aircraft.estimation
 
