@@ -89,7 +89,7 @@ def measure(make: type[Hub], kind: str, clients: int, seconds: float) -> str:
 
 
 def main() -> None:
-    """Run, and print what was seen."""
+    """Run, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--clients", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--seconds", type=float, default=2.0, help="of each single run")

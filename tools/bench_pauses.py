@@ -1,12 +1,11 @@
-"""Find what stops the gateway's loop: a demo for some minutes, ground stations coming and going.
+"""Find pauses of the gateway's loop in a demo, while ground stations connect and disconnect.
 
     python tools/bench_pauses.py --minutes 60
 
-It flies simulated aircraft, records all in files that are soon full, serves metrics, and is visited
-by stations by UDP, TCP and WebSocket that ask for all there is. Printed are the longest turns of
-its loop by the program's own doing, apart from what the machine takes: first until all aircraft are
-heard, then while telemetry flows. The baseline, which runs at the same time, is a loop whose turns
-are all alike.
+The demo flies simulated aircraft, records all in files that are soon full, serves metrics, and has
+clients over UDP, TCP and WebSocket that send every request. Printed are the longest turns of its
+loop, without the time that the machine takes: first until all aircraft send, then while telemetry
+flows. The baseline, which runs at the same time, is a loop that does the same work in every turn.
 """
 
 import argparse
@@ -41,7 +40,7 @@ LOOK_S = 0.1
 
 
 def settings_in(folder: Path, vehicles: int, ports: list[int]) -> GatewaySettings:
-    """Have everything on that may hold the loop up."""
+    """Enable everything that may delay the loop."""
     settings = GatewaySettings()
     udp, tcp, web, metrics = ports
     endpoints = (f"udp-listen:127.0.0.1:{udp}", f"tcp-listen:127.0.0.1:{tcp}")
@@ -82,7 +81,7 @@ async def fly(settings: GatewaySettings, watch: TurnWatch, seconds: float) -> No
 
 
 def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
-    """Fly while ground stations come and go."""
+    """Fly while ground stations connect and disconnect."""
     ports = free_ports(4)
     settings = settings_in(folder, options.vehicles, ports)
     load_entry_points()
@@ -95,7 +94,7 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
         with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(watch)) as runner:
             runner.run(fly(settings, watch, 60.0 * options.minutes))
         if stations.poll() is not None:
-            raise SystemExit("the stations have died")
+            raise SystemExit("the stations have ended")
     finally:
         stations.terminate()
         stations.wait()
@@ -103,12 +102,12 @@ def run(options: argparse.Namespace, folder: Path) -> TurnWatch:
 
 
 def send_even_turns(seconds: float, to: Connection) -> None:
-    """Be the baseline."""
+    """Send the results of the baseline."""
     to.send(even_turns(seconds))
 
 
 def main() -> None:
-    """Run, and print what was seen."""
+    """Run, and print the results."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--vehicles", type=int, default=2)

@@ -1,4 +1,4 @@
-"""Ground stations that come and go: by UDP, TCP and WebSocket, each asking for all there is.
+"""Ground stations that connect by UDP, TCP and WebSocket, send every request, and leave.
 
     python tools/changing_stations.py UDP_PORT TCP_PORT WS_PORT METRICS_PORT
 
@@ -9,7 +9,6 @@ for some seconds and leave, until the process is ended. Its metrics are scraped 
 import asyncio
 import contextlib
 import random
-import struct
 import sys
 import urllib.request
 from pathlib import Path
@@ -17,22 +16,15 @@ from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.vehicle.services.ftp import Opcode
 from tools.bench_hub import HANDSHAKE
-from tools.fault_traffic import heartbeat, packed, request_message
+from tools.fault_traffic import ftp, heartbeat, packed, request_message
 
 AT_ONCE = 6
-"""Stations that are there at a time."""
+"""Stations at a time."""
 LONGEST_STAY_S = 8.0
 SCRAPE_S = 5.0
-OPEN_FILE_RO, BURST_READ_FILE = 4, 15
 METADATA = b"/general.json"
-
-
-def ftp(opcode: int, data: bytes) -> bytes:
-    """Encode a request for a file of the vehicle."""
-    head = struct.pack("<HBBBBBBI", 1, 0, opcode, len(data), 0, 0, 0, 0)
-    payload = (head + data).ljust(251, b"\0")
-    return packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, list(payload)))
 
 
 def questions() -> list[bytes]:
@@ -44,13 +36,13 @@ def questions() -> list[bytes]:
         packed(mavlink.MAVLink_mission_request_list_message(1, 1, 0)),
         request_message(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, to_all=False),
         packed(mavlink.MAVLink_command_long_message(1, 1, 511, 0, *rate)),
-        ftp(OPEN_FILE_RO, METADATA),
-        ftp(BURST_READ_FILE, b""),
+        ftp(Opcode.OPEN_FILE_RO, 0, METADATA),
+        ftp(Opcode.BURST_READ_FILE, 0),
     ]
 
 
 class Datagrams(asyncio.DatagramProtocol):
-    """A client that listens to nothing."""
+    """A client that reads nothing."""
 
 
 async def visit_udp(port: int, stay_s: float) -> None:
@@ -87,7 +79,7 @@ def _masked(data: bytes) -> bytes:
 
 
 async def come_and_go(udp: int, tcp: int, web: int) -> None:
-    """Be one station after the other."""
+    """Be one station after another."""
     while True:
         stay_s = random.uniform(0.5, LONGEST_STAY_S)
         try:
@@ -111,7 +103,7 @@ async def scrape(port: int) -> None:
 
 
 async def main() -> None:
-    """Let all come and go."""
+    """Run all stations."""
     udp, tcp, web, metrics = map(int, sys.argv[1:])
     stations = [come_and_go(udp, tcp, web) for _ in range(AT_ONCE)]
     await asyncio.gather(scrape(metrics), *stations)

@@ -2,13 +2,12 @@
 
     python fault_traffic.py PORT KIND
 
-The hub trusts who calls at 127.0.0.1 and nobody who calls at 127.0.0.2, both on this port; system 1
+The hub trusts clients of its address 127.0.0.1 and none of 127.0.0.2, both on this port; system 1
 behind it answers, and system 42 is the healthy source.
 """
 
 import itertools
 import socket
-import struct
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -18,11 +17,11 @@ from pathlib import Path
 from pymavlink.dialects.v20 import common as mavlink
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from gateway.vehicle.services.ftp import Opcode, Packet
 from tools.bench_hub import SOURCE_SYSTEM, source_frames
 
 TRUSTED, UNTRUSTED = "127.0.0.1", "127.0.0.2"
 PORTS = 31
-OPEN_FILE_RO, BURST_READ_FILE = 4, 15
 TURN_S = 0.005
 """Between two batches; the rates below are kept on average."""
 
@@ -46,14 +45,14 @@ def request_message(number: int, *, to_all: bool) -> bytes:
 
 
 def caller(host: str, port: int) -> socket.socket:
-    """Open a socket that speaks to the hub and listens to nothing."""
+    """Open a socket that sends to the hub and reads nothing."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.connect((host, port))
     return sock
 
 
 def forge(port: int) -> Batch:
-    """Call the source a station, claim its components, and say what it will say in advance."""
+    """Send heartbeats of the source as a station, of its components, and its frames in advance."""
     client = caller(UNTRUSTED, port)
     frames = itertools.cycle(source_frames())
     names = itertools.cycle(range(1, 250))
@@ -76,7 +75,7 @@ def bursts(port: int) -> Batch:
     """Have a file sent byte by byte, again and again, from many ports."""
     callers = [(sock, ftp_session(sock)) for sock in (caller(UNTRUSTED, port) for _ in range(16))]
     for sock, session in itertools.cycle(callers):
-        yield partial(sock.send, ftp(BURST_READ_FILE, session, b"", 1))
+        yield partial(sock.send, ftp(Opcode.BURST_READ_FILE, session, size=1))
 
 
 def ftp_session(sock: socket.socket) -> int:
@@ -84,7 +83,7 @@ def ftp_session(sock: socket.socket) -> int:
     parser = mavlink.MAVLink(None)
     sock.settimeout(0.1)
     while True:
-        sock.send(ftp(OPEN_FILE_RO, 0, b"/parameter.json.xz"))
+        sock.send(ftp(Opcode.OPEN_FILE_RO, 0, b"/parameter.json.xz"))
         for _ in range(50):
             try:
                 data = sock.recv(2048)
@@ -95,16 +94,14 @@ def ftp_session(sock: socket.socket) -> int:
                     return int(message.payload[2])
 
 
-def ftp(opcode: int, session: int, data: bytes, size: int | None = None) -> bytes:
+def ftp(opcode: int, session: int, data: bytes = b"", size: int | None = None) -> bytes:
     """Encode one FTP request."""
-    length = len(data) if size is None else size
-    payload = struct.pack("<HBBBBBxI", 1, session, opcode, length, 0, 0, 0) + data
-    message = mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload.ljust(251, b"\0"))
-    return packed(message)
+    packet = Packet(1, session, opcode, len(data) if size is None else size, 0, 0, 0, data)
+    return packed(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, packet.encode()))
 
 
 def crowd(port: int) -> Batch:
-    """Hold every place of the port from one machine, and knock for more."""
+    """Use all clients that the port allows, and request more, from one machine."""
     callers = [caller(UNTRUSTED, port) for _ in range(100)]
     frames = [heartbeat(1 + number) for number in range(100)]
     for sock, frame in itertools.cycle(zip(callers, frames, strict=True)):
@@ -135,11 +132,11 @@ KINDS: dict[str, tuple[Callable[[int], Batch], int]] = {
     "crowd": (crowd, 1000),
     "twins": (twins, 200),
 }
-"""What there is, and how often a second."""
+"""Function and rate in Hz of each kind."""
 
 
 def main() -> None:
-    """Make trouble until killed."""
+    """Send hostile traffic until killed."""
     port, kind = int(sys.argv[1]), sys.argv[2]
     make, rate_hz = KINDS[kind]
     batch, begin_s, done = make(port), time.monotonic(), 0

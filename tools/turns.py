@@ -1,10 +1,10 @@
-"""How long the turns of an event loop take, and how much of that is the program's own doing.
+"""Measure the turns of an event loop, and the program's own share of each.
 
-A turn is what a loop does between two waits: for so long nothing that comes is looked at. Of the
-program's own doing is what the thread computes and what it waits for, be it a disk, a lock or
-another thread. Of a turn without such a wait that is its processor time. From another the time is
-taken off in which the thread was ready and the kernel let others run; what the host of a virtual
-machine took stays in it: `even_turns` is a program whose turns are all alike, and so shows it.
+A turn is the time between two waits of the loop, in which no input is handled. The program's own
+share is the time in which its thread computes or waits for a disk, a lock or another thread. In a
+turn without such a wait that is its processor time; from any other turn the time is subtracted in
+which the thread was ready and the kernel ran others. Time that the host of a virtual machine takes
+remains in it: `even_turns`, a loop whose turns do the same work, measures that.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 WORST = 5
 """Turns that are kept."""
 LONG_US = 2000.0
-"""Turns that are counted by the program's own doing take longer."""
+"""Turns whose own share is longer are counted."""
 PAUSE_S = 0.001
 COUNT = 25_000
 """Numbers that an even turn adds up: 0.3 ms or more, as a turn of the gateway takes, so that the
@@ -39,12 +39,12 @@ class Turn(NamedTuple):
 
 
 class TurnWatch(selectors.EpollSelector):
-    """The selector of an event loop, which sees the beginning and the end of every turn."""
+    """The selector of an event loop, which is called at the beginning and the end of every turn."""
 
     def __init__(self) -> None:
         super().__init__()
         self.worst: list[Turn] = []
-        """The longest by the program's own doing; a heap."""
+        """The turns with the longest own share; a heap."""
         self.turns = self.long_turns = 0
         self.longest_wall_us = 0.0
         self.longest_collection_us = [0.0, 0.0, 0.0]
@@ -59,7 +59,7 @@ class TurnWatch(selectors.EpollSelector):
         self.restart()
 
     def restart(self) -> None:
-        """Begin, and discard what was seen."""
+        """Begin, and discard the results so far."""
         self._is_on = True
         self.worst.clear()
         self.turns = self.long_turns = 0
@@ -70,11 +70,11 @@ class TurnWatch(selectors.EpollSelector):
         self._begin_ns: int | None = None
 
     def stop(self) -> None:
-        """See no more."""
+        """Stop measuring."""
         self._is_on = False
 
     def mark(self, what: str) -> None:
-        """Note what happens now, to be compared with the longest turns."""
+        """Note an event, to be compared with the longest turns."""
         self.marks.append((self.seconds_at(time.perf_counter_ns()), what))
 
     def seconds_at(self, time_ns: int) -> float:
@@ -82,11 +82,11 @@ class TurnWatch(selectors.EpollSelector):
         return (time_ns - self._began_ns) / 1e9
 
     def longest(self) -> Turn:
-        """Return the longest turn by the program's own doing."""
+        """Return the turn with the longest own share."""
         return max(self.worst)
 
     def install(self) -> None:
-        """See single callbacks and collections too."""
+        """Measure single callbacks and garbage collections too."""
         watch = self
 
         def run(handle: asyncio.Handle) -> None:
@@ -100,7 +100,7 @@ class TurnWatch(selectors.EpollSelector):
         gc.callbacks.append(self._on_collection)
 
     def select(self, timeout: float | None = None) -> list[Any]:
-        """Wait; what lies between two calls is a turn."""
+        """Wait for events; the time between two calls is a turn."""
         if self._begin_ns is not None and self._is_on:
             self._end_turn(self._begin_ns)
         found = super().select(timeout)
@@ -136,10 +136,10 @@ class TurnWatch(selectors.EpollSelector):
         longest[generation] = max(longest[generation], (now_ns - self._collecting_ns) / 1e3)
 
     def report(self) -> str:
-        """Say in some lines what was seen."""
+        """Describe the results in some lines."""
         lines = [
             f"  {self.long_turns} of {self.turns} turns took more than {LONG_US / 1e3:.0f} ms",
-            f"  longest turn, the machine's doing included: {self.longest_wall_us / 1e3:.2f} ms",
+            f"  longest turn, the machine's share included: {self.longest_wall_us / 1e3:.2f} ms",
         ]
         lines += [
             f"  own {turn.own_us / 1e3:6.2f} ms of {turn.wall_us / 1e3:6.2f} ms at "
@@ -170,16 +170,16 @@ async def _add_up(parent: int) -> None:
 
 
 def even_turns(seconds: float) -> tuple[Turn, float, int, int]:
-    """Watch a loop that does the same computing in every turn, or until its parent process ends.
+    """Measure a loop that does the same work in every turn, at most until its parent process ends.
 
     Returns
     -------
     longest : Turn
-        By its own doing.
+        The turn with the longest own share.
     wall_us : float
-        The longest of all.
+        The longest turn of all.
     long_turns, turns : int
-        How many took more than `LONG_US`, and how many there were.
+        Turns whose own share exceeds `LONG_US`, and all turns.
     """
     watch = TurnWatch()
     with (
