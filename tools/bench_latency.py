@@ -204,13 +204,7 @@ class Line:
         raise SystemExit(f"no answer from {self.process.args!r}")
 
     def exchange(self, rate_hz: int, seconds: float) -> list[float]:
-        """Send at a rate and match each IMU frame with its answer, in order.
-
-        Returns
-        -------
-        list of float
-            Latencies in µs.
-        """
+        """Send at a rate, match IMU frames with their answers in order; return latencies in µs."""
         self._latencies_us = []
         begin = time.perf_counter()
         count, total = 0, round(seconds * rate_hz)

@@ -92,15 +92,7 @@ class Figures:
 
 
 class PanelBench:
-    """A panel, its operator, and its misbehaving clients.
-
-    Parameters
-    ----------
-    pid : int
-        Process of the panel.
-    link : str
-        Address of its page.
-    """
+    """A panel, by its process and the address of its page, its operator and misbehaving clients."""
 
     def __init__(self, pid: int, link: str) -> None:
         self.pid = pid

@@ -92,12 +92,9 @@ async def record_for_ever(folder: Path, shared: mmap.mmap) -> None:
 
 
 def kill_one(folder: Path, life_s: float) -> float:
-    """Let a recorder live so long, kill it, and return how many seconds of its work are lost.
+    """Kill a recorder after so long, and return how many seconds of its work are lost.
 
-    Raises
-    ------
-    AssertionError
-        If something is wrong with what it left.
+    Raises AssertionError if its files are damaged.
     """
     shared = mmap.mmap(-1, NUMBERS.size)
     child = os.fork()

@@ -59,13 +59,7 @@ class _Call:
 
 
 class Sources:
-    """The syntax trees of a package.
-
-    Parameters
-    ----------
-    folder : Path
-        Folder of the package.
-    """
+    """The syntax trees of the package in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -115,20 +115,7 @@ class SimulatedFlight:
 def fly(
     settings: SimulatorSettings, index: int = 0, duration_s: float = FLIGHT_S
 ) -> SimulatedFlight:
-    """Simulate one aircraft's flight.
-
-    Parameters
-    ----------
-    settings : SimulatorSettings
-    index : int
-        Which of the aircraft; 0 is the first.
-    duration_s : float
-        Duration; the flight repeats after `FLIGHT_S`.
-
-    Returns
-    -------
-    SimulatedFlight
-    """
+    """Simulate the flight of one aircraft, by its index from 0; it repeats after `FLIGHT_S`."""
     aircraft = SimulatedAircraft(settings, index)
     return SimulatedFlight(
         settings=settings,

@@ -6,22 +6,7 @@ from gateway.cli.app import app
 
 
 def invoke(*words: object, answers: str = "", code: int | None = None) -> Result:
-    """Run `mavgate` with some words.
-
-    Parameters
-    ----------
-    words : object
-        Arguments; each is converted to text.
-    answers : str, optional
-        Standard input.
-    code : int, optional
-        The expected exit code; by default any.
-
-    Returns
-    -------
-    Result
-        Exit code and output.
-    """
+    """Run `mavgate` with words as text and its standard input; check the exit code if given."""
     result = CliRunner().invoke(app, [str(word) for word in words], input=answers)
     # An exit is the one exception that a user may see.
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception

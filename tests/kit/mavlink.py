@@ -22,25 +22,7 @@ def packed(
     version: int = 2,
     signing: tuple[bytes, int, int] | None = None,
 ) -> bytes:
-    """Encode one message.
-
-    Parameters
-    ----------
-    message : MAVLink_message
-        Of any dialect.
-    system, component : int
-        Ids of its sender.
-    sequence : int, optional
-        Its number.
-    version : int, optional
-        Of MAVLink.
-    signing : (bytes, int, int), optional
-        Key, link and timestamp of its signature.
-
-    Returns
-    -------
-    bytes
-    """
+    """Encode one message; `signing` contains the key, link and timestamp of its signature."""
     link = dialect.MAVLink(None, system, component)
     link.seq = sequence
     if signing is not None:
@@ -50,14 +32,9 @@ def packed(
 
 
 class Sender:
-    """A MAVLink system that numbers its frames.
+    """A MAVLink system that numbers its frames, and signs them with `KEY` if wanted.
 
-    Parameters
-    ----------
-    system, component : int
-        Ids in the frames; with component `STATION` its heartbeat is a ground station's.
-    signed : bool, optional
-        Sign the frames with `KEY`.
+    With component `STATION` its heartbeat is a ground station's.
     """
 
     def __init__(self, system: int = 1, component: int = 1, *, signed: bool = False) -> None:

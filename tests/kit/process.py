@@ -26,18 +26,9 @@ def wait_for(look: Callable[[], Found | None], describe: Callable[[], str] = str
 
 
 class Process:
-    """A command that runs until it is ended.
+    """A command that runs until it is ended; settings, output and control socket are in `folder`.
 
-    Parameters
-    ----------
-    folder : Path
-        Of its settings, its output and its control socket.
-    *arguments : str
-        The command and its options.
-    config : str
-        Its settings file.
-    **options : Any
-        Of `subprocess.Popen`.
+    `config` is the text of its settings file, `options` are those of `subprocess.Popen`.
     """
 
     def __init__(self, folder: Path, *arguments: str, config: str, **options: Any) -> None:
