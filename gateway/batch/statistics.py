@@ -166,7 +166,7 @@ class Versus:
     leads: dict[str, Lead]
     """Of now over then, by estimator."""
     worse: pd.DataFrame
-    """`place`, `estimator`, `before_m` and `after_m` of flights, the worst first."""
+    """`location`, `estimator`, `before_m` and `after_m` of flights, the worst first."""
     compared: int
     """Flights that both have."""
 
@@ -210,12 +210,12 @@ def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
     both = [new for new in now if HELD in new.figures and new.digest in before]
     changes = pd.DataFrame(
         [
-            (new.place, group_of(new), name, before[new.digest][name], after_m)
+            (new.location, group_of(new), name, before[new.digest][name], after_m)
             for new in both
             for name, after_m in new.figures[HELD].items()
             if name in before[new.digest]
         ],
-        columns=["place", "group", "estimator", "before_m", "after_m"],
+        columns=["location", "group", "estimator", "before_m", "after_m"],
     )
     leads = {
         str(name): lead_of(
@@ -256,7 +256,7 @@ def write_season_page(
     if compared is not None:
         sections.append(_versus_section(compared))
     if broken:
-        rows = [(_file_name(result.place), result.error) for result in broken]
+        rows = [(_file_name(result.location), result.error) for result in broken]
         failed = ReportTable("failed", pd.DataFrame(rows, columns=["recording", "why"]), "Failed.")
         lead = "They are in none of the other tables."
         sections.append(Section("Recordings that failed", lead, tables=[failed]))
@@ -277,15 +277,15 @@ def write_season_page(
     return write_report(Report("Season", description, facts, sections), folder, jobs=1)
 
 
-def _file_name(place: str) -> str:
-    return place.rsplit("/", 1)[-1]
+def _file_name(location: str) -> str:
+    return location.rsplit("/", 1)[-1]
 
 
 def _row(result: FlightResult) -> dict[str, Any]:
     summary = result.figures.get("summary", result.figures)
     held = result.figures.get(HELD, {})
     return {
-        "recording": _file_name(result.place),
+        "recording": _file_name(result.location),
         "aircraft": "" if result.vehicle is None else str(result.vehicle),
         "began": result.began or "",
         "duration, s": _number(summary.get("duration, s", summary.get("duration_s"))),
@@ -313,7 +313,7 @@ def _versus_section(compared: Versus) -> Any:
     tables = [ReportTable("versus", leads, "Errors of now over those of then.")]
     if len(compared.worse):
         worse = compared.worse.drop(columns="group").assign(
-            place=compared.worse["place"].map(_file_name)
+            location=compared.worse["location"].map(_file_name)
         )
         worse.columns = pd.Index(["recording", "estimator", "then, m", "now, m"])
         tables.append(ReportTable("worse", worse, f"{len(worse)} that got worse."))

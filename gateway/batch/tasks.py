@@ -46,7 +46,7 @@ HELD: Final = "held_m"
 class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
     """Result of a task on one recording, as it is stored."""
 
-    place: str
+    location: str = msgspec.field(name="place")
     """Path or URL of its first file."""
     digest: str
     key: str
@@ -395,7 +395,7 @@ def run_season(
         key = _key(task, stamp)
         kept = folder.find(key) if folder is not None else None
         if kept is not None:
-            found[number] = msgspec.structs.replace(kept, place=as_text(item.location))
+            found[number] = msgspec.structs.replace(kept, location=as_text(item.location))
         else:
             todo[number] = (item, names[number], _blank(task, item, stamp, key))
     numbers = list(todo)
@@ -442,7 +442,7 @@ def _key(task: FlightTask, stamp: str) -> str:
 
 def _blank(task: FlightTask, item: BatchItem, stamp: str, key: str) -> FlightResult:
     return FlightResult(
-        place=as_text(item.location), digest=stamp, key=key, task=task.name, version=__version__
+        location=as_text(item.location), digest=stamp, key=key, task=task.name, version=__version__
     )
 
 

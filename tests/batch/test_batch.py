@@ -128,7 +128,12 @@ def test_results_of_two_versions_are_compared(
 def test_partial_result_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = ResultFolder(tmp_path)
     result = FlightResult(
-        place="a", digest="d", key="k", task="report", version="1", files=("reports/a/index.html",)
+        location="a",
+        digest="d",
+        key="k",
+        task="report",
+        version="1",
+        files=("reports/a/index.html",),
     )
 
     def fail(*_: object, **__: object) -> None:
@@ -177,11 +182,11 @@ def test_two_batches_do_not_write_into_one_folder(season: Path, tmp_path: Path) 
 def test_results_with_equal_times_are_sorted_by_name(tmp_path: Path) -> None:
     folder = ResultFolder(tmp_path)
     for key in ("b", "z", "a", "m", "c", "y"):
-        result = FlightResult(place=key, digest="d", key=key, task="info", version="1")
+        result = FlightResult(location=key, digest="d", key=key, task="info", version="1")
         folder.keep(result, {})
         os.utime(tmp_path / RESULTS / f"{key}.json", ns=(1, 1))
     os.utime(tmp_path / RESULTS / "b.json", ns=(2, 2))
-    assert [found.place for found in read_results(tmp_path)] == [*"acmyzb"]
+    assert [found.location for found in read_results(tmp_path)] == [*"acmyzb"]
 
 
 def test_info_describes_every_file(season: Path, tmp_path: Path) -> None:
@@ -202,7 +207,7 @@ def test_files_with_non_utf8_names_are_processed(season: Path, tmp_path: Path) -
         code, text = run("info", there, "-o", tmp_path / "out", "--jobs", 1)
         assert code == 1
         assert "1 of 2 recordings failed" in text
-    names = {Path(result.place).name for result in read_results(tmp_path / "out")}
+    names = {Path(result.location).name for result in read_results(tmp_path / "out")}
     assert names == {r"fl\xfcg_01_v1.csv", r"bad\xff.csv"}
 
 
@@ -343,7 +348,7 @@ def test_remote_files_are_fetched_once_unless_changed(season: Path, tmp_path: Pa
         results = run_season(InfoTask(OPTIONS), items, ThisProcess(), folder, lambda *_: None)
         digests = [sha256(storage.store[f"/flights/{name}"].getvalue()) for name in FLIGHTS[:2]]
         assert [r.digest for r in results[:2]] == [digest.hexdigest() for digest in digests]
-        assert [r.place for r in results[:2]] == [
+        assert [r.location for r in results[:2]] == [
             f"elsewhere://host/flights/{n}" for n in FLIGHTS[:2]
         ]
         place = "elsewhere://host/flights/locked.csv: "

@@ -73,9 +73,9 @@ def test_single_day_cannot_be_separated_from_chance() -> None:
     assert lead_of(np.array([np.nan]), np.ones(1), ["a"]) is None
 
 
-def flight(place: str, vehicle: int, **held_m: float) -> FlightResult:
+def flight(location: str, vehicle: int, **held_m: float) -> FlightResult:
     return FlightResult(
-        place=place, digest=place, key="", task="fuse", version="", vehicle=vehicle,
+        location=location, digest=location, key="", task="fuse", version="", vehicle=vehicle,
         began="2026-06-01 10:00:00", figures={"held_m": held_m},
     )  # fmt: skip
 
@@ -97,7 +97,7 @@ def test_degraded_flights_are_listed_worst_first() -> None:
     then = [flight("a", 1, eskf=1.0), flight("b", 1, eskf=1.0), flight("c", 1, eskf=1.0)]
     now = [flight("a", 1, eskf=1.04), flight("b", 1, eskf=2.0), flight("c", 1, eskf=3.0)]
     found = versus([*now, flight("new", 1, eskf=9.0)], then)
-    assert found.worse[["place", "after_m"]].to_numpy().tolist() == [["c", 3.0], ["b", 2.0]]
+    assert found.worse[["location", "after_m"]].to_numpy().tolist() == [["c", 3.0], ["b", 2.0]]
     assert found.compared == 3
 
 

@@ -108,7 +108,7 @@ def info(
             continue
         km = sum(vehicle["distance_m"] for vehicle in figures["vehicles"]) / 1000.0
         grid.add_row(
-            result.place.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
+            result.location.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
             f"{figures['duration_s']:.0f}", f"{km:.2f}", str(len(figures["gaps"])),
             str(figures["damaged_bytes"]),
         )  # fmt: skip
@@ -188,7 +188,7 @@ def _show_versus(compared: "Versus") -> None:
         console.print(f"{estimator} against the other results: {lead.text}")
     for change in compared.worse.itertuples():
         console.print(
-            f"worse: {change.place}, {change.estimator}: {change.before_m:.3f} m before, "
+            f"worse: {change.location}, {change.estimator}: {change.before_m:.3f} m before, "
             f"{change.after_m:.3f} m now",
         )
 

@@ -307,7 +307,7 @@ def run_season_sweep(
     best = with_values(fusion, keys, points[choice.winner])
     table = pd.DataFrame(
         {
-            "recording": [result.place for result in swept],
+            "recording": [result.location for result in swept],
             "aircraft": [result.vehicle for result in swept],
             "began": [result.began for result in swept],
             "as it came": base,

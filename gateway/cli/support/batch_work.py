@@ -142,7 +142,7 @@ def _print_failures(results: Sequence[FlightResult]) -> None:
     failed = [result for result in results if result.error is not None]
     for result in failed[:SHOWN_FAILURES]:
         text = result.error or ""
-        line = text if text.startswith(result.place) else f"{result.place}: {text}"
+        line = text if text.startswith(result.location) else f"{result.location}: {text}"
         console.print(line, style="red")
     if len(failed) > SHOWN_FAILURES:
         console.print(f"and {len(failed) - SHOWN_FAILURES} more that failed")
