@@ -86,13 +86,6 @@ def _mark(wanted: np.dtype[Any]) -> int:
 
 
 @compiled
-def fill(target: FloatArray, value: float) -> None:
-    """Write one number everywhere."""
-    for k in range(target.shape[0]):
-        target[k] = value
-
-
-@compiled
 def as_quat(q: FloatArray) -> Quat:
     """Read four numbers of a record."""
     return (q[0], q[1], q[2], q[3])

@@ -71,9 +71,7 @@ TIME: Final = 7
 @compiled
 def clear_pairs(s: State) -> None:
     """Discard the pairs."""
-    for i in range(MOMENTS):
-        for j in range(MOMENTS):
-            s.moments[i, j] = 0.0
+    s.moments[:] = 0.0
     s.pairs = s.pairs_s = 0.0
     s.pair_s = NEVER_S
 

@@ -43,7 +43,7 @@ from gateway.estimation.eskf.update import (
     sustained_sq,
     update_gravity,
 )
-from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
+from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import from_rotation_vector, multiply, normalise
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -93,7 +93,7 @@ def begin_attitude(s: State, p: Gains, level_var: float, heading_var: float) -> 
 def end_aiding(s: State) -> None:
     """Stop estimating position and velocity."""
     reset_states(s, VEL, 0.0)
-    fill(s.vel_n, 0.0)
+    s.vel_n[:] = 0.0
     s.aided = 0
 
 
@@ -199,7 +199,7 @@ def discard_calibration(s: State, p: Gains) -> None:
     """Discard the sensor errors that were estimated with a wrong attitude."""
     reset_accel_bias(s, p)
     reset_hard_iron(s, p)
-    fill(s.gyro_scale_b, 0.0)
+    s.gyro_scale_b[:] = 0.0
     if s.rest_seen > 0:
         write_vec(s.gyro_bias_b, as_vec(s.rest_bias_b))
     reset_states(s, GYRO_BIAS, gyro_bias_var(s, p))
@@ -210,7 +210,7 @@ def discard_calibration(s: State, p: Gains) -> None:
 def reset_accel_bias(s: State, p: Gains) -> None:
     """Discard the accelerometer bias."""
     propagate(s, p)
-    fill(s.accel_bias_b, 0.0)
+    s.accel_bias_b[:] = 0.0
     reset_states(s, ACCEL_BIAS, accel_bias_var(s, p))
 
 
@@ -218,8 +218,8 @@ def reset_accel_bias(s: State, p: Gains) -> None:
 def reset_gyro_bias(s: State, p: Gains) -> None:
     """Discard the gyroscope bias, and that of the last rest."""
     propagate(s, p)
-    fill(s.gyro_bias_b, 0.0)
-    fill(s.rest_bias_b, 0.0)
+    s.gyro_bias_b[:] = 0.0
+    s.rest_bias_b[:] = 0.0
     s.rest_seen = 0
     reset_states(s, GYRO_BIAS, gyro_bias_var(s, p))
 

@@ -20,7 +20,7 @@ from gateway.estimation.columns import FRESH_GPS_S
 from gateway.estimation.eskf.alignment import MISMATCH_SIGMA
 from gateway.estimation.eskf.predict import look_back
 from gateway.estimation.eskf.state import LATENCIES, NEVER_S, State
-from gateway.estimation.record import FloatArray, fill
+from gateway.estimation.record import FloatArray
 from gateway.geometry.quaternion import norm_sq
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
@@ -117,10 +117,8 @@ def close_window(s: State) -> None:
         mean_sq = (sums[1] ** 2 + sums[2] ** 2 + sums[3] ** 2) / (n * n)
         if sums[4] / n - mean_sq > MANOEUVRE_MPS2 * MANOEUVRE_MPS2:
             add_window(s, n)
-    fill(sums, 0.0)
-    for k in range(LATENCIES):
-        for i in range(10):
-            products[k, i] = 0.0
+    sums[:] = 0.0
+    products[:] = 0.0
 
 
 @compiled

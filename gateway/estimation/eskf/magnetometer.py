@@ -30,7 +30,7 @@ from gateway.estimation.eskf.state import (
     reset_states,
 )
 from gateway.estimation.eskf.update import clear_row, consider, inject, update_scalar
-from gateway.estimation.record import as_quat, as_vec, fill, write_quat, write_vec
+from gateway.estimation.record import as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.angle import wrap_pi
 from gateway.geometry.quaternion import (
     body_axes,
@@ -106,7 +106,7 @@ def is_sound_field(s: State, mag_b: Vec3, dt: float) -> bool:
     if norm_sq(difference(mag_b, as_vec(s.mag_last))) == 0.0:
         return bool(s.mag_misplaced == 0 and not stuck)
     write_vec(s.mag_last, mag_b)
-    fill(s.mag_turned, 0.0)
+    s.mag_turned[:] = 0.0
     check_placement(s, mag_b)
     return bool(s.mag_misplaced == 0)
 
@@ -312,7 +312,7 @@ def raise_hard_iron_by_dip(s: State, earth_dip_rad: float) -> None:
 def reset_hard_iron(s: State, p: Gains) -> None:
     """Discard the hard iron that was found."""
     propagate(s, p)
-    fill(s.hard_iron_b, 0.0)
+    s.hard_iron_b[:] = 0.0
     reset_states(s, HARD_IRON, hard_iron_var(s, p))
 
 

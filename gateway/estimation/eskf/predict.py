@@ -44,7 +44,7 @@ from gateway.estimation.eskf.state import (
     raise_variance,
     scale_state,
 )
-from gateway.estimation.record import FloatArray, as_quat, as_vec, fill, write_quat, write_vec
+from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, write_vec
 from gateway.geometry.quaternion import (
     body_axes,
     difference,
@@ -241,11 +241,10 @@ def propagate(s: State, p: Gains) -> None:
     limit_variance(s.P, ATT + 2, NO_HEADING_VAR)
     follow_bias_steps(s, dt)
     s.pending_s = 0.0
-    fill(s.pending_noise, 0.0)
-    fill(s.pending_force_n, 0.0)
-    for k in range(3):
-        for j in range(3):
-            s.pending_rotation[k, j] = s.pending_rotation_gyro[k, j] = 0.0
+    s.pending_noise[:] = 0.0
+    s.pending_force_n[:] = 0.0
+    s.pending_rotation[:] = 0.0
+    s.pending_rotation_gyro[:] = 0.0
 
 
 @compiled
@@ -320,8 +319,8 @@ def follow_bias_steps(s: State, dt: float) -> None:
     known = s.lost == 0 and s.heading_known == 1
     s.bias_watch_s = min(s.bias_watch_s + dt, BIAS_MEMORY_S) if known else 0.0
     if min(s.bias_watch_s, s.sound_s) < BIAS_MEMORY_S:
-        fill(s.bias_sum, 0.0)
-        fill(s.bias_sum_var, 0.0)
+        s.bias_sum[:] = 0.0
+        s.bias_sum_var[:] = 0.0
         return
     kept = math.exp(-dt / BIAS_MEMORY_S)
     for k in range(3):

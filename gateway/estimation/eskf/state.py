@@ -296,9 +296,8 @@ def level_variance(s: State) -> float:
 def reset_state(s: State, k: int, variance: float) -> None:
     """Give one state a new variance, uncorrelated with the others."""
     s.resets[k] += 1.0
-    for j in range(STATES):
-        s.P[k, j] = 0.0
-        s.P[j, k] = 0.0
+    s.P[k, :] = 0.0
+    s.P[:, k] = 0.0
     s.P[k, k] = variance
 
 

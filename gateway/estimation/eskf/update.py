@@ -39,7 +39,7 @@ from gateway.estimation.eskf.state import (
     VEL,
     State,
 )
-from gateway.estimation.record import as_quat, fill, write_quat
+from gateway.estimation.record import as_quat, write_quat
 from gateway.geometry.quaternion import (
     body_axes,
     from_rotation_vector,
@@ -66,21 +66,21 @@ REST_RATE_VAR: Final = 0.002**2
 @compiled
 def clear_row(s: State) -> None:
     """Clear the row of the measurement matrix and the considered states."""
-    fill(s.h, 0.0)
-    fill(s.considered, 0.0)
+    s.h[:] = 0.0
+    s.considered[:] = 0.0
 
 
 @compiled
 def consider(s: State, first: int, count: int) -> None:
     """Keep states as they are in this update, while their uncertainty counts [2]_."""
-    fill(s.considered[first : first + count], 1.0)
+    s.considered[first : first + count] = 1.0
 
 
 @compiled
 def innovation_variance(s: State, variance: float) -> float:
     """Compute `P h`, and return `h^T P h` plus the variance of the measurement."""
     P, Ph = s.P, s.Ph
-    fill(Ph, 0.0)
+    Ph[:] = 0.0
     for j in range(STATES):
         factor = s.h[j]
         if factor != 0.0:
@@ -142,7 +142,7 @@ def inject(s: State) -> None:
         s.gyro_scale_b[k] += d[GYRO_SCALE + k]
     s.baro_offset_m += d[BARO_OFFSET]
     s.mag_latency_s += d[MAG_LATENCY]
-    fill(d, 0.0)
+    d[:] = 0.0
 
 
 @compiled
