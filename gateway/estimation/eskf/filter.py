@@ -106,7 +106,7 @@ from gateway.estimation.eskf.update import (
 from gateway.estimation.record import FloatArray, as_quat, as_vec, layout, write_quat, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
-from gateway.records import NAN, Vec3
+from gateway.records import NAN, UNKNOWN_VEC3, Vec3
 from gateway.units import RAD_PER_DEG
 
 UNAIDED_SCALE: Final = 0.01
@@ -323,7 +323,7 @@ def write_output(s: State, p: Gains, row: FloatArray) -> None:
     write_quat(row[NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
     write_vec(row[NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
     row[NAV_FLAGS] = float(flags_of(s, p))
-    row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3] = NAN
+    write_vec(row[NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3], UNKNOWN_VEC3)
     if s.started == 1:
         write_std(row, NAV_ATTITUDE_STD, s, ATT)
         row[NAV_ATTITUDE_STD + 2] = heading_std_rad(s)
@@ -351,9 +351,9 @@ def heading_std_rad(s: State) -> float:
 @compiled
 def write_position(s: State, row: FloatArray) -> None:
     """Write position, velocity and their standard deviations; NaN for the unknown."""
-    row[NAV_VEL : NAV_VEL + 3] = NAN
-    row[NAV_VEL_STD : NAV_VEL_STD + 3] = NAN
-    row[NAV_POS_STD : NAV_POS_STD + 3] = NAN
+    write_vec(row[NAV_VEL : NAV_VEL + 3], UNKNOWN_VEC3)
+    write_vec(row[NAV_VEL_STD : NAV_VEL_STD + 3], UNKNOWN_VEC3)
+    write_vec(row[NAV_POS_STD : NAV_POS_STD + 3], UNKNOWN_VEC3)
     row[NAV_LAT] = row[NAV_LON] = NAN
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_s != NEVER_S else NAN
     if s.has_origin == 0:
