@@ -32,7 +32,7 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from gateway.live.control_socket import request
 from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
-from tools.bench_hub import cpu_ns, resident_kib, udp_socket
+from tools.bench_hub import cpu_ns, hub_command, resident_kib, udp_socket
 
 SITES = (1, 10, 50, 200)
 RATE_HZ = 60
@@ -102,22 +102,6 @@ with socket.create_connection(("127.0.0.1", int(sys.argv[1]))) as link:
     load([link.sendall], int(sys.argv[2]), float(sys.argv[3]))
 """
 )
-
-HUB = """
-import asyncio, sys
-from gateway.clock import GatewayClock
-from gateway.hub.hub import Hub
-from gateway.hub.settings import HubSettings
-
-async def main():
-    endpoints = ("tcp-listen:127.0.0.1:0", f"udp:127.0.0.1:{sys.argv[1]}")
-    hub = Hub(HubSettings(endpoints=endpoints), lambda incoming: None, GatewayClock())
-    hub.start()
-    print(hub.listening_ports()[0], flush=True)
-    await asyncio.Event().wait()
-
-asyncio.run(main())
-"""
 
 
 @dataclass(frozen=True)
@@ -256,7 +240,8 @@ def run(sites: int, unsubscribed: int, fleets: int, rate_hz: int, seconds: float
 def run_plain(rate_hz: int, seconds: float) -> FleetRun:
     """Measure one site that comes to a plain hub over TCP."""
     station = Station(ATTITUDE, time.time_ns)
-    hub = start("-c", HUB, str(station.port))
+    _, *words = hub_command("tcp-listen:127.0.0.1:0", f"udp:127.0.0.1:{station.port}")
+    hub = start(*words)
     assert hub.stdout is not None
     port = hub.stdout.readline().strip()
     load = start("-c", TCP_GENERATOR, port, str(rate_hz), str(seconds))

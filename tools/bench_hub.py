@@ -82,6 +82,7 @@ async def main(endpoints):
     hub = Hub(HubSettings(endpoints=tuple(endpoints), max_clients=500), lambda incoming: None,
               GatewayClock())
     hub.start()
+    print(*hub.listening_ports(), flush=True)
     await asyncio.Event().wait()
 
 event_loop, *endpoints = sys.argv[1:]
