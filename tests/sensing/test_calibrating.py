@@ -224,7 +224,7 @@ def test_tilted_pose_is_no_side() -> None:
     assert sides_of([pose(G * np.array([half, half, 0.0]))]) == set()
 
 
-def test_pose_in_motion_does_not_count() -> None:
+def test_pose_in_motion_is_not_counted() -> None:
     shaken = pose(SIDES[0], shaking=3.0)
     assert not still_windows(shaken)
     assert sides_of([shaken, pose(SIDES[1])]) == {1}

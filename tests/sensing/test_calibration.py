@@ -19,25 +19,25 @@ from gateway.sensing.calibration import (
 
 
 @pytest.mark.parametrize(("range_g", "counts"), [(2, 16384), (4, 8192), (8, 4096), (16, 2048)])
-def test_one_g_at_every_range(range_g: int, counts: int) -> None:
+def test_one_g_is_read_at_every_range(range_g: int, counts: int) -> None:
     assert accel_from_counts((0, 0, counts), range_g) == pytest.approx((0.0, 0.0, 9.80665))
 
 
 @pytest.mark.parametrize(
     ("range_dps", "lsb"), [(250, 131), (500, 65.5), (1000, 32.8), (2000, 16.4)]
 )
-def test_ten_degrees_a_second_at_every_range(range_dps: int, lsb: float) -> None:
+def test_ten_degrees_a_second_are_read_at_every_range(range_dps: int, lsb: float) -> None:
     rate = gyro_from_counts((round(10 * lsb), 0, 0), range_dps)
     assert rate[0] == pytest.approx(math.radians(10.0), rel=1e-3)
 
 
-def test_magnetometer_gain_and_overflow() -> None:
+def test_magnetometer_is_scaled_by_its_gain_and_none_on_overflow() -> None:
     assert mag_from_counts((1090, -545, 0), 1090) == pytest.approx((100.0, -50.0, 0.0))
     assert mag_from_counts((1090, -4096, 0), 1090) is None
     assert mag_from_counts((1, 1, 1), 0) is None
 
 
-def test_temperature_word() -> None:
+def test_temperature_word_is_converted_to_degrees() -> None:
     assert temperature_from_counts(-3920) == pytest.approx(25.0, abs=0.01)
 
 

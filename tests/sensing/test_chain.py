@@ -29,7 +29,7 @@ def chain() -> SensorChain:
     return SensorChain(NodeCalibration())
 
 
-def test_level_board_in_si_and_body_axes(chain: SensorChain) -> None:
+def test_sample_of_a_level_board_is_in_si_and_body_axes(chain: SensorChain) -> None:
     sample = chain.imu(LEVEL)
     assert sample.accel_b_mps2 == pytest.approx((0.0, 0.0, -9.80665))
     assert sample.mag_b_ut == pytest.approx((20.0, 0.0, 40.0))
@@ -62,7 +62,9 @@ def test_sensors_without_a_calibration_are_marked(chain: SensorChain) -> None:
     ],
     ids=["old", "absent", "overflow", "blank"],
 )
-def test_no_magnetometer_value_where_there_is_none(chain: SensorChain, raw: ImuRaw) -> None:
+def test_sample_without_a_new_field_has_no_magnetometer_value(
+    chain: SensorChain, raw: ImuRaw
+) -> None:
     assert chain.imu(raw).mag_b_ut is None
 
 
@@ -74,11 +76,13 @@ def test_payload_after_a_sensor_reset_has_no_values(chain: SensorChain) -> None:
 @pytest.mark.parametrize(
     ("pressure_pa", "alt_m"), [(101_325.0, 0.0), (89_874.6, 1000.0), (54_019.9, 5000.0)]
 )
-def test_pressure_altitude_of_the_standard_atmosphere(pressure_pa: float, alt_m: float) -> None:
+def test_pressure_altitude_is_that_of_the_standard_atmosphere(
+    pressure_pa: float, alt_m: float
+) -> None:
     assert pressure_altitude_m(pressure_pa) == pytest.approx(alt_m, abs=0.5)
 
 
-def test_barometer(chain: SensorChain) -> None:
+def test_pressure_altitude_is_unknown_without_a_pressure(chain: SensorChain) -> None:
     raw = BaroRaw(time_us=5, node=NODE, node_time_us=5, pressure_pa=0.0, temperature_degc=20.0)
     assert math.isnan(chain.baro(raw).alt_pressure_m)
     assert chain.baro(replace(raw, pressure_pa=101_325.0)).alt_pressure_m == 0.0

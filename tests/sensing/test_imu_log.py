@@ -43,7 +43,7 @@ def payloads(seed: int) -> list[ImuRaw]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_same_bits(seed: int) -> None:
+def test_calibrated_log_equals_its_single_samples_to_the_bit(seed: int) -> None:
     raws = payloads(seed)
     chain = SensorChain(CALIBRATION)
     expected = [chain.imu(raw) for raw in raws]
