@@ -227,12 +227,12 @@ class FrameTranslation:
     def to_site(self, frame: MavFrame, now_us: int) -> tuple[int, MavFrame] | None:
         """Return the system at the site that a frame is for (0: all) and the frame for it.
 
-        None for one that cannot be translated, or is for another site's vehicle: that one has got
-        its id from a vehicle of this site, where it may be a third one's.
+        None for one that cannot be translated, or is for an id that no vehicle of this site has
+        (any more): the hub's routes outlive a reassignment, and at the site that id may be a
+        third vehicle's, or that of an excluded one.
         """
         sender, target = self._id_there(frame.origin[0]), frame.target[0]
-        addressed = self._ids.vehicle_of(target)
-        if addressed is not None and addressed[0] != self._site:
+        if target and (self._ids.vehicle_of(target) or ("",))[0] != self._site:
             return None
         signatures = self._signatures
         # The site itself checks for replays: it knows all its streams.

@@ -201,6 +201,20 @@ def test_command_for_an_id_passed_to_another_site_is_not_sent_to_the_former() ->
     assert found[0] == 1
 
 
+@pytest.mark.parametrize("is_excluded", [True, False])
+def test_command_for_an_id_without_a_vehicle_is_not_sent_to_its_former_vehicle(
+    is_excluded: bool,
+) -> None:
+    ids = IdMap()
+    there = FrameTranslation("b", ids)
+    assert ids.id_of("b", 30) == 30
+    if is_excluded:
+        ids.leave_out("b", 30)
+    else:
+        ids.set_by_hand("b", 30, 7)
+    assert to_site(there, packed(command(30), 255)) is None
+
+
 def test_frame_of_a_vehicle_without_id_is_counted() -> None:
     ids = IdMap()
     for n in range(260):
