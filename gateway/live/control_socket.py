@@ -316,7 +316,7 @@ def find_socket(name: str) -> Path:
     own = live_sockets(name)
     if len(own) > 1:
         listed = ", ".join(map(str, own))
-        raise ControlError(f"several run: choose one by --socket: {listed}")
+        raise ControlError(f"several run: choose one by --socket or MAVGATE_SOCKET: {listed}")
     if own:
         return own[0]
     service = SERVICE_FOLDER / f"{name}.sock"

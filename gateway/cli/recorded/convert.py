@@ -6,7 +6,6 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -19,11 +18,11 @@ from gateway.cli.support.recording_options import (
     SmoothOption,
     SystemOption,
     ToOption,
-    files_of,
     print_remarks,
     progress_of,
     read_range,
     read_sensors,
+    recorded_files,
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.estimation.record import IntArray
@@ -80,7 +79,7 @@ def convert(
     if message and out.suffix != ONE_KIND:
         refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
     of_tlogs = not fuse and (out.suffix in FROM_TLOGS or message)
-    files = files_of(files, recordings_folder(config), "tlogs" if of_tlogs else "tables")
+    files = recorded_files(files, config, "tlogs" if of_tlogs else "tables")
     with progress_of(files) as advance:
         options = read_options(
             read_settings(config),
@@ -152,7 +151,7 @@ def fuse_log(
     manoeuvres, or the default is assumed, with a message.
     """
     current = read_settings(config)
-    files = files_of([file], recordings_folder(config), "tables")
+    files = recorded_files([file], config, "tables")
     inputs = [*files, columns, config]
     check_output(out, inputs, overwrite=force)
     with progress_of(files) as advance:

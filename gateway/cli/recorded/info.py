@@ -10,9 +10,13 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import ConfigOption, read_options, read_settings
-from gateway.cli.support.recording_options import ColumnsOption, ForceOption, files_of, progress_of
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    ForceOption,
+    progress_of,
+    recorded_files,
+)
 from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
 from gateway.output import write_new
 from gateway.recordings.files import (
@@ -57,7 +61,7 @@ def info(
 ) -> None:
     """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
     # A file needs no settings, which would import every stage.
-    files = [file] if file.exists() else files_of([file], recordings_folder(config), "all")
+    files = recorded_files([file], config, "all")
     with progress_of(files) as advance:
 
         def options() -> ReadOptions:

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.control import AskingTyper, ask, recordings_folder, with_socket
+from gateway.cli.support.control import AskingTyper, ask, with_socket
 from gateway.cli.support.options import ConfigOption, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -22,10 +22,10 @@ from gateway.cli.support.recording_options import (
     PositionOption,
     SettingsOption,
     ToOption,
-    files_of,
     print_remarks,
     progress_of,
     read_range,
+    recorded_files,
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
@@ -104,7 +104,7 @@ def play(
             *read_range(begin, end), _speed(speed), skip_gaps, loop, paused,
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
-        files = files_of(files, recordings_folder(config), "tlogs")
+        files = recorded_files(files, config, "tlogs")
         options = read_options(gateway, columns, choice=settings, position=position)
         with progress_of(files) as advance:
             recorded = open_flights(files, replace(options, progress=advance), opened)

@@ -12,9 +12,8 @@ import typer
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses, has_dask
 from gateway.batch.storage import BatchItem, has_fsspec, is_url, items_of
 from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_season, without_secrets
-from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import read_options, read_settings
-from gateway.cli.support.recording_options import Wanted, files_of
+from gateway.cli.support.recording_options import Wanted, recorded_files
 from gateway.cli.support.terminal import console_of, how_to_add, progress_bar, refuse
 from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice
@@ -77,8 +76,7 @@ class SeasonWork:
             if is_url(name):
                 names.append(name)
                 continue
-            folder = recordings_folder(self.config)
-            names += map(str, files_of([Path(name).expanduser()], folder, wanted))
+            names += map(str, recorded_files([Path(name).expanduser()], self.config, wanted))
         try:
             items = items_of(names, each_file=each_file)
         except OSError as error:

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from collections.abc import Callable
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, cast
+from typing import Annotated, Any, Final, TypeVar, cast
 
 import typer
 
 from gateway.cli.support.options import folder_of, read_settings
 from gateway.live.control_socket import find_socket, live_sockets, request
 
+SOCKET_VARIABLE: Final = "MAVGATE_SOCKET"
 SocketOption = Annotated[
     Path | None,
     typer.Option(
         "--socket",
-        envvar="MAVGATE_SOCKET",
+        envvar=SOCKET_VARIABLE,
         help="Control socket of the gateway, if several run.",
     ),
 ]
@@ -40,12 +42,18 @@ def ask(
 
 def socket_of(of: str) -> Path:
     """Return the selected gateway's socket; raises ControlError if there is none."""
-    return _named.get() or find_socket(of)
+    return _chosen() or find_socket(of)
 
 
 def is_running() -> bool:
     """Return whether a gateway of this user runs."""
-    return _named.get() is not None or bool(live_sockets("run"))
+    return _chosen() is not None or bool(live_sockets("run"))
+
+
+def _chosen() -> Path | None:
+    """Return the socket that the user has chosen, for commands without `--socket` too."""
+    named = _named.get() or os.environ.get(SOCKET_VARIABLE)
+    return Path(named) if named else None
 
 
 def recordings_folder(config: Path | None) -> Path:

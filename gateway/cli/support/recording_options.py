@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 import typer
 from rich.progress import DownloadColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import folder_of
 from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
@@ -110,13 +111,25 @@ Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""
 
 
+def recorded_files(names: Iterable[Path], config: Path | None, wanted: Wanted) -> list[Path]:
+    """Replace names of recordings by their files, for which alone a gateway is asked."""
+    names = list(names)
+    if all(map(_is_path, names)):
+        return names
+    return files_of(names, recordings_folder(config), wanted)
+
+
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
     """Replace names of recordings by their files; paths stay unchanged."""
     return [file for name in names for file in _files_of(name, folder, wanted)]
 
 
+def _is_path(name: Path) -> bool:
+    return name.exists() or name.name != str(name)
+
+
 def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
-    if name.exists() or name.name != str(name):
+    if _is_path(name):
         return [name]
     try:
         files = list(find_recording(folder, str(name)).files)

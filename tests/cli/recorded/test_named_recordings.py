@@ -2,7 +2,9 @@
 
 import gzip
 import json
+import socket
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -144,6 +146,29 @@ def test_existing_path_takes_precedence_over_a_name(tmp_path: Path) -> None:
     assert files_of([there, missing], tmp_path, "tables") == [there, missing]
     with pytest.raises(FlightError, match=r"gone\.tlog: no such file"):
         files_of([Path("gone.tlog")], tmp_path, "tables")
+
+
+def test_only_names_need_a_choice_where_several_gateways_run(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runtime = tmp_path / "runtime"
+    (runtime / "mavgate").mkdir(parents=True, mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    file, out = config.parent / "recordings" / "lake_01.tlog", tmp_path / "out.tlog"
+    with ExitStack() as opened:
+        for name in ("run.sock", "run-2.sock"):
+            listening = opened.enter_context(socket.socket(socket.AF_UNIX))
+            listening.bind(str(runtime / "mavgate" / name))
+            listening.listen()
+        run("convert", file, "-o", out)
+        assert out.read_bytes() == file.read_bytes()
+        refused = invoke("convert", "lake", "-o", tmp_path / "again.tlog")
+        assert refused.exit_code == 2
+        assert "MAVGATE_SOCKET" in refused.output
+    monkeypatch.setenv("MAVGATE_SOCKET", str(runtime / "mavgate" / "run-2.sock"))
+    chosen = invoke("convert", "lake", "-o", tmp_path / "again.tlog")
+    assert "nobody listens at the socket" in chosen.output
+    assert "run-2.sock" in chosen.output.replace("\n", "")
 
 
 def test_info_accepts_a_foreign_csv(tmp_path: Path) -> None:
