@@ -10,7 +10,7 @@ are not tracked by the garbage collector. `msgspec.structs.replace` copies one w
 """
 
 from enum import IntEnum, IntFlag
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 
@@ -294,7 +294,7 @@ class FusedSample(msgspec.Struct, frozen=True, gc=False):
 class FusionState(msgspec.Struct, frozen=True, gc=False):
     """The state of one aircraft between two samples that is needed to continue exactly."""
 
-    vehicle_id: int
+    vehicle_id: Annotated[int, msgspec.Meta(ge=1, le=255)]
     fits: str
     """Checksum of version and settings that it can be restored with."""
     estimation: bytes

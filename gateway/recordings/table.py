@@ -52,6 +52,10 @@ MAX_LINE: Final = 1 << 20
 """Longer than any settings; a disk's zeros without a line's end must not fill the memory."""
 
 
+TimeUs = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
+"""A time in µs; the sum of two fits 64 bits."""
+
+
 class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """The head of a table."""
 
@@ -63,7 +67,7 @@ class TableHeader(msgspec.Struct, frozen=True, kw_only=True):
     """Part of the recording; the states of a later part carry on those of the one before."""
     cold_start: bool = True
     """Whether the first row is the first sample that the estimator ever saw."""
-    unix_us_at_zero: int | None = None
+    unix_us_at_zero: TimeUs | None = None
     """Civil time of `time_us` zero in µs since 1970, as far as it was known at the start."""
     settings: dict[str, Any] = {}
     """The settings, as in the settings file."""
@@ -80,7 +84,7 @@ REMARK: Final = "Mark: "
 class TableMark(msgspec.Struct, frozen=True):
     """A remark at a moment of the flight."""
 
-    time_us: int
+    time_us: TimeUs
     text: str
 
 

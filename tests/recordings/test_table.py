@@ -147,3 +147,20 @@ def test_pieces_of_a_block_contain_all_events_in_order(size: int, count: int) ->
     pieces = [*block_of(events).pieces(size)]
     assert max(map(len, pieces)) <= size
     assert repr([event for piece in pieces for event in piece.events(3)]) == repr(events)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f'# header: {{"unix_us_at_zero": {10**30}}}',
+        f'# mark: {{"time_us": {10**30}, "text": "over the wood"}}',
+        f'# mark: {{"time_us": {-(10**30)}, "text": "over the wood"}}',
+        '# state: {"vehicle_id": 256, "fits": "", "estimation": ""}',
+        '# state: {"vehicle_id": 0, "fits": "", "estimation": ""}',
+    ],
+)
+def test_comment_with_a_number_that_no_other_format_can_hold_is_a_fault(line: str) -> None:
+    _, events = read(make_table([]) + line.encode() + b"\n")
+    (fault,) = events
+    assert isinstance(fault, TableFault)
+    assert "Expected `int`" in fault.reason
