@@ -1,5 +1,6 @@
 """Mutual TLS with the commands and files of docs/fleet.md as they stand there."""
 
+import os
 import re
 import socket
 import subprocess
@@ -165,3 +166,16 @@ def test_site_reads_and_writes_its_own_keys_only(join: Callable[[str], Any]) -> 
         second.put("mavlink/field-2/1/out", b"own")
         time.sleep(0.02)
     assert set(got) == {("mavlink/field-2/1/out", b"own")}
+
+
+def test_device_as_configuration_is_refused_unread() -> None:
+    with pytest.raises(ValueError, match=r"not a regular file of at most 1048576 bytes"):
+        session_config("tcp/127.0.0.1:7447", "/dev/null")
+
+
+def test_large_configuration_is_refused_unread(tmp_path: Path) -> None:
+    file = tmp_path / "site.json5"
+    file.touch()
+    os.truncate(file, 1 << 30)
+    with pytest.raises(ValueError, match=r"not a regular file of at most 1048576 bytes"):
+        session_config("tcp/127.0.0.1:7447", str(file))

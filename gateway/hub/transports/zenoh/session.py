@@ -37,6 +37,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
+from stat import S_ISREG
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import msgspec
@@ -55,6 +56,8 @@ RAW_OUT: Final = "mavlink_raw/out"
 RAW_IN: Final = "mavlink_raw/in"
 JSON_OUT: Final = "mavlink/out"
 JSON_IN: Final = "mavlink/in"
+MAX_CONFIG: Final = 1 << 20
+"""Bytes of a configuration file, which Zenoh reads at once; a complete one has some 30 kB."""
 MAX_KEY: Final = 256
 """Letters of a key; ours have at most 150."""
 
@@ -165,7 +168,7 @@ def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Conf
     listens = "listen" if mode == "router" else "connect"
     try:
         if file:
-            config = zenoh.Config.from_file(Path(file).expanduser())
+            config = zenoh.Config.from_file(_regular_file(file))
         else:
             config = zenoh.Config()
             config.insert_json5("transport/link/tx/queue/size/data", str(BATCHES))
@@ -179,6 +182,18 @@ def session_config(locator: str, file: str, mode: str = "client") -> "zenoh.Conf
     except zenoh.ZError as error:
         raise ValueError(f"zenoh: {_message_of(error)}") from None
     return config
+
+
+def _regular_file(file: str) -> Path:
+    """Return a configuration's path; reading a device or a pipe could block the loop for ever."""
+    path = Path(file).expanduser()
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ValueError(f"zenoh: {path}: {reason_of(error)}") from None
+    if not S_ISREG(found.st_mode) or found.st_size > MAX_CONFIG:
+        raise ValueError(f"zenoh: {path} is not a regular file of at most {MAX_CONFIG} bytes")
+    return path
 
 
 def open_session(config: "zenoh.Config") -> "zenoh.Session":
