@@ -35,6 +35,8 @@ class Dialogue:
         self.files = FileClient(system_id)
         self.metas: dict[str, ParameterMeta] = {}
         """Metadata of the parameters, as far as the aircraft provides it."""
+        self._reading: str | None = None
+        """Metadata file that is being read."""
         self.calibration: CalibrationRun | None = None
         """The newest one, running or finished."""
         self.before: dict[str, float] = {}
@@ -44,7 +46,10 @@ class Dialogue:
         """Request the parameters and their metadata; return the messages to send."""
         self.files.refused.clear()
         found = self.parameters.load(now_us)
-        return found if self.metas else found + self.files.read(GENERAL_PATHS[0], now_us)
+        if not self.metas:
+            self._reading = GENERAL_PATHS[0]
+            found += self.files.read(GENERAL_PATHS[0], now_us)
+        return found
 
     @property
     def unanswered(self) -> CalibrationStep | None:
@@ -79,25 +84,19 @@ class Dialogue:
         return found + self._follow_files(now_us)
 
     def _follow_files(self, now_us: int) -> list[Any]:
-        """Read the general metadata file, then the parameters' one."""
-        if self.metas or self.files.busy:
+        """Read the general metadata file, then the parameters' one; each is parsed only once."""
+        path, following = self._reading, None
+        if path is None or self.files.busy:
             return []
-        files, found = self.files.files, list[Any]()
-        general = next((files[path] for path in GENERAL_PATHS if path in files), None)
-        if general is None:
-            if (
-                GENERAL_PATHS[0] in self.files.refused
-                and GENERAL_PATHS[1] not in self.files.refused
-            ):
-                found = self.files.read(GENERAL_PATHS[1], now_us)
-            return found
-        path = parameter_path(general)
-        if path is None or path in self.files.refused:
-            return []
-        if path in files:
-            self.metas = parse_parameters(files[path])
-            return []
-        return self.files.read(path, now_us)
+        content = self.files.files.pop(path, None)
+        if content is None:
+            following = GENERAL_PATHS[1] if path == GENERAL_PATHS[0] else None
+        elif path in GENERAL_PATHS:
+            following = parameter_path(content)
+        else:
+            self.metas = parse_parameters(content)
+        self._reading = following
+        return [] if following is None else self.files.read(following, now_us)
 
 
 class Dialogues:

@@ -182,7 +182,8 @@ def parameter_path(general: bytes) -> str | None:
     for kind in _items(_parsed(general), "metadataTypes"):
         uri = str(kind.get("uri", ""))
         if kind.get("type") == TYPE_PARAMETER and uri.startswith("mftp://"):
-            return "/" + uri.removeprefix("mftp://").lstrip("/")
+            path = "/" + uri.removeprefix("mftp://").lstrip("/")
+            return None if path in GENERAL_PATHS else path
     return None
 
 
@@ -201,7 +202,7 @@ def _parsed(content: bytes) -> Any:
         if content[:6] == b"\xfd7zXZ\0":
             content = lzma.LZMADecompressor().decompress(content, MAX_PLAIN)
         return json.loads(content)
-    except (ValueError, lzma.LZMAError):
+    except (ValueError, RecursionError, lzma.LZMAError):
         return {}
 
 

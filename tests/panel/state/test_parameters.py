@@ -5,12 +5,14 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import EstimationSettings
+from gateway.panel.dialogues import Dialogue
 from gateway.panel.state.parameters import (
     MAX_ATTEMPTS,
     MAX_PARAMETERS,
     FileClient,
     ListState,
     ParameterClient,
+    ParameterMeta,
     parameter_path,
     parse_parameters,
 )
@@ -206,6 +208,25 @@ def test_metadata_describes_every_parameter(lose_every: int) -> None:
     assert not files.busy
 
 
+def test_metadata_that_describes_no_parameter_is_parsed_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It would be parsed again with each message, which takes long for a large one."""
+    parsed: list[bytes] = []
+
+    def parse(content: bytes) -> dict[str, ParameterMeta]:
+        parsed.append(content)
+        return {}
+
+    monkeypatch.setattr("gateway.panel.dialogues.parse_parameters", parse)
+    dialogue = Dialogue(1)
+    bench = Bench(dialogue)
+    bench.run(dialogue.load(bench.now_us), 10.0)
+    assert len(parsed) == 1
+    bench.run(dialogue.load(bench.now_us), 10.0)
+    assert len(parsed) == 2
+
+
 def test_missing_file_is_refused() -> None:
     files = FileClient(1)
     bench = Bench(files)
@@ -223,7 +244,12 @@ def test_file_request_without_an_answer_is_given_up() -> None:
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b'{"parameters": 3}', b'{"parameters": [{"name": 3}, 4]}']
+    "content",
+    [
+        *(b"", b"{", b"[]", b'{"parameters": 3}', b'{"parameters": [{"name": 3}, 4]}'),
+        b"[" * 100_000,
+        b'{"metadataTypes": [{"type": 1, "uri": "mftp://general.json"}]}',
+    ],
 )
 def test_invalid_metadata_describes_no_parameter(content: bytes) -> None:
     assert parse_parameters(content) == {}
