@@ -215,7 +215,7 @@ def read_column_map(path: Path) -> ColumnMap:
         raise FlightError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
     except OSError as error:
         raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise FlightError(f"{path}: is no column map: {error}") from error
 
 

@@ -218,6 +218,7 @@ def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
         (b'[columns]\ntime_us = "t"\n\xe4 = "x"\n', "map.toml: line 3: is not UTF-8"),
         (b"[columns]\nfoo = 3\n", "map.toml: is no column map"),
         (b"[columns", "map.toml: is no column map"),
+        (b"x = " + b"[" * 10_000, "map.toml: is no column map"),
     ],
 )
 def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
