@@ -16,6 +16,8 @@ from gateway.output import sync_folder
 from gateway.printable import UserError
 
 _FILE_NAME: Final = re.compile(r"(?P<name>.+)_(?P<part>\d{2,})(?:_v\d+)?\.(?:tlog|csv)")
+_SURROGATE: Final = re.compile("[\ud800-\udfff]")
+"""Python's sign of a file name that is not UTF-8, which JSON cannot hold."""
 MAX_NAME: Final = 100
 NEWEST: Final = "last"
 """Name that always means the newest recording."""
@@ -100,7 +102,8 @@ def list_recordings(folder: Path) -> list[Recording]:
     files: dict[str, list[Path]] = {}
     with contextlib.suppress(FileNotFoundError):
         for path in sorted(folder.iterdir()):
-            if (match := _FILE_NAME.fullmatch(path.name)) and path.is_file():
+            match = _FILE_NAME.fullmatch(path.name)
+            if match and not _SURROGATE.search(path.name) and path.is_file():
                 files.setdefault(match["name"], []).append(path)
     found = []
     for name, paths in files.items():

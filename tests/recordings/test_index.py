@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from gateway.recordings.index import (
@@ -33,6 +34,13 @@ def test_files_belong_to_recordings_oldest_first(folder: Path) -> None:
     assert [(r.name, len(r.files), r.size) for r in found] == [("b", 3, 6), ("a", 1, 4)]
     assert find_recording(folder, "last").name == "a"
     assert list_recordings(folder / "none") == []
+
+
+def test_file_whose_name_is_not_utf_8_is_no_recording(folder: Path) -> None:
+    (folder / os.fsdecode(b"\xff\xfe_01.tlog")).touch()
+    found = list_recordings(folder)
+    assert [recording.name for recording in found] == ["b", "a"]
+    assert msgspec.json.encode(found, enc_hook=str)
 
 
 def test_recordings_of_equal_time_are_sorted_by_name(tmp_path: Path) -> None:
