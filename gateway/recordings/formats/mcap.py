@@ -343,6 +343,10 @@ def _time(time_us: int) -> dict[str, int]:
     return {"sec": seconds, "nsec": us * 1000}
 
 
+LAST_US: Final = (2**64 - 1) // 1000
+"""Later times are written as this one, the last that the format holds, µs."""
+
+
 class _Topics:
     """Channels and schemas of one file, each registered at its first use."""
 
@@ -359,7 +363,7 @@ class _Topics:
             number = self._schema(schema)
             channel = self._writer.register_channel(topic, "json", number)
             self._channels[topic] = channel
-        time_ns = time_us * 1000
+        time_ns = min(time_us, LAST_US) * 1000
         data = msgspec.json.encode(content)
         self._writer.add_message(channel, time_ns, data, time_ns, sequence)
 
