@@ -172,12 +172,14 @@ class Sources:
         assigned = [
             pattern
             for node in ast.walk(function)
-            for value in self._assigned(node, name)
+            for value in self._assigned(node, name, function, package)
             for pattern in self._patterns(value, function, package, depth)
         ]
         return assigned or self._passed(name, function, package, depth)
 
-    def _assigned(self, node: ast.AST, name: str) -> list[ast.expr]:
+    def _assigned(
+        self, node: ast.AST, name: str, function: Function, package: str
+    ) -> list[ast.expr]:
         """Return the values that a statement gives to a name: by assignment, or row by row."""
         match node:
             case ast.Assign(targets=[target], value=ast.expr() as value):
@@ -185,25 +187,35 @@ class Sources:
             case ast.AnnAssign(target=target, value=ast.expr() as value):
                 rows = [value]
             case ast.For(target=target, iter=ast.Name(id=table)):
-                rows = getattr(self._values.get(table), "elts", [])
+                passed = [value for value, _ in self._arguments(table, function, package)]
+                names = [table, *(value.id for value in passed if isinstance(value, ast.Name))]
+                tables = [self._values[name] for name in names if name in self._values]
+                rows = [row for each in tables for row in getattr(each, "elts", [])]
             case _:
                 return []
         return [value for row in rows for value in _unpacked(target, row, name)]
 
     def _passed(self, name: str, function: Function, package: str, depth: int) -> list[str]:
         """Return the values of a parameter in all calls of its function."""
-        arguments = [argument.arg for argument in function.args.args]
-        if name not in arguments:
-            return []
-        position = arguments.index(name) - (arguments[0] == "self")
-        found = []
+        return [
+            pattern
+            for value, caller in self._arguments(name, function, package)
+            for pattern in self._patterns(value, caller, package, depth + 1)
+        ]
+
+    def _arguments(
+        self, name: str, function: Function, package: str
+    ) -> Iterator[tuple[ast.expr, Function | None]]:
+        """Yield the argument of each call for a parameter, with the caller; none of recursion."""
+        parameters = [argument.arg for argument in function.args.args]
+        if name not in parameters:
+            return
+        position = parameters.index(name) - (parameters[0] == "self")
         for one in self._calls_by_name.get((package, function.name), []):
             given = [word.value for word in one.call.keywords if word.arg == name]
             given += one.call.args[position : position + 1]
-            for value in given[:1]:
-                if one.caller is not function:
-                    found += self._patterns(value, one.caller, package, depth + 1)
-        return found
+            if given and one.caller is not function:
+                yield given[0], one.caller
 
 
 def _calls(tree: ast.AST) -> Iterator[tuple[ast.Call, Function | None]]:
