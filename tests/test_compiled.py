@@ -130,7 +130,7 @@ def test_only_a_change_of_code_makes_a_library_stale(
     assert changed_source(stamp) == (None if current else "kernel.py")
 
 
-def test_library_contains_stamp_of_its_sources(
+def test_library_records_versions_of_its_sources(
     scaling: EntryPoint[[int, int, float]], tmp_path: Path
 ) -> None:
     build_library(path := tmp_path / "kernels.so", [scaling], stamp='gateway/units.py 1 2\n"\\\0x')

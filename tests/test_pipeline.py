@@ -197,7 +197,7 @@ def test_invalid_marks_are_rejected(
         pipeline.mark(Location(lat_deg, 0.0, 0.0), vehicle_id, 0)
 
 
-def test_nothing_is_sent_before_an_aircraft_is_heard(pipeline: Pipeline) -> None:
+def test_no_frame_is_sent_before_the_first_sample(pipeline: Pipeline) -> None:
     assert pipeline.poll(0) == Outputs()
     assert pipeline.next_due_us() == 1_000_000
     pipeline.feed(b"\x05garbage\x00" * 100, 0)

@@ -94,7 +94,7 @@ class UdpReader:
         self.decoded: set[str] = set()
 
     def read(self, wait_s: float) -> None:
-        """Decode what was received; return once nothing comes for that time."""
+        """Decode the received messages; return after a gap of that length."""
         self._sock.settimeout(wait_s)
         with suppress(TimeoutError, BlockingIOError):
             for _ in range(500):

@@ -110,7 +110,7 @@ async def test_hundreds_of_short_visits_cost_others_no_frame(rig: Any, room: int
     reason="only root can make network namespaces, with iproute2 and util-linux",
 )
 @pytest.mark.slow
-async def test_interface_that_goes_down_and_up_costs_others_no_frame(tmp_path: Any) -> None:
+async def test_interface_outage_loses_no_frame_of_other_clients(tmp_path: Any) -> None:
     """Run in a network namespace of its own: see `interface_world.py`."""
     program = os.path.join(os.path.dirname(__file__), "interface_world.py")  # noqa: PTH118, PTH120
     run = await asyncio.to_thread(

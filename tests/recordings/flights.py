@@ -103,7 +103,7 @@ def read(table: bytes) -> tuple[TableHeader, list[TableRow]]:
 def fly_from_the_middle(
     estimator: str, rng: np.random.Generator
 ) -> tuple[AircraftSettings, FusionState, list[TableRow]]:
-    """Fly, and keep only what was remembered in the middle and the rows behind it."""
+    """Return a flight cut in the middle: the stored state there and all later rows."""
     settings = make_settings(estimator)
     pipeline, builder = Pipeline(PipelineSettings(settings)), RowBuilder()
     records = make_flight(rng, 30)

@@ -189,7 +189,7 @@ def test_impossible_numbers_are_faults(changed: dict[str, str], reason: str) -> 
     assert reason in fault.reason
 
 
-def test_whole_numbers_written_as_floats_are_read() -> None:
+def test_whole_number_in_float_notation_is_read_exactly() -> None:
     (row,) = (row for row in make_rows(2, 60)[:1])
     text = row_to_line(row).replace(f"{row.time_us},", f"{row.time_us}.0,", 1)
     (again,) = TableReader().feed((encode_head(TableHeader(vehicle_id=3)) + text).encode())

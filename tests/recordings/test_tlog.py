@@ -147,7 +147,7 @@ def test_zeros_at_the_end_as_after_a_power_cut_are_damage() -> None:
 
 @pytest.mark.parametrize("fill", [b"\0", b"\xff"])
 @pytest.mark.parametrize("torn", range(9))
-def test_record_with_a_torn_time_gets_that_of_its_predecessor(torn: int, fill: bytes) -> None:
+def test_record_with_partial_time_gets_time_of_previous_record(torn: int, fill: bytes) -> None:
     records = make_records(100)
     head, data = make_tlog(records[:50]), make_tlog(records)
     cut = data[: len(head) - 20] + fill * (20 + torn) + data[len(head) + torn :]

@@ -61,7 +61,7 @@ def test_six_sides_give_bias_and_scale(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_many_poses_give_the_misalignment_too(seed: int) -> None:
+def test_eighteen_poses_determine_bias_and_misalignment(seed: int) -> None:
     rng = np.random.default_rng(seed)
     skew = rng.normal(0, 0.01, (3, 3))
     matrix = np.eye(3) + 0.5 * (skew + skew.T)

@@ -19,7 +19,7 @@ from gateway.sensing.calibration import (
 
 
 @pytest.mark.parametrize(("range_g", "counts"), [(2, 16384), (4, 8192), (8, 4096), (16, 2048)])
-def test_one_g_is_read_at_every_range(range_g: int, counts: int) -> None:
+def test_one_g_is_converted_at_every_range(range_g: int, counts: int) -> None:
     assert accel_from_counts((0, 0, counts), range_g) == pytest.approx((0.0, 0.0, 9.80665))
 
 

@@ -27,7 +27,7 @@ def columns(samples: object) -> dict[str, np.ndarray]:
 
 
 class TestSamples:
-    def test_samples_come_at_their_rates(self, flight: SimulatedFlight) -> None:
+    def test_samples_have_the_rates_of_their_sensors(self, flight: SimulatedFlight) -> None:
         assert len(flight.imu.time_s) == pytest.approx(21_800, abs=4)
         assert flight.imu.mag_new.mean() == pytest.approx(0.75, abs=0.001)
         assert len(flight.baro.time_s) == pytest.approx(5450, abs=2)

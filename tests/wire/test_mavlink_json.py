@@ -137,7 +137,7 @@ def test_command_of_the_mavlink2rest_readme_is_read() -> None:
         ("custom_mode", 7.0, 7),
     ],
 )
-def test_other_notations_of_a_value_are_read(field: str, value: Any, number: int) -> None:
+def test_alternative_notation_of_value_is_accepted(field: str, value: Any, number: int) -> None:
     message = from_json({**template("HEARTBEAT"), field: value})
     assert getattr(message, field.removeprefix("mav")) == number
 

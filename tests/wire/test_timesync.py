@@ -91,7 +91,7 @@ def test_clock_is_estimated_again_after_a_restart(rng: np.random.Generator) -> N
     assert observed == int(arrivals[-1]) + 400_000
 
 
-def test_late_stamp_is_placed_in_the_past() -> None:
+def test_delayed_timestamp_keeps_its_own_time() -> None:
     tracker = ClockTracker()
     for step in range(100):
         tracker.observe(step * 10_000, 2_000_000 + step * 10_000)
@@ -101,7 +101,7 @@ def test_late_stamp_is_placed_in_the_past() -> None:
 
 
 @pytest.mark.parametrize("ahead_us", [60_000, 600_000, 1_400_000])
-def test_single_stamp_ahead_does_not_move_the_estimate(ahead_us: int) -> None:
+def test_single_timestamp_ahead_leaves_the_estimate(ahead_us: int) -> None:
     tracker = ClockTracker()
     observed = []
     for step in range(300):

@@ -127,6 +127,6 @@ def test_jump_of_the_clock_is_kept(leap: int) -> None:
 
 
 @pytest.mark.parametrize("own", ["86401", "-86400", "1e12", "1780000000"])
-def test_fix_with_a_time_of_another_clock_gets_the_time_of_its_line(own: str) -> None:
+def test_fix_time_of_another_clock_is_replaced_by_row_time(own: str) -> None:
     _, (row,) = read(f"1.5,0,0,-9.8,0,0,0,,,,,{own},47.1,8.5,430,1,2,3,,,")
     assert row.gps.time_us == row.time_us
