@@ -6,10 +6,14 @@ start from a coincidence. At each candidate:
 
 | condition                                       | action                                 |
 | ----------------------------------------------- | -------------------------------------- |
-| the frame is not complete yet                   | waits; at a datagram's end, as below   |
+| the frame is not complete yet                   | waits, of a datagram as below          |
 | the checksum holds                              | yields the frame's own bytes           |
 | an unknown message, then another start or an end | yields it: routers pass the unknown    |
 | anything else, or a flag other than "signed"    | drops one byte and seeks the next start |
+
+A serial bridge may cut frames anywhere between its datagrams. `DatagramSplitter` keeps the first
+bytes of an unfinished frame, but seeks on behind them: a frame that is found there is returned at
+once and shows that those bytes were no frame.
 
 Dropped bytes in a row are reported as one fault. The signature is skipped, not checked. Each frame
 is returned as a `MavFrame`, whose header is read once; routing and transports use its fields.
@@ -17,6 +21,7 @@ is returned as a `MavFrame`, whose header is read once; routing and transports u
 
 import re
 import struct
+from collections.abc import Hashable
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
@@ -28,6 +33,7 @@ from gateway.records import PAYLOAD_V1 as PAYLOAD_V1
 from gateway.records import PAYLOAD_V2 as PAYLOAD_V2
 from gateway.records import START_V2 as START_V2
 from gateway.records import MavFrame as MavFrame
+from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, NO_TARGET, TARGET_OFFSETS, base_size
 
 START_V1: Final = 0xFE
@@ -42,6 +48,11 @@ KEY_V2: Final = slice(5, 10)
 SIGNATURE_SIZE: Final = 13
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
+KEPT_US: Final = US_PER_S
+"""Time limit of an unfinished frame between two datagrams: 280 bytes at 2800 Bd, and what a radio
+link delays them."""
+KEPT_PEERS: Final = 64
+"""Peers of one socket whose unfinished frames are kept; beyond, the oldest is dropped."""
 
 _HEAD_V2: Final = struct.Struct("<BBBBBBBHB").unpack_from
 """Start, length, two bytes of flags, sequence, system, component, message id in three bytes."""
@@ -81,8 +92,10 @@ class MavlinkSplitter:
 
         Frames are byte for byte as received. Never raises on data.
         """
-        events, consumed = _split(self._rest + data, final=False)
-        self._rest = (self._rest + data)[consumed:]
+        data = self._rest + data
+        events, end, unfinished = _split(data)
+        self._rest = data[unfinished:]
+        _report(events, data, end, unfinished)
         return events
 
     def reset(self) -> None:
@@ -90,9 +103,45 @@ class MavlinkSplitter:
         self._rest = b""
 
 
+class DatagramSplitter:
+    """Turn the datagrams of some peers into frames and faults; frames may be cut between them."""
+
+    def __init__(self) -> None:
+        self._rests: dict[Hashable, tuple[bytes, int]] = {}
+        """The first bytes of an unfinished frame of a peer, and when they were received."""
+
+    def __bool__(self) -> bool:
+        """Return whether an unfinished frame is kept."""
+        return bool(self._rests)
+
+    def feed(self, data: bytes, now_us: int, peer: Hashable = None) -> list[Event]:
+        """Take a peer's next datagram; return the frames and runs of dropped bytes it ends."""
+        rest, since_us = self._rests.pop(peer, (b"", now_us))
+        late: list[Event] = []
+        if now_us - since_us > KEPT_US:
+            late, rest = [SplitFault(SplitFaultKind.CRC, len(rest))], b""
+        data = rest + data
+        events, end, unfinished = _split(data, seeks_on=True)
+        _report(events, data, end, unfinished)
+        if unfinished < len(data):
+            if len(self._rests) >= KEPT_PEERS:
+                del self._rests[next(iter(self._rests))]
+            self._rests[peer] = data[unfinished:], now_us
+        return late + events
+
+    def split_off(self, peer: Hashable) -> "DatagramSplitter":
+        """Return another splitter that continues with the datagrams of one peer alone."""
+        other = DatagramSplitter()
+        if peer in self._rests:
+            other._rests[None] = self._rests.pop(peer)
+        return other
+
+
 def split_datagram(data: bytes) -> list[Event]:
     """Cut one datagram into frames and runs of dropped bytes; nothing carries over to the next."""
-    return _split(data, final=True)[0]
+    events, end, _ = _split(data, seeks_on=True)
+    _report(events, data, end, len(data))
+    return events
 
 
 def read_datagram(data: bytes) -> MavFrame | None:
@@ -185,23 +234,30 @@ def to_mavlink1(frame: bytes) -> bytes | None:
     return bytes((START_V1,)) + content + crc.to_bytes(2, "little")
 
 
-def _split(data: bytes, *, final: bool) -> tuple[list[Event], int]:
+def _split(data: bytes, *, seeks_on: bool = False) -> tuple[list[Event], int, int]:
+    """Return frames, the faults before them, the end of the last one, where one is unfinished.
+
+    That is the end of the data if none is. `seeks_on` looks for frames behind it.
+    """
     events: list[Event] = []
-    position = good = false_starts = 0
+    position = end = false_starts = 0
+    unfinished = len(data)
     while position < len(data):
-        size = _measure(data, position)
-        if size == _INCOMPLETE and not final:
-            break
+        size = _measure(data, position, takes_unknown=unfinished == len(data))
+        if size == _INCOMPLETE:
+            unfinished = min(unfinished, position)
+            if not seeks_on:
+                break
         if size > 0:
-            _report(events, data, good, position)
+            _report(events, data, end, position)
             events.append(frame_of(data[position : position + size]))
-            position = good = position + size
+            position = end = position + size
+            unfinished = len(data)
             continue
         false_starts += 1
         following = _STARTS.search(data, position + 1)
         position = following.start() if following and false_starts < MAX_FALSE_STARTS else len(data)
-    _report(events, data, good, position)
-    return events, position
+    return events, end, unfinished
 
 
 def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:
@@ -211,7 +267,7 @@ def _report(events: list[Event], data: bytes, begin: int, end: int) -> None:
         events.append(SplitFault(kind, end - begin))
 
 
-def _measure(data: bytes, begin: int) -> int:
+def _measure(data: bytes, begin: int, *, takes_unknown: bool) -> int:
     """Return the size of the frame that begins here, or why there is none."""
     available = len(data) - begin
     start = data[begin]
@@ -231,10 +287,10 @@ def _measure(data: bytes, begin: int) -> int:
         return _NO_FRAME
     if available < size:
         return _INCOMPLETE
-    return size if _is_genuine(data, begin, checked, size) else _NO_FRAME
+    return size if _is_genuine(data, begin, checked, size, takes_unknown) else _NO_FRAME
 
 
-def _is_genuine(data: bytes, begin: int, checked: int, size: int) -> bool:
+def _is_genuine(data: bytes, begin: int, checked: int, size: int, takes_unknown: bool) -> bool:
     """Check the checksum, which ends `checked` bytes after the start; the signature follows."""
     if data[begin] == START_V2:
         message_id = data[begin + 7] | data[begin + 8] << 8 | data[begin + 9] << 16
@@ -243,7 +299,7 @@ def _is_genuine(data: bytes, begin: int, checked: int, size: int) -> bool:
     extra = CRC_EXTRA.get(message_id)
     if extra is None:
         end = begin + size
-        return end == len(data) or data[end] in (START_V1, START_V2)
+        return takes_unknown and (end == len(data) or data[end] in (START_V1, START_V2))
     end = begin + checked
     crc: int = mcrf4xx(data[begin + 1 : end - 2] + extra)
     return crc == data[end - 2] | data[end - 1] << 8

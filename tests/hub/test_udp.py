@@ -385,3 +385,28 @@ async def test_second_gateway_on_a_port_waits_until_it_is_free(rig: Any) -> None
     first.close()
     rig.clock.us = 2_000_000
     await rig.until(lambda: second.listening_ports() == (port,))
+
+
+@pytest.mark.parametrize("kind", ["udp-listen", "udp"])
+@pytest.mark.parametrize("size", [10, 64, 300])
+async def test_frames_that_a_bridge_cuts_over_datagrams_are_forwarded(
+    rig: Any, kind: str, size: int
+) -> None:
+    bridge, station = rig.station(), rig.station()
+    port = bridge.port if kind == "udp" else 0
+    hub = await rig.open(f"{kind}:127.0.0.1:{port}", f"udp:127.0.0.1:{station.port}")
+    if kind == "udp":
+        hub.send(rig.out(rig.vehicle.attitude()))
+        _, bridge.target = await asyncio.get_running_loop().sock_recvfrom(bridge.socket, 100)
+        await station.receive()
+    else:
+        bridge.target = ("127.0.0.1", hub.listening_ports()[0])
+    sender = rig.sender(42)
+    frames = [sender.attitude() if n % 4 else sender.raw_imu() for n in range(60)]
+    data = b"".join(frames)
+    for begin in range(0, len(data), size):
+        bridge.send(data[begin : begin + size])
+        await asyncio.sleep(0)
+    assert [await station.receive() for _ in frames] == frames
+    (client,) = (each for each in hub.clients() if each.received)
+    assert (client.received, client.bytes_garbage) == (60, 0)

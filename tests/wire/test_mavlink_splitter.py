@@ -8,7 +8,10 @@ from pymavlink.dialects.v20 import common as dialect
 
 from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import (
+    KEPT_PEERS,
+    KEPT_US,
     MAX_FALSE_STARTS,
+    DatagramSplitter,
     MavFrame,
     MavlinkSplitter,
     SplitFault,
@@ -157,6 +160,48 @@ def test_hostile_datagram_costs_a_bounded_number_of_checksums() -> None:
     events = split_datagram(data)
     assert events == [SplitFault(SplitFaultKind.CRC, len(data))]
     assert len(data) > MAX_FALSE_STARTS
+
+
+PIECES = (1, 7, 20, 64, 100, 300)
+
+
+@pytest.mark.parametrize("size", PIECES)
+def test_frames_cut_over_datagrams_are_joined(size: int) -> None:
+    frames = [V2, V1, V2_SIGNED, V2_COMMAND, UNKNOWN, V2] * 20
+    data = b"".join(frames)
+    splitter, events = DatagramSplitter(), []
+    for n, begin in enumerate(range(0, len(data), size)):
+        events += splitter.feed(data[begin : begin + size], n * KEPT_US // 2)
+    # An unknown message passes only where a datagram ends with it, or another begins behind it.
+    known = [frame for frame in frames_of(events) if frame != UNKNOWN]
+    assert known == [frame for frame in frames if frame != UNKNOWN]
+
+
+@pytest.mark.parametrize("cut", range(1, len(V2_COMMAND)))
+def test_whole_frame_after_a_lost_piece_is_returned_at_once(cut: int) -> None:
+    splitter = DatagramSplitter()
+    assert splitter.feed(V2_COMMAND[:cut], 0) == []
+    events = splitter.feed(V2, 1)
+    assert frames_of(events) == [V2]
+    assert sum(event.size for event in events if isinstance(event, SplitFault)) == cut
+    assert not splitter
+
+
+def test_unfinished_frame_is_dropped_after_its_time() -> None:
+    splitter = DatagramSplitter()
+    assert splitter.feed(V2[:9], 0) == []
+    events = splitter.feed(V2[9:], KEPT_US + 1)
+    assert frames_of(events) == []
+    assert events[0] == SplitFault(SplitFaultKind.CRC, 9)
+
+
+def test_pieces_of_two_peers_are_not_joined_and_their_number_is_bounded() -> None:
+    splitter = DatagramSplitter()
+    for peer in range(2 * KEPT_PEERS):
+        assert splitter.feed(V2[:9], 0, peer) == []
+    found = [frames_of(splitter.feed(V2[9:], 0, peer)) for peer in range(KEPT_PEERS, 0, -1)]
+    assert found == [[V2]] + [[]] * (KEPT_PEERS - 1)
+    assert frames_of(splitter.split_off(2 * KEPT_PEERS - 1).feed(V2[9:], 0)) == [V2]
 
 
 def test_reset_discards_a_half_frame() -> None:

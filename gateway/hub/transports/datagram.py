@@ -19,7 +19,7 @@ from gateway.hub.transports.base import (
     new_socket,
     not_open,
 )
-from gateway.wire.mavlink_splitter import KEY_V2, MavFrame, read_datagram, split_datagram
+from gateway.wire.mavlink_splitter import KEY_V2, DatagramSplitter, MavFrame, read_datagram
 
 NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 4096
@@ -53,6 +53,7 @@ class DatagramClient(Client):
         super().__post_init__()
         self._backlog: deque[bytes] = deque(maxlen=BACKLOG_DATAGRAMS)
         self._packer = self._packer_of(self.endpoint)
+        self.splitter = DatagramSplitter()
 
     @property
     def is_direct(self) -> bool:
@@ -105,13 +106,13 @@ class DatagramClient(Client):
         self._read = self._reader(sock)
         self.loop.add_reader(sock, self._read)
 
-    def accept(self, data: bytes, now_us: int) -> None:
-        """Process one datagram of this peer."""
+    def accept(self, data: bytes, now_us: int, sender: Address | None = None) -> None:
+        """Process one datagram of this peer; `sender` distinguishes several."""
         if self.state != "open":
             self._revive()
-        frame = read_datagram(data)
+        frame = None if self.splitter else read_datagram(data)
         if frame is None:
-            self.receive(split_datagram(data), len(data), now_us)
+            self.receive(self.splitter.feed(data, now_us, sender), len(data), now_us)
             return
         self.counters.bytes_received += len(data)
         self.receive_frame(frame, now_us)
@@ -220,6 +221,7 @@ class DatagramClient(Client):
                     if (
                         route is None
                         or self.state != "open"
+                        or self.splitter
                         or not route.forward_datagram(data, now_us)
                     ):
                         self.accept(data, now_us)

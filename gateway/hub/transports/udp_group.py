@@ -7,6 +7,7 @@ the first.
 
 import socket
 import struct
+from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
@@ -64,17 +65,21 @@ class GroupClient(DatagramClient):
         self._own_address = sock.getsockname()[:2]
         self.adopt(sock, lambda data: sock.sendto(data, address))
 
+    def _reader(self, sock: socket.socket) -> Callable[[], None]:
+        return partial(self._on_group, sock)
+
     def _on_group(self, sock: socket.socket) -> None:
         size, most = 0, self.context.read_bytes
         for _ in READS:
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
-            except OSError:
+            except OSError as error:
+                self._note_read_error(error)
                 break
             if address[:2] != self._own_address:
                 size += len(data)
-                self.accept(data, self.context.now_us())
-            if size >= most:
+                self.accept(data, self.context.now_us(), address[:2])
+            if size >= most or sock.fileno() < 0:
                 break
         self.limit_reads(sock, partial(self._on_group, sock), size)
 

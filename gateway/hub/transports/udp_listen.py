@@ -34,7 +34,7 @@ from gateway.hub.transports.datagram import (
     local_host_of,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavFrame, split_datagram
+from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame
 
 ANCILLARY_BYTES: Final = 64
 REMOVALS: Final = 32
@@ -49,6 +49,8 @@ class UdpListener(Listener[DatagramPeer]):
         self._by_address: dict[Address, DatagramPeer] = {}
         self._full_until_us = 0
         """Until then no client of a full port can have become stale."""
+        self._splitter = DatagramSplitter()
+        """Of peers that have not sent a complete frame yet."""
 
     def tick(self, now_us: int) -> None:
         """Bind again if that failed, and remove clients that have gone."""
@@ -88,16 +90,20 @@ class UdpListener(Listener[DatagramPeer]):
         self._accept(data, address, local_host_of(ancillary))
 
     def _accept(self, data: bytes, address: Address, local_host: str) -> None:
-        client = self._by_address.get(address[:2]) or self._admit(data, address, local_host)
-        if client is not None:
-            client.accept(data, self._context.now_us())
-
-    def _admit(self, data: bytes, address: Address, local_host: str) -> DatagramPeer | None:
-        """Admit a new client if it sends MAVLink and there is room."""
-        first = next((event for event in split_datagram(data) if isinstance(event, MavFrame)), None)
-        if first is None:
-            return None
         now_us = self._context.now_us()
+        if client := self._by_address.get(address[:2]):
+            client.accept(data, now_us)
+            return
+        events = self._splitter.feed(data, now_us, address[:2])
+        first = next((event for event in events if isinstance(event, MavFrame)), None)
+        client = self._admit(first, address, local_host, now_us) if first is not None else None
+        if client is not None:
+            client.receive(events, len(data), now_us)
+
+    def _admit(
+        self, first: MavFrame, address: Address, local_host: str, now_us: int
+    ) -> DatagramPeer | None:
+        """Admit a new client, which has sent a frame, if there is room."""
         if not self._has_room(str(address[0]), now_us):
             self.turned_away += 1
             return None
@@ -118,6 +124,7 @@ class UdpListener(Listener[DatagramPeer]):
             self._context, client_id, self.endpoint, peer, self.endpoint.name_of(peer)
         )
         client.identity, client.address = first.origin, address[:2]
+        client.splitter = self._splitter.split_off(client.address)
         self._clients[client_id] = self._by_address[client.address] = client
         client.adopt(sock, sock.send)
         self._context.appear(client)
