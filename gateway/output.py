@@ -44,6 +44,12 @@ def check_output(
     _check_writable(path, path.parent)
 
 
+def check_ending(path: Path, endings: Iterable[str]) -> None:
+    """Raise OSError if a file's name has none of the endings of what is written to it."""
+    if path.suffix not in endings:
+        raise OSError(errno.EINVAL, f"the output must end in {', '.join(endings)}", str(path))
+
+
 def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
     there = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())

@@ -30,12 +30,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "vehicle": FOUNDATION | {"sensing"},
     "clock": set(),
     "printable": set(),
-    "hub": FOUNDATION | {"wire", "printable", "recordings"},
+    "extras": {"printable"},
+    "hub": FOUNDATION | {"wire", "printable", "extras", "recordings"},
     "simulator": FOUNDATION | {"wire"},
     "aircraft": FOUNDATION | {"sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},
-    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable"},
+    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "extras"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output", "printable"},
     "batch": FOUNDATION
     | STAGES
@@ -46,14 +47,18 @@ MAY_IMPORT: dict[str, set[str]] = {
     "fleet": FOUNDATION | STAGES | {"output"} | EDGES,
     "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
-    "live": FOUNDATION | STAGES | JOINED | {"status", "config", "recordings", "output"} | EDGES,
+    "live": FOUNDATION
+    | STAGES
+    | JOINED
+    | {"status", "config", "recordings", "output", "extras"}
+    | EDGES,
     "extensions": {"printable"},
     "player": FOUNDATION | STAGES | JOINED | {"recordings", "config"} | EDGES,
     "cli": FOUNDATION
     | STAGES
     | JOINED
     | {"status", "recordings", "config", "player", "analysis"}
-    | {"extensions", "panel", "fleet", "flashing", "batch", "output"}
+    | {"extensions", "extras", "panel", "fleet", "flashing", "batch", "output"}
     | EDGES,
 }
 """The law: a package may import itself and these; `gateway` itself (the version) is free to all."""

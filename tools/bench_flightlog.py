@@ -143,10 +143,10 @@ def measure_files(folder: Path, count: int) -> dict[str, float]:
     dump = str(Path(sys.executable).with_name("mavlogdump.py"))
     # The first run may write bytecode files: it is not measured.
     write_flight(folder / "tiny.tlog", 1000)
-    cpu_of(*mavgate, "convert", str(folder / "tiny.tlog"), "--out", str(folder / "tiny.csv"))
+    cpu_of(*mavgate, "convert", str(folder / "tiny.tlog"), "-o", str(folder / "tiny.csv"))
     found = {
         "messages": count,
-        "convert_to_csv_cpu_s": cpu_of(*mavgate, "convert", str(path), "--out", str(table)),
+        "convert_to_csv_cpu_s": cpu_of(*mavgate, "convert", str(path), "-o", str(table)),
         "info_cpu_s": cpu_of(*mavgate, "info", str(path)),
         "help_cpu_s": cpu_of(*mavgate, "--help"),
         "mavlogdump_to_csv_cpu_s": cpu_of(

@@ -176,7 +176,7 @@ def figures(part: str, way: str, written: dict[int, int], got: list[tuple[int, i
 
 def with_fetch(site: Field, seconds: float) -> tuple[list[WayFigures], float]:
     """Measure while a recording is fetched; return its rate in bytes a second too."""
-    words = ("fleet", "recordings", "get", "field", "bench", "--to", str(site.home / "fetched"))
+    words = ("fleet", "recordings", "get", "field", "bench", "-o", str(site.home / "fetched"))
     fetch = start("-m", "gateway.cli", *words, home=site.home)
     part = site.home / "fetched" / PIECES
     try:

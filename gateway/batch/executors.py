@@ -13,7 +13,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from multiprocessing.synchronize import Event
 from typing import Any, Final, Protocol, TypeVar
 
@@ -166,11 +165,6 @@ LARGEST_KEPT_BYTES: Final = 32 << 20
 
 class ClusterError(UserError):
     """A cluster that cannot be used; the text says why."""
-
-
-def has_dask() -> bool:
-    """Return whether a cluster can be reached from here."""
-    return find_spec("distributed") is not None
 
 
 class DaskCluster:

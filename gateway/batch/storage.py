@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import sha256
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -66,11 +65,6 @@ def is_url(name: str) -> bool:
 def without_user(url: str) -> str:
     """Return a URL without user name and password, as it may be shown and kept."""
     return _USER.sub("", url)
-
-
-def has_fsspec() -> bool:
-    """Return whether URLs can be opened here."""
-    return find_spec("fsspec") is not None
 
 
 def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem]:

@@ -10,7 +10,7 @@ import io
 import logging
 import os
 import sys
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Annotated, Any, Final, cast
@@ -19,12 +19,10 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
-from gateway.cli.support.terminal import refusing
+from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG
+from gateway.cli.support.terminal import refuse, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
-
-RECORDINGS: Final = "Recordings"
-GATEWAY: Final = "A running gateway"
 
 MODULES: Final = {
     "live.run": ("run",),
@@ -48,72 +46,144 @@ MODULES: Final = {
 }
 """The commands of each module below `gateway.cli`, which its `app` contains."""
 
-COMMANDS: Final = {
-    "run": "Run the gateway on the receiver's serial port until interrupted.",
-    "demo": "Fly the simulated tracker, over and over, until interrupted.",
-    "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
-    "tuning.",
-    "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
-    "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
-    "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
-    "ports": "List the serial ports, and the one that `auto` selects.",
-    "check-config": "Check the settings and those of the aircraft, or print all settings with "
-    "their defaults.",
-    "flash": "Write a ready-made program with its settings to a board, or read them back.",
-    "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.",
-    "map": "Fetch an area of a map for the panel, for use without a network.",
-    "report": "Make a page of figures and tables of a flight, those of the paper included.",
-    "page": "Make one HTML file of a flight, which opens offline in any browser.",
-    "sweep": "Try settings on one flight or many, and write the best as a settings file.",
-    "record": "Start, stop, name, list and delete recordings.",
-    "play": "Play recordings to the ground stations, several at once if you like.",
-    "seek": "Seek in the running player.",
-    "player": "Control the running player.",
-    "convert": "Convert, trim and join recordings.",
-    "fuse": "Fuse a log again and write one row per IMU sample: attitude, position, velocity.",
-    "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
-    "batch": "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
-    "catalogue": "Index all recordings under a folder, and list and search what is in them.",
-    "recover": "Write the intact part of a damaged recording to a new file, and list what was left "
-    "out.",
-    "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
-    "clients": "List, add and remove clients and sources.",
-    "mark": "Mark a location: ground stations show distance and bearing to it. Without one, clear "
-    "it.",
-    "reload": "Apply changed settings of the hub and of signing; other clients stay connected.",
+JUDGING: Final = ("fuse", "report", "sweep")
+HELP: Final = {"help_option_names": ["-h", "--help"]}
+GROUPS: Final = {
+    "Fly": {
+        "run": "Run the gateway on the receiver's serial port until interrupted.",
+        "demo": "Fly the simulated tracker, over and over, until interrupted.",
+        "panel": "Show the aircraft in a browser: instruments, map, link, recordings, calibration, "
+        "tuning.",
+        "status": "Show the status of the gateway: receiver, nodes, aircraft, clients.",
+        "mark": "Mark a location: ground stations show distance and bearing to it. Without one, "
+        "clear it.",
+    },
+    "Recordings": {
+        "record": "Start, stop, name, list and delete recordings.",
+        "play": "Play recordings to the ground stations, several at once if you like.",
+        "seek": "Seek in the running player.",
+        "player": "Control the running player.",
+        "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        "page": "Make one HTML file of a flight, which opens offline in any browser.",
+        "convert": "Convert, trim and join recordings.",
+        "recover": "Write the intact part of a damaged recording to a new file, and list what was "
+        "left out.",
+    },
+    "Clients and fleet": {
+        "clients": "List, add and remove clients and sources.",
+        "reload": "Apply changed settings of the hub and of signing; other clients stay connected.",
+        "fleet": "Show the vehicles of many sites here, through a Zenoh router.",
+    },
+    "Analysis": {
+        "report": "Make a page of figures and tables of a flight, those of the paper included.",
+        "fuse": "Re-run the estimator on a log and write one row per IMU sample.",
+        "sweep": "Try settings on one flight or many, and write the best as a settings file.",
+        "batch": "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+        "catalogue": "Index all recordings under a folder, and list and search what is in them.",
+    },
+    "Set-up": {
+        "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
+        "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
+        "check-config": "Check the settings and those of the aircraft, or print all settings with "
+        "their defaults.",
+        "ports": "List the serial ports, and the one that `auto` selects.",
+        "flash": "Write a ready-made program with its settings to a board, or read them back.",
+        "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, "
+        "disk.",
+        "map": "Fetch an area of a map for the panel, for use without a network.",
+    },
 }
-"""The summary of each command, in the order of the list."""
-
-PANELS: Final = {
-    **dict.fromkeys(("page", "record", "play", "seek", "player", "convert"), RECORDINGS),
-    **dict.fromkeys(("fuse", "info", "batch", "catalogue", "recover"), RECORDINGS),
-    **dict.fromkeys(("status", "clients", "mark", "reload"), GATEWAY),
+"""The headings of the list, and the summary of each command below it."""
+COMMANDS: Final = {name: text for below in GROUPS.values() for name, text in below.items()}
+HOISTED: Final = frozenset({"--config", "-c", "--socket"})
+"""Options of `mavgate` itself that may follow the command, too."""
+EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
+FORMER: Final[dict[str, dict[str, str]]] = {
+    "convert": {"--out": "--output", "--settings": "--fuse-with"},
+    "fuse": {"--out": "--output", "--settings": "--fuse-with"},
+    "recover": {"--out": "--output"},
+    "map get": {"--from": "--source"},
+    "fleet recordings get": {"--to": "--output"},
+    **{
+        words: {"--settings": "--fuse-with"}
+        for words in ("play", "page", "report", "sweep", *(f"batch {name}" for name in JUDGING))
+    },
 }
-"""The headings under which commands are listed, if not under that of all."""
+"""Former names of options, by command; for one release each leads to its present name."""
+MOVED: Final = {
+    "record save": "record rename",
+}
+"""Former names of commands, with those that do their work now."""
 
 
 def load_command(name: str) -> Any:
     """Import the file of a command and create it."""
-    if PANELS.get(name) != GATEWAY:
+    if name not in MODULES["live.clients"]:
         _load_extensions()
     module = next(module for module, names in MODULES.items() if name in names)
     group = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
     gc.enable()
-    return tidied(group.commands[name])
+    return tidied(group.commands[name], name)
 
 
-def tidied(command: Any) -> Any:
-    """Return a command whose help flows at any width, and names a type only where one is typed."""
+def tidied(command: Any, words: str = "") -> Any:
+    """Return a command whose help flows at any width, and names a type only where one is typed.
+
+    `words` are those that call it. Its former names lead to the present ones.
+    """
     if command.help:
         paragraphs = command.help.split("\n\n")
         command.help = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
     # A context that parses nothing, since parsing loads what takes half of the time of `--help`.
-    for parameter in command.get_params(command.context_class(command)):
+    for parameter in command.get_params(command.context_class(command, **HELP)):
         if getattr(parameter, "is_flag", False):
             parameter.metavar = ""
-    for below in getattr(command, "commands", {}).values():
-        tidied(below)
+    if words:
+        command.epilog = EPILOG
+    if former := FORMER.get(words):
+        parse = command.parse_args
+        command.parse_args = lambda ctx, args: parse(ctx, [_present(a, former) for a in args])
+    if (below := getattr(command, "commands", None)) is not None:
+        for moved, name in MOVED.items():
+            if moved.rpartition(" ")[0] == words and words:
+                below[moved.rpartition(" ")[2]] = _pointer(moved, name)
+        for name, each in below.items():
+            tidied(each, f"{words} {name}".strip())
     return command
+
+
+def _present(word: str, former: dict[str, str]) -> str:
+    """Return the present name of an option, with a message if it had another."""
+    name, equals, value = word.partition("=")
+    if (present := former.get(name)) is None:
+        return word
+    typer.echo(f"{name} is called {present} now; the former name works until version 0.2", err=True)
+    return f"{present}{equals}{value}"
+
+
+def _pointer(moved: str, name: str) -> TyperCommand:
+    """Return a command that ends with the name of its successor."""
+
+    def point() -> None:
+        refuse(f"`mavgate {moved}` was replaced: use `mavgate {name}`")
+
+    any_words = {"ignore_unknown_options": True, "allow_extra_args": True}
+    text = f"Former name of `mavgate {name}`."
+    return TyperCommand(moved, callback=point, help=text, hidden=True, context_settings=any_words)
+
+
+def hoisted(words: list[str]) -> list[str]:
+    """Move the options of `mavgate` itself before the command that they follow."""
+    end = words.index("--") if "--" in words else len(words)
+    moved, left, at = list[str](), list[str](), 0
+    while at < end:
+        name, equals, _ = words[at].partition("=")
+        size = 1 if name not in HOISTED or equals else 2
+        if at + size > end:
+            return [name]  # Its value is missing, which is the error to show.
+        (moved if name in HOISTED else left).extend(words[at : at + size])
+        at += size
+    return [*moved, *left, *words[end:]]
 
 
 @cache
@@ -123,6 +193,11 @@ def _load_extensions() -> None:
     from gateway.extensions import load_extensions
 
     load_extensions()
+
+
+def group_of(name: str) -> str:
+    """Return the heading under which a command is listed."""
+    return next(group for group, below in GROUPS.items() if name in below)
 
 
 class LazyGroup(TyperGroup):
@@ -139,6 +214,10 @@ class LazyGroup(TyperGroup):
         with refusing():
             return super().invoke(ctx)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the options of `mavgate` itself, wherever they are."""
+        return super().parse_args(ctx, hoisted(args))
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; the error for an unknown name suggests the nearest."""
         self.commands = cast(Any, dict.fromkeys(COMMANDS))
@@ -153,7 +232,7 @@ class LazyGroup(TyperGroup):
         if summary is None:
             return None
         if self._listing:
-            return TyperCommand(cmd_name, help=summary, rich_help_panel=PANELS.get(cmd_name))
+            return TyperCommand(cmd_name, help=summary, rich_help_panel=group_of(cmd_name))
         return load_command(cmd_name)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
@@ -179,7 +258,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_show_locals=False,
     rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={**HELP},
 )
 
 
@@ -191,12 +270,33 @@ def _show_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     *,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            "--config",
+            "-c",
+            help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}.",
+        ),
+    ] = None,
+    socket: Annotated[
+        Path | None,
+        typer.Option(
+            "--socket", envvar="MAVGATE_SOCKET", help="Control socket, if several gateways run."
+        ),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log details too.")] = False,
     _version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show version.")
     ] = False,
 ) -> None:
+    for chosen, value in ((CONFIG, config), (SOCKET, socket)):
+        context.call_on_close(partial(chosen.reset, chosen.set(value)))
+    _begin_logging(verbose=verbose)
+
+
+def _begin_logging(*, verbose: bool) -> None:
     level = logging.DEBUG if verbose else logging.INFO
     form = "%(asctime)s %(levelname)s %(message)s"
     handler: logging.Handler = logging.StreamHandler()

@@ -88,7 +88,7 @@ class HubSettings(Settings, frozen=True):
     event_loop: Annotated[
         str,
         setting(
-            "Event loop of the gateway: asyncio, or uvloop (pip install 'mavgate[fast]'), which "
+            "Event loop of the gateway: asyncio, or uvloop (extra fast), which "
             "delivers up to a quarter more frames to many clients. Applies at the next start.",
             pattern=r"^(asyncio|uvloop)$",
         ),

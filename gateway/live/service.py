@@ -19,6 +19,7 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Final
 
+from gateway.extras import how_to_add
 from gateway.units import NS_PER_US, US_PER_S
 
 log = logging.getLogger(__name__)
@@ -75,7 +76,7 @@ def run_event_loop(main: Coroutine[Any, Any, None], kind: str) -> None:
         try:
             import uvloop
         except ModuleNotFoundError:
-            log.warning("uvloop is not installed (pip install 'mavgate[fast]'): using asyncio")
+            log.warning("%s; using asyncio", how_to_add("hub.event_loop = uvloop", "fast"))
         else:
             make = uvloop.new_event_loop
     with asyncio.Runner(loop_factory=make) as runner:

@@ -21,6 +21,7 @@ import numpy as np
 from gateway import __version__
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.select import migrate_sections
+from gateway.extras import how_to_add
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TIMES, BoolArray, TableRow
 from gateway.recordings.files import (
@@ -131,9 +132,7 @@ def import_format(module: str, name: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("gateway"):
             raise
-        raise FlightError(
-            f"{name} needs {error.name}, the extra mavgate[formats]: see mavgate doctor"
-        ) from error
+        raise FlightError(how_to_add(name, "formats")) from error
 
 
 def _add_packaged(name: str, module: str) -> None:
@@ -188,7 +187,7 @@ def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
     except msgspec.ValidationError as error:
         raise FlightError(
             f"the recorded settings are of another version ({error}); "
-            "use the current ones: --settings current"
+            "use the current ones: --fuse-with current"
         ) from error
 
 

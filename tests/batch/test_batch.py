@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 from fsspec.implementations.memory import MemoryFileSystem
 
+from gateway import extras
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.reporting.ground_track import ground_track
 from gateway.batch.executors import LocalProcesses, ThisProcess, WorkFailed
@@ -391,17 +392,17 @@ def test_url_without_a_file_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("words", "lacking"),
-    [(("memory://flights",), "has_fsspec"), (("{season}", "--scheduler", "tcp://x:1"), "has_dask")],
+    [(("memory://flights",), "fsspec"), (("{season}", "--scheduler", "tcp://x:1"), "distributed")],
 )
 def test_missing_extra_is_named(
     words: tuple[str, ...], lacking: str, season: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(f"gateway.cli.support.batch_work.{lacking}", lambda: False)
+    monkeypatch.setattr(extras, "find_spec", lambda name: None if name == lacking else name)
     named = [word.format(season=season) for word in words]
     code, text = run("fuse", *named, "-o", tmp_path)
     assert code == 2
-    assert "mavgate[batch]" in text
+    assert "needs the extra batch; to install it: " in text
 
 
 def test_signing_passphrase_is_not_sent_to_workers() -> None:

@@ -1,16 +1,19 @@
 """Commands are imported when they are called, and the list agrees with them."""
 
+import re
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
-from gateway.cli.app import COMMANDS, MODULES, app, load_command
+from gateway.cli.app import COMMANDS, FORMER, GROUPS, MODULES, MOVED, app, hoisted, load_command
 
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
 LARGE = (
@@ -45,6 +48,89 @@ def test_help_flows_to_the_width_and_names_no_type_of_a_flag(words: list[str]) -
     for line, after in pairwise(text):
         assert line.endswith(".") or len(f"{line} {after.split()[0]}") > 70, line
     assert "<bool>" not in found.output
+
+
+def leaves_of(command: Any, words: tuple[str, ...]) -> Iterator[tuple[str, ...]]:
+    yield words
+    for name, below in getattr(command, "commands", {}).items():
+        yield from leaves_of(below, (*words, name))
+
+
+ALL = [words for name in COMMANDS for words in leaves_of(load_command(name), (name,))]
+
+
+@pytest.mark.parametrize("option", ["-h", "--help"])
+def test_every_command_and_group_shows_its_help(option: str) -> None:
+    for words in ((), *ALL):
+        found = CliRunner().invoke(app, [*words, option])
+        assert (found.exit_code, "Usage: " in found.output) == (0, True), words
+
+
+def test_help_lists_commands_by_reader() -> None:
+    output = CliRunner().invoke(app, ["--help"], terminal_width=100).output
+    at = [output.index(f"╭─ {heading} ─") for heading in GROUPS]
+    assert at == sorted(at)
+    for (begin, end), below in zip(pairwise([*at, len(output)]), GROUPS.values(), strict=True):
+        assert re.findall(r"^│ ([a-z-]+) ", output[begin:end], re.MULTILINE) == [*below]
+
+
+@pytest.mark.parametrize(
+    ("words", "moved"),
+    [
+        ("info x --config f", "--config f info x"),
+        ("info x -c f --json", "-c f info x --json"),
+        ("--config=f info x", "--config=f info x"),
+        ("status --socket s", "--socket s status"),
+        ("info -- --config f", "info -- --config f"),
+        ("info --config", "--config"),
+    ],
+)
+def test_settings_and_socket_may_follow_the_command(words: str, moved: str) -> None:
+    assert hoisted(words.split()) == moved.split()
+
+
+@pytest.mark.parametrize("words", ["{0} info x", "info x {0}"])
+def test_settings_file_is_read_wherever_it_is_named(words: str, tmp_path: Path) -> None:
+    file = tmp_path / "absent.toml"
+    found = CliRunner().invoke(app, words.format(f"--config {file}").split())
+    assert (found.exit_code, f"{file}: cannot be read" in found.output) == (2, True)
+    # Another call starts from nothing.
+    assert str(file) not in CliRunner().invoke(app, ["info", "x"]).output
+
+
+@pytest.mark.parametrize(
+    ("words", "former", "present"),
+    [(words, *pair) for words, names in FORMER.items() for pair in names.items()],
+)
+def test_former_option_leads_to_the_present_one(words: str, former: str, present: str) -> None:
+    found = CliRunner().invoke(app, [*words.split(), f"{former}=recorded"])
+    assert f"{former} is called {present} now" in found.output
+    assert "No such option" not in found.output
+
+
+@pytest.mark.parametrize(("words", "present"), MOVED.items())
+def test_former_command_ends_with_its_successor(words: str, present: str) -> None:
+    found = CliRunner().invoke(app, [*words.split(), "anything", "--at-all"])
+    assert (found.exit_code, f"use `mavgate {present}`" in found.output) == (2, True)
+    assert tuple(present.split()) in ALL
+
+
+@pytest.mark.parametrize(
+    ("words", "endings"),
+    [
+        ("fuse x -o x.kml", ".csv"),
+        ("convert x -o x.doc", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
+        ("recover x -o x.kml", ".tlog, .csv"),
+        ("page x -o page.pdf", ".html"),
+        ("sweep x -o best.csv", ".toml"),
+        ("sweep x --table trials.toml", ".csv"),
+        ("flash imu -o imu.bin", ".hex"),
+    ],
+)
+def test_output_of_another_ending_is_refused(words: str, endings: str) -> None:
+    found = CliRunner().invoke(app, words.split())
+    assert found.exit_code == 2
+    assert f": the output must end in {endings}" in found.output
 
 
 def test_help_lists_every_command() -> None:

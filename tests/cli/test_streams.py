@@ -67,7 +67,7 @@ def test_log_lines_stay_above_a_progress_bar(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(logging.root, "handlers", [])
     monkeypatch.setattr(logging.root, "level", logging.WARNING)
     monkeypatch.setattr(sys, "stderr", before)
-    app._options()
+    app._begin_logging(verbose=False)
     monkeypatch.setattr(sys, "stderr", above_the_bar)
     logging.getLogger("gateway").warning("the port has gone")
     assert "the port has gone" in above_the_bar.getvalue()
@@ -78,6 +78,6 @@ def test_found_fonts_are_not_logged(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first report of a machine collects them."""
     monkeypatch.setattr(logging.root, "handlers", [])
     monkeypatch.setattr(logging.root, "level", logging.WARNING)
-    app._options(verbose=True)
+    app._begin_logging(verbose=True)
     assert logging.getLogger("gateway").isEnabledFor(logging.DEBUG)
     assert not logging.getLogger("matplotlib.font_manager").isEnabledFor(logging.INFO)

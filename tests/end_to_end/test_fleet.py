@@ -187,7 +187,7 @@ def test_sites_with_wrong_civil_clocks_are_fused_recorded_and_fetched(
     def fetched(site: str) -> bool:
         """Fetch what is on the site's disk by now."""
         with suppress(subprocess.CalledProcessError):
-            fleet.ask("recordings", "get", site, "last", "--to", str(tmp_path / site))
+            fleet.ask("recordings", "get", site, "last", "-o", str(tmp_path / site))
         logs[site] = [log.read_bytes() for log in sorted((tmp_path / site).glob("*.tlog"))]
         return sum(map(len, logs[site])) > 10_000
 

@@ -81,7 +81,7 @@ class TestOverTheSession:
         shown = await run("fleet", "recordings", "--site", "field-*")
         assert "flight" in shown.output
         to = tmp_path / "fetched"
-        words = ("fleet", "recordings", "get", "field-a", "flight", "--to", str(to))
+        words = ("fleet", "recordings", "get", "field-a", "flight", "-o", str(to))
         assert (await run(*words)).exit_code == 0
         assert (to / NAME).read_bytes() == CONTENT
         assert sorted(path.name for path in to.iterdir()) == [NAME, "flight_01_v1.csv"]

@@ -117,7 +117,7 @@ def test_server_without_ranges_and_vector_tiles_are_refused(world: Path, tmp_pat
 def test_command_writes_into_the_folder_of_tiles(world: Path, tmp_path: Path) -> None:
     config = tmp_path / "gateway.toml"
     config.write_text(f'[panel]\ntiles_folder = "{tmp_path}/tiles"\n')
-    command = ["map", "get", "--from", str(world), "--around", "47.0,8.0", "--name", "Home field"]
+    command = ["map", "get", "--source", str(world), "--around", "47.0,8.0", "--name", "Home field"]
     done = invoke(*command, "--config", config)
     assert done.exit_code == 0, done.output
     assert (tmp_path / "tiles" / "Home field.pmtiles").is_file()

@@ -14,7 +14,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn
 
 from gateway.cli.support.control import ask, is_running
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.options import CONFIG, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import GatewayClock
@@ -101,18 +101,17 @@ def calibrate(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Show the result, but do not save it.")
     ] = False,
-    config: ConfigOption = None,
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
     Each step is saved when it is done. A running gateway gives the samples and uses the result at
     once; without one, or with --port, the receiver is read.
     """
-    settings = read_settings(config)
+    settings = read_settings()
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
     chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
     old = aircraft.calibration
-    is_live = log is None and port is None and config is None and is_running()
+    is_live = log is None and port is None and CONFIG.get() is None and is_running()
     if is_live:
         found = ask("imu.calibration", {"vehicle_id": vehicle})
         old = msgspec.convert(found, NodeCalibration)

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from gateway.cli.support.control import AskingTyper, ask
-from gateway.cli.support.options import USER_CONFIG, ConfigOption
+from gateway.cli.support.control import ask
+from gateway.cli.support.options import CONFIG, USER_CONFIG
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     UNKNOWN,
@@ -29,8 +29,8 @@ US_PER_MS: Final = 1000
 Record = Mapping[str, Any]
 """A dataclass, as decoded from the control socket."""
 
-app = AskingTyper()
-group = AskingTyper(help="List, add and remove clients and sources.", no_args_is_help=True)
+app = typer.Typer()
+group = typer.Typer(help="List, add and remove clients and sources.", no_args_is_help=True)
 app.add_typer(group, name="clients")
 
 
@@ -78,12 +78,11 @@ def add(
     save: Annotated[
         bool, typer.Option("--save", help="Save it in the settings file too, for the next start.")
     ] = False,
-    config: ConfigOption = None,
 ) -> None:
     """Add a client or a source, until the gateway ends or permanently."""
     print(*ask("clients.add", {"url": url}), sep="\n")
     if save:
-        _save(config or USER_CONFIG.expanduser(), url)
+        _save(CONFIG.get() or USER_CONFIG.expanduser(), url)
     snapshot = ask("status")
     for added in (*snapshot["listeners"], *snapshot["clients"]):
         if added["endpoint"] == url and added["reason"]:

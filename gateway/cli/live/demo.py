@@ -20,9 +20,9 @@ from msgspec.structs import replace
 
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
-from gateway.cli.live.panel import is_installed, launched_panel
+from gateway.cli.live.panel import launched_panel
 from gateway.cli.live.run import EndpointOption, PlainOption, serve, with_endpoints
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
@@ -41,7 +41,6 @@ app = typer.Typer()
 @app.command()
 def demo(
     *,
-    config: ConfigOption = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
     record: Annotated[bool, typer.Option("--record", help="Record it from the start.")] = False,
@@ -62,11 +61,11 @@ def demo(
     """
 
     def read() -> GatewaySettings:
-        return with_endpoints(read_settings(config), endpoint)
+        return with_endpoints(read_settings(), endpoint)
 
     settings = read()
     # First of all, as it loads for seconds; so the simulator is imported after this.
-    page = launched_panel(config, wanted=panel and is_installed())
+    page = launched_panel(wanted=panel)
     load_entry_points()
     daemons: list[Daemon] = []
 

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from functools import partial
-from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.support.options import ConfigOption, folder_of, read_settings
-from gateway.cli.support.terminal import console_of, how_to_add, refuse
+from gateway.cli.support.options import folder_of, read_settings
+from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import (
     ConfigError,
@@ -31,6 +30,7 @@ from gateway.config import (
     load_aircraft,
     render,
 )
+from gateway.extras import how_to_add, missing
 from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
@@ -43,11 +43,13 @@ app = typer.Typer()
 TTY: Final = Path("/sys/class/tty")
 SLOW_LATENCY_MS: Final = 4
 """FTDI's timer: how long bytes wait in the adapter; 16 is its default."""
-EXTRAS: Final = {
-    "plot": ("jinja2", "matplotlib"),
-    "panel": ("nicegui", "pmtiles"),
-    "fleet": ("zenoh",),
-    "formats": ("mcap", "pyarrow", "pyulog"),
+EXTRA_USES: Final = {
+    "plot": "`mavgate report`",
+    "panel": "`mavgate panel`",
+    "fleet": "`mavgate fleet`",
+    "formats": "reading and writing of ULog, MCAP and Parquet",
+    "batch": "`mavgate batch` on a cluster and on URLs",
+    "fast": "hub.event_loop = uvloop",
 }
 ENOUGH_HOURS: Final = 4.0
 MB_PER_HOUR: Final = 100.0
@@ -256,10 +258,9 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
 
 def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check which optional parts are installed."""
-    for extra, modules in EXTRAS.items():
-        missing = [name for name in modules if find_spec(name) is None]
-        if missing:
-            yield note(f"extra {extra}", f"not installed: {how_to_add(extra)}")
+    for extra, use in EXTRA_USES.items():
+        if missing(extra):
+            yield note("extra", how_to_add(use, extra))
 
 
 CHECKS: Final[tuple[Check, ...]] = (
@@ -278,14 +279,14 @@ STYLES: Final = {Grade.GOOD: "green", Grade.NOTE: "yellow", Grade.WRONG: "red"}
 
 
 @app.command()
-def doctor(*, config: ConfigOption = None) -> None:
+def doctor() -> None:
     """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
     It changes nothing. The exit code is 1 if something is wrong.
     """
     console = console_of()
     failed = False
-    settings = read_settings(config)
+    settings = read_settings()
     for finding in chain.from_iterable(check(settings) for check in CHECKS):
         failed |= finding.grade is Grade.WRONG
         console.print(f"{finding.grade:5} ", style=STYLES[finding.grade], end="")

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gateway.cli.live.calibrate import Step, calibrate_each, capture_from, listen, poses_from
-from gateway.cli.support.options import ConfigOption, read_settings
+from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
@@ -75,14 +75,13 @@ def setup(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Try it on the simulated receiver; saves nothing.")
     ] = False,
-    config: ConfigOption = None,
 ) -> None:
     """Guide through the first start: receiver, sensors, radio, GPS, calibration.
 
     Each calibration is saved when it is done. The gateway must not run meanwhile: the receiver's
     port is read by one program at a time.
     """
-    settings = read_settings(config)
+    settings = read_settings()
     serial = settings.serial if port is None else replace(settings.serial, port=port)
     if not simulated:
         _guide(settings, serial, vehicle)

@@ -9,6 +9,7 @@ import msgspec
 import typer
 from intelhex import IntelHex
 
+from gateway.cli.support.options import output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing import boards
 from gateway.flashing.boards import USED_BY, BoardSettings, FlashError, Program, SettingsBlock
@@ -84,7 +85,7 @@ def flash(
     clock: Annotated[int, typer.Option("--clock", help="Crystal: 16 or 8 MHz.")] = 16,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Write the image to this file, not to a board."),
+        output_file("Write the image to this file, not to a board.", (".hex",)),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
     vehicle: Annotated[int | None, _option("vehicle_id")] = None,

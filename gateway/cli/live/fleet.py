@@ -23,17 +23,17 @@ import typer
 from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColumn
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.control import AskingTyper, ask, socket_of, with_socket
-from gateway.cli.support.options import ConfigOption, read_settings
+from gateway.cli.support.control import ask, socket_of
+from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import (
     UNKNOWN,
     JsonOption,
     console_of,
-    how_to_add,
     print_json,
     refuse,
     table_of,
 )
+from gateway.extras import require
 from gateway.hub.endpoint import SITE_NAME
 from gateway.live.control_socket import ControlError, request
 from gateway.live.service import run_event_loop
@@ -182,13 +182,13 @@ def _digest_of(file: BinaryIO) -> "hashlib._Hash":
 
 
 app = typer.Typer()
-group = AskingTyper(
+group = typer.Typer(
     help="Show the vehicles of many sites here, through a Zenoh router.",
     invoke_without_command=True,
 )
 app.add_typer(group, name="fleet")
 
-recordings_group = AskingTyper(
+recordings_group = typer.Typer(
     help="List the recordings of the sites, and fetch them.", invoke_without_command=True
 )
 group.add_typer(recordings_group, name="recordings")
@@ -209,12 +209,12 @@ def fleet(
         list[str] | None, typer.Option("--site", help="Sites to show, such as 'field-*'.")
     ] = None,
     endpoint: EndpointOption = None,
-    config: ConfigOption = None,
 ) -> None:
     """Show the vehicles of many sites here, through a Zenoh router."""
     if context.invoked_subcommand is not None:
         return
-    settings = with_endpoints(read_settings(config), endpoint)
+    require("the fleet", "fleet")
+    settings = with_endpoints(read_settings(), endpoint)
     changes = {
         **({} if listen is None else {"listen": listen, "router": ""}),
         **({} if connect is None else {"router": connect}),
@@ -294,8 +294,6 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
     try:
         server = FleetServer(settings, hub_settings)
         await server.start()
-    except ModuleNotFoundError:
-        refuse(f"the fleet is an extra: {how_to_add('fleet')}")
     except (ValueError, ControlError) as error:
         refuse(str(error))
     stations = ", ".join(hub_settings.endpoints)
@@ -308,7 +306,6 @@ async def _serve(settings: Any, hub_settings: Any) -> None:
 
 
 @recordings_group.callback()
-@with_socket
 def recordings(
     context: typer.Context,
     *,
@@ -341,8 +338,9 @@ def get(
     site: Annotated[str, typer.Argument(help="The site.")],
     name: Annotated[str, typer.Argument(help="Name of a recording, or last.")],
     *,
-    to: Annotated[
-        Path | None, typer.Option("--to", help="Folder; by default one called as the site.")
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", "-o", help="Folder; by default one called as the site."),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace files that differ.")] = False,
 ) -> None:
@@ -357,7 +355,7 @@ def get(
         recording = listed[-1]
     if recording is None:
         refuse(f"site {site} has no recording {name!r}; `mavgate fleet recordings` lists them")
-    socket, folder = socket_of("fleet"), to or Path(site)
+    socket, folder = socket_of("fleet"), output or Path(site)
 
     def send(verb: str, params: dict[str, Any], wait_s: float) -> Any:
         return request(socket, verb, params, timeout_s=wait_s)

@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 from rich.progress import Progress
 
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import files_of
-from gateway.cli.support.terminal import console_of, how_to_add, refuse
+from gateway.cli.support.terminal import console_of, refuse
+from gateway.extras import require
 
 app = typer.Typer()
 group = typer.Typer(help="Fetch an area of a map for the panel, for use without a network.")
@@ -22,7 +23,7 @@ def get(
     source: Annotated[
         str,
         typer.Option(
-            "--from",
+            "--source",
             help="A PMTiles file of raster tiles: an https:// address whose owner permits "
             "extracts, or a path.",
         ),
@@ -35,18 +36,16 @@ def get(
     name: Annotated[
         str | None, typer.Option("--name", help="Name of the map style; by default the area's.")
     ] = None,
-    config: ConfigOption = None,
 ) -> None:
     """Copy an area of a map into a file that the panel offers as a map style.
 
     Only what the area needs is fetched, one request at a time.
     """
-    try:
-        from gateway.panel import map_area
-        from gateway.panel.flight_page import read_flight
-    except ModuleNotFoundError as error:
-        refuse(f"maps belong to the panel, and {error.name} is missing: {how_to_add('panel')}")
-    settings = read_settings(config)
+    require("a map", "panel")
+    from gateway.panel import map_area
+    from gateway.panel.flight_page import read_flight
+
+    settings = read_settings()
     positions: list[tuple[float, float]] = []
     if (pair := _coordinates(around)) is not None:
         positions = [pair]

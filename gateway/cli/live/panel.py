@@ -7,16 +7,15 @@ import subprocess
 import sys
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 from msgspec.structs import replace
 
-from gateway.cli.support.control import SocketOption
-from gateway.cli.support.options import ConfigOption, folder_of, read_settings
-from gateway.cli.support.terminal import how_to_add, refuse
+from gateway.cli.support.options import CONFIG, SOCKET, folder_of, read_settings
+from gateway.cli.support.terminal import refuse
+from gateway.extras import how_to_add, missing, require
 from gateway.hub.endpoint import parse_endpoint
 from gateway.live.terminal import own_command
 from gateway.printable import LONGEST, PrintableFormatter
@@ -39,11 +38,9 @@ def panel(
         ),
     ] = None,
     port: Annotated[int | None, typer.Option("--port", "-p", min=0, max=65535)] = None,
-    config: ConfigOption = None,
     hash_password: Annotated[
         bool, typer.Option("--hash-password", help="Ask for a password and print its hash.")
     ] = False,
-    socket: SocketOption = None,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
 ) -> None:
     """Show the aircraft in a browser: instruments, map, link, recordings, calibration, tuning.
@@ -51,13 +48,12 @@ def panel(
     Without --connect it shows the gateway that runs on this machine, and reconnects whenever that
     is restarted.
     """
+    require("the panel", "panel")
     if not (attached or hash_password):
         log.info("the panel is loading; its address follows")
     os.nice(NICENESS)
-    try:
-        from gateway.panel.panel_server import PanelError, run_panel
-    except ModuleNotFoundError as error:
-        refuse(f"the panel is an extra, and {error.name} is missing: {how_to_add('panel')}")
+    from gateway.panel.panel_server import PanelError, run_panel
+
     if hash_password:
         from gateway.panel.access import hash_password as hashed
 
@@ -74,8 +70,8 @@ def panel(
         line = sys.stdin.buffer.readline()
         if not line:
             return
-        socket = Path(os.fsdecode(line.removesuffix(b"\n")))
-    settings = read_settings(config)
+        SOCKET.set(Path(os.fsdecode(line.removesuffix(b"\n"))))
+    settings = read_settings()
     wanted = settings.panel if port is None else replace(settings.panel, port=port)
     folder = folder_of(settings)
 
@@ -85,7 +81,7 @@ def panel(
     try:
         if connect is not None:
             parse_endpoint(connect)
-        run_panel(wanted, folder, connect, socket, show_link, attached=attached)
+        run_panel(wanted, folder, connect, SOCKET.get(), show_link, attached=attached)
     except (PanelError, ValueError) as error:
         refuse(str(error))
 
@@ -104,16 +100,14 @@ END_S: Final = 3.0
 """Within which it ends by itself when asked to; the loop must not close before it has."""
 
 
-def is_installed() -> bool:
-    """Return whether the extra is installed."""
-    return find_spec("nicegui") is not None
-
-
-def launched_panel(config: Path | None, *, wanted: bool) -> "PanelProcess | None":
-    """Return the panel, which begins to load, or None if it is not wanted."""
+def launched_panel(*, wanted: bool) -> "PanelProcess | None":
+    """Return the panel, which begins to load, or None if it is not wanted or not installed."""
     if not wanted:
         return None
-    panel = PanelProcess(config)
+    if missing("panel"):
+        log.warning("no panel here: %s", how_to_add("it", "panel"))
+        return None
+    panel = PanelProcess()
     panel.launch()
     return panel
 
@@ -133,11 +127,11 @@ class OneLineFormatter(PrintableFormatter):
 class PanelProcess:
     """The panel as a child process of the gateway; restarted when it dies."""
 
-    def __init__(self, config: Path | None) -> None:
+    def __init__(self) -> None:
         self.link = ""
         """The page's address; empty while there is none."""
         self._command = own_command("panel", "--attached")
-        if config is not None:
+        if (config := CONFIG.get()) is not None:
             self._command += ["--config", str(config)]
         self._task: asyncio.Task[None] | None = None
         self._child: subprocess.Popen[bytes] | None = None

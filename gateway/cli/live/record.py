@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import typer
 
-from gateway.cli.support.control import AskingTyper, ask, is_running, recordings_folder
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.control import ask, is_running, recordings_folder
+from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_json, table_of
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
@@ -29,7 +29,7 @@ NameArgument = Annotated[str, typer.Argument(help="Name of a recording, or last.
 
 
 app = typer.Typer()
-group = AskingTyper(
+group = typer.Typer(
     help="Start, stop, name, list and delete recordings.",
     no_args_is_help=True,
 )
@@ -62,20 +62,19 @@ def status(*, json: JsonOption = False) -> None:
 
 
 @group.command()
-def save(
+def rename(
     name: Annotated[str, typer.Argument(help="Letters, digits, spaces, dots, hyphens.")],
     *,
     recording: Annotated[
         str | None,
         typer.Option("--recording", help="Recording; by default the current or last one."),
     ] = None,
-    config: ConfigOption = None,
 ) -> None:
     """Rename a recording; nothing is ever overwritten."""
     if recording is None and is_running():
         _show(ask("record.save", {"name": name}))
         return
-    _list([rename_recording(_folder(config), recording or "last", name)])
+    _list([rename_recording(_folder(), recording or "last", name)])
 
 
 @group.command()
@@ -83,11 +82,10 @@ def delete(
     name: NameArgument,
     *,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")] = False,
-    config: ConfigOption = None,
 ) -> None:
     """Delete a recording, after asking."""
     running = is_running()
-    folder = Path(ask("record.status")["folder"]) if running else _folder(config)
+    folder = Path(ask("record.status")["folder"]) if running else _folder()
     # `last` may have become another one while the user was asked.
     found = find_recording(folder, name)
     if not yes:
@@ -102,9 +100,9 @@ def delete(
 
 
 @group.command("list")
-def list_all(*, json: JsonOption = False, config: ConfigOption = None) -> None:
+def list_all(*, json: JsonOption = False) -> None:
     """List the recordings, the newest last."""
-    folder = recordings_folder(config)
+    folder = recordings_folder()
     found = list_recordings(folder)
     if json:
         figures = _figures(found) if found else {}
@@ -127,8 +125,8 @@ def note(text: Annotated[str, typer.Argument(help="What happens now.")]) -> None
     _show(ask("record.note", {"text": text}))
 
 
-def _folder(config: Path | None) -> Path:
-    return folder_of(read_settings(config))
+def _folder() -> Path:
+    return folder_of(read_settings())
 
 
 def _show(status: dict[str, Any]) -> None:
@@ -157,7 +155,7 @@ def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]
             shown.update(f"reading new recordings: {done} of {total} files")
 
         try:
-            index_folder(folder, read_options(read_settings(None)), ThisProcess(), show)
+            index_folder(folder, read_options(read_settings()), ThisProcess(), show)
             return figures_of(folder)
         except (CatalogueError, OSError) as error:
             console.print(f"no figures of the flights: {error}")

@@ -13,10 +13,11 @@ import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
-from gateway.cli.support.options import ConfigOption, read_settings
+from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
+from gateway.extras import require
 from gateway.live.daemon import Daemon
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
@@ -43,7 +44,6 @@ EndpointOption = Annotated[
 @app.command("run")
 def run_gateway(
     *,
-    config: ConfigOption = None,
     port: Annotated[
         str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
     ] = None,
@@ -56,15 +56,17 @@ def run_gateway(
     """Run the gateway on the receiver's serial port until interrupted."""
 
     def read() -> GatewaySettings:
-        settings = read_settings(config)
+        settings = read_settings()
         if port is not None:
             serial = msgspec.structs.replace(settings.serial, port=port)
             settings = msgspec.structs.replace(settings, serial=serial)
         return with_endpoints(settings, endpoint)
 
     settings = read()
+    if panel:
+        require("--panel", "panel")
     aircraft = load_aircraft(settings)
-    page = launched_panel(config, wanted=panel or settings.panel.enabled)
+    page = launched_panel(wanted=panel or settings.panel.enabled)
     load_entry_points()
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)

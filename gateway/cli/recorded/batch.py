@@ -1,7 +1,6 @@
 """`mavgate batch`: one work on many recordings, here or on a cluster."""
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
@@ -18,9 +17,10 @@ from gateway.cli.support.batch_work import (
     failures,
     season_options,
 )
-from gateway.cli.support.options import ConfigOption, read_settings
-from gateway.cli.support.recording_options import ColumnsOption, ForceOption, SettingsOption
-from gateway.cli.support.terminal import console_of, how_to_add, refuse, table_of
+from gateway.cli.support.options import read_settings
+from gateway.cli.support.recording_options import ColumnsOption, ForceOption, FuseWithOption
+from gateway.cli.support.terminal import console_of, refuse, table_of
+from gateway.extras import how_to_add, missing, require
 from gateway.output import write_new
 from gateway.units import counted
 
@@ -32,7 +32,6 @@ FAILED: Final = 1
 FLIGHTS_CSV: Final = "flights.csv"
 BEST_TOML: Final = "best.toml"
 SWEEP_CSV: Final = "sweep.csv"
-FOR_PAGES: Final = ("jinja2", "matplotlib")
 
 Metric = Literal["held", "interpolated", "reference", "attitude"]
 
@@ -65,16 +64,15 @@ def _add_judging(name: Literal["fuse", "report"], text: str) -> None:
         output: OutputOption,
         against: AgainstOption = None,
         columns: ColumnsOption = None,
-        settings: SettingsOption = "recorded",
+        fuse_with: FuseWithOption = "recorded",
         jobs: JobsOption = None,
         scheduler: SchedulerOption = None,
-        config: ConfigOption = None,
     ) -> None:
-        if name == "report" and not _can_make_pages():
-            refuse(f"reports need the extra mavgate[plot]:\n{how_to_add('plot')}")
-        work = SeasonWork(files, config, jobs, scheduler)
+        if name == "report":
+            require("a report", "plot")
+        work = SeasonWork(files, jobs, scheduler)
         task = {"fuse": FuseTask, "report": ReportTask}[name]
-        options = season_options(config, columns, settings)
+        options = season_options(columns, fuse_with)
         _finish(work.run(task(options), work.items(), output), output, against)
 
 
@@ -93,13 +91,12 @@ def info(
     columns: ColumnsOption = None,
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
-    config: ConfigOption = None,
 ) -> None:
     """Describe many files, one by one, as `mavgate info` does."""
     from gateway.batch.statistics import flight_table
 
-    work = SeasonWork(files, config, jobs, scheduler)
-    task = InfoTask(season_options(config, columns, "recorded"))
+    work = SeasonWork(files, jobs, scheduler)
+    task = InfoTask(season_options(columns, "recorded"))
     results = work.run(task, work.items(each_file=True), output)
     grid = table_of("recording", "aircraft", "began (UTC)", "s", "km", "gaps", "damaged", left=1)
     for result in results:
@@ -131,22 +128,21 @@ def sweep(
     hold_out: HoldOutOption = 5,
     gps_interval: IntervalOption = 0.0,
     columns: ColumnsOption = None,
-    settings: SettingsOption = "recorded",
+    fuse_with: FuseWithOption = "recorded",
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
-    config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
     """Find one set of settings for many flights; those of other days judge what was chosen."""
     from gateway.cli.recorded.sweep import SweepOptions, run_season_sweep
 
-    work = SeasonWork(files, config, jobs, scheduler)
+    work = SeasonWork(files, jobs, scheduler)
     options = SweepOptions(
         [], vary, 0, metric, hold_out, gps_interval, jobs, output / BEST_TOML, output / SWEEP_CSV,
         force,
     )  # fmt: skip
-    read = season_options(config, columns, settings)
-    _end(run_season_sweep(work, read, read_settings(config), options, output))
+    read = season_options(columns, fuse_with)
+    _end(run_season_sweep(work, read, read_settings(), options, output))
 
 
 def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
@@ -165,11 +161,11 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
         _show_versus(compared)
     rows = flight_table(results).to_csv(index=False).encode()
     write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
-    if _can_make_pages():
+    if not missing("plot"):
         print(write_season_page(results, output, compared))
     else:
         print(output / FLIGHTS_CSV)
-        console.print(f"a page needs the extra mavgate[plot]:\n{how_to_add('plot')}")
+        console.print(how_to_add("a page of the season", "plot"))
     _end(results)
 
 
@@ -197,7 +193,3 @@ def _end(results: Sequence[FlightResult]) -> None:
     if count := failures(results):
         console_of(stderr=True).print(f"{count} of {counted(len(results), 'recording')} failed")
         raise typer.Exit(FAILED)
-
-
-def _can_make_pages() -> bool:
-    return all(find_spec(name) is not None for name in FOR_PAGES)

@@ -11,7 +11,7 @@ from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
 from gateway.cli.support.batch_work import JobsOption
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption
 from gateway.cli.support.terminal import (
     UNKNOWN,
@@ -70,10 +70,9 @@ def index(
     *,
     columns: ColumnsOption = None,
     jobs: JobsOption = None,
-    config: ConfigOption = None,
 ) -> None:
     """Bring the catalogue of a folder up to date; the word `index` may be left out."""
-    settings = read_settings(config)
+    settings = read_settings()
     root = (folder or folder_of(settings)).expanduser()
     if not root.is_dir():
         refuse(f"{root}: is no folder")
@@ -98,10 +97,9 @@ def list_flights(
     folder: FolderOption = None,
     json: JsonOption = False,
     geojson: GeojsonOption = False,
-    config: ConfigOption = None,
 ) -> None:
     """List the flights of the catalogue, or those for which a condition holds."""
-    root = _folder(folder, config)
+    root = _folder(folder)
     if geojson or json:
         print_json(geojson_of(root, where) if geojson else find_flights(root, where))
     else:
@@ -115,10 +113,9 @@ def show(
     folder: FolderOption = None,
     json: JsonOption = False,
     geojson: GeojsonOption = False,
-    config: ConfigOption = None,
 ) -> None:
     """Show all that the catalogue knows of one recording; `last` is the newest."""
-    root = _folder(folder, config)
+    root = _folder(folder)
     with suppress(RecordingError):
         name = find_recording(root, name).name
     quoted = name.replace("'", "''")
@@ -139,8 +136,8 @@ def show(
         console_of().print(grid)
 
 
-def _folder(folder: Path | None, config: Path | None) -> Path:
-    return (folder or folder_of(read_settings(config))).expanduser()
+def _folder(folder: Path | None) -> Path:
+    return (folder or folder_of(read_settings())).expanduser()
 
 
 def _show_table(rows: list[Row]) -> None:

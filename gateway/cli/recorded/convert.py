@@ -6,15 +6,15 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
-from gateway.cli.support.options import ConfigOption, read_options, read_settings
+from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,
     ForceOption,
     FromOption,
+    FuseWithOption,
     PositionOption,
     SensorOption,
-    SettingsOption,
     SmoothOption,
     SystemOption,
     ToOption,
@@ -43,9 +43,7 @@ FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 def convert(
     files: Files,
     *,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Output; its ending selects the format.")
-    ],
+    output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
     begin: FromOption = None,
     end: ToOption = None,
     columns: ColumnsOption = None,
@@ -55,14 +53,13 @@ def convert(
         typer.Option("--fuse", help="Fuse a table again instead of using its recorded states."),
     ] = False,
     smooth: SmoothOption = False,
-    settings: SettingsOption = "recorded",
+    fuse_with: FuseWithOption = "recorded",
     position: PositionOption = "causal",
     system: SystemOption = None,
     message: Annotated[
         str | None,
         typer.Option("--message", help="For Parquet: this MAVLink message instead of the table."),
     ] = None,
-    config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
     """Convert, trim and join recordings.
@@ -71,20 +68,17 @@ def convert(
     of other autopilots (tlog, ULog, DataFlash) become tables that can be fused, and so does a CSV
     of another program, by its column map.
     """
-    write = WRITERS.get(out.suffix)
-    if write is None:
-        refuse(f"{out}: the output must end in {', '.join(WRITERS)}")
     if smooth and not fuse:
         refuse("--smooth smooths what --fuse fuses: give both")
-    if message and out.suffix != ONE_KIND:
+    if message and output.suffix != ONE_KIND:
         refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
-    of_tlogs = not fuse and (out.suffix in FROM_TLOGS or message)
-    files = recorded_files(files, config, "tlogs" if of_tlogs else "tables")
+    of_tlogs = not fuse and (output.suffix in FROM_TLOGS or message)
+    files = recorded_files(files, "tlogs" if of_tlogs else "tables")
     with progress_of(files) as advance:
         options = read_options(
-            read_settings(config),
+            read_settings(),
             columns,
-            choice=settings,
+            choice=fuse_with,
             position=position,
             system_id=system,
             sensors=read_sensors(sensor),
@@ -94,17 +88,18 @@ def convert(
             files,
             options,
             limits=read_range(begin, end),
-            title=out.stem,
+            title=output.stem,
             fuse=fuse,
             smooth=smooth,
             message=message,
         )
-        size = write_new(out, write(flight), overwrite=force, inputs=[*files, columns, config])
+        inputs = [*files, columns, CONFIG.get()]
+        size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)
-    lacks = LACKS[out.suffix].of_tlogs if flight.is_mavlink else LACKS[out.suffix].of_tables
+    lacks = LACKS[output.suffix].of_tlogs if flight.is_mavlink else LACKS[output.suffix].of_tables
     if lacks and message is None:
-        print_remarks([f"{out} does not hold {lacks}"])
-    console_of().print(f"{out}: {size / 1e6:.3f} MB")
+        print_remarks([f"{output} does not hold {lacks}"])
+    console_of().print(f"{output}: {size / 1e6:.3f} MB")
 
 
 LEAST_RATE_HZ: Final = 10.0
@@ -124,7 +119,7 @@ def _known_estimator(name: str | None) -> str | None:
 def fuse_log(
     file: Annotated[Path, typer.Argument(help="Recording, by name or file, or log; also gzipped.")],
     *,
-    out: Annotated[Path, typer.Option("--out", "-o", help="CSV to write.")],
+    output: Annotated[Path, output_file("CSV to write.", (".csv",))],
     estimator: Annotated[
         str | None,
         typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
@@ -135,12 +130,11 @@ def fuse_log(
         float | None,
         typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
     ] = None,
-    settings: SettingsOption = "recorded",
+    fuse_with: FuseWithOption = "recorded",
     smooth: SmoothOption = False,
-    config: ConfigOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Fuse a log again and write one row per IMU sample: attitude, position, velocity.
+    """Re-run the estimator on a log and write one row per IMU sample.
 
     The columns are those of a recording's table, so every command accepts the file as one.
     Reads mavgate's own recordings, autopilots' logs (tlog, ULog, DataFlash), and CSV files with
@@ -150,15 +144,15 @@ def fuse_log(
     file's # lines are used; a latency that is not given there either is estimated from its
     manoeuvres, or the default is assumed, with a message.
     """
-    current = read_settings(config)
-    files = recorded_files([file], config, "tables")
-    inputs = [*files, columns, config]
-    check_output(out, inputs, overwrite=force)
+    current = read_settings()
+    files = recorded_files([file], "tables")
+    inputs = [*files, columns, CONFIG.get()]
+    check_output(output, inputs, overwrite=force)
     with progress_of(files) as advance:
         options = read_options(
             current,
             columns,
-            choice="current" if config is not None else settings,
+            choice=fuse_with if CONFIG.get() is None else "current",
             progress=advance,
             sensors=read_sensors(sensor),
         )
@@ -168,10 +162,10 @@ def fuse_log(
         )  # fmt: skip
         time_us, states = fusion.states()
         lines = fused_lines(fusion.header, time_us, states)
-        write_new(out, lines, overwrite=force, inputs=inputs)
+        write_new(output, lines, overwrite=force, inputs=inputs)
     print_remarks(fusion.remarks)
     name = fusion.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-    _report(file, time_us, f"{out}: ", f" fused by {name}")
+    _report(file, time_us, f"{output}: ", f" fused by {name}")
 
 
 def _report(file: Path, time_us: IntArray, before: str, behind: str) -> None:

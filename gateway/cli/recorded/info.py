@@ -10,7 +10,7 @@ import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
-from gateway.cli.support.options import ConfigOption, read_options, read_settings
+from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
@@ -57,15 +57,14 @@ def info(
     *,
     columns: ColumnsOption = None,
     json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
-    config: ConfigOption = None,
 ) -> None:
     """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
     # A file needs no settings, which would import every stage.
-    files = recorded_files([file], config, "all")
+    files = recorded_files([file], "all")
     with progress_of(files) as advance:
 
         def options() -> ReadOptions:
-            return read_options(read_settings(config), columns, progress=advance)
+            return read_options(read_settings(), columns, progress=advance)
 
         found = [(each, describe(each, advance, options)) for each in files]
     for number, (each, info_of_file) in enumerate(found):
@@ -80,8 +79,9 @@ def info(
 def recover(
     file: Annotated[Path, typer.Argument(help="Damaged recording.", show_default=False)],
     *,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output; by default NAME.recovered.EXT.")
+    output: Annotated[
+        Path | None,
+        output_file("Output; by default NAME.recovered.EXT.", (".tlog", ".csv")),
     ] = None,
     force: ForceOption = False,
 ) -> None:
@@ -94,9 +94,9 @@ def recover(
     with progress_of([file]) as advance:
         is_tlog = format_of(file) == TLOG
         kept, other = (".tlog", ".csv") if is_tlog else (".csv", ".tlog")
-        target = out or file.with_name(f"{file.stem}.recovered{kept}")
-        if out is not None and out.suffix == other:
-            refuse(f"{out}: {file} is repaired as a {kept}; first that, then `mavgate convert` it")
+        target = output or file.with_name(f"{file.stem}.recovered{kept}")
+        if output is not None and output.suffix == other:
+            refuse(f"{output}: {file} is repaired as a {kept}; then `mavgate convert` that")
         sound = _sound_records if is_tlog else _sound_lines
         size = write_new(
             target, sound(file, advance, left_out.append), overwrite=force, inputs=[file]

@@ -13,14 +13,14 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
 from gateway.cli.live.run import EndpointOption, with_endpoints
-from gateway.cli.support.control import AskingTyper, ask, with_socket
-from gateway.cli.support.options import ConfigOption, read_options, read_settings
+from gateway.cli.support.control import ask
+from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     Files,
     FromOption,
+    FuseWithOption,
     PositionOption,
-    SettingsOption,
     ToOption,
     print_remarks,
     progress_of,
@@ -72,7 +72,7 @@ def play(
             help="System id for each recording's first vehicle; its others get the next ids.",
         ),
     ] = None,
-    settings: SettingsOption = "recorded",
+    fuse_with: FuseWithOption = "recorded",
     position: PositionOption = "causal",
     columns: ColumnsOption = None,
     with_commands: Annotated[
@@ -87,7 +87,6 @@ def play(
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
     endpoint: EndpointOption = None,
-    config: ConfigOption = None,
 ) -> None:
     """Play recordings to the ground stations, several at once if you like.
 
@@ -96,7 +95,7 @@ def play(
     make of it can be compared on one map. The parts of a recording are one flight. `mavgate seek`
     and `mavgate player` control it meanwhile.
     """
-    gateway = with_endpoints(read_settings(config), endpoint)
+    gateway = with_endpoints(read_settings(), endpoint)
     if with_commands and not yes:
         _ask_for_commands(gateway)
     with ExitStack() as opened:
@@ -104,8 +103,8 @@ def play(
             *read_range(begin, end), _speed(speed), skip_gaps, loop, paused,
             with_commands, commands_anywhere=with_commands,
         )  # fmt: skip
-        files = recorded_files(files, config, "tlogs")
-        options = read_options(gateway, columns, choice=settings, position=position)
+        files = recorded_files(files, "tlogs")
+        options = read_options(gateway, columns, choice=fuse_with, position=position)
         with progress_of(files) as advance:
             recorded = open_flights(files, replace(options, progress=advance), opened)
             flights = lay_out(recorded, system or [], with_commands=with_commands)
@@ -125,12 +124,11 @@ def _ask_for_commands(settings: GatewaySettings) -> None:
         )
 
 
-group = AskingTyper(help="Control the running player.", no_args_is_help=True)
+group = typer.Typer(help="Control the running player.", no_args_is_help=True)
 app.add_typer(group, name="player")
 
 
 @app.command(context_settings=NEGATIVE_NUMBERS)
-@with_socket
 def seek(
     to: Annotated[
         str, typer.Argument(help="80 or 1:20 from the start, +10 or -0:30 from here, or a date.")

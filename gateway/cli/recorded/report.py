@@ -1,20 +1,19 @@
 """`mavgate report`: figures and tables of a flight; `mavgate page`: a flight as one HTML file."""
 
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 from rich.progress import TimeElapsedColumn
 
-from gateway.cli.support.options import ConfigOption, folder_of, read_options, read_settings
+from gateway.cli.support.options import folder_of, output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     FlightArgument,
     ForceOption,
+    FuseWithOption,
     ReferenceOption,
-    SettingsOption,
     SmoothOption,
     SystemOption,
     files_of,
@@ -23,14 +22,13 @@ from gateway.cli.support.recording_options import (
     print_remarks,
     progress_of,
 )
-from gateway.cli.support.terminal import how_to_add, progress_bar, refuse
+from gateway.cli.support.terminal import progress_bar
+from gateway.extras import require
 from gateway.output import check_folder, write_new
 from gateway.recordings.fuse import with_reference
 from gateway.recordings.recorded_fusion import smoothed_latency_in_words
 
 app = typer.Typer()
-
-NEEDED: Final = ("jinja2", "matplotlib", "pandas")
 
 OutputOption = Annotated[
     Path, typer.Option("--output", "-o", help="Folder for the page, its figures and tables.")
@@ -52,25 +50,22 @@ def report(
     columns: ColumnsOption = None,
     system: SystemOption = None,
     smooth: SmoothOption = False,
-    settings: SettingsOption = "recorded",
-    config: ConfigOption = None,
+    fuse_with: FuseWithOption = "recorded",
     force: ForceOption = False,
 ) -> None:
     """Make a page of figures and tables of a flight, those of the paper included.
 
     Without a flight the built-in simulated one is used.
     """
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        needed = " and ".join(missing)
-        refuse(f"a report needs {needed}, the extra mavgate[plot]:\n{how_to_add('plot')}")
-    # These need an extra, and take a second to import.
+    require("a report", "plot")
+    # These need the extra, and take a second to import.
     from gateway.analysis.case import make_case
     from gateway.analysis.reporting.compose import make_report
     from gateway.analysis.reporting.page import count_pictures, write_report
 
     check_folder(output, overwrite=force)
-    gateway = read_settings(config)
-    options = read_options(gateway, columns, choice=settings, system_id=system)
+    gateway = read_settings()
+    options = read_options(gateway, columns, choice=fuse_with, system_id=system)
     loaded = load_flight(flight, gateway, options, reference)
     other = loaded if against is None else load_flight(against, gateway, options)
     others = None
@@ -104,9 +99,7 @@ def page(
         Path, typer.Argument(help="A recording by its name, or any flight log.", show_default=False)
     ],
     *,
-    output: Annotated[Path, typer.Option("--output", "-o", help="The HTML file.")] = Path(
-        "flight.html"
-    ),
+    output: Annotated[Path, output_file("The HTML file.", (".html",))] = Path("flight.html"),
     compare: Annotated[
         bool,
         typer.Option(
@@ -115,22 +108,20 @@ def page(
         ),
     ] = True,
     columns: ColumnsOption = None,
-    settings: SettingsOption = "recorded",
-    config: ConfigOption = None,
+    fuse_with: FuseWithOption = "recorded",
     force: ForceOption = False,
 ) -> None:
     """Make one HTML file of a flight, which opens offline in any browser.
 
     It contains the instruments, the flight in 3D and on a plan, a slider, plots and events.
     """
-    try:
-        # These need an extra, and take a second to import.
-        from gateway.panel.flight_page import compare_estimators, read_flight, render_page
-    except ModuleNotFoundError as error:
-        refuse(f"the page is made by the panel, and {error.name} is missing: {how_to_add('panel')}")
-    gateway = read_settings(config)
+    require("a page", "panel")
+    # These take a second to import.
+    from gateway.panel.flight_page import compare_estimators, read_flight, render_page
+
+    gateway = read_settings()
     files = files_of([flight], folder_of(gateway), "tlogs")
-    options = read_options(gateway, columns, choice=settings)
+    options = read_options(gateway, columns, choice=fuse_with)
     with progress_of(files) as advance:
         made = read_flight(files, replace(options, progress=advance), flight.name)
     if compare:

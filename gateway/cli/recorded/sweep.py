@@ -38,12 +38,12 @@ from gateway.cli.support.batch_work import (
     SeasonWork,
     season_options,
 )
-from gateway.cli.support.options import ConfigOption, read_options, read_settings
+from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
+    FuseWithOption,
     ReferenceOption,
-    SettingsOption,
     SystemOption,
     fusion_of,
     load_flight,
@@ -90,15 +90,16 @@ def sweep(
     hold_out: HoldOutOption = 5,
     gps_interval: IntervalOption = 0.0,
     jobs: JobsOption = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Settings file for the best.")
-    ] = Path("best.toml"),
-    table: Annotated[Path | None, typer.Option("--table", help="CSV file for every trial.")] = None,
+    output: Annotated[Path, output_file("Settings file for the best.", (".toml",))] = Path(
+        "best.toml"
+    ),
+    table: Annotated[
+        Path | None, output_file("CSV file for every trial.", (".csv",), "--table")
+    ] = None,
     reference: ReferenceOption = None,
     columns: ColumnsOption = None,
     system: SystemOption = None,
-    settings: SettingsOption = "recorded",
-    config: ConfigOption = None,
+    fuse_with: FuseWithOption = "recorded",
     force: ForceOption = False,
 ) -> None:
     """Try settings on one flight or many, and write the best as a settings file.
@@ -107,7 +108,7 @@ def sweep(
     fixes that are withheld from it. With many flights, the choice is scored by flights of other
     aircraft and days.
     """
-    current = read_settings(config)
+    current = read_settings()
     named = [(name, text) for name, text in (("alpha", alpha), ("beta", beta)) if text]
     options = SweepOptions(
         named, vary or [], optimise, metric, hold_out, gps_interval, jobs, output, table, force
@@ -116,11 +117,11 @@ def sweep(
     if len(given) > 1 or any(Path(name).is_dir() or is_url(name) for name in given):
         if reference is not None or system is not None:
             refuse("--reference and --system belong to one flight")
-        read = season_options(config, columns, settings)
-        run_season_sweep(SeasonWork(given, config, jobs), read, current, options)
+        read = season_options(columns, fuse_with)
+        run_season_sweep(SeasonWork(given, jobs), read, current, options)
         return
     path = Path(given[0]) if given else None
-    read = read_options(current, columns, choice=settings, system_id=system)
+    read = read_options(current, columns, choice=fuse_with, system_id=system)
     run_sweep(path, current, options, lambda: load_flight(path, current, read, reference))
 
 

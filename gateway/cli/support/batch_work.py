@@ -9,12 +9,13 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.batch.executors import DaskCluster, Executor, LocalProcesses, has_dask
-from gateway.batch.storage import BatchItem, has_fsspec, is_url, items_of
+from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
+from gateway.batch.storage import BatchItem, is_url, items_of
 from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_season, without_secrets
 from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import Wanted, recorded_files
-from gateway.cli.support.terminal import console_of, how_to_add, progress_bar, refuse
+from gateway.cli.support.terminal import console_of, progress_bar, refuse
+from gateway.extras import require
 from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice
 from gateway.recordings.reading import ReadOptions
@@ -57,15 +58,13 @@ class SeasonWork:
     """Recordings, and the processes or the cluster that work on them."""
 
     names: Sequence[str]
-    config: Path | None
     jobs: int | None = None
     scheduler: str | None = None
 
     def items(self, *, each_file: bool = False) -> list[BatchItem]:
         """Find the recordings; what is not there ends the command."""
         if any(map(is_url, self.names)):
-            if not has_fsspec():
-                refuse(f"URLs need fsspec, the extra mavgate[batch]:\n{how_to_add('batch')}")
+            require("a URL", "batch")
             log = logging.getLogger()
             # Storages log each connection.
             if log.level == logging.INFO:
@@ -76,7 +75,7 @@ class SeasonWork:
             if is_url(name):
                 names.append(name)
                 continue
-            names += map(str, recorded_files([Path(name).expanduser()], self.config, wanted))
+            names += map(str, recorded_files([Path(name).expanduser()], wanted))
         try:
             items = items_of(names, each_file=each_file)
         except OSError as error:
@@ -91,8 +90,7 @@ class SeasonWork:
         if self.scheduler is None:
             yield LocalProcesses(self.jobs)
             return
-        if not has_dask():
-            refuse(f"--scheduler needs Dask, the extra mavgate[batch]:\n{how_to_add('batch')}")
+        require("--scheduler", "batch")
         with closing(DaskCluster(self.scheduler)) as cluster:
             yield cluster
 
@@ -123,11 +121,9 @@ class SeasonWork:
         return results
 
 
-def season_options(
-    config: Path | None, columns: Path | None, choice: SettingsChoice
-) -> ReadOptions:
+def season_options(columns: Path | None, choice: SettingsChoice) -> ReadOptions:
     """Take what reads a season's flights out of the settings; nothing that must stay secret."""
-    return without_secrets(read_options(read_settings(config), columns, choice=choice))
+    return without_secrets(read_options(read_settings(), columns, choice=choice))
 
 
 def failures(results: Sequence[FlightResult]) -> int:

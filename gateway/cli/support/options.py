@@ -1,4 +1,4 @@
-"""The settings file of a command.
+"""What the user has named: settings file, control socket, and the file to write.
 
 The settings import every stage, and with them NumPy: a command that never reads them must not wait
 for that, so they are imported where they are read.
@@ -6,10 +6,14 @@ for that, so they are imported where they are read.
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextvars import ContextVar
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import typer
+
+from gateway.output import check_ending
 
 if TYPE_CHECKING:
     from gateway.config import GatewaySettings
@@ -17,23 +21,33 @@ if TYPE_CHECKING:
 
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", "-c", help=f"Settings file; by default gateway.toml in {USER_CONFIG.parent}."
-    ),
-]
+CONFIG: Final[ContextVar[Path | None]] = ContextVar("config", default=None)
+"""Settings file that the user has named."""
+SOCKET: Final[ContextVar[Path | None]] = ContextVar("socket", default=None)
+"""Control socket that the user has named."""
 
 
-def read_settings(file: Path | None) -> GatewaySettings:
-    """Load the given settings, the user's own, or the defaults."""
+def read_settings(file: Path | None = None) -> GatewaySettings:
+    """Load the given settings, those that the user has named, the user's own, or the defaults."""
     from gateway.config import GatewaySettings, load
 
+    file = file or CONFIG.get()
     if file is None:
         file = USER_CONFIG.expanduser()
         if not file.exists():
             return GatewaySettings()
     return load(file)
+
+
+def output_file(text: str, endings: Collection[str], *names: str) -> Any:
+    """Return the option of a file to write, by default `--output`, that has one of the endings."""
+
+    def check(path: Path | None) -> Path | None:
+        if path is not None:
+            check_ending(path, endings)
+        return path
+
+    return typer.Option(*(names or ("--output", "-o")), help=text, callback=check)
 
 
 def folder_of(settings: GatewaySettings) -> Path:

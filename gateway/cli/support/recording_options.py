@@ -49,9 +49,9 @@ SensorOption = Annotated[
         "By default the first with data.",
     ),
 ]
-SettingsOption = Annotated[
+FuseWithOption = Annotated[
     SettingsChoice,
-    typer.Option("--settings", help="Fuse tables with the recorded or the current settings."),
+    typer.Option("--fuse-with", help="Fuse tables with the recorded or the current settings."),
 ]
 PositionOption = Annotated[
     Position,
@@ -111,12 +111,12 @@ Wanted = Literal["tlogs", "tables", "all"]
 """Which files of a recording a command uses; the others if it has none of these."""
 
 
-def recorded_files(names: Iterable[Path], config: Path | None, wanted: Wanted) -> list[Path]:
+def recorded_files(names: Iterable[Path], wanted: Wanted) -> list[Path]:
     """Replace names of recordings by their files, for which alone a gateway is asked."""
     names = list(names)
     if all(map(_is_path, names)):
         return names
-    return files_of(names, recordings_folder(config), wanted)
+    return files_of(names, recordings_folder(), wanted)
 
 
 def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:

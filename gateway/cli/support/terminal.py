@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import typer
@@ -100,10 +98,6 @@ def progress_bar(*columns: ProgressColumn, auto_refresh: bool = False) -> Progre
     )  # fmt: skip
 
 
-DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")
-"""Where `make deb` puts all; what is installed by pip is not found from there."""
-
-
 def refuse(text: str) -> NoReturn:
     """End the command with an error."""
     console = console_of(stderr=True)
@@ -125,10 +119,3 @@ def refusing() -> Iterator[None]:
         if error.filename is None:
             raise
         refuse(f"{error.filename}: {error.strerror or reason_of(error)}")
-
-
-def how_to_add(extra: str) -> str:
-    """Return the command line that installs an optional part, if one can."""
-    if Path(__file__).is_relative_to(DEBIAN_PACKAGE):
-        return "the Debian package does not have it: /usr/share/doc/mavgate/service.md, Elsewhere"
-    return f"{sys.executable} -m pip install 'mavgate[{extra}]'"

@@ -21,7 +21,7 @@ async def control_socket() -> Path:
 
 def panel_that_runs(code: str) -> PanelProcess:
     """Return a panel whose child process runs some Python code instead."""
-    panel = PanelProcess(None)
+    panel = PanelProcess()
     panel._command = [sys.executable, "-c", code]
     return panel
 
@@ -73,7 +73,7 @@ async def test_panel_that_is_launched_but_not_started_ends_when_closed() -> None
 
 
 async def test_panel_is_closed_while_it_waits_for_the_gateway() -> None:
-    panel = PanelProcess(None)
+    panel = PanelProcess()
     panel.start(asyncio.get_running_loop().create_future)
     await asyncio.sleep(0)
     await panel.close()
@@ -109,7 +109,7 @@ async def test_traceback_of_the_panel_is_one_record_that_ends_with_its_error(
     stream.feed_eof()
     limit = LogLimit()
     caplog.handler.addFilter(limit)
-    await PanelProcess(None)._read(stream)
+    await PanelProcess()._read(stream)
     caplog.handler.removeFilter(limit)
     (logged,) = caplog.records
     assert logged.getMessage().startswith("panel: It failed\n")

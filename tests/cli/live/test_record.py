@@ -47,7 +47,7 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: 
     assert "recording" in await run("note", "over the wood")
     assert "the note is empty" in await run("note", " ", code=2)
     # Also before anything of it is on the disk.
-    assert "first" in await run("save", "first")
+    assert "first" in await run("rename", "first")
     await gateway.recorder.settle()
     assert "stop it first" in await run("delete", "first", "--yes", code=2)
     assert "idle" in await run("stop")

@@ -98,7 +98,7 @@ def test_table_fused_with_other_settings_has_other_states(table: Path, tmp_path:
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     out = tmp_path / "again.csv"
-    run("convert", table, "-o", out, "--fuse", "--settings", "current", "--config", config)
+    run("convert", table, "-o", out, "--fuse", "--fuse-with", "current", "--config", config)
     (_, before), (_, after) = read_table(table), read_table(out)
     assert [row.raw for row in after] == [row.raw for row in before]
     assert after[-1].state != before[-1].state
@@ -305,7 +305,7 @@ def test_recover_to_another_format_is_refused(tlog: Path, table: Path, tmp_path:
         (tlog, tmp_path / "x.csv", ".tlog"),
     ):
         text = run("recover", file, "-o", out, code=2)
-        assert f"is repaired as a {kept}; first that, then `mavgate convert` it" in text
+        assert f"is repaired as a {kept}; then `mavgate convert` that" in text
         assert not out.exists()
 
 
@@ -325,7 +325,7 @@ def test_head_of_a_fused_table_has_the_settings_of_its_fusion(table: Path, tmp_p
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
-    run("convert", table, "-o", again, "--fuse", "--settings", "current", "--config", config)
+    run("convert", table, "-o", again, "--fuse", "--fuse-with", "current", "--config", config)
     run("convert", again, "-o", twice, "--fuse")
     assert twice.read_bytes() == again.read_bytes() != table.read_bytes()
 
@@ -351,7 +351,7 @@ def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     assert "nothing runs" in run("record", "start", code=2)
     listed = msgspec.json.decode(run("record", "list", "--json", "-c", config))
     assert [recording["name"] for recording in listed] == ["a"]
-    run("record", "save", "first flight", "-c", config)
+    run("record", "rename", "first flight", "-c", config)
     assert "aborted" in run("record", "delete", "last", "-c", config, code=1).lower()
     assert [path.name for path in folder.glob("*.tlog")] == ["first flight_01.tlog"]
     run("record", "delete", "last", "--yes", "-c", config)

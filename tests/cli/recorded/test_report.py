@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from gateway import extras
 from gateway.analysis.reporting.page import Report
 from gateway.analysis.reporting.raw_sensors import timing
 from gateway.cli.recorded import report
@@ -46,10 +47,10 @@ def test_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     def without(name: str) -> ModuleSpec | None:
         return None if name == "jinja2" else find_spec(name)
 
-    monkeypatch.setattr(report, "find_spec", without)
+    monkeypatch.setattr(extras, "find_spec", without)
     result = invoke("report", code=2)
-    assert "needs jinja2, the extra mavgate[plot]" in result.output
-    assert "-m pip install 'mavgate[plot]'\n" in result.output
+    assert result.output.startswith("a report needs the extra plot; to install it: ")
+    assert result.output.endswith("install 'jinja2>=3.1' 'matplotlib>=3.9'\n")
 
 
 def test_full_disk_is_reported_with_its_folder(

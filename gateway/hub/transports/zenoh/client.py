@@ -9,12 +9,12 @@ import logging
 from functools import partial
 from typing import NamedTuple
 
+from gateway.extras import how_to_add
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import READ_BYTES, Client
 from gateway.hub.transports.zenoh.session import (
     MAX_MESSAGE,
-    NOT_INSTALLED,
     RELIABLE_IDS,
     SECURED,
     Connection,
@@ -136,7 +136,7 @@ class ZenohClient(Client):
             session = await off_loop(open_session, config)
         except ModuleNotFoundError:
             self.become("unreachable")
-            self.reason = NOT_INSTALLED
+            self.reason = how_to_add("this endpoint", "fleet")
         except (OSError, ValueError) as error:
             self.become("unreachable", error)
         else:

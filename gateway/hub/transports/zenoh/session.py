@@ -95,7 +95,6 @@ def site_of(key: str) -> str:
 
 log = logging.getLogger(__name__)
 
-NOT_INSTALLED: Final = "the extra mavgate[fleet] is not installed: see mavgate doctor"
 MAX_WAITING: Final = 4096
 """Received messages that wait for the loop: a third of a second of two hundred aircraft."""
 AT_ONCE: Final = 64
