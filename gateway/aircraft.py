@@ -44,12 +44,11 @@ from gateway.vehicle.requests import (
     SavePlan,
     SaveSettings,
     SettingsChange,
-    SigningClock,
-    SigningTimestamps,
     StatusText,
 )
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_signing import SigningClock, SigningTimestamps
 
 
 @dataclass(frozen=True, slots=True)

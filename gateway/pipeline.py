@@ -27,15 +27,14 @@ from gateway.records import (
 )
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location, StoredPlan
-from gateway.vehicle.requests import (
-    BAD_SIGNATURE,
+from gateway.vehicle.requests import BAD_SIGNATURE, StatusText
+from gateway.wire.link import Link
+from gateway.wire.mavlink_signing import (
+    FrameSigner,
     KeptTimestamps,
     SigningClock,
     SigningTimestamps,
-    StatusText,
 )
-from gateway.wire.link import Link
-from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.timesync import GpsTime
 
 REPORT_INTERVAL_US: Final = US_PER_S

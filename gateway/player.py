@@ -26,7 +26,8 @@ from gateway.recordings.reading import NOTHING_WITHIN
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.recorded_vehicle import RecordedAction, RecordedVehicle
-from gateway.wire.mavlink_splitter import frame_of, message_id_of, renumbered
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 READY_S: Final = 3.0
 """A name that takes longer to be resolved is not waited for."""
@@ -204,13 +205,13 @@ class _Numbering:
     def played(self, frame: bytes) -> bytes:
         """Return a recorded frame, renumbered after inserted answers."""
         read = frame_of(frame)
-        sequence = read.sequence + self._added.get(read.origin, 0) & 0xFF
-        self._last[read.origin] = sequence
-        return renumbered(read, sequence).data
+        added = self._added.get(read.origin, 0)
+        sequence = self._last[read.origin] = read.sequence + added & 0xFF
+        return (edit_frame(read, sequence=sequence) or read).data if added else frame
 
     def inserted(self, frame: bytes) -> bytes:
         """Return an answer, numbered in between the recorded frames."""
         read = frame_of(frame)
         sequence = self._last[read.origin] = self._last.get(read.origin, 0xFF) + 1 & 0xFF
         self._added[read.origin] = self._added.get(read.origin, 0) + 1
-        return renumbered(read, sequence).data
+        return (edit_frame(read, sequence=sequence) or read).data

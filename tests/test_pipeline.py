@@ -12,10 +12,10 @@ from gateway.pipeline import GONE_US, Pipeline, PipelineSettings
 from gateway.records import BaroRaw, FusedSample, GpsFix, GpsFixType, ImuFlags, Incoming, NodeId
 from gateway.sensing.calibration import NodeCalibration
 from gateway.vehicle.plan import Location
-from gateway.vehicle.requests import EPOCH_2015_US, key_from_passphrase
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
+from gateway.wire.mavlink_signing import EPOCH_2015_US, key_from_passphrase
 from gateway.wire.mavlink_splitter import frame_of
 
 UNIX_US = 1_790_000_000_000_000

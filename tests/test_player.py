@@ -18,7 +18,8 @@ from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
-from gateway.wire.mavlink_splitter import frame_of, renumbered
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import STATION, Sender
 from tests.recordings.flights import OPTIONS
 from tests.recordings.frames import START_US, make_tlog
@@ -111,7 +112,9 @@ async def test_commands_of_stations_are_played_only_on_request(
     wanted = [r.frame for r in recording()]
     if not with_commands:
         # The parameters are an answer; without it the second heartbeat follows the first.
-        wanted = [wanted[0], renumbered(frame_of(wanted[-1]), 1).data]
+        edited = edit_frame(frame_of(wanted[-1]), sequence=1)
+        assert edited is not None
+        wanted = [wanted[0], edited.data]
     await station.until(len(wanted))
     daemon.close()
     assert station.frames == wanted

@@ -15,7 +15,7 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.clock import GatewayClock
-from gateway.fleet.frame_translation import FrameTranslation, SiteSignatures
+from gateway.fleet.frame_translation import FrameTranslation
 from gateway.fleet.id_map import LEFT_OUT, IdsFile
 from gateway.fleet.loop_detection import LoopDetection
 from gateway.fleet.remote_recordings import RemoteRecordings
@@ -29,7 +29,7 @@ from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, in_key
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
-from gateway.vehicle.requests import key_from_passphrase
+from gateway.wire.mavlink_signing import WindowVerifier, key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
 
 NO_BROADCASTS: Final = frozenset({1 << 24})
@@ -167,7 +167,7 @@ class FleetServer:
         self._ids = self._ids_file.ids
         at_zero_us = time.time_ns() // 1000 - self._now_us()
         self._signatures = {
-            each.name: SiteSignatures(key_from_passphrase(each.passphrase), at_zero_us)
+            each.name: WindowVerifier(key_from_passphrase(each.passphrase), at_zero_us)
             for each in settings.site
             if each.passphrase
         }

@@ -22,12 +22,12 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 import numpy as np
-from fastcrc.crc16 import mcrf4xx
 
-from gateway.recordings.tlog import Batch, fields_of, payload_of, readdress
+from gateway.recordings.tlog import Batch, fields_of, payload_of
 from gateway.recordings.tlog_scan import IntArray
-from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
-from gateway.wire.mavlink_splitter import START_V2, frame_of, message_id_of, origin_of
+from gateway.wire.frame_editing import edit_frame
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
+from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 FIRST_GROUND_STATION: Final = 250
 """System ids from here on are by custom ground stations, which keep their id."""
@@ -246,11 +246,19 @@ class VehicleAnswers:
 
     def frames(self, message_id: int) -> list[bytes]:
         """Return the frames that were sent last before the moment, or else first after it."""
+        return [self._edited(frame) for frame in self._recorded(message_id)]
+
+    def _recorded(self, message_id: int) -> list[bytes]:
         return [
-            readdress(course.at(self._position_us()), self.played_as)
+            course.at(self._position_us())
             for (system, kind, _), course in self._log.frames.items()
             if (system, kind) == (self._system_id, message_id)
         ]
+
+    def _edited(self, frame: bytes, **fields: int) -> bytes:
+        read, system_id = frame_of(frame), self.played_as
+        edited = edit_frame(read, system=system_id, fields=fields, drop_signature=True)
+        return (edited or read).data
 
     def mission(self, kind: int) -> Items | None:
         """Return the frames of the items of a mission; None if the recording has none."""
@@ -259,24 +267,17 @@ class VehicleAnswers:
 
     def parameters(self) -> dict[str, bytes]:
         """Return the parameters by name, in their order, numbered so that the list is complete."""
-        values = [
-            _VALUE.unpack(payload_of(frame, _VALUE.size)) for frame in self.frames(PARAM_VALUE_ID)
-        ]
+        frames = self._recorded(PARAM_VALUE_ID)
         # Answers to a setting carry no index (65535); they come last.
-        values.sort(key=lambda value: (value[2], value[3]))
-        found: dict[str, bytes] = {}
-        for number, (value, _, _, name, kind) in enumerate(values):
-            payload = _VALUE.pack(value, len(values), number, name, kind)
-            text = name.split(b"\0", 1)[0].decode("ascii", "replace")
-            found[text] = _encode(PARAM_VALUE_ID, self.played_as, payload)
-        return found
-
-
-def _encode(message_id: int, system_id: int, payload: bytes) -> bytes:
-    """Build a frame of an autopilot; its sender sets the sequence number."""
-    head = bytes((len(payload), 0, 0, 0, system_id, AUTOPILOT)) + message_id.to_bytes(3, "little")
-    crc: int = mcrf4xx(CRC_EXTRA[message_id], mcrf4xx(head + payload))
-    return bytes((START_V2,)) + head + payload + crc.to_bytes(2, "little")
+        values = sorted(
+            (*_VALUE.unpack(payload_of(frame, _VALUE.size))[2:4], frame) for frame in frames
+        )
+        return {
+            name.split(b"\0", 1)[0].decode("ascii", "replace"): self._edited(
+                frame, param_count=len(values), param_index=number
+            )
+            for number, (_, name, frame) in enumerate(values)
+        }
 
 
 def _key_of(frame: bytes) -> bytes:

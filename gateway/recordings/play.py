@@ -26,19 +26,12 @@ from typing import Final, Protocol
 import numpy as np
 
 from gateway.recordings.answers import answers_of, telemetry_of
-from gateway.recordings.tlog import (
-    SEEK_BYTES,
-    STRIDE,
-    Batch,
-    TlogIndex,
-    TlogRecord,
-    TlogScanner,
-    readdress,
-)
+from gateway.recordings.tlog import SEEK_BYTES, STRIDE, Batch, TlogIndex, TlogRecord, TlogScanner
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
+from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_IDS
-from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of, renumbered
+from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 BLOCK_BYTES: Final = 1 << 18
 """Read at once while playing: some 0.1 s of reading and deciding for minutes of flight."""
@@ -172,7 +165,8 @@ class Track:
                 frame = batch.frame(i)
                 if count := left_out[origin]:
                     read = frame_of(frame)
-                    frame = renumbered(read, read.sequence - count & 0xFF).data
+                    edited = edit_frame(read, sequence=read.sequence - count & 0xFF)
+                    frame = (edited or read).data
                 yield TlogRecord(int(batch.time_us[i]), frame)
 
     def _left_out(self, batch: Batch) -> IntArray:
@@ -182,7 +176,10 @@ class Track:
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])
-        return frame if system_id is None else readdress(frame, system_id)
+        if system_id is None:
+            return frame
+        read = frame_of(frame)
+        return (edit_frame(read, system=system_id, drop_signature=True) or read).data
 
     def _read_from(self, offset: int) -> Iterator[Batch]:
         scanner, timeline = TlogScanner(offset), self._source.index.timeline

@@ -9,13 +9,10 @@ from array import array
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from fastcrc.crc16 import mcrf4xx
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.tlog_scan import (
     COLUMNS,
@@ -29,8 +26,8 @@ from gateway.recordings.tlog_scan import (
     scan,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, START_V2, frame_of, message_id_of
+from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
+from gateway.wire.mavlink_splitter import START_V2, frame_of, message_id_of
 from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
@@ -85,23 +82,9 @@ def payload_of(frame: bytes, size: int) -> bytes:
     return frame[begin : begin + min(frame[1], size)].ljust(size, b"\0")
 
 
-@cache
-def layout_of(kind: Any) -> np.dtype[np.void]:
-    """Return a message's fields as they lie in its payload."""
-    fields = []
-    for name, code, length in zip(
-        kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
-    ):
-        if chr(code) == "c":
-            fields.append((name, f"S{max(1, length)}"))
-        else:
-            fields.append((name, f"({length},)<{chr(code)}" if length else f"<{chr(code)}"))
-    return np.dtype(fields)
-
-
 def fields_of(frame: bytes) -> dict[str, Any]:
     """Return the fields of a frame of the dialect, as Python's own values."""
-    layout = layout_of(mavlink.mavlink_map[message_id_of(frame)])
+    layout = layout_of(message_id_of(frame))
     values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
     return dict(zip(layout.names or (), values, strict=True))
 
@@ -440,23 +423,3 @@ class Stamper:
         """Return whether the clock now knows a time that differs too much for this file."""
         offset_us = clock.offset_us
         return offset_us is not None and abs(offset_us - self.offset_us) > JUMP_US
-
-
-_FLAGS_AT: Final = 2
-_SYSTEM_AT_V2: Final = 5
-_SYSTEM_AT_V1: Final = 3
-
-
-def readdress(frame: bytes, system_id: int) -> bytes:
-    """Return a frame as if another system had sent it."""
-    extra = CRC_EXTRA.get(message_id_of(frame))
-    if extra is None:
-        return frame
-    body = bytearray(frame[: -SIGNATURE_SIZE - 2] if frame_of(frame).signed else frame[:-2])
-    if frame[0] == START_V2:
-        body[_FLAGS_AT] = 0
-        body[_SYSTEM_AT_V2] = system_id
-    else:
-        body[_SYSTEM_AT_V1] = system_id
-    crc: int = mcrf4xx(extra, mcrf4xx(bytes(body[1:])))
-    return bytes(body) + crc.to_bytes(2, "little")

@@ -2,27 +2,11 @@
 
 Invalid frames are counted and dropped. Equal failed requests share one log entry with a count, for
 `mavgate status --requests`; the entries are bounded, and the oldest gives way.
-
-MAVLink 2 signing authenticates clients on a network where anybody may send. A signature is the
-first 48 bits of SHA-256 over key and frame; a timestamp in units of 10 us since 2015 inside it
-makes every frame unique, so that a recorded one cannot be sent again. A stream is one link of one
-component. Its timestamp must grow; a new stream must not be more than a minute behind our own
-clock. See https://mavlink.io/en/guide/message_signing.html.
-
-The newest timestamp of every stream is kept over restarts and passphrase changes; otherwise a
-recorded command could be replayed after a restart of the gateway. The kept timestamps are ahead of
-the received ones by `RESERVE_TICKS`, so that a busy stream is written only every few seconds: after
-a crash a stream is accepted again once its timestamps have passed the reserve.
-
-The check is our own, not pymavlink's: that one stores the timestamp of a stream before it has
-checked the signature, so a single forged frame would lock the true sender out.
 """
 
-import hashlib
-import hmac
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
@@ -34,6 +18,8 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings
 from gateway.vehicle.encoding import AUTOPILOT_COMPONENT
 from gateway.vehicle.plan import StoredPlan
+from gateway.wire.mavlink_signing import Verifier
+from gateway.wire.mavlink_splitter import SIGNED, START_V2
 
 
 class Reply(msgspec.Struct, frozen=True, gc=False):
@@ -199,123 +185,6 @@ class TransferService(Service):
         return self.poll(now_us)
 
 
-TICKS_PER_S: Final = 100_000
-RESERVE_TICKS: Final = 5 * TICKS_PER_S
-MAX_KEYS: Final = 16
-MAX_STREAMS: Final = 256
-"""Only holders of the key make streams, so untrusted clients never reach this."""
-
-KeptTimestamps = dict[str, dict[str, int]]
-"""By the id of the key, then by the stream as `link.system.component`."""
-
-
-def key_id_of(key: bytes) -> str:
-    """Return an identifier of a key that does not reveal it."""
-    return hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
-
-
-class SigningTimestamps:
-    """The timestamps that one vehicle has accepted, also in earlier runs."""
-
-    def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
-        self._newest = _copied(kept or {})
-        self._kept = _copied(self._newest)
-        self.is_due = False
-        """Whether `to_keep` has something that must be written."""
-
-    def accept(self, key_id: str, stream: str, timestamp: int, oldest: int) -> bool:
-        """Add a timestamp if it grows, or of a new stream if it is not older than `oldest`."""
-        streams = self._newest.get(key_id, {})
-        is_known = stream in streams
-        if timestamp < (streams[stream] + 1 if is_known else oldest):
-            return False
-        if not is_known and len(streams) >= MAX_STREAMS:
-            return False
-        streams[stream] = timestamp
-        # The key that was used last comes last.
-        self._newest.pop(key_id, None)
-        self._newest[key_id] = streams
-        for removed in list(self._newest)[:-MAX_KEYS]:
-            del self._newest[removed]
-            self._kept.pop(removed, None)
-        if timestamp > self._kept.get(key_id, {}).get(stream, -1):
-            self._kept.setdefault(key_id, {})[stream] = timestamp + RESERVE_TICKS
-            self.is_due = True
-        return True
-
-    def to_keep(self) -> KeptTimestamps:
-        """Return what to write now, so that no frame accepted so far is accepted again."""
-        self.is_due = False
-        return _copied(self._kept)
-
-    def exact(self) -> KeptTimestamps:
-        """Return the timestamps without the reserve, for a clean shutdown."""
-        return _copied(self._newest)
-
-
-def _copied(found: Mapping[str, Mapping[str, int]]) -> KeptTimestamps:
-    return {key_id: dict(streams) for key_id, streams in found.items()}
-
-
-SIGNATURE_BYTES: Final = 13
-KEY_BYTES: Final = 32
-EPOCH_2015_US: Final = 1_420_070_400_000_000
-TICK_US: Final = 10
-NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
-"""Largest age of the first timestamp of a stream."""
-GPS_TOLERANCE_US: Final = 2_000_000
-
-
-def key_from_passphrase(passphrase: str) -> bytes:
-    """Derive the key as ground stations do: SHA-256 of the passphrase."""
-    return hashlib.sha256(passphrase.encode()).digest()
-
-
-class SigningClock:
-    """The timestamps of one signer."""
-
-    def __init__(self, unix_us_at_zero: int) -> None:
-        """Start with the Unix time when the gateway clock was zero."""
-        self._offset_us = unix_us_at_zero - EPOCH_2015_US
-
-    def set_gps_time(self, unix_us_at_zero: int) -> None:
-        """Use GPS time if the machine's differs from it by more than the latency."""
-        offset_us = unix_us_at_zero - EPOCH_2015_US
-        if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
-            self._offset_us = offset_us
-
-    def timestamp(self, now_us: int) -> int:
-        """Return the time in signing ticks."""
-        return max(0, self._offset_us + now_us) // TICK_US
-
-
-class Verifier:
-    """Check the signatures of frames that clients send, and keep their timestamps."""
-
-    def __init__(
-        self, key: bytes, clock: SigningClock, timestamps: SigningTimestamps | None = None
-    ) -> None:
-        if len(key) != KEY_BYTES:
-            raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
-        self._key = key
-        self._key_id = key_id_of(key)
-        self._clock = clock
-        self._timestamps = SigningTimestamps() if timestamps is None else timestamps
-
-    def accepts(self, frame: bytes, now_us: int) -> bool:
-        """Return whether a whole frame is signed by a holder of the key, and not a replay."""
-        signature = frame[-6:]
-        wanted = hashlib.sha256(self._key + frame[:-6]).digest()[:6]
-        if not hmac.compare_digest(signature, wanted):
-            return False
-        stream = f"{frame[-SIGNATURE_BYTES]}.{frame[5]}.{frame[6]}"
-        timestamp = int.from_bytes(frame[-12:-6], "little")
-        oldest = self._clock.timestamp(now_us) - NEW_STREAM_TICKS
-        return self._timestamps.accept(self._key_id, stream, timestamp, oldest)
-
-
-V2_START: Final = 0xFD
-SIGNED: Final = 0x01
 BROADCAST: Final = 0
 BAD_SIGNATURE: Final = "bad signature"
 
@@ -342,7 +211,7 @@ class RequestReader:
             return None
         allowed = incoming.trusted
         if self.verifier is not None:
-            signed = frame[0] == V2_START and frame[2] & SIGNED
+            signed = frame[0] == START_V2 and frame[2] & SIGNED
             if signed and not self.verifier.accepts(frame, now_us):
                 self.faults[BAD_SIGNATURE] += 1
                 return None
@@ -353,7 +222,7 @@ class RequestReader:
     def _decode(self, frame: bytes) -> Any:
         """Decode a frame, or return what is wrong with it."""
         # An unknown incompatibility flag forbids reading on.
-        if not frame or (frame[0] == V2_START and frame[2:] and frame[2] & ~SIGNED):
+        if not frame or (frame[0] == START_V2 and frame[2:] and frame[2] & ~SIGNED):
             return "malformed"
         try:
             message = self._mav.decode(bytearray(frame))

@@ -37,11 +37,7 @@ from gateway.vehicle.requests import (
     RequestReader,
     Service,
     SettingsChange,
-    SigningClock,
-    SigningTimestamps,
     StatusText,
-    Verifier,
-    key_from_passphrase,
 )
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW, Calibrator
 from gateway.vehicle.services.commands import (
@@ -62,6 +58,12 @@ from gateway.vehicle.telemetry.announcements import Announcements, Announcer
 from gateway.vehicle.telemetry.health import Health
 from gateway.vehicle.telemetry.telemetry import IN_AIR, Telemetry
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_signing import (
+    SigningClock,
+    SigningTimestamps,
+    Verifier,
+    key_from_passphrase,
+)
 
 OWN_SECTION: Final = "vehicle"
 REFUSALS_AT_ONCE: Final = 3

@@ -8,15 +8,33 @@ import struct
 from functools import cache
 from typing import Any, Final
 
+import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
-MISSING: Final = {
-    300: ("PROTOCOL_VERSION", 217),
-    397: ("COMPONENT_METADATA", 182),
-    512: ("CONTROL_STATUS", 21),
+_HASH: Final = "(8,)u1"
+MISSING: Final[dict[int, tuple[str, int, list[tuple[str, str]]]]] = {
+    300: (
+        "PROTOCOL_VERSION",
+        217,
+        [
+            *(("version", "<u2"), ("min_version", "<u2"), ("max_version", "<u2")),
+            *(("spec_version_hash", _HASH), ("library_version_hash", _HASH)),
+        ],
+    ),
+    397: (
+        "COMPONENT_METADATA",
+        182,
+        [("time_boot_ms", "<u4"), ("file_crc", "<u4"), ("uri", "S100")],
+    ),
+    512: (
+        "CONTROL_STATUS",
+        21,
+        [("flags", "u1"), ("gcs_main", "u1"), ("gcs_secondary", "(10,)u1")],
+    ),
 }
-"""Name and checksum seed of messages that the dialects lack and a vehicle of the gateway sends."""
+"""Name, checksum seed and fields of messages that the dialects lack and a vehicle of the gateway
+sends."""
 
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
@@ -25,30 +43,41 @@ WIDEST: Final = 8
 """Bytes of the widest type of a field."""
 
 
-def offset_of(message: Any, field: str) -> int:
-    """Find where a field begins in the payload, or `NO_TARGET`."""
-    offset = 0
+@cache
+def layout_of(message_id: int) -> np.dtype[np.void]:
+    """Return a message's fields as they lie in its payload."""
+    if message_id in MISSING:
+        return np.dtype(MISSING[message_id][2])
+    kind = dialect.mavlink_map[message_id]
+    fields = []
     for name, code, length in zip(
-        message.ordered_fieldnames, message.native_format[1:], message.array_lengths, strict=True
+        kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
     ):
-        if name == field:
-            return offset
-        offset += struct.calcsize("<" + chr(code)) * max(1, length)
-    return NO_TARGET
+        if chr(code) == "c":
+            fields.append((name, f"S{max(1, length)}"))
+        else:
+            fields.append((name, f"({length},)<{chr(code)}" if length else f"<{chr(code)}"))
+    return np.dtype(fields)
+
+
+def offset_of(message_id: int, field: str) -> int:
+    """Find where a field begins in the payload, or `NO_TARGET`."""
+    fields = layout_of(message_id).fields
+    return fields[field][1] if fields is not None and field in fields else NO_TARGET
 
 
 CRC_EXTRA: Final[dict[int, bytes]] = {
     message_id: bytes((message.crc_extra,)) for message_id, message in dialect.mavlink_map.items()
-} | {message_id: bytes((extra,)) for message_id, (_, extra) in MISSING.items()}
+} | {message_id: bytes((extra,)) for message_id, (_, extra, _) in MISSING.items()}
 """The byte that closes each message's checksum, as the checksum function wants it."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
-    message_id: (system, offset_of(message, "target_component"))
+    message_id: (offset_of(message_id, "target_system"), offset_of(message_id, "target_component"))
     for message_id, message in dialect.mavlink_map.items()
-    if (system := offset_of(message, "target_system")) != NO_TARGET
+    if "target_system" in message.fieldnames
 } | {
     dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: (
-        offset_of(dialect.MAVLink_manual_control_message, "target"),
+        offset_of(dialect.MAVLINK_MSG_ID_MANUAL_CONTROL, "target"),
         NO_TARGET,
     )
 }
@@ -56,7 +85,7 @@ TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
 
 MESSAGE_NAMES: Final[dict[int, str]] = {
     message_id: message.msgname for message_id, message in dialect.mavlink_map.items()
-} | {message_id: name for message_id, (name, _) in MISSING.items()}
+} | {message_id: name for message_id, (name, *_) in MISSING.items()}
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
 

@@ -1,47 +1,119 @@
-"""Sequence numbers and signatures of frames, applied where a frame is encoded for a link.
+"""MAVLink 2 signing: keys, timestamps, signing of sent frames, checks of received ones [1]_.
+
+A signature is the first 48 bits of SHA-256 over key and frame; a timestamp in units of 10 us since
+2015 inside it makes every frame unique, so that a recorded one cannot be sent again. A stream is
+one link of one component; the first timestamp of a stream must not be more than a minute behind our
+own clock.
 
 A frame is signed where it is sent, because only there its sequence number and its order are known:
 before, it may be renumbered, be overtaken, or be kept for a new client, and a receiver drops a
 frame whose signing timestamp is earlier than that of the frame before it.
 
+There are two policies against replays:
+
+| received                              | accepted once, and                                     |
+| ------------------------------------- | ------------------------------------------------------ |
+| from a client: `Verifier`             | only if later than all before of its stream            |
+| over Zenoh, where frames of different | only if not further behind the newest than a window,   |
+| priority overtake: `WindowVerifier`   | as IPsec does with sequence numbers [2]_               |
+
+The newest timestamp of every stream of a client is kept over restarts and passphrase changes;
+otherwise a recorded command could be replayed after a restart of the gateway. The kept timestamps
+are ahead of the received ones by `RESERVE_TICKS`, so that a busy stream is written only every few
+seconds: after a crash a stream is accepted again once its timestamps have passed the reserve.
+
+The check is our own, not pymavlink's: that one stores the timestamp of a stream before it has
+checked the signature, so a single forged frame would lock the true sender out.
+
 References
 ----------
 .. [1] https://mavlink.io/en/guide/message_signing.html
+.. [2] RFC 4303, section 3.4.3.
 """
 
 import hashlib
-from typing import Final, Protocol
+import hmac
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Final
 
-from fastcrc.crc16 import mcrf4xx
+from gateway.wire.frame_editing import Sign, edit_frame
+from gateway.wire.mavlink_splitter import SIGNATURE_SIZE, MavFrame
 
-from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import (
-    SIGNATURE_SIZE,
-    SIGNED,
-    START_V2,
-    MavFrame,
-    frame_of,
-    renumbered,
-)
-
-LINK_ID: Final = bytes(1)
-TIMESTAMP_BYTES: Final = 6
+KEY_BYTES: Final = 32
 HASH_BYTES: Final = 6
+OWN_LINK: Final = 0
+EPOCH_2015_US: Final = 1_420_070_400_000_000
+TICK_US: Final = 10
+TICKS_PER_S: Final = 100_000
+NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
+"""Largest age of the first timestamp of a stream."""
+GPS_TOLERANCE_US: Final = 2_000_000
+
+_TIMESTAMP: Final = slice(-12, -HASH_BYTES)
+"""Between the link id and the hash."""
+_TIMESTAMP_BYTES: Final = 6
 
 
-class Clock(Protocol):
-    """Time for signing timestamps."""
+def key_from_passphrase(passphrase: str) -> bytes:
+    """Derive the key as ground stations do: SHA-256 of the passphrase."""
+    return hashlib.sha256(passphrase.encode()).digest()
+
+
+def key_id_of(key: bytes) -> str:
+    """Return an identifier of a key that does not reveal it."""
+    return hashlib.sha256(b"mavgate key" + key).hexdigest()[:16]
+
+
+def signature(key: bytes, link: int, timestamp: int, content: bytes) -> bytes:
+    """Return the signature that follows the content of a frame, which ends with the checksum."""
+    begin = bytes((link,)) + timestamp.to_bytes(_TIMESTAMP_BYTES, "little")
+    return begin + _hash(key, content + begin)
+
+
+def is_genuine(key: bytes, data: bytes) -> bool:
+    """Return whether a signed frame was signed with this key."""
+    return hmac.compare_digest(_hash(key, data[:-HASH_BYTES]), data[-HASH_BYTES:])
+
+
+def timestamp_of(data: bytes) -> int:
+    """Return the timestamp of a signed frame."""
+    return int.from_bytes(data[_TIMESTAMP], "little")
+
+
+def _hash(key: bytes, data: bytes) -> bytes:
+    return hashlib.sha256(key + data).digest()[:HASH_BYTES]
+
+
+class SigningClock:
+    """The time for signing timestamps."""
+
+    def __init__(self, unix_us_at_zero: int) -> None:
+        """Start with the Unix time when the gateway clock was zero."""
+        self._offset_us = unix_us_at_zero - EPOCH_2015_US
+
+    def set_gps_time(self, unix_us_at_zero: int) -> None:
+        """Use GPS time if the machine's differs from it by more than the latency."""
+        offset_us = unix_us_at_zero - EPOCH_2015_US
+        if abs(offset_us - self._offset_us) > GPS_TOLERANCE_US:
+            self._offset_us = offset_us
 
     def timestamp(self, now_us: int) -> int:
         """Return gateway time in units of 10 us since 2015."""
+        return max(0, self._offset_us + now_us) // TICK_US
+
+    def oldest(self, now_us: int) -> int:
+        """Return the least timestamp with which a stream may start."""
+        return self.timestamp(now_us) - NEW_STREAM_TICKS
 
 
 class FrameSigner:
     """Number our own frames, and sign those of systems that have a key, which needs a clock."""
 
-    def __init__(self, clock: Clock | None = None) -> None:
+    def __init__(self, clock: SigningClock | None = None) -> None:
         self.keys: dict[int, bytes] = {}
-        """Signing keys of 32 bytes, by system id; set by the stage that owns the vehicles."""
+        """Signing keys by system id; set by the stage that owns the vehicles."""
         self._clock = clock
         self._newest = 0
         """Each timestamp is later than the one before."""
@@ -49,33 +121,146 @@ class FrameSigner:
     def sequence_and_sign(self, frame: MavFrame, sequence: int, now_us: int) -> MavFrame:
         """Return a frame with this sequence number, signed again if its system has a key.
 
-        A frame of an unknown message is returned as it is; one of version 1 is numbered and never
-        signed.
+        A frame of an unknown message, or signed by somebody else, is returned as it is; one of
+        version 1 is numbered and never signed.
         """
         key = self.keys.get(frame.origin[0]) if self.keys else None
         if key is None or self._clock is None:
-            return renumbered(frame, sequence)
+            if frame.sequence == sequence:
+                return frame
+            return edit_frame(frame, sequence=sequence) or frame
         self._newest = max(self._newest + 1, self._clock.timestamp(now_us))
-        return frame_of(sign(frame.data, sequence, key, self._newest))
+        sign = partial(signature, key, OWN_LINK, self._newest)
+        return edit_frame(frame, sequence=sequence, sign=sign) or frame
 
 
-def sign(data: bytes, sequence: int, key: bytes, timestamp: int) -> bytes:
-    """Return a frame of MAVLink 2 with this sequence number and a new signature.
+RESERVE_TICKS: Final = 5 * TICKS_PER_S
+MAX_KEYS: Final = 16
+MAX_STREAMS: Final = 256
+"""Only holders of the key make streams, so untrusted clients never reach this."""
 
-    One of version 1 or of an unknown message is returned as it is. The key has 32 bytes; the
-    timestamp is in units of 10 us since 2015.
-    """
-    frame = frame_of(data)
-    extra = CRC_EXTRA.get(frame.message_id)
-    if extra is None or data[0] != START_V2:
-        return data
-    end = -2 - SIGNATURE_SIZE * frame.signed
-    body = bytes((data[1], SIGNED, data[3], sequence)) + data[5:end]
-    crc = mcrf4xx(extra, mcrf4xx(body)).to_bytes(2, "little")
-    signed = data[:1] + body + crc + LINK_ID + timestamp.to_bytes(TIMESTAMP_BYTES, "little")
-    return signed + signature_hash(key, signed)
+KeptTimestamps = dict[str, dict[str, int]]
+"""By the id of the key, then by the stream as `link.system.component`."""
 
 
-def signature_hash(key: bytes, data: bytes) -> bytes:
-    """Return the hash that ends a signed frame, of all bytes before it."""
-    return hashlib.sha256(key + data).digest()[:HASH_BYTES]
+class SigningTimestamps:
+    """The timestamps that one vehicle has accepted, also in earlier runs."""
+
+    def __init__(self, kept: Mapping[str, Mapping[str, int]] | None = None) -> None:
+        self._newest = _copied(kept or {})
+        self._kept = _copied(self._newest)
+        self.is_due = False
+        """Whether `to_keep` has something that must be written."""
+
+    def accept(self, key_id: str, stream: str, timestamp: int, oldest: int) -> bool:
+        """Add a timestamp if it grows, or of a new stream if it is not older than `oldest`."""
+        streams = self._newest.get(key_id, {})
+        is_known = stream in streams
+        if timestamp < (streams[stream] + 1 if is_known else oldest):
+            return False
+        if not is_known and len(streams) >= MAX_STREAMS:
+            return False
+        streams[stream] = timestamp
+        # The key that was used last comes last.
+        self._newest.pop(key_id, None)
+        self._newest[key_id] = streams
+        for removed in list(self._newest)[:-MAX_KEYS]:
+            del self._newest[removed]
+            self._kept.pop(removed, None)
+        if timestamp > self._kept.get(key_id, {}).get(stream, -1):
+            self._kept.setdefault(key_id, {})[stream] = timestamp + RESERVE_TICKS
+            self.is_due = True
+        return True
+
+    def to_keep(self) -> KeptTimestamps:
+        """Return what to write now, so that no frame accepted so far is accepted again."""
+        self.is_due = False
+        return _copied(self._kept)
+
+    def exact(self) -> KeptTimestamps:
+        """Return the timestamps without the reserve, for a clean shutdown."""
+        return _copied(self._newest)
+
+
+def _copied(found: Mapping[str, Mapping[str, int]]) -> KeptTimestamps:
+    return {key_id: dict(streams) for key_id, streams in found.items()}
+
+
+class Verifier:
+    """Check the signatures of frames that clients send, and keep their timestamps."""
+
+    def __init__(
+        self, key: bytes, clock: SigningClock, timestamps: SigningTimestamps | None = None
+    ) -> None:
+        if len(key) != KEY_BYTES:
+            raise ValueError(f"signing key of {len(key)} bytes; it must have {KEY_BYTES}")
+        self._key = key
+        self._key_id = key_id_of(key)
+        self._clock = clock
+        self._timestamps = SigningTimestamps() if timestamps is None else timestamps
+
+    def accepts(self, data: bytes, now_us: int) -> bool:
+        """Return whether a whole frame is signed by a holder of the key, and not a replay."""
+        if not is_genuine(self._key, data):
+            return False
+        stream = f"{data[-SIGNATURE_SIZE]}.{data[5]}.{data[6]}"
+        oldest = self._clock.oldest(now_us)
+        return self._timestamps.accept(self._key_id, stream, timestamp_of(data), oldest)
+
+
+WINDOW_TICKS: Final = 5 * TICKS_PER_S
+"""Zenoh gives up a message that has waited for 5 s, so none is overtaken for longer."""
+MAX_WINDOWS: Final = 1024
+"""Streams of one site; only a holder of the passphrase begins one."""
+
+
+@dataclass(slots=True)
+class _Window:
+    newest: int
+    seen: set[int] = field(default_factory=set)
+    """Accepted timestamps within the window."""
+    pruned: int = 0
+    """Newest timestamp when `seen` was last pruned."""
+
+    def accepts(self, timestamp: int) -> bool:
+        if timestamp <= self.newest - WINDOW_TICKS or timestamp in self.seen:
+            return False
+        self.newest = max(self.newest, timestamp)
+        self.seen.add(timestamp)
+        if self.newest - self.pruned > WINDOW_TICKS:
+            self.pruned = self.newest
+            self.seen = {each for each in self.seen if each > self.newest - WINDOW_TICKS}
+        return True
+
+
+class WindowVerifier:
+    """Check and renew signatures of frames that may overtake each other."""
+
+    def __init__(self, key: bytes, unix_us_at_zero: int) -> None:
+        self._key = key
+        self._clock = SigningClock(unix_us_at_zero)
+        self._windows: dict[tuple[int, int, int], _Window] = {}
+
+    def check(self, frame: MavFrame, now_us: int) -> str:
+        """Return the counter of why a frame is rejected; empty if it is accepted."""
+        if not frame.signed:
+            return "unsigned"
+        if not self.is_genuine(frame):
+            return "forged"
+        timestamp = timestamp_of(frame.data)
+        stream = (frame.data[-SIGNATURE_SIZE], *frame.origin)
+        window = self._windows.get(stream)
+        if window is None:
+            if timestamp < self._clock.oldest(now_us) or len(self._windows) >= MAX_WINDOWS:
+                return "replayed"
+            window = self._windows[stream] = _Window(timestamp)
+        return "" if window.accepts(timestamp) else "replayed"
+
+    def is_genuine(self, frame: MavFrame) -> bool:
+        """Return whether a signed frame was signed with the passphrase."""
+        return is_genuine(self._key, frame.data)
+
+    def renewal(self, frame: MavFrame) -> Sign:
+        """Return the signer of a changed frame, with the link and timestamp of the former one."""
+        data = frame.data
+        return partial(signature, self._key, data[-SIGNATURE_SIZE], timestamp_of(data))

@@ -201,17 +201,6 @@ def message_id_of(data: bytes) -> int:
     return data[5]
 
 
-def renumbered(frame: MavFrame, sequence: int) -> MavFrame:
-    """Return a frame with another sequence number; a signed or an unknown one as it is."""
-    message_id = frame.message_id
-    if frame.signed or frame.sequence == sequence or message_id not in CRC_EXTRA:
-        return frame
-    data = bytearray(frame.data)
-    data[SEQUENCE_V2 if data[0] == START_V2 else SEQUENCE_V1] = sequence
-    data[-2:] = mcrf4xx(bytes(data[1:-2]) + CRC_EXTRA[message_id]).to_bytes(2, "little")
-    return MavFrame(bytes(data), frame.key, message_id, frame.origin, frame.target, sequence, False)
-
-
 def to_mavlink1(frame: bytes) -> bytes | None:
     """Encode a frame of either version as MAVLink 1, without extension fields and signature [1]_.
 

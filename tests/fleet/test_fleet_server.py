@@ -20,7 +20,7 @@ from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, request
-from gateway.vehicle.requests import EPOCH_2015_US, TICK_US, key_from_passphrase
+from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, key_from_passphrase
 from tests.fleet.conftest import World, run
 from tests.hub.conftest import LIMIT_S
 from tests.kit.process import Process, wait_for

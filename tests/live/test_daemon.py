@@ -20,8 +20,9 @@ from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
 from gateway.live.part import BURST_S, UNTRUSTED_RATE
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
-from gateway.vehicle.requests import EPOCH_2015_US, Request, SaveSettings, key_from_passphrase
+from gateway.vehicle.requests import Request, SaveSettings
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_signing import EPOCH_2015_US, key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame
 from tests.kit.mavlink import packed
 

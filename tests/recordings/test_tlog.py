@@ -23,11 +23,10 @@ from gateway.recordings.tlog import (
     TlogScanner,
     encode_record,
     is_damaged,
-    readdress,
 )
 from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
 from gateway.wire.mavlink_messages import CRC_EXTRA
-from gateway.wire.mavlink_splitter import frame_of, message_id_of
+from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH
 from tests.recordings.frames import START_US, STEP_US, make_frames, make_records, make_tlog
 
@@ -329,23 +328,6 @@ def heartbeat(*, v1: bool = False, signed: bool = False) -> bytes:
     mav.signing.sign_outgoing = signed
     message = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
     return bytes(message.pack(mav, force_mavlink1=v1))
-
-
-@pytest.mark.parametrize("frame", [*make_frames(3), heartbeat(v1=True), heartbeat(signed=True)])
-def test_readdressed_frame_changes_only_its_sender_and_loses_its_signature(
-    frame: bytes,
-) -> None:
-    changed = readdress(frame, 42)
-    before, after = decode(frame), decode(changed)
-    assert after.get_srcSystem() == 42
-    assert after.get_srcComponent() == before.get_srcComponent()
-    assert after.to_dict() == before.to_dict()
-    assert len(changed) == len(frame) - 13 * frame_of(frame).signed
-
-
-def test_unknown_message_is_not_readdressed() -> None:
-    frame = b"\xfd\x00\x00\x00\x00\x01\x01\xff\xff\xff\x00\x00"
-    assert readdress(frame, 9) == frame
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.requests import (
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import VehicleSettings
+from gateway.wire.mavlink_signing import (
     EPOCH_2015_US,
     KEY_BYTES,
     MAX_KEYS,
@@ -16,8 +18,6 @@ from gateway.vehicle.requests import (
     Verifier,
     key_from_passphrase,
 )
-from gateway.vehicle.vehicle import Vehicle
-from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.kit.ground_station import GroundStation, of_kind
 from tests.kit.mavlink import packed

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.wire.mavlink_signing import FrameSigner, sign
+from gateway.wire.mavlink_signing import FrameSigner, SigningClock
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import packed
 
@@ -24,10 +24,12 @@ def strict() -> Any:
     return receiver
 
 
-class Clock:
+class Clock(SigningClock):
     """The time in signing ticks, whatever the gateway's clock says."""
 
-    ticks = TIMESTAMP
+    def __init__(self) -> None:
+        super().__init__(0)
+        self.ticks = TIMESTAMP
 
     def timestamp(self, now_us: int) -> int:
         return self.ticks
@@ -72,10 +74,12 @@ def test_timestamps_follow_the_clock_and_always_increase() -> None:
     assert found == [TIMESTAMP, TIMESTAMP + 1, TIMESTAMP + 2, TIMESTAMP + 100]
 
 
-def test_frames_that_cannot_be_signed_are_unchanged() -> None:
-    old, unknown = attitude(3, version=1), bytes.fromhex("fd000000000101fffe0a1234")
-    assert sign(old, 9, KEY, TIMESTAMP) == old
-    assert sign(unknown, 9, KEY, TIMESTAMP) == unknown
+def test_unknown_message_is_unchanged_and_version_1_is_numbered_only() -> None:
+    ours, unknown = signer(Clock()), bytes.fromhex("fd000000000101fffe0a1234")
+    assert signed_by(ours, unknown, 9) == unknown
+    numbered = frame_of(signed_by(ours, attitude(3, version=1), 9))
+    assert (numbered.sequence, numbered.signed) == (9, False)
+    assert mavlink.MAVLink(None).decode(bytearray(numbered.data)).roll == pytest.approx(0.1)
 
 
 def test_a_system_without_a_key_is_numbered_and_not_signed() -> None:

@@ -20,7 +20,6 @@ from gateway.wire.mavlink_splitter import (
     message_id_of,
     origin_of,
     read_datagram,
-    renumbered,
     split_datagram,
 )
 from tests.kit.ground_station import OWN_MESSAGES
@@ -270,21 +269,6 @@ TARGETS = {
 def test_target_is_that_of_the_message(name: str) -> None:
     message, target = TARGETS[name]
     assert frame_of(bytes(message.pack(link()))).target == target
-
-
-class TestSequence:
-    @pytest.mark.parametrize("frame", [V2, V1, V2_COMMAND], ids=["v2", "v1", "command"])
-    def test_result_is_a_valid_frame_with_the_new_number(self, frame: bytes) -> None:
-        stamped = renumbered(frame_of(frame), 200).data
-        assert frames_in(stamped) == [stamped]
-        decoded = dialect.MAVLink(None).parse_buffer(stamped)[0]
-        assert decoded.get_seq() == 200
-        before = frame_of(frame).sequence
-        assert renumbered(frame_of(stamped), before).data == frame
-
-    @pytest.mark.parametrize("frame", [V2_SIGNED, UNKNOWN], ids=["signed", "unknown"])
-    def test_signed_and_unknown_frames_stay(self, frame: bytes) -> None:
-        assert renumbered(frame_of(frame), 200).data == frame
 
 
 @pytest.mark.parametrize("number", [300, 397, 512])

@@ -22,10 +22,11 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, layout_of
+from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
 from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.wire.mavlink_messages import layout_of
 from gateway.wire.mavlink_splitter import START_V2
 
 HEAD_V1: Final = 6
@@ -35,7 +36,7 @@ LENGTH_AT: Final = 1
 
 def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
     """Read the fields of some frames of one message; those cut off or unknown are zero."""
-    layout = layout_of(kind)
+    layout = layout_of(kind.id)
     data = np.frombuffer(batch.data, np.uint8)
     starts = batch.starts[wanted] + TIME_SIZE
     begins = starts + np.where(data[starts] == START_V2, HEAD_V2, HEAD_V1)
@@ -210,7 +211,7 @@ IMU_RANK: Final = {
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: 1,
 }
 _WANTED: Final = np.array([*IMU_RANK, ATTITUDE, POSITION, PRESSURE, FIX])
-_POSITION_LAYOUT: Final = layout_of(mavlink.mavlink_map[POSITION])
+_POSITION_LAYOUT: Final = layout_of(POSITION)
 
 _OWN_CLOCKS: Final = frozenset({FIX, PRESSURE, ATTITUDE})
 """Kinds of messages that may have another clock than the IMU's."""

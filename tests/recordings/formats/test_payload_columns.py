@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.formats.mavlink import columns_of
-from gateway.recordings.tlog import Batch, TlogScanner, encode_record, layout_of
-from gateway.wire.mavlink_messages import CRC_EXTRA
+from gateway.recordings.tlog import Batch, TlogScanner, encode_record
+from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
 
 KINDS = sorted(mavlink.mavlink_map.items())
 FRAMES = 3
@@ -30,7 +30,7 @@ def frame_of(message_id: int, payload: bytes, version: int) -> bytes:
 
 def some_frames(message_id: int, kind: Any, chance: random.Random) -> list[bytes]:
     """Make frames whose payloads are whole or cut off, of both versions where there are two."""
-    size = layout_of(kind).itemsize
+    size = layout_of(kind.id).itemsize
     frames = []
     for _ in range(FRAMES):
         length = chance.choice((size, chance.randint(1, size)))
@@ -82,6 +82,6 @@ def test_only_requested_frames_are_read() -> None:
 def test_extra_fields_at_the_end_are_ignored(message_id: int) -> None:
     """A later dialect may have added fields at the end."""
     kind = mavlink.mavlink_map[message_id]
-    payload = bytes(range(1, layout_of(kind).itemsize + 1))
+    payload = bytes(range(1, layout_of(kind.id).itemsize + 1))
     rows = columns_of(batch_of([frame_of(message_id, payload + b"\7\7", 2)]), np.array([0]), kind)
     assert rows.tobytes() == payload

@@ -1,0 +1,132 @@
+"""Edited frames: other values in the header or the payload, with the checksum computed again.
+
+A signature covers the whole frame, so an edited frame loses its own, or is signed again. Whoever
+edits decides: without a decision a signed frame is not edited.
+"""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+from fastcrc.crc16 import mcrf4xx
+
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_NAMES, layout_of
+from gateway.wire.mavlink_splitter import (
+    PAYLOAD_V1,
+    PAYLOAD_V2,
+    SEQUENCE_V1,
+    SEQUENCE_V2,
+    SIGNATURE_SIZE,
+    SIGNED,
+    START_V2,
+    MavFrame,
+    frame_of,
+)
+
+FLAGS: Final = 2
+CRC_SIZE: Final = 2
+NO_FIELDS: Final[Mapping[str, Any]] = {}
+
+Sign = Callable[[bytes], bytes]
+"""Returns the signature that follows these bytes of a frame, which end with the checksum."""
+
+
+def edit_frame(
+    frame: MavFrame,
+    *,
+    sequence: int | None = None,
+    system: int | None = None,
+    component: int | None = None,
+    fields: Mapping[str, Any] = NO_FIELDS,
+    sign: Sign | None = None,
+    drop_signature: bool = False,
+) -> MavFrame | None:
+    """Return a frame with other values.
+
+    Parameters
+    ----------
+    frame : MavFrame
+        Of either version.
+    sequence, system, component : int, optional
+        Of the header, 0 to 255.
+    fields : mapping, optional
+        Of the payload, by name: a number, a text or bytes for an array of characters, and a number
+        or a sequence for another array. Extension fields do not exist in MAVLink 1: skipped there.
+    sign : callable, optional
+        Signs the edited frame; without effect on MAVLink 1, which has no signatures.
+    drop_signature : bool, optional
+        Whether a signed frame becomes an unsigned one if there is no `sign`.
+
+    Returns
+    -------
+    MavFrame or None
+        None if the frame cannot be edited: its message is unknown, so that its checksum cannot be
+        computed, or it is signed and would keep a wrong signature.
+
+    Raises
+    ------
+    ValueError
+        If the message has no such field, or a value does not fit it.
+    """
+    message_id, data = frame.message_id, frame.data
+    extra = CRC_EXTRA.get(message_id)
+    if extra is None or (frame.signed and sign is None and not drop_signature):
+        return None
+    is_v2 = data[0] == START_V2
+    content = bytearray(data[: -CRC_SIZE - SIGNATURE_SIZE * frame.signed])
+    at = SEQUENCE_V2 if is_v2 else SEQUENCE_V1
+    if sequence is not None:
+        content[at] = sequence
+    if system is not None:
+        content[at + 1] = system
+    if component is not None:
+        content[at + 2] = component
+    if fields:
+        _write(content, message_id, fields)
+    if is_v2:
+        content[FLAGS] = SIGNED if sign is not None else 0
+    edited = bytes(content)
+    edited += mcrf4xx(edited[1:] + extra).to_bytes(CRC_SIZE, "little")
+    if fields or sign is not None or system is not None or component is not None:
+        return frame_of(edited + sign(edited) if is_v2 and sign is not None else edited)
+    number = edited[at]
+    return MavFrame(edited, frame.key, message_id, frame.origin, frame.target, number, False)
+
+
+def _write(content: bytearray, message_id: int, fields: Mapping[str, Any]) -> None:
+    """Write fields into a frame without checksum; zeros that version 2 cut off are added."""
+    is_v2 = content[0] == START_V2
+    begin, size = PAYLOAD_V2 if is_v2 else PAYLOAD_V1, len(content)
+    for name, value in fields.items():
+        offset, packed = _packed(message_id, name, value)
+        end = begin + offset + len(packed)
+        if end > len(content):
+            if not is_v2:
+                continue
+            content.extend(bytes(end - len(content)))
+        content[begin + offset : end] = packed
+    while len(content) > size and not content[-1]:
+        content.pop()
+    content[1] = len(content) - begin
+
+
+def _packed(message_id: int, name: str, value: Any) -> tuple[int, bytes]:
+    """Return where a field begins in the payload, and a value as its bytes."""
+    offset, kind, shape = _field(message_id, name)
+    try:
+        values = np.array(value, kind)
+        packed = (np.broadcast_to(values, shape) if values.shape != shape else values).tobytes()
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ValueError(f"{MESSAGE_NAMES[message_id]}.{name}: {value!r}: {error}") from None
+    return offset, packed
+
+
+@cache
+def _field(message_id: int, name: str) -> tuple[int, np.dtype[Any], tuple[int, ...]]:
+    """Return offset, type and shape of a field."""
+    layout = layout_of(message_id)
+    if layout.fields is None or name not in layout.fields:
+        raise ValueError(f"{MESSAGE_NAMES[message_id]} has no field {name}")
+    kind, offset = layout.fields[name][:2]
+    return offset, kind.base, kind.shape

@@ -1,0 +1,100 @@
+"""Fields of messages that hold system ids, for links on which systems have other ids.
+
+In addition to the sender in its header a message may hold: the system that it addresses; one that
+it reports, as the one in control of a gimbal; and one in a parameter of a command, also of a
+command in a mission: the vehicle to follow, the target of a camera.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final
+
+import numpy as np
+from pymavlink.dialects.v20 import all as dialect
+
+from gateway.wire.frame_editing import Sign, edit_frame
+from gateway.wire.mavlink_messages import MESSAGE_NAMES, layout_of
+from gateway.wire.mavlink_splitter import MavFrame
+
+LAST_ID: Final = 255
+
+FIELD_NAMES: Final = (
+    *("target_system", "gcs_system_id", "primary_control_sysid", "secondary_control_sysid"),
+    *("gcs_main", "gcs_secondary"),
+)
+"""Names that are used in all messages for a system id."""
+FIELDS: Final[dict[int, tuple[str, ...]]] = {
+    message_id: names
+    for message_id in MESSAGE_NAMES
+    if (names := tuple(name for name in layout_of(message_id).names or () if name in FIELD_NAMES))
+} | {dialect.MAVLINK_MSG_ID_MANUAL_CONTROL: ("target",)}
+"""Fields with a system id, or an array of them, by message id."""
+
+COMMANDS: Final = {
+    dialect.MAV_CMD_DO_FOLLOW: (1,),
+    dialect.MAV_CMD_DO_SET_ROI_SYSID: (1,),
+    dialect.MAV_CMD_DO_GUIDED_MASTER: (1,),
+    dialect.MAV_CMD_DO_GIMBAL_MANAGER_CONFIGURE: (1, 3),
+    dialect.MAV_CMD_ARM_AUTHORIZATION_REQUEST: (1,),
+}
+"""Commands, and which of their parameters are system ids."""
+CARRIERS: Final = frozenset(
+    message_id
+    for message_id in FIELDS
+    if {"command", "param1"} <= set(layout_of(message_id).names or ())
+)
+"""Messages with a command."""
+
+
+def rename_systems(
+    frame: MavFrame,
+    sender: int,
+    rename: Callable[[int], int],
+    *,
+    sign: Sign | None = None,
+) -> MavFrame | None:
+    """Return a frame from another sender, with other system ids in its fields.
+
+    Parameters
+    ----------
+    frame : MavFrame
+        Returned itself if nothing changes.
+    sender : int
+        System id of the result's sender.
+    rename : callable
+        Returns the new id of a system; called for ids from 1 to 255.
+    sign : callable, optional
+        Signs the result if the frame is signed and changes.
+
+    Returns
+    -------
+    MavFrame or None
+        None if the frame must change and cannot; see `edit_frame`.
+    """
+    fields = _renamed_fields(frame, rename) if frame.message_id in FIELDS else {}
+    if sender == frame.origin[0] and not fields:
+        return frame
+    return edit_frame(frame, system=sender, fields=fields, sign=sign if frame.signed else None)
+
+
+def _renamed_fields(frame: MavFrame, rename: Callable[[int], int]) -> dict[str, Any]:
+    """Return the fields whose values change."""
+    message_id = frame.message_id
+    layout = layout_of(message_id)
+    values = np.frombuffer(frame.payload.ljust(layout.itemsize, b"\0"), layout, 1)[0]
+    names = FIELDS[message_id]
+    if message_id in CARRIERS:
+        names += tuple(f"param{number}" for number in COMMANDS.get(int(values["command"]), ()))
+    found: dict[str, Any] = {}
+    for name in names:
+        before = values[name].tolist()
+        after = _renamed(before, rename)
+        if after != before:
+            found[name] = after
+    return found
+
+
+def _renamed(value: Any, rename: Callable[[int], int]) -> Any:
+    if isinstance(value, list):
+        return [_renamed(each, rename) for each in value]
+    # NaN and negative numbers, as in the command for gimbals, are no ids.
+    return rename(int(value)) if 0 < value <= LAST_ID else value
