@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent / "gateway"
 
-FOUNDATION = {"records", "units", "settings", "compiled", "geometry"}
+FOUNDATION = {"records", "units", "gps_time", "settings", "compiled", "geometry"}
 STAGES = {"wire", "sensing", "estimation", "vehicle", "simulator"}
 JOINED = {"aircraft", "pipeline"}
 EDGES = {"hub", "live", "clock", "printable"}
@@ -20,6 +20,7 @@ EDGES = {"hub", "live", "clock", "printable"}
 MAY_IMPORT: dict[str, set[str]] = {
     "records": set(),
     "units": set(),
+    "gps_time": {"units"},
     "settings": set(),
     "compiled": set(),
     "output": set(),

@@ -12,6 +12,7 @@ import errno
 import gzip
 import io
 import os
+import re
 import stat
 import zlib
 from collections import Counter
@@ -19,6 +20,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from enum import IntEnum
+from itertools import chain
 from pathlib import Path
 from tempfile import NamedTemporaryFile, gettempdir
 from typing import IO, BinaryIO, Final, Literal, cast
@@ -49,9 +51,13 @@ MAX_HEAD: Final = 4 * MAX_LINE
 MAX_UNPACKED: Final = 1 << 30
 """Bytes to which a packed file may be unpacked at once, unless the settings give another limit; a
 megabyte of gzip can hold a gigabyte of zeros."""
-ERASED: Final = b"\xff"
-"""Flash memory that was erased and never written, as in front of a log that was copied whole."""
-MAX_ERASED: Final = 1 << 20
+HEAD: Final = 1 << 14
+"""The begin of a log is looked for in so many bytes, behind text that a console wrote; and some
+hundred frames, by which the layout of a tlog is recognised."""
+BLANK: Final = b"\xff\0"
+"""Flash memory that was erased and never written, and zeros of a card that lost its power, as in
+front of a log that was copied whole."""
+MAX_BLANK: Final = 1 << 20
 GZIP: Final = ".gz"
 GZIP_MAGIC: Final = b"\x1f\x8b"
 """The first bytes show that a file is packed, whatever its name."""
@@ -78,9 +84,23 @@ def _begins(*heads: bytes) -> Callable[[bytes], bool]:
     return lambda head: head.startswith(heads)
 
 
+ULOG_HEAD: Final = b"ULog\x01\x12\x35"
+ULOG_BEGIN: Final = re.compile(
+    rb"\A[^\xfd\xfe]*?(?=ULog\x01\x12\x35|..F[a-z0-9_]+:uint64_t timestamp;)", re.DOTALL
+)
+"""Ends at the header of a ULog, or where that is lost at the first format of a topic. A tlog that
+holds the download of a log has MAVLink frames before it."""
+DATAFLASH_BEGIN: Final = re.compile(
+    rb"\A(?:(?=\xa3\x95)|[^\xfd\xfe]*?(?=\xa3\x95\x80..[A-Z][A-Z0-9]{2,3}))", re.DOTALL
+)
+"""The same of a binary DataFlash log: its first message, or behind other bytes its first format."""
+_DATAFLASH_LINE: Final = re.compile(rb"^FMT, ?\d", re.MULTILINE)
+
 OTHER_FORMATS: Final[dict[str, Callable[[bytes], bool]]] = {
-    "ULog": _begins(b"ULog\x01\x12\x35"),
-    "DataFlash": lambda head: head.startswith((b"\xa3\x95", b"FMT,")) or b"\nFMT, 1" in head,
+    "ULog": lambda head: ULOG_BEGIN.search(head) is not None,
+    "DataFlash": lambda head: any(
+        begin.search(head) is not None for begin in (DATAFLASH_BEGIN, _DATAFLASH_LINE)
+    ),
     PARQUET: _begins(b"PAR1"),
 }
 """Whether a file that begins with these bytes is of a format, by the format's name."""
@@ -108,22 +128,55 @@ def format_of(path: Path) -> str:
         return name
     if head.startswith((b"# mavgate table", b"time_us,")):
         return TABLE
-    is_binary = b"\0" in head or b"\xfd" in head or b"\xfe" in head
-    has_cells = any(delimiter in head for delimiter in (b",", b";", b"\t"))
+    first = head[:SNIFF]
+    has_frames = b"\xfd" in head or b"\xfe" in head
+    is_binary = b"\0" in first or b"\xfd" in first or b"\xfe" in first
+    is_binary |= has_frames and b"\0" in head
+    has_cells = any(delimiter in first for delimiter in (b",", b";", b"\t"))
     return CSV if has_cells and not is_binary else TLOG
 
 
 def first_bytes(path: Path) -> bytes:
     """Return the begin of a file, unpacked, by which its format is known; raises OSError."""
     with open_unpacked(path) as (file, _):
-        head = file.read(SNIFF)
-        for _ in range(MAX_ERASED // SNIFF):
-            if head.strip(ERASED) or not head:
-                break
-            head = file.read(SNIFF)
-        if head[:2] == ERASED * 2:
-            head = head.lstrip(ERASED) + file.read(SNIFF)
-        return head.removeprefix(codecs.BOM_UTF8)
+        head, _ = _behind_blank(iter(lambda: file.read(HEAD), b""))
+        return head[:HEAD].removeprefix(codecs.BOM_UTF8)
+
+
+def _behind_blank(content: Iterator[bytes]) -> tuple[bytes, int]:
+    """Return the first bytes that are not blank, `HEAD` of them if there are; and how many were."""
+    head, size = b"", 0
+    for data in content:
+        size += len(data)
+        head += data
+        if head[:1] * 2 == head[:2] and head[:1] in (b"\xff", b"\0"):
+            head = head.lstrip(BLANK)
+        if len(head) >= HEAD or size > MAX_BLANK:
+            break
+    return head, size - len(head)
+
+
+@dataclass(frozen=True, slots=True)
+class Before:
+    """Bytes before the begin of a log."""
+
+    blank: int = 0
+    text: bytes = b""
+    """Those that follow the blank ones."""
+
+    @property
+    def remarks(self) -> list[str]:
+        """Remarks for the user about them."""
+        size = self.blank + len(self.text)
+        return [f"left out {counted(size, 'byte')} before its first message"] if size else []
+
+
+def skip_to(begin: re.Pattern[bytes], content: Iterator[bytes]) -> tuple[Iterator[bytes], Before]:
+    """Leave out what is before the begin of a log."""
+    head, blank = _behind_blank(content)
+    found = begin.search(head, 0, HEAD)
+    at = found.end() if found else 0
+    return chain([head[at:]], content), Before(blank, head[:at])
 
 
 def is_packed(path: Path) -> bool:
@@ -288,8 +341,6 @@ class FrameClock:
         self._bases_us[key] = (base_us, own_us)
 
 
-HEAD_BYTES: Final = 1 << 14
-"""Some hundred frames, by which the layout is recognised."""
 PIECE: Final = 1 << 12
 SHOWN_JUMPS: Final = 3
 _DAY_S: Final = 86_400
@@ -343,8 +394,7 @@ class TlogSource:
 
 def open_tlog(path: Path) -> TlogSource:
     """Recognise the layout of a file, and read its times once; raises OSError."""
-    with open_unpacked(path) as (file, _):
-        layout = file_layout(file.read(HEAD_BYTES))
+    layout = file_layout(first_bytes(path))
     if layout is Layout.BARE:
         return _open_bare(path)
     timeline, scanner = Timeline(), TlogScanner()

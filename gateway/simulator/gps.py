@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from gateway.geometry.geodesy import radii_m
+from gateway.gps_time import WEEK_US, gps_us_of_unix
 from gateway.records import GpsFixType
 from gateway.simulator.sensors import BoolArray, IntArray, Wander, White
 from gateway.simulator.simulator_settings import GpsOutages, SimulatorSettings
@@ -37,9 +38,6 @@ SETTLING_S: Final = 3.0
 """Accuracies come back to their usual values this fast after an outage."""
 SETTLING_FACTOR: Final = 4.0
 
-GPS_EPOCH_UNIX_US: Final = 315_964_800_000_000
-LEAP_US: Final = 18_000_000
-WEEK_MS: Final = 604_800_000
 EARLIEST_UNIX_US: Final = 946_684_800_000_000
 LATEST_UNIX_US: Final = EARLIEST_UNIX_US + 255 * 365 * 86_400_000_000
 """The last year that the node's byte, from 2000 on, can hold."""
@@ -48,6 +46,12 @@ LATEST_UNIX_US: Final = EARLIEST_UNIX_US + 255 * 365 * 86_400_000_000
 def gps_start(unix_us: int) -> int:
     """Return the UTC of the GPS at the start, limited to its range."""
     return min(max(unix_us, EARLIEST_UNIX_US), LATEST_UNIX_US)
+
+
+def itow_ms_of(unix_us: IntArray) -> IntArray:
+    """Return the ms of the GPS week at times in UTC, with the leap seconds of the first."""
+    first_us = int(unix_us[0]) if len(unix_us) else 0
+    return (unix_us + (gps_us_of_unix(first_us) - first_us)) % WEEK_US // 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +124,7 @@ class GpsSampler:
         return GpsSamples(
             time_s=valid_s + np.maximum(s.gps_latency_s + jitter_s, MIN_LATENCY_S),
             valid_time_s=valid_s,
-            itow_ms=(unix_us - GPS_EPOCH_UNIX_US + LEAP_US) // 1000 % WEEK_MS,
+            itow_ms=itow_ms_of(unix_us),
             unix_us=unix_us,
             time_valid=valid_s >= s.gps_first_fix_s - TIME_KNOWN_EARLIER_S,
             has_fix=has_fix,

@@ -18,7 +18,7 @@ import numpy as np
 
 from gateway.records import ImuFlags, NodeId
 from gateway.simulator.flight import GPS_BOOT_US, GPS_NODE, IMU_NODE, START_UNIX_US
-from gateway.simulator.gps import GPS_EPOCH_UNIX_US, LEAP_US, WEEK_MS, GpsSamples, gps_start
+from gateway.simulator.gps import GpsSamples, gps_start, itow_ms_of
 from gateway.simulator.node import (
     GPS_SENSORS,
     IMU_SENSORS,
@@ -303,7 +303,7 @@ def _gps_samples(flight: RecordedFlight, start_unix_us: int) -> GpsSamples:
     return GpsSamples(
         time_s=flight.gps_time_s,
         valid_time_s=valid_s,
-        itow_ms=(unix_us - GPS_EPOCH_UNIX_US + LEAP_US) // 1000 % WEEK_MS,
+        itow_ms=itow_ms_of(unix_us),
         unix_us=unix_us,
         time_valid=np.ones(size, dtype=np.bool_),
         has_fix=np.ones(size, dtype=np.bool_),

@@ -45,7 +45,7 @@ SensorOption = Annotated[
     list[str] | None,
     typer.Option(
         "--sensor",
-        help="Of a DataFlash log: gps=2 for the second GPS; so with imu, mag and baro. "
+        help="Of a ULog or DataFlash log: gps=2 for the second GPS; so with imu, mag and baro. "
         "By default the first with data.",
     ),
 ]

@@ -11,6 +11,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
@@ -20,8 +21,16 @@ from msgspec.structs import replace
 from pymavlink.DFReader import DFReader_binary, DFReader_text
 
 from gateway.geometry.quaternion import from_euler
+from gateway.gps_time import GPS_EPOCH_UNIX_US, LEAPS_KNOWN_UNTIL_US, WEEK_US, unix_us_of_gps
 from gateway.recordings.columns import Imported, RowBuilder, TableRow
-from gateway.recordings.files import ERASED, FlightError, read_chunks, temporary_copy
+from gateway.recordings.files import (
+    DATAFLASH_BEGIN,
+    Before,
+    FlightError,
+    read_chunks,
+    skip_to,
+    temporary_copy,
+)
 from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
@@ -37,10 +46,6 @@ from gateway.records import (
 )
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 
-GPS_EPOCH_UNIX_US: Final = 315_964_800 * US_PER_S
-LEAP_US: Final = 18 * US_PER_S
-"""GPS time is ahead of UTC by so much since 2017."""
-WEEK_US: Final = 604_800 * US_PER_S
 LATE_US: Final = US_PER_S
 """Messages of one loop are not quite in order; one later than this has a damaged time."""
 AHEAD_US: Final = 3_600 * US_PER_S
@@ -50,6 +55,7 @@ AGREEING: Final = 50
 LEAST_AGREEING: Final = 3
 """And so many that nothing follows."""
 FIX_2D: Final = 2
+TIME_COLUMNS: Final = ("TimeUS", "TimeMS")
 SENSOR_NUMBERS: Final = ("I", "C")
 """Columns with the number of the sensor, or Kalman filter, of a message."""
 KINDS: Final = {
@@ -58,12 +64,17 @@ KINDS: Final = {
     "GPA": "GPA", "GPA2": "GPA",
 }  # fmt: skip
 """Kind of sensor by the name of its messages."""
-SENSORS: Final = ("IMU", "MAG", "BARO", "GPS")
-"""Kinds of which a log may hold several."""
+SENSORS: Final = {
+    "IMU": ("AccX", "AccY", "AccZ"),
+    "MAG": ("MagX", "MagY", "MagZ"),
+    "BARO": ("Press",),
+    "GPS": ("Status",),
+}
+"""Kinds of which a log may hold several, and columns that are not all zero where one has data."""
 ROLLOVER_US: Final = 1024 * WEEK_US
-FIRST_LOG_US: Final = 1_262_304_000 * US_PER_S
-"""The year 2010: nobody wrote this format before, so a receiver with an earlier date has lost count
-of the weeks, which begin again every 1024."""
+FIRST_LOG_US: Final = 1_262_304_000 * US_PER_S - GPS_EPOCH_UNIX_US
+"""The year 2010, as GPS time: nobody wrote this format before, so a receiver with an earlier date
+has lost count of the weeks, which begin again every 1024."""
 
 Message = Any
 """With the columns of its format as attributes, in the units of the format."""
@@ -75,10 +86,10 @@ def sensor_of(name: str, message: Message) -> int:
     return int(number) or (int(name[-1]) - 1 if name in KINDS and name[-1].isdigit() else 0)
 
 
-def in_era(unix_us: int) -> int:
+def in_era(gps_us: int) -> int:
     """Add the weeks that a GPS receiver has lost count of."""
-    lost = -(-(FIRST_LOG_US - unix_us) // ROLLOVER_US) if unix_us < FIRST_LOG_US else 0
-    return unix_us + lost * ROLLOVER_US
+    lost = -(-(FIRST_LOG_US - gps_us) // ROLLOVER_US) if gps_us < FIRST_LOG_US else 0
+    return gps_us + lost * ROLLOVER_US
 
 
 def _own_us(name: str, message: Message) -> int:
@@ -101,6 +112,8 @@ class ArdupilotReader:
         """How often it began again."""
         self.is_rolled_over = False
         """Whether a receiver has lost count of the weeks."""
+        self.is_beyond_leaps = False
+        """Whether a date is later than the leap seconds are known."""
         self.zero_us: int | None = None
         """The autopilot's time at the records' zero."""
         self._vehicle_id = vehicle_id
@@ -206,9 +219,10 @@ class ArdupilotReader:
         week, week_ms = getattr(m, "GWk", 0) or getattr(m, "Week", 0), getattr(m, "GMS", None)
         week_ms = m.TimeMS if week_ms is None else week_ms
         if week and has_fix:
-            counted_us = GPS_EPOCH_UNIX_US + week * WEEK_US + week_ms * 1000 - LEAP_US
-            utc_us = in_era(counted_us)
-            self.is_rolled_over |= utc_us != counted_us
+            counted_us = week * WEEK_US + week_ms * 1000
+            utc_us = unix_us_of_gps(in_era(counted_us))
+            self.is_rolled_over |= counted_us < FIRST_LOG_US
+            self.is_beyond_leaps |= utc_us > LEAPS_KNOWN_UNTIL_US
         self._fix = GpsFix(
             time_us=time_us,
             node=NodeId(self._vehicle_id, 1),
@@ -278,6 +292,7 @@ class _PrintedDamage(io.TextIOBase):
     """Count the damage that pymavlink prints to the terminal."""
 
     def __init__(self) -> None:
+        self.before = Before()
         self.bytes = self.messages = 0
         self.was_printed = False
 
@@ -314,23 +329,46 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     stream = rows()
     first = next((row for row in stream if row.imu is not None), None)
     if first is None:
-        raise FlightError(f"{path}: holds no IMU messages, so there is nothing to fuse")
-    # By the first week and time of GPS; 0 without one.
-    unix_us = in_era(round(log.clock.timebase * US_PER_S)) if log.clock.timebase else None
-    zero_us = None if unix_us is None else unix_us + (reader.zero_us or 0)
+        raise FlightError(f"{path}: {_why_empty(log, damage, reader)}")
+    # By the first week and time of GPS, to which pymavlink applies the leap seconds of today; 0
+    # without one.
+    clock, zero_us = log.clock, None
+    if clock.timebase:
+        zero_us = round((clock.timebase - clock._gpsTimeToTime(0, 0)) * US_PER_S)  # noqa: SLF001
+        zero_us = unix_us_of_gps(in_era(zero_us + (reader.zero_us or 0)))
     table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
     table.remarks = remarks
     return table
 
 
+def _why_empty(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> str:
+    """Return why a log gave no IMU samples."""
+    formats = {known.name: {*known.columns} for known in log.formats.values()}
+    if not formats.keys() - {"FMT"}:
+        return "it has no list of formats (FMT), without which its messages cannot be decoded"
+    needed = {*SENSORS["IMU"], "GyrX", "GyrY", "GyrZ"}
+    for name, columns in formats.items():
+        lacking = needed - columns | ({"TimeUS"} if columns.isdisjoint(TIME_COLUMNS) else set())
+        if KINDS.get(name) == "IMU" and lacking:
+            return (
+                f"its {name} messages cannot be decoded: they have no {', '.join(sorted(lacking))}"
+                ", as in a log of sdlog2, PX4's logger before ULog, which is not read"
+            )
+    if damage.messages or reader.dropped:
+        return "none of its IMU messages can be decoded"
+    return "holds no IMU messages, so there is nothing to fuse"
+
+
 def _sensors_of(log: Any, damage: _PrintedDamage) -> dict[str, int]:
     """Find the first sensor of each kind that has data; a GPS that has a fix."""
     found: dict[str, int] = {}
-    for kind in SENSORS:
+    for kind, columns in SENSORS.items():
         names = {name for name, of in KINDS.items() if of == kind}
+        least = FIX_2D if kind == "GPS" else 0.0
         seen: set[int] = set()
         for message in islice(_each(log, damage, names), MAX_LOOKED_AT):
-            if kind != "GPS" or getattr(message, "Status", 0) >= FIX_2D:
+            values = (getattr(message, column, 0) for column in columns)
+            if any(isinstance(v, int | float) and abs(v) >= least and v != 0 for v in values):
                 seen.add(sensor_of(message.get_type(), message))
             if 0 in seen:
                 break
@@ -355,11 +393,9 @@ def _open(path: Path, options: ReadOptions, damage: _PrintedDamage) -> Any:
 
     pymavlink maps a log into the memory, where one that shrinks would end the process.
     """
-    content = read_chunks(path, options.progress, options.unpacked_limit)
+    whole = read_chunks(path, options.progress, options.unpacked_limit)
+    content, damage.before = skip_to(DATAFLASH_BEGIN, whole)
     first = next(content, b"")
-    while first and not first.strip(ERASED):
-        first = next(content, b"")
-    first = first.lstrip(ERASED) if first[:2] == ERASED * 2 else first
     is_binary = first.startswith(MAGIC)
     kind = DFReader_binary if is_binary else DFReader_text
     # A byte that is not text must not stop the reading.
@@ -417,6 +453,7 @@ def _lines_of(log: Any, names: set[str]) -> int:
 
 
 def _remarks(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Iterator[str]:
+    yield from damage.before.remarks
     if damage.bytes:
         yield f"is damaged: left out {counted(damage.bytes, 'byte')} without a message"
     if log.offset < log.data_len:
@@ -429,3 +466,6 @@ def _remarks(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Itera
         yield f"the autopilot restarted {counted(reader.restarts, 'time')}; its times run on"
     if reader.is_rolled_over:
         yield "its GPS receiver counts 1024 weeks too few; its dates are corrected"
+    if reader.is_beyond_leaps:
+        known = datetime.fromtimestamp(LEAPS_KNOWN_UNTIL_US / US_PER_S, UTC)
+        yield f"its dates assume no leap second since {known:%d %B %Y}"

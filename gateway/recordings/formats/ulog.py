@@ -4,7 +4,8 @@ IMU: `sensor_combined`. Magnetic field: `vehicle_magnetometer`, in old logs amon
 fields. Barometer: `vehicle_air_data`, `sensor_baro`, or the former's heights. GPS:
 `vehicle_gps_position` or `sensor_gps`, with positions in 1e-7 degrees or, in newer logs, in
 degrees. What the autopilot estimated: `vehicle_attitude`, `vehicle_global_position`,
-`vehicle_local_position`. All are in body FRD and NED already, in us since the start.
+`vehicle_local_position`. All are in body FRD and NED already, in us since the start. Of several
+topics, and instances of a topic, the first with data is taken.
 """
 
 import contextlib
@@ -15,8 +16,10 @@ import os
 import struct
 from collections.abc import Iterator, Mapping
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from statistics import median_low
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -27,7 +30,14 @@ from pyulog.exceptions import ULogException
 
 from gateway.geometry.atmosphere import pressure_at_height
 from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, TableRow
-from gateway.recordings.files import FlightError, read_chunks, temporary_copy
+from gateway.recordings.files import (
+    ULOG_BEGIN,
+    ULOG_HEAD,
+    FlightError,
+    read_chunks,
+    skip_to,
+    temporary_copy,
+)
 from gateway.recordings.formats.mavlink import UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.recordings.tlog import FIRST_CIVIL_US
@@ -45,59 +55,93 @@ from gateway.records import (
 )
 from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA, US_PER_S, counted
 
-TOPICS: Final = (
-    *("sensor_combined", "vehicle_magnetometer", "vehicle_air_data", "sensor_baro"),
-    *("vehicle_gps_position", "sensor_gps"),
-    *("vehicle_attitude", "vehicle_global_position", "vehicle_local_position"),
-)
+SOURCES: Final = {
+    "IMU": ("sensor_combined",),
+    "MAG": ("vehicle_magnetometer", "sensor_combined"),
+    "BARO": ("vehicle_air_data", "sensor_baro", "sensor_combined"),
+    "GPS": ("vehicle_gps_position", "sensor_gps"),
+    "attitude": ("vehicle_attitude",),
+    "position": ("vehicle_global_position",),
+    "velocity": ("vehicle_local_position", "vehicle_global_position"),
+}
+"""Topics of each kind of data, the best first."""
+TOPICS: Final = tuple(dict.fromkeys(name for names in SOURCES.values() for name in names))
 """All that is read."""
 LEAST_PA: Final = 2000.0
 """A smaller value is in hPa, as in `sensor_baro` before PX4 1.14: no aircraft flies that high."""
 AROUND: Final = 5
 """Rows whose median time is used."""
-FAR_US: Final = 60 * US_PER_S
-"""A row so far from that has a damaged time."""
+FAR_US: Final = US_PER_S
+"""A row so far from that has a damaged time: those of a topic are in order."""
+AT_ENDS_US: Final = 60 * US_PER_S
+"""And at an end of a topic, where a gap of the record is as far from it."""
 NOT_THERE: Final = 0x7FFFFFFF
 """A time relative to the sample's that means "no new one"."""
-EXTRAPOLATED: Final = 8
+FIX_2D, EXTRAPOLATED = 2, 8
 ORDER: Final[dict[type, int]] = {NavState: 0, BaroRaw: 1, GpsFix: 2, ImuCalibrated: 3}
 """Of records of one time: that of a row."""
 
 _FIX_TYPES: Final = {
-    0: GpsFixType.NONE, 1: GpsFixType.NONE, 2: GpsFixType.FIX_2D,
+    0: GpsFixType.NONE, 1: GpsFixType.NONE, FIX_2D: GpsFixType.FIX_2D,
     EXTRAPOLATED: GpsFixType.DEAD_RECKONING,
 }  # fmt: skip
 
 Topic = Mapping[str, NDArray[Any]]
 Row = Mapping[str, Any]
+Instance = tuple[str, int]
+"""Name of a topic, and which of its instances it is, counted from 0."""
 
 
 class Px4Log:
     """The topics of one log."""
 
-    def __init__(self, topics: Mapping[str, Topic], vehicle_id: int) -> None:
+    def __init__(
+        self,
+        topics: Mapping[Instance, Topic],
+        vehicle_id: int,
+        sensors: Mapping[str, int] = MappingProxyType({}),
+    ) -> None:
         self.dropped = 0
         """Samples with an impossible time."""
-        sound = {name: _sound_columns(topic) for name, topic in topics.items()}
-        self.left_out = sorted(name for name, topic in sound.items() if _lacks(name, topic))
+        sound = {instance: _sound_columns(topic) for instance, topic in topics.items()}
+        kept = {one: topic for one, topic in sound.items() if not _lacks(one[0], topic)}
+        self.left_out = sorted({name for name, _ in sound.keys() - kept.keys()})
         """Topics without the fields that are needed of them."""
-        self._topics = {
-            name: self._in_order(topic)
-            for name, topic in sound.items()
-            if name not in self.left_out
-        }
-        if not len(self._topics.get("sensor_combined", {}).get("timestamp", ())):
+        self.chosen: list[str] = []
+        """Sources that are not the first of their kind, for the user."""
+        sources = {kind: self._choose(kind, kept, sensors.get(kind)) for kind in SOURCES}
+        ordered = {one: self._in_order(kept[one]) for one in {*sources.values()} if one}
+        self._topics = {kind: ordered[one] for kind, one in sources.items() if one}
+        if not len(self._topics.get("IMU", {}).get("timestamp", ())):
             raise ValueError("holds no sensor_combined, the samples of the IMU")
         self._vehicle_id = vehicle_id
         begins = (t["timestamp"][0] for t in self._topics.values() if len(t["timestamp"]))
         self._zero_us = int(min(begins))
+
+    def _choose(
+        self, kind: str, topics: Mapping[Instance, Topic], wanted: int | None
+    ) -> Instance | None:
+        """Choose the first source with data; that of IMU and GPS even without."""
+        found = [
+            (name, k)
+            for name in SOURCES[kind]
+            for k in sorted(k for other, k in topics if other == name and wanted in (None, k))
+        ]
+        default = found[0] if found and kind in ("IMU", "GPS") else None
+        chosen = next((one for one in found if _has_data(kind, topics[one])), default)
+        if chosen is None:
+            self.chosen += [] if wanted is None else [f"has no {kind} {wanted + 1}"]
+        elif chosen != (found[0][0], 0):
+            other = f" of {chosen[0]}" if chosen[0] != found[0][0] else ""
+            self.chosen.append(f"uses {kind} {chosen[1] + 1}{other}")
+        return chosen
 
     @property
     def unix_us_at_zero(self) -> int | None:
         """Civil time of the records' time zero, by GPS; None if GPS never had it."""
         found = [
             row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
-            for row in self._rows(*_GPS_TOPICS)
+            for row in self._rows("GPS")
             if FIRST_CIVIL_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
         ]
         return self._zero_us + median_low(found) if found else None
@@ -113,27 +157,26 @@ class Px4Log:
         sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
         if len(time_us) >= AROUND:
             around = np.median(sliding_window_view(time_us, AROUND), axis=1)
-            usual = np.pad(around, AROUND // 2, mode="edge")
-            sound &= np.abs(time_us - usual) < FAR_US
+            early_us = np.pad(around, AROUND // 2, mode="edge") - time_us
+            far_us = np.full((2, len(time_us)), FAR_US)
+            far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = AT_ENDS_US
+            sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
         self.dropped += int(np.count_nonzero(~sound))
         order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
         return {name: column[order] for name, column in topic.items()}
 
-    def _rows(self, *names: str) -> Iterator[Row]:
-        """Yield the rows of the first topic that the log has."""
-        for name in names:
-            topic = self._topics.get(name)
-            if topic is not None:
-                columns = [column.tolist() for column in topic.values()]
-                return (dict(zip(topic, row, strict=True)) for row in zip(*columns, strict=True))
-        return iter(())
+    def _rows(self, kind: str) -> Iterator[Row]:
+        """Yield the rows of the topic with a kind of data."""
+        topic = self._topics.get(kind, {})
+        columns = [column.tolist() for column in topic.values()]
+        return (dict(zip(topic, row, strict=True)) for row in zip(*columns, strict=True))
 
     def _time(self, row: Row) -> int:
         return int(row["timestamp"]) - self._zero_us
 
     def _imu(self) -> Iterator[ImuCalibrated]:
         fields, node = self._fields_at_samples(), NodeId(self._vehicle_id, 0)
-        for number, row in enumerate(self._rows("sensor_combined")):
+        for number, row in enumerate(self._rows("IMU")):
             mag = fields.get(number)
             flags = ImuFlags.MAG_NEW if mag else ImuFlags(0)
             if row.get("accelerometer_clipping", 0):
@@ -145,24 +188,20 @@ class Px4Log:
 
     def _fields_at_samples(self) -> dict[int, Vec3]:
         """Return the newest magnetic field of each IMU sample that has a new one, by its number."""
-        imu = self._topics["sensor_combined"]
-        if "vehicle_magnetometer" not in self._topics and all(
-            axis in imu for axis in _axes("magnetometer_ga")
-        ):
+        imu, mag = self._topics["IMU"], self._topics.get("MAG")
+        if mag is None:
+            return {}
+        if mag is imu:
             relative = imu.get("magnetometer_timestamp_relative", np.zeros(len(imu["timestamp"])))
             at = np.flatnonzero(relative != NOT_THERE).tolist()
-            rows = list(self._rows("sensor_combined"))
+            rows = list(self._rows("IMU"))
             return {number: _field(rows[number]) for number in at}
-        magnetometer = self._topics.get("vehicle_magnetometer")
-        if magnetometer is None:
-            return {}
-        after = np.searchsorted(imu["timestamp"], magnetometer["timestamp"]).tolist()
-        return dict(zip(after, map(_field, self._rows("vehicle_magnetometer")), strict=True))
+        after = np.searchsorted(imu["timestamp"], mag["timestamp"]).tolist()
+        return dict(zip(after, map(_field, self._rows("MAG")), strict=True))
 
     def _baros(self) -> Iterator[BaroRaw]:
         node = NodeId(self._vehicle_id, 0)
-        names = ("vehicle_air_data", "sensor_baro", "sensor_combined")
-        for row in self._rows(*names):
+        for row in self._rows("BARO"):
             pressure_pa = row.get("baro_pressure_pa", row.get("pressure", NAN))
             if pressure_pa < LEAST_PA:
                 pressure_pa *= PA_PER_HPA
@@ -176,7 +215,7 @@ class Px4Log:
                 yield BaroRaw(time_us, node, time_us, pressure_pa, degc)
 
     def _fixes(self) -> Iterator[GpsFix]:
-        return (self._fix(row) for row in self._rows(*_GPS_TOPICS))
+        return (self._fix(row) for row in self._rows("GPS"))
 
     def _fix(self, row: Row) -> GpsFix:
         time_us = self._time(row)
@@ -207,9 +246,8 @@ class Px4Log:
 
     def _states(self) -> Iterator[NavState]:
         """Yield the autopilot's own solution, for comparison."""
-        positions = _Newest(self._rows("vehicle_global_position"))
-        motions = _Newest(self._rows("vehicle_local_position", "vehicle_global_position"))
-        for row in self._rows("vehicle_attitude"):
+        positions, motions = _Newest(self._rows("position")), _Newest(self._rows("velocity"))
+        for row in self._rows("attitude"):
             position, motion = positions.at(row["timestamp"]), motions.at(row["timestamp"])
             north, east, down = (motion.get(k, motion.get(old, NAN)) for k, old in _VELOCITY)
             yield autopilot_state(
@@ -278,7 +316,21 @@ def _lacks(name: str, topic: Topic) -> bool:
     return not all(any(field in topic for field in fields) for fields in needed)
 
 
-_GPS_TOPICS: Final = ("vehicle_gps_position", "sensor_gps")
+_DATA: Final = {
+    "IMU": _axes("accelerometer_m_s2"),
+    "MAG": _axes("magnetometer_ga"),
+    "BARO": ("baro_pressure_pa", "pressure", "baro_alt_meter"),
+}
+"""Fields that are not all zero where a sensor has data."""
+
+
+def _has_data(kind: str, topic: Topic) -> bool:
+    if kind == "GPS" and "fix_type" in topic:
+        return bool((topic["fix_type"] >= FIX_2D).any())
+    fields = [topic[name] for name in _DATA.get(kind, ("timestamp",)) if name in topic]
+    return any(bool((np.isfinite(values) & (values != 0)).any()) for values in fields)
+
+
 _BARO_DEGC: Final = ("ambient_temperature", "baro_temp_celcius", "temperature")
 _VELOCITY: Final = (("vx", "vel_n"), ("vy", "vel_e"), ("vz", "vel_d"))
 
@@ -348,18 +400,21 @@ class _Content(io.BufferedReader):
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a ULog as a flight; raises FlightError if there is none in it."""
-    with temporary_copy(
-        path, read_chunks(path, options.progress, options.unpacked_limit)
-    ) as content:
+    whole = read_chunks(path, options.progress, options.unpacked_limit)
+    rest, before = skip_to(ULOG_BEGIN, whole)
+    with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:
         log, unread = _load(path, content.name)
-    topics = {data.name: data.data for data in reversed(log.data_list)}
+    topics = {(data.name, data.multi_id): data.data for data in reversed(log.data_list)}
     known = log.initial_parameters.get(SYSTEM_ID, 1)
     is_id = isinstance(known, int) and 1 <= known <= 255
     vehicle_id = options.system_id or (known if is_id else 1)
     try:
-        flight = Px4Log(topics, vehicle_id)
+        flight = Px4Log(topics, vehicle_id, dict(options.sensors))
     except ValueError as error:
-        raise FlightError("; it ".join([f"{path}: {error}", *_damage(log, unread)])) from error
+        if lost := log._missing_message_ids:  # noqa: SLF001
+            lost = f", and the formats of {counted(len(lost), 'topic')} are lost"
+        why = f"{path}: {error}{lost or ''}"
+        raise FlightError("; it ".join([why, *_damage(log, unread)])) from error
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
@@ -368,9 +423,24 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
         yield from builder.flush()
 
     table = table_of_rows(rows(), options, vehicle_id, flight.unix_us_at_zero)
-    remarks = [*_damage(log, unread), *_remarks(log, flight)]
+    remarks = [*before.remarks, *_damage(log, unread), *_remarks(log, flight)]
     table.remarks += [f"{path}: {remark}" for remark in remarks]
     return table
+
+
+def _lost_head(rest: Iterator[bytes], before: bytes) -> Iterator[bytes]:
+    """Yield a header for a log that lacks it, and the format that lost its name with it."""
+    first = next(rest, b"")
+    if not first.startswith(ULOG_HEAD):
+        yield ULOG_HEAD + bytes(9)
+        cut, _, fields = before.partition(b";")
+        is_whole = b"uint64_t timestamp".endswith(cut.rpartition(b":")[2])
+        for topic, needed in _NEEDED.items() if is_whole else ():
+            names = [{f" {name.partition('[')[0]};".encode() for name in one} for one in needed]
+            if all(any(name in b";" + fields for name in one) for one in names):
+                text = topic.encode() + b":uint64_t timestamp;" + fields
+                yield struct.pack("<Hc", len(text), b"F") + text
+    yield first
 
 
 def _load(path: Path, copy: str) -> tuple[Any, int]:
@@ -406,6 +476,7 @@ def _damage(log: Any, unread: int) -> Iterator[str]:
 
 
 def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
+    yield from flight.chosen
     if log.dropouts:
         lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
         slow = counted(len(log.dropouts), "time")

@@ -204,7 +204,8 @@ def test_dataflash_of_old_firmware_is_read_in_milliseconds(
     path = dataflash(tmp_path / "old.log", *title, *old_log())
     assert rates(path) == {"imu": 600, "gps": 60}
     assert info(path)["duration_s"] == pytest.approx(11.98)
-    assert "2013-12-11" in run("info", path)
+    # 16 leap seconds then.
+    assert "2013-12-11 23:59:44" in run("info", path)
 
 
 def test_second_sensor_of_a_dataflash_is_used_without_a_first(tmp_path: Path) -> None:
@@ -240,6 +241,23 @@ def test_dataflash_with_a_restart_keeps_every_sample(tmp_path: Path, after_us: i
 def test_erased_flash_before_a_dataflash_log_is_skipped(tmp_path: Path, count: int) -> None:
     path = dataflash(tmp_path / "flash.log", *RECENT, *recent_log(), before=b"\xff" * count)
     assert rates(path) == {"imu": 600, "gps": 60}
+
+
+@pytest.mark.parametrize(
+    ("formats", "reason"),
+    [
+        (b"\x83\x30", "it has no list of formats"),
+        (b"\x80\x83\x27IMU\0fffffffff" + bytes(7) + b"AccX,AccY,AccZ,GyroX,GyroY", "no GyrX, GyrY"),
+        (
+            b"\x80\x83\x1bIMU\0Qffffff" + bytes(9) + b"TimeUS,GyrX,GyrY,GyrZ,AccX,AccY,AccZ",
+            "no IMU",
+        ),
+    ],
+)
+def test_dataflash_without_samples_states_why(tmp_path: Path, formats: bytes, reason: str) -> None:
+    path = tmp_path / "empty.bin"
+    path.write_bytes(b"\xa3\x95" + formats.ljust(87, b"\0") + bytes(600))
+    assert reason in run("info", path, code=2)
 
 
 NAMES = ("time_s", "ax", "ay", "az", "gx", "gy", "gz")

@@ -18,7 +18,7 @@ from gateway.cli.support.options import read_options
 from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import FlightError
+from gateway.recordings.files import TLOG, FlightError, format_of
 from gateway.recordings.flown import open_flown
 from gateway.recordings.opening import open_flights
 from gateway.recordings.reading import RecordedTable, open_rows
@@ -203,6 +203,42 @@ def test_damage_is_counted_and_reported(folder: Path, tmp_path: Path, name: str)
     assert any("is damaged" in remark for remark in table.remarks)
     text = run("convert", spoilt, "-o", tmp_path / "x.csv")
     assert "is damaged" in text
+
+
+CONSOLE = b"INFO  [blackbox] log file opened, free space 14 GB\r\n"
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize(
+    "before",
+    [bytes(90), b"\xff" * 20_000, CONSOLE * 30, bytes(50) + CONSOLE],
+    ids=["zeros", "erased", "text", "zeros and text"],
+)
+def test_bytes_before_a_log_are_left_out_and_reported(
+    folder: Path, tmp_path: Path, name: str, before: bytes
+) -> None:
+    path = flown.write(tmp_path / name, before + (folder / name).read_bytes())
+    table, rows = rows_of(path)
+    assert repr(rows) == repr(whole(folder / name)[1])
+    # Text before a log of text is a title.
+    size = len(before.rstrip(CONSOLE)) if name == "flight.log" else len(before)
+    said = [f"{path}: left out {size} bytes before its first message"] if size else []
+    assert table.remarks == said
+
+
+@pytest.mark.parametrize("name", ["new.ulg", "old.ulg", "flight.bin"])
+def test_samples_behind_a_lost_header_are_read(folder: Path, tmp_path: Path, name: str) -> None:
+    data = bytes(90) + (folder / name).read_bytes()[90:]
+    table, rows = rows_of(flown.write(tmp_path / name, data))
+    assert len(rows) == len(whole(folder / name)[1])
+    assert any("before its first message" in remark for remark in table.remarks)
+
+
+def test_download_of_a_log_in_a_tlog_is_a_tlog(folder: Path, tmp_path: Path) -> None:
+    frame = b"\xfd\x09\0\0\0\x01\x01\0\0\0" + bytes(11)
+    for name in ("new.ulg", "flight.bin"):
+        data = bytes(8) + frame + bytes(8) + frame[:12] + (folder / name).read_bytes()[:500]
+        assert format_of(flown.write(tmp_path / "download.tlog", data)) == TLOG
 
 
 @pytest.mark.parametrize("name", MAKERS)
