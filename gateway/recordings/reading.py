@@ -275,19 +275,21 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
             f"{path}: {error} (as {encoding}); name its columns with --columns MAP"
         ) from error
     if first is None:
-        raise FlightError(f"{path}: holds no row that can be read")
+        why = f": {reader.first_fault}" if reader.first_fault else ""
+        raise FlightError(f"{path}: holds no row that can be read{why}")
 
     def counting() -> Iterator[TableBlock]:
         yield from chain([first], blocks)
         if reader.skipped:
             text = counted(reader.skipped, "line")
             remarks.append(f"{path}: left out {text} of text before the column names")
-        if reader.faults:
-            text = counted(reader.faults, "line")
-            remarks.append(f"{path}: left out {text} that cannot be read")
+        odd = ((reader.faults, "line"), (reader.odd_cells, "cell"))
+        if left_out := " and ".join(counted(*one) for one in odd if one[0]):
+            example = f" ({reader.first_fault})" if reader.first_fault else ""
+            remarks.append(f"{path}: left out {left_out} that cannot be read{example}")
 
     remarks: list[str] = []
-    header = _header_of_today(options, options.system_id or 1, None)
+    header = _header_of_today(options, options.system_id or 1, reader.unix_us_at_zero)
     return RecordedTable(header, _monotone(counting(), path, remarks), remarks)
 
 

@@ -2,15 +2,18 @@
 
 import csv
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
 from itertools import chain, islice, pairwise
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from msgspec.structs import replace
 
 from gateway.geometry.atmosphere import pressure_at_height
-from gateway.recordings.columns import BARO, COLUMNS, GPS, NAV, RAW, SI, FloatArray, normalise
+from gateway.recordings.columns import BARO, COLUMNS, GPS, MAG, NAV, RAW, SI, FloatArray, normalise
 from gateway.recordings.table import BLOCK_ROWS, NO_ROWS, TableBlock
 from gateway.recordings.tlog import is_damaged
 from gateway.records import NAN, GpsFixType, ImuFlags
@@ -28,10 +31,18 @@ VECTORS: Final = tuple(
 NEEDED: Final = frozenset({"time_us"}).union(*VECTORS[:2])
 """Without these there is nothing to fuse."""
 DELIMITERS: Final = {",": "commas", ";": "semicolons", "\t": "tabs"}
-MAX_HEAD_LINES: Final = 200
+MAX_HEAD_LINES: Final = 1000
 """The names of the columns are looked for in so many lines."""
 MAX_SHOWN: Final = 200
 """Characters of the found names in an error."""
+EMPTY: Final = frozenset({"-", "--", "?", "null", "nil", "none", "n/a", "#n/a", "na"})
+"""Cells without a value, in small letters, in addition to empty ones and NaN."""
+CLOCK: Final = re.compile(r"(\d{1,2}):(\d\d):(\d\d(?:[.,]\d*)?)")
+"""A time of the day."""
+DAY_S, HOUR_S, MINUTE_S = 86_400, 3600, 60
+EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+MAX_CELL: Final = 40
+"""Characters of an unreadable cell in a message."""
 LATE_US: Final = 60 * US_PER_S
 """A value measured this long before or after its line has a damaged time, or another clock's."""
 
@@ -74,25 +85,36 @@ class CsvReader:
             for name, column in column_map.columns.items()
         }
         self._lenient = lenient
+        self.unix_us_at_zero: int | None = None
+        """Civil time of the rows' time zero, where their times have dates."""
         self.skipped = 0
         """Lines of text before that with the names of the columns."""
         self.faults = 0
         """Lines that could not be read, or whose time is not between its neighbours."""
+        self.odd_cells = 0
+        """Cells that could not be read in other lines."""
+        self.first_fault = ""
+        """The first of all that: line, column and text."""
+        self._has_decimal_comma = False
+        self._day_s, self._clock_s = 0, 0.0
+        """Midnights that times of the day have passed, and the newest of them."""
 
     def blocks(self, lines: Iterable[str]) -> Iterator[TableBlock]:
         """Read a whole file; raises ValueError if it lacks needed columns."""
-        kept = (line for line in lines if not line.startswith("#"))
+        # Lines that are left out stay empty, so that their numbers are those of the file.
+        kept = ("" if line.startswith("#") else line for line in lines)
         head = [*islice(kept, MAX_HEAD_LINES)]
         delimiter, names, begin = self._find_names(head)
-        self.skipped = begin - 1
+        self.skipped = sum(map(bool, head[: begin - 1]))
+        self._has_decimal_comma = delimiter != ","
         table = csv.reader(chain(head[begin:], kept), delimiter=delimiter)
-        values, held = self._values(table, names, has_decimal_comma=delimiter != ","), NO_ROWS
+        values, held = self._values(table, names, begin), NO_ROWS
         before_us: float | None = None
         while lines_of_block := [*islice(values, BLOCK_ROWS)]:
-            cells = _cells(dict(zip(self._columns, np.array(lines_of_block).T, strict=True)))
-            faults = normalise(cells)
-            self.faults += len(faults)
-            cells = np.concatenate([held, np.delete(cells, [*faults], axis=0)])
+            numbers, rows = zip(*lines_of_block, strict=True)
+            cells = _cells(dict(zip(self._columns, np.array(rows).T, strict=True)))
+            invalid = self._invalid(cells, numbers)
+            cells = np.concatenate([held, np.delete(cells, invalid, axis=0)])
             sound = []
             for row, (time_us, after_us) in enumerate(pairwise(cells[:, 0].tolist())):
                 if before_us is not None and is_damaged(before_us, time_us, after_us):
@@ -105,26 +127,108 @@ class CsvReader:
         yield TableBlock(held)
 
     def _values(
-        self, table: Iterator[list[str]], names: Sequence[str], *, has_decimal_comma: bool
-    ) -> Iterator[list[float]]:
-        """Yield the mapped values of each line; NaN is an empty cell."""
+        self, table: Any, names: Sequence[str], begin: int
+    ) -> Iterator[tuple[int, list[float]]]:
+        """Yield number and mapped values of each line; NaN is an empty cell."""
         at = {name: number for number, name in enumerate(names)}
         wanted = [(at[c.column], c.scale, c.offset) for c in self._columns.values()]
         while True:
             try:
                 line = next(table)
-                texts = [line[k].strip() if k < len(line) else "" for k, _, _ in wanted]
-                if has_decimal_comma:
-                    texts = [text.replace(",", ".") for text in texts]
-                if line:
-                    yield [
-                        float(text) * scale + offset if text else NAN
-                        for text, (_, scale, offset) in zip(texts, wanted, strict=True)
-                    ]
             except StopIteration:
                 return
-            except (ValueError, csv.Error):
-                self.faults += 1
+            except csv.Error as error:
+                self._add_fault(begin + table.line_num, str(error))
+                continue
+            if not line:
+                continue
+            texts = [line[k].strip() if k < len(line) else "" for k, _, _ in wanted]
+            if self._has_decimal_comma:
+                texts = [text.replace(",", ".") for text in texts]
+            try:
+                values = [
+                    float(text) * scale + offset if text else NAN
+                    for text, (_, scale, offset) in zip(texts, wanted, strict=True)
+                ]
+            except ValueError:
+                found = self._odd_values(texts, begin + table.line_num)
+                if found is None:
+                    continue
+                values = found
+            yield begin + table.line_num, values
+
+    def _odd_values(self, texts: Sequence[str], number: int) -> list[float] | None:
+        """Read a line whose cells are not all plain numbers; None without a time."""
+        values = []
+        for (ours, column), text in zip(self._columns.items(), texts, strict=True):
+            value = self._value(ours, column, text)
+            if value is None:
+                why = f"{column.column} is {text[:MAX_CELL]!r}, which is no number"
+                if ours == "time_us":
+                    self._add_fault(number, why)
+                    return None
+                self.first_fault = self.first_fault or f"line {number}: {why}"
+                self.odd_cells += 1
+                value = NAN
+            values.append(value)
+        return values
+
+    def _value(self, ours: str, column: Column, text: str) -> float | None:
+        """Read one cell; NaN if it is empty, None if it cannot be read."""
+        if not text or text.casefold() in EMPTY:
+            return NAN
+        if ours.endswith("time_us") or ours == "gps_utc_us":
+            time_us = self._time_us(ours, text)
+            if time_us is not None:
+                return time_us
+        with suppress(ValueError):
+            return float(text) * column.scale + column.offset
+        # Quoted, so that it does not separate.
+        if "," not in text or "." in text:
+            return None
+        with suppress(ValueError):
+            value = float(text.replace(",", ".")) * column.scale + column.offset
+            self._has_decimal_comma = True
+            return value
+        return None
+
+    def _time_us(self, ours: str, text: str) -> float | None:
+        """Read a time of the day, or a date and time of ISO 8601, UTC without a zone."""
+        if clock := CLOCK.fullmatch(text):
+            hours, minutes, seconds = (float(part.replace(",", ".")) for part in clock.groups())
+            clock_s = hours * HOUR_S + minutes * MINUTE_S + seconds
+            if ours == "time_us":
+                self._day_s += DAY_S * (clock_s < HOUR_S and self._clock_s >= DAY_S - HOUR_S)
+                self._clock_s = clock_s
+            return (self._day_s + clock_s) * US_PER_S
+        try:
+            date = datetime.fromisoformat(text.replace("/", "-").replace(",", "."))
+        except ValueError:
+            return None
+        civil = date if date.tzinfo else date.replace(tzinfo=UTC)
+        unix_us = (civil - EPOCH) // timedelta(microseconds=1)
+        if ours == "gps_utc_us":
+            return unix_us
+        if ours == "time_us" and self.unix_us_at_zero is None:
+            self.unix_us_at_zero = unix_us
+        return NAN if self.unix_us_at_zero is None else unix_us - self.unix_us_at_zero
+
+    def _invalid(self, cells: FloatArray, numbers: Sequence[int]) -> list[int]:
+        """Return which rows are invalid; of one with an invalid fix or pressure only that is."""
+        for row, why in normalise(cells).items():
+            group = {"gps": GPS, "baro": BARO}.get(why.partition("_")[0])
+            if group is not None:
+                self.first_fault = self.first_fault or f"line {numbers[row]}: {why}"
+                self.odd_cells += 1
+                cells[row, group] = NAN
+        faults = normalise(cells)
+        for row, why in faults.items():
+            self._add_fault(numbers[row], why)
+        return [*faults]
+
+    def _add_fault(self, number: int, why: str) -> None:
+        self.faults += 1
+        self.first_fault = self.first_fault or f"line {number}: {why}"
 
     def _find_names(self, head: Sequence[str]) -> tuple[str, list[str], int]:
         """Find the line with the names of the columns."""
@@ -165,7 +269,8 @@ def _cells(values: dict[str, FloatArray]) -> FloatArray:
         found = values.get(name, cells[:, -1])
         return np.where(np.isnan(found), default, found)
 
-    new_flags = np.where(np.isnan(get("mag_x_b_ut")), 0.0, float(ImuFlags.MAG_NEW))
+    has_field = np.isfinite(sum(get(f"mag_{axis}_b_ut") for axis in "xyz"))
+    new_flags = np.where(has_field, float(ImuFlags.MAG_NEW), 0.0)
     by_height_pa = np.array([*map(pressure_at_height, get("baro_alt_m").tolist())])
     north_mps, east_mps = get("gps_vel_north_mps"), get("gps_vel_east_mps")
     level = level_velocity(get("gps_speed_mps"), get("gps_course_deg"))
@@ -199,7 +304,8 @@ def _cells(values: dict[str, FloatArray]) -> FloatArray:
 _GROUPS_NEED: Final = [
     (group, [COLUMNS.index(name) for name in names])
     for group, names in (
-        (SI, ("accel_x_b_mps2", "gyro_x_b_radps")),
+        (SI, NEEDED - {"time_us"}),
+        (MAG, VECTORS[2]),
         (BARO, ("baro_pressure_pa",)),
         (GPS, ("gps_lat_dege7", "gps_lon_dege7")),
     )

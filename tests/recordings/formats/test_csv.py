@@ -66,6 +66,77 @@ def test_unreadable_lines_are_counted() -> None:
     assert reader.faults == 2
 
 
+PLAIN = "1.5,0,0,-9.8,0,0,0,20,5,-40,500,1.45,47.1,8.5,430,1,2,3,hi,5,120"
+AT = {name: number for number, name in enumerate(NAMES.split(","))}
+
+
+def with_cells(**texts: str) -> str:
+    cells = PLAIN.split(",")
+    for name, text in texts.items():
+        cells[AT[name]] = text
+    return ",".join(cells)
+
+
+@pytest.mark.parametrize("word", ["null", "N/A", "NaN", "nan", "-", "--", "None", "#N/A", " "])
+def test_words_for_no_value_are_empty_cells(word: str) -> None:
+    reader, (row,) = read(with_cells(gps_lat=word, gps_lon=word, mx=word, baro_alt_m=word))
+    assert (row.gps, row.baro, row.imu.mag_b_ut, row.imu.flags) == (None, None, None, ImuFlags(0))
+    assert (reader.faults, reader.odd_cells, reader.first_fault) == (0, 0, "")
+
+
+@pytest.mark.parametrize(
+    ("cells", "lost"),
+    [
+        ({"gps_lat": "x"}, "gps"),
+        ({"gps_lat": "1e300"}, "gps"),
+        ({"baro_alt_m": "low"}, "baro"),
+        ({"ay": "broken"}, "imu"),
+    ],
+)
+def test_unreadable_cell_drops_only_its_record(cells: dict[str, str], lost: str) -> None:
+    reader, rows = read(PLAIN.replace("1.5,", "1.4,", 1), with_cells(**cells))
+    assert [kind for kind in ("imu", "gps", "baro") if getattr(rows[1], kind) is None] == [lost]
+    assert (reader.faults, reader.odd_cells) == (0, 1)
+    assert reader.first_fault.startswith("line 4: ")
+    assert next(iter(cells)).removesuffix("_m") in reader.first_fault
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [("soon,0,0,-9.8,0,0,0", "line 3: time_s is 'soon', which is no number"), ("", "")],
+)
+def test_line_without_a_time_is_named(line: str, fault: str) -> None:
+    reader, rows = read(line)
+    assert (rows, reader.first_fault) == ([], fault)
+
+
+def test_quoted_decimal_commas_between_commas_are_read() -> None:
+    cells = [cell.replace(".", ",") for cell in PLAIN.split(",")]
+    _, (row,) = read(",".join(f'"{number}"' for number in cells))
+    assert (row.time_us, row.imu.accel_b_mps2) == (1_500_000, (0.0, 0.0, -9.8))
+    assert (row.gps.time_us, row.gps.lat_dege7) == (1_450_000, 471_000_000)
+
+
+@pytest.mark.parametrize(
+    ("times", "found_s", "unix_s"),
+    [
+        (["12:00:00.5", "12:00:01,5", "12:00:02"], [43200.5, 43201.5, 43202.0], None),
+        (["23:59:59", "0:00:00.5", "00:00:01"], [86399.0, 86400.5, 86401.0], None),
+        (["2026-06-11T14:25:30Z", "2026-06-11T14:25:31.5Z"], [0.0, 1.5], 1_781_187_930),
+        (["2026-06-11 16:25:30+02:00", "2026-06-11 16:25:31+02:00"], [0.0, 1.0], 1_781_187_930),
+        (["2026/06/11 14:25:30", "2026/06/11 14:25:30.25"], [0.0, 0.25], 1_781_187_930),
+    ],
+)
+def test_times_of_the_day_and_dates_are_read(
+    times: list[str], found_s: list[float], unix_s: int | None
+) -> None:
+    quoted = (time.join('""') if "," in time else time for time in times)
+    reader, rows = read(*(with_cells(time_s=text, gps_time_s=text) for text in quoted))
+    assert [row.time_us / 1e6 for row in rows] == found_s
+    assert [row.gps.time_us for row in rows] == [row.time_us for row in rows]
+    assert reader.unix_us_at_zero == (None if unix_s is None else unix_s * 1_000_000)
+
+
 def test_scale_and_offset_are_applied() -> None:
     columns = {"time_us": Column(column="t", scale=1e3, offset=5.0), "baro_pressure_pa": "p"}
     (row,) = rows_of(CsvReader(ColumnMap(columns=columns)), "t,p", "2,95000")
