@@ -175,7 +175,7 @@ class RecordedVehicle:
         if service is None:
             return []
         if service.changes_state(request):
-            return self._finish(service.refuse(request))
+            return self._finish(service.refuse(request, DENIED))
         return self._finish(service.handle(request, now_us))
 
     def poll(self, now_us: int) -> list[RecordedAction]:

@@ -39,6 +39,8 @@ class Request:
     message: Any
     may_change: bool
     """Whether the client may change state: trusted, and signed where a key is set."""
+    reason: str = ""
+    """Why it may not, and the remedy."""
 
     def reply(self, message: Any) -> Reply:
         """Answer the client that asked."""
@@ -127,8 +129,8 @@ class Service:
         """Answer a request."""
         return []
 
-    def refuse(self, _request: Request) -> list[Answer]:
-        """Answer a client that may not send this request."""
+    def refuse(self, _request: Request, _result: int) -> list[Answer]:
+        """Answer a client that may not send this request; the result is a command's."""
         return []
 
     def poll(self, _now_us: int) -> list[Answer]:
@@ -187,6 +189,8 @@ class TransferService(Service):
 
 BROADCAST: Final = 0
 BAD_SIGNATURE: Final = "bad signature"
+NOT_TRUSTED: Final = "not trusted; set trusted=yes at its endpoint"
+NOT_SIGNED: Final = "not signed; set the signing passphrase in the ground station"
 
 
 class RequestReader:
@@ -209,15 +213,16 @@ class RequestReader:
             return None
         if not self._is_for_us(message):
             return None
-        allowed = incoming.trusted
+        allowed, reason = incoming.trusted, "" if incoming.trusted else NOT_TRUSTED
         if self.verifier is not None:
             signed = frame[0] == START_V2 and frame[2] & SIGNED
             if signed and not self.verifier.accepts(frame, now_us):
                 self.faults[BAD_SIGNATURE] += 1
                 return None
-            allowed = allowed and bool(signed)
+            if allowed and not signed:
+                allowed, reason = False, NOT_SIGNED
         sender = (message.get_srcSystem(), message.get_srcComponent())
-        return Request(incoming.client_id, *sender, message, allowed)
+        return Request(incoming.client_id, *sender, message, allowed, reason)
 
     def _decode(self, frame: bytes) -> Any:
         """Decode a frame, or return what is wrong with it."""
@@ -249,6 +254,14 @@ MAX_ENTRIES: Final = 64
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9_@/.? =-]")
 _GOOD_RESULTS: Final = (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS)
 _FTP_OPCODE, _FTP_DATA = 3, 12
+_FTP_ENDS: Final = (mavlink.MAV_FTP_OPCODE_TERMINATESESSION, mavlink.MAV_FTP_OPCODE_RESETSESSION)
+_CONTROL_NACKS: Final = {
+    1: "wrong passkey",
+    2: "unsupported passkey encryption",
+    3: "under another's control",
+}
+UNANSWERED: Final = frozenset({"LOG_REQUEST_END", "COMMAND_ACK", "MISSION_ACK", "LOGGING_ACK"})
+"""Messages to a vehicle to which the protocols have no answer."""
 
 
 class RequestLog:
@@ -279,14 +292,17 @@ class RequestLog:
         """Add a request if one of its answers is negative."""
         for answer in answers:
             if isinstance(answer, Reply) and answer.client_id == request.client_id:
-                outcome = failure_of(answer.message)
+                outcome = failure_of(answer.message, request.message)
                 if outcome is not None:
                     self.add(request, outcome, now_us)
                     return
 
 
-def failure_of(message: Any) -> str | None:
-    """Return the reason in a negative answer; None for any other message."""
+def failure_of(message: Any, request: Any) -> str | None:
+    """Return the reason in a negative answer; None for any other message.
+
+    The end of a file or a list, and the end of a session that has ended already, are no failures.
+    """
     match message.get_type():
         case "COMMAND_ACK" if message.result not in _GOOD_RESULTS:
             return _name("MAV_RESULT", message.result)
@@ -297,9 +313,11 @@ def failure_of(message: Any) -> str | None:
         case "PARAM_EXT_ACK" if message.param_result != mavlink.PARAM_ACK_ACCEPTED:
             return _name("PARAM_ACK", message.param_result)
         case "CHANGE_OPERATOR_CONTROL_ACK" if message.ack:
-            return f"NACK {message.ack}"
+            return _CONTROL_NACKS.get(message.ack, f"NACK {message.ack}")
         case "FILE_TRANSFER_PROTOCOL" if message.payload[_FTP_OPCODE] == mavlink.MAV_FTP_OPCODE_NAK:
-            return f"FTP error {message.payload[_FTP_DATA]}"
+            error, asked = message.payload[_FTP_DATA], request.payload[_FTP_OPCODE]
+            if error != mavlink.MAV_FTP_ERR_EOF and asked not in _FTP_ENDS:
+                return _name("MAV_FTP_ERR", error)
     return None
 
 
@@ -317,7 +335,8 @@ def describe(message: Any) -> str:
     elif kind == "FILE_TRANSFER_PROTOCOL":
         payload = bytes(message.payload)
         path = payload[_FTP_DATA : _FTP_DATA + payload[4]].partition(b"\0")[0]
-        subject = f"opcode {payload[_FTP_OPCODE]} {path.decode('ascii', 'replace')}"
+        opcode = _name("MAV_FTP_OPCODE", payload[_FTP_OPCODE])
+        subject = f"{opcode} {path.decode('ascii', 'replace')}"
     return _UNSAFE.sub("?", f"{kind} {subject}".strip())
 
 

@@ -28,6 +28,7 @@ from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.requests import (
     INFO,
     NOTICE,
+    UNANSWERED,
     WARNING,
     Action,
     Answer,
@@ -42,7 +43,9 @@ from gateway.vehicle.requests import (
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW, Calibrator
 from gateway.vehicle.services.commands import (
     ACCEPTED,
+    DENIED,
     FAILED,
+    NOT_IN_CONTROL,
     CommandService,
     IntervalService,
     QueryService,
@@ -226,25 +229,29 @@ class Vehicle:
         self._control.on_request(request, now_us)
         service = self._services.get(request.message.get_type())
         if service is None:
-            if getattr(request.message, "target_system", None) == self.system_id:
+            is_to_us = getattr(request.message, "target_system", None) == self.system_id
+            if is_to_us and request.message.get_type() not in UNANSWERED:
                 self.requests.add(request, "no answer", now_us)
             return []
         if service.changes_state(request):
             if not request.may_change:
-                return self._refuse(service, request, "", now_us)
+                return self._refuse(service, request, request.reason, DENIED, now_us)
             if not self._control.permits(request):
-                return self._refuse(service, request, f": {self._control.denial()}", now_us)
+                reason = self._control.denial(request)
+                return self._refuse(service, request, reason, NOT_IN_CONTROL, now_us)
         answers = service.handle(request, now_us)
         self.requests.add_failed(request, answers, now_us)
         return self._finish(answers)
 
-    def _refuse(self, service: Service, request: Request, reason: str, now_us: int) -> list[Action]:
+    def _refuse(
+        self, service: Service, request: Request, reason: str, result: int, now_us: int
+    ) -> list[Action]:
         """Answer and announce a request that the sender may not make."""
         self.refusals += 1
-        self.requests.add(request, f"refused{reason or ': not trusted'}", now_us)
+        self.requests.add(request, f"refused: {reason}", now_us)
         name = _describe(request)
-        status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}{reason}")
-        answers = service.refuse(request)
+        status = StatusText(NOTICE, f"Refused {name} of system {request.system_id}: {reason}")
+        answers = service.refuse(request, result)
         answers += self._refusal_texts.say(status, now_us)
         return self._finish(answers)
 

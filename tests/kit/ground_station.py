@@ -73,8 +73,14 @@ def kinds(found: Iterable[Any]) -> list[str]:
 
 
 def texts(found: Iterable[Any]) -> list[str]:
-    """Return the texts of STATUSTEXT."""
-    return [message.text for message in of_kind(found, "STATUSTEXT")]
+    """Return the texts of STATUSTEXT, with their chunks joined."""
+    joined: list[str] = []
+    for message in of_kind(found, "STATUSTEXT"):
+        if message.chunk_seq:
+            joined[-1] += message.text
+        else:
+            joined.append(message.text)
+    return joined
 
 
 def results(found: Iterable[Any]) -> list[int]:

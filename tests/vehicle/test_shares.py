@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.vehicle.requests import NOT_TRUSTED
 from gateway.vehicle.services.ftp import Opcode
 from tests.kit.ground_station import FtpClient, GroundStation, load_parameters, of_kind, texts
 
@@ -83,4 +84,4 @@ def test_refusals_of_untrusted_clients_are_reported_at_a_limited_rate(
         station.wait(0.05)
     reported = [text for text in texts(station.frames) if text.startswith("Refused")]
     assert 3 <= len(reported) <= 8
-    assert set(reported) == {"Refused LOGGING_START of system 255"}
+    assert set(reported) == {f"Refused LOGGING_START of system 255: {NOT_TRUSTED}"}

@@ -257,10 +257,7 @@ def test_compass_with_wrong_axes_is_reported_once_with_the_remedy() -> None:
     for time_us in range(0, 20 * ONE_S, ONE_S // 10):
         state = state_at(time_us, flags=NavFlags.MAG_MISPLACED | NavFlags.MAG_DISTURBED)
         reported += texts(vehicle.on_state(state, sample_at(time_us), time_us))
-    assert reported == [
-        "Compass axes wrong, not used: check CAL_MAG_MNT",
-        "Magnetic field disturbed",
-    ]
+    assert reported == ["Compass axes wrong, not used: check CAL_MAG_MNT"]
 
 
 @pytest.mark.parametrize(
@@ -285,7 +282,7 @@ def test_gps_latency_is_announced_once_its_estimate_has_settled() -> None:
     for n in range(200):
         time_us, moved = n * ONE_S // 5, min(n - n // 10, 70)
         reported += texts(vehicle.on_latency(0.3 - 0.002 * moved, 0.3, time_us))
-    assert reported == ["GPS is 0.16 s late, not 0.30: set gps_latency_s"]
+    assert reported == ["GPS is 0.16 s late, not 0.30: set REF_GPS_LATENCY"]
 
 
 def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
@@ -300,6 +297,76 @@ def test_flags_of_the_estimator_are_reported_and_cannot_flood() -> None:
         flood += vehicle.on_state(state, sample_at(time_us), time_us)
     assert "Magnetic field disturbed" in texts(flood)
     assert len(texts(flood)) <= 4
+
+
+LOST = NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
+REJECTED = LOST | NavFlags.GPS_REJECTED
+FAULT = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
+FINE = state_at(0).flags
+NO_ATTITUDE = ~(NavFlags.ATTITUDE_VALID | NavFlags.HEADING_VALID)
+GPS_STATUS = status(node=GPS_NODE, sensors_present=1 << 3)
+
+EVENTS: dict[str, tuple[dict[str, Any], list[str]]] = {
+    "no fix": ({"fix": NO_FIX, "flags": FINE | LOST}, ["GPS fix lost", "GPS fix"]),
+    "no data from the receiver": ({"fix": None, "flags": FINE | LOST}, ["GPS fix lost", "GPS fix"]),
+    "silent node": (
+        {"fix": None, "node": False, "flags": FINE | LOST},
+        ["GPS node 1 silent", "GPS node 1 is back"],
+    ),
+    "receiver unplugged": (
+        {"fix": None, "link": False, "flags": FINE | LOST},
+        ["Receiver lost: port", "Receiver connected: port"],
+    ),
+    "rejected fixes": ({"flags": FINE | REJECTED}, ["GPS fixes rejected", "GPS accepted again"]),
+    "useless fixes": (
+        {"flags": FINE | LOST},
+        ["Position is dead-reckoned", "Position follows GPS again"],
+    ),
+    "faulty sensor": (
+        {"flags": (FINE & NO_ATTITUDE) | FAULT},
+        ["Sensor fault", "Sensors OK again"],
+    ),
+    "lost attitude": ({"flags": FINE & NO_ATTITUDE}, ["Attitude not valid", "Attitude valid"]),
+    "disturbed field": (
+        {"flags": FINE & ~NavFlags.HEADING_VALID | NavFlags.MAG_DISTURBED},
+        ["Magnetic field disturbed", "Magnetic field normal again"],
+    ),
+    "short outage": ({"flags": FINE | LOST, "seconds": 3}, []),
+}
+
+
+@pytest.mark.parametrize("name", EVENTS)
+def test_one_cause_is_announced_once_and_so_is_its_end(name: str) -> None:
+    event, expected = EVENTS[name]
+    vehicle, reported = make(), []
+    vehicle.on_node_status(GPS_STATUS, 0)
+    last_us = 0
+    for time_us in range(0, 60 * ONE_S, ONE_S // 5):
+        begin_s = 20
+        is_on = begin_s <= time_us / ONE_S < begin_s + event.get("seconds", 20)
+        now = event if is_on else {}
+        # The estimator notices an outage after a while.
+        flags = now["flags"] if now and time_us >= (begin_s + 1.5) * ONE_S else FINE
+        found = [*vehicle.on_state(state_at(time_us, flags=flags), sample_at(time_us), time_us)]
+        if (fix := now.get("fix", FIX)) is not None:
+            found += vehicle.on_gps(replace(fix, time_us=time_us), time_us)
+        if time_us % ONE_S == 0:
+            last_us = time_us if now.get("node", True) else last_us
+            seen = link(node=GPS_NODE, last_time_us=last_us)
+            connected = now.get("link", True)
+            found += vehicle.on_link(
+                report(seen, time_us=time_us, port="port", connected=connected), time_us
+            )
+        reported += [(time_us, text) for text in texts([*found, *vehicle.poll(time_us)])]
+    assert [text for time_us, text in reported if time_us >= 20 * ONE_S] == expected
+
+
+def test_lost_gps_is_no_failed_attitude() -> None:
+    vehicle = make()
+    fly(vehicle, 0, 2)
+    vehicle.on_state(state_at(2 * ONE_S, flags=FINE | LOST), sample_at(2 * ONE_S), 2 * ONE_S)
+    _, _, healthy = vehicle.health.sensors(2 * ONE_S)
+    assert healthy & mavlink.MAV_SYS_STATUS_AHRS
 
 
 def test_system_time_follows_gps() -> None:

@@ -35,6 +35,8 @@ UNSUPPORTED: Final[int] = mavlink.MAV_RESULT_UNSUPPORTED
 NOT_NOW: Final[int] = mavlink.MAV_RESULT_TEMPORARILY_REJECTED
 IN_PROGRESS: Final[int] = mavlink.MAV_RESULT_IN_PROGRESS
 FAILED: Final[int] = mavlink.MAV_RESULT_FAILED
+NOT_IN_CONTROL: Final = 10
+"""MAV_RESULT_NOT_IN_CONTROL of MAVLink's common.xml, which pymavlink's dialects lack."""
 
 NO_PROGRESS: Final = 255
 REQUEST_MESSAGE: Final = mavlink.MAV_CMD_REQUEST_MESSAGE
@@ -304,9 +306,9 @@ class CommandService(Service):
         """Return whether the command would change anything."""
         return read_command(request).number in self._changing
 
-    def refuse(self, request: Request) -> list[Answer]:
-        """Acknowledge as denied."""
-        return [read_command(request).ack(DENIED)]
+    def refuse(self, request: Request, result: int) -> list[Answer]:
+        """Acknowledge with this result."""
+        return [read_command(request).ack(result)]
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
         """Carry out a command and acknowledge it."""
@@ -454,7 +456,7 @@ class QueryService(Service):
         """Return whether the request would change anything if it were supported."""
         return request.message.get_type() in ("SETUP_SIGNING", "PARAM_EXT_SET")
 
-    def refuse(self, request: Request) -> list[Answer]:
+    def refuse(self, request: Request, _result: int) -> list[Answer]:
         """Refuse to set a parameter; the other messages have no answer of their own."""
         is_parameter = request.message.get_type() == "PARAM_EXT_SET"
         return [request.reply(_extended_parameter_refused(request.message))] if is_parameter else []

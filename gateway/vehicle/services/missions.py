@@ -139,7 +139,7 @@ class MissionService(Service):
         """Return whether the request would store, clear or change the current item."""
         return request.message.get_type() in CHANGING
 
-    def refuse(self, request: Request) -> list[Answer]:
+    def refuse(self, request: Request, _result: int) -> list[Answer]:
         """Deny by MISSION_ACK; MISSION_SET_CURRENT has no negative answer of its own."""
         if request.message.get_type() == "MISSION_SET_CURRENT":
             return []

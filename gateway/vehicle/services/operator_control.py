@@ -10,9 +10,23 @@
 | release | another is, or nobody                  | denied                    |
 | any     | the sender is not trusted              | denied                    |
 
-The station in control is known by its MAVLink system id. It loses control when its link closes, and
-when nothing was received from it for `TIMEOUT_US`. CONTROL_STATUS reports who is in control; it is
-sent with "exclusive" only, since a ground station that has received one expects to need control.
+The station in control is known by its client and its MAVLink system id, so that frames of others
+with the same id neither keep control nor use it; the same station may request it again by another
+link. It loses control when its link closes, and when nothing was received from it for `TIMEOUT_US`.
+CONTROL_STATUS reports who is in control; it is sent with "exclusive" only, since a ground station
+that has received one expects to need control. This is the protocol's single-owner mode: there are
+no secondary stations.
+
+The command has two orders of parameters. Definitions before 2026-04-15 begin with a system id, 0
+from a ground station; those since then with the action:
+
+| order   | 1           | 2        | 3          | 4                        | 5          |
+| ------- | ----------- | -------- | ---------- | ------------------------ | ---------- |
+| present | action      | takeover | timeout, s | sender, or first of some | their last |
+| former  | sender or 0 | action   | takeover   | timeout, s               |            |
+
+CONTROL_STATUS changed with them, its checksum seed included: a program of the former definition
+discards the present message.
 
 References
 ----------
@@ -20,7 +34,7 @@ References
 .. [2] CHANGE_OPERATOR_CONTROL in MAVLink's common.xml
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from pymavlink.dialects.v20 import all as mavlink
@@ -43,14 +57,55 @@ REQUEST_OPERATOR_CONTROL: Final = 32100
 SYSTEM_MANAGER: Final = 1
 TAKEOVER_ALLOWED: Final = 2
 """GCS_CONTROL_STATUS_FLAGS."""
-INTERVAL_US: Final = 2 * US_PER_S
+INTERVAL_US: Final = US_PER_S
 TIMEOUT_US: Final = 30 * US_PER_S
+
+REQUEST: Final = 1
+RELEASE: Final = 0
+"""Actions of the command."""
+TIMEOUTS_S: Final = (3, 60)
+"""Shortest and longest timeout of a request, by which the two orders of parameters differ."""
 
 LEGACY_ACK: Final = 0
 LEGACY_DENIED: Final = 1
 LEGACY_BAD_VERSION: Final = 2
 LEGACY_TAKEN: Final = 3
 """Values of CHANGE_OPERATOR_CONTROL_ACK; 1 is "wrong passkey"."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    """A request for control, or its release, of either order of parameters."""
+
+    action: int
+    takeover: int
+    timeout_s: float
+    systems: range
+    """System ids that it may be sent by; empty for any."""
+    is_former: bool
+
+    def parameters(self, system_id: int) -> tuple[float, ...]:
+        """Return the command's parameters that pass a request of a system on."""
+        if self.is_former:
+            return (system_id, self.action, self.takeover, self.timeout_s)
+        return (self.action, self.takeover, self.timeout_s, system_id)
+
+
+def read_wanted(params: tuple[float, ...], sender: int) -> _Wanted:
+    """Read the command; where both orders are possible it is in the present one."""
+    first, second, third, fourth, fifth = map(whole, params[:5])
+    shortest, longest = TIMEOUTS_S
+    is_former = first not in (RELEASE, REQUEST) or (
+        (first, second) == (0, REQUEST)
+        and third in (0, 1)
+        and shortest <= fourth <= longest
+        and fourth != sender
+    )
+    if is_former:
+        systems = range(first, first + 1) if first else range(0)
+        return _Wanted(second, third, params[3], systems, is_former=True)
+    systems = range(fourth, max(fourth, fifth) + 1) if fourth else range(0)
+    return _Wanted(first, second, params[2], systems, is_former=False)
 
 
 @dataclass(slots=True)
@@ -60,6 +115,8 @@ class _Operator:
     received_us: int
     """When its newest message was received."""
     allows_takeover: bool
+    uses_former: bool
+    """Whether it requested control with the former order of parameters."""
 
 
 class OperatorControl(Service):
@@ -77,15 +134,18 @@ class OperatorControl(Service):
         """Return whether the sender may change things now."""
         return not self.exclusive or self._is_operator(request)
 
-    def denial(self) -> str:
+    def denial(self, request: Request) -> str:
         """Return why another station may not change things."""
         if self._operator is None:
-            return "no station is in control"
-        return f"system {self._operator.request.system_id} is in control"
+            return "no station is in control; request it first"
+        system_id = self._operator.request.system_id
+        if system_id == request.system_id:
+            return f"system {system_id} is in control by another link; request it again"
+        return f"system {system_id} is in control"
 
     def on_request(self, request: Request, now_us: int) -> None:
         """Note that a station is alive."""
-        if self._operator is not None and self._is_operator(request):
+        if self._operator is not None and self._is_operator(request) and request.may_change:
             self._operator.received_us = now_us
 
     def handle(self, request: Request, now_us: int) -> list[Answer]:
@@ -102,7 +162,7 @@ class OperatorControl(Service):
             outcome, answers = self._release(request, now_us)
             result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_DENIED
         else:
-            outcome, answers = self._request(request, now_us, allows_takeover=False)
+            outcome, answers = self._request(request, now_us)
             result = LEGACY_ACK if outcome == ACCEPTED else LEGACY_TAKEN
         ack = mavlink.MAVLink_change_operator_control_ack_message(
             request.system_id, message.control_request, result
@@ -111,26 +171,37 @@ class OperatorControl(Service):
 
     def command(self, command: Command, now_us: int) -> Outcome:
         """Carry out MAV_CMD_REQUEST_OPERATOR_CONTROL."""
-        request, (action, takeover, timeout_s, system_id) = command.request, command.params[:4]
-        if not request.may_change or whole(system_id) not in (0, request.system_id):
-            return DENIED, []
-        if whole(action) == 0:
+        request = command.request
+        wanted = read_wanted(command.params, request.system_id)
+        is_release, reason = wanted.action == RELEASE, request.reason
+        if wanted.systems and request.system_id not in wanted.systems and not is_release:
+            reason = reason or "requested for another system"
+        if reason:
+            text = f"Refused control to system {request.system_id}: {reason}"
+            return DENIED, self._explain(text, now_us)
+        if is_release:
             return self._release(request, now_us)
-        result, answers = self._request(request, now_us, allows_takeover=whole(takeover) == 1)
-        if result == FAILED and self._operator is not None:
-            operator, params = self._operator.request, (1.0, takeover, timeout_s, request.system_id)
-            notice = mavlink.MAVLink_command_long_message(
-                operator.system_id,
-                operator.component_id,
-                REQUEST_OPERATOR_CONTROL,
-                0,
-                *params,
-                0,
-                0,
-                0,
-            )
-            answers = [*answers, operator.reply(notice)]
+        result, answers = self._request(
+            request, now_us, allows_takeover=wanted.takeover == 1, uses_former=wanted.is_former
+        )
+        if result == FAILED:
+            answers = [*answers, *self._notice(request, wanted)]
         return result, answers
+
+    def _notice(self, request: Request, wanted: _Wanted) -> list[Answer]:
+        """Notify the station in control of another's request, in the order that it uses."""
+        if self._operator is None:
+            return []
+        operator = self._operator.request
+        notice = mavlink.MAVLink_command_long_message(
+            operator.system_id,
+            operator.component_id,
+            REQUEST_OPERATOR_CONTROL,
+            0,
+            *replace(wanted, is_former=self._operator.uses_former).parameters(request.system_id),
+            *(0.0, 0.0, 0.0),
+        )
+        return [operator.reply(notice)]
 
     def poll(self, now_us: int) -> list[Answer]:
         """Send CONTROL_STATUS, and release the control of a station that timed out."""
@@ -163,20 +234,30 @@ class OperatorControl(Service):
         return ControlStatus(SYSTEM_MANAGER | takeover, operator.request.system_id, b"")
 
     def _is_operator(self, request: Request) -> bool:
-        operator = self._operator
-        return operator is not None and operator.request.system_id == request.system_id
+        if self._operator is None:
+            return False
+        operator = self._operator.request
+        return (operator.client_id, operator.system_id) == (request.client_id, request.system_id)
 
-    def _request(self, request: Request, now_us: int, *, allows_takeover: bool) -> Outcome:
+    def _request(
+        self,
+        request: Request,
+        now_us: int,
+        *,
+        allows_takeover: bool = False,
+        uses_former: bool = False,
+    ) -> Outcome:
         if not self.exclusive:
             return ACCEPTED, []
         operator = self._operator
-        is_own = self._is_operator(request)
+        is_own = operator is not None and operator.request.system_id == request.system_id
         if operator is not None and not is_own and not operator.allows_takeover:
             return FAILED, self._explain(
-                f"System {request.system_id} requests control; {self.denial()}", now_us
+                f"System {request.system_id} requests control; {self.denial(request)}", now_us
             )
         text = "" if is_own else f"System {request.system_id} is in control"
-        return ACCEPTED, self._change(_Operator(request, now_us, allows_takeover), text, now_us)
+        granted = _Operator(request, now_us, allows_takeover, uses_former)
+        return ACCEPTED, self._change(granted, text, now_us)
 
     def _release(self, request: Request, now_us: int) -> Outcome:
         if not self.exclusive:

@@ -75,7 +75,7 @@ class ReadOnlyParameters(TransferService, Generic[Entry]):
         """Return whether the request is to set one."""
         return bool(request.message.get_type() == "PARAM_SET")
 
-    def refuse(self, request: Request) -> list[Answer]:
+    def refuse(self, request: Request, _result: int) -> list[Answer]:
         """Return the unchanged value."""
         return self._reject(request, FORBIDDEN)
 

@@ -6,6 +6,10 @@ are merged: at the end of the hold its state is announced if it differs from the
 announced. A flapping topic thus costs at most one text in `HOLD_US`, and the last text is always
 right. Single events that have no state go through `say`, at most `BUCKET` at once and one more
 every `REFILL_US`.
+
+One cause gives one text, and its end one more. A topic that follows from others (`CAUSES`) is
+announced as bad only after `GRACE_US` in which none of them was: a silent GPS node also takes the
+fix and then the position, and all of them recover in any order.
 """
 
 from collections import deque
@@ -18,9 +22,11 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
 from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, Answer, Reply, StatusText
-from gateway.vehicle.telemetry.health import Finding, Health, status_text
+from gateway.vehicle.telemetry.health import GPS, Finding, Health, status_text
 
 HOLD_US: Final = 5 * US_PER_S
+GRACE_US: Final = 4 * US_PER_S
+"""A cause is found a few seconds after its first consequence, and ends as long before its last."""
 BUCKET: Final = 10
 REFILL_US: Final = US_PER_S // 2
 TEXT_BYTES: Final = 50
@@ -33,7 +39,15 @@ class _Topic:
     state: object
     announced: object
     text: StatusText
+    causes: tuple[str, ...] = ()
     held_until_us: int = 0
+    """Its state is not announced before."""
+    bad_us: int = -GRACE_US - 1
+    """When it was last bad."""
+
+    @property
+    def is_bad(self) -> bool:
+        return bool(self.text.severity <= WARNING)
 
 
 class Announcer:
@@ -50,19 +64,21 @@ class Announcer:
 
     def track(self, finding: Finding, now_us: int) -> list[Answer]:
         """Note the present state of a topic, and announce it if it changed."""
-        topic, state, text = finding
+        topic, state, text, causes = finding
         known = self._topics.get(topic)
         if known is None:
             known = self._topics[topic] = _Topic(False, False, text)
-        known.state, known.text = state, text
+        was_bad = known.is_bad and known.state == state
+        known.state, known.text, known.causes = state, text, causes
+        if known.is_bad:
+            if causes and not was_bad and now_us - known.bad_us > GRACE_US:
+                known.held_until_us = max(known.held_until_us, now_us + GRACE_US)
+            known.bad_us = now_us
         if state == known.announced:
             self._pending.pop(topic, None)
             return []
-        if now_us < known.held_until_us:
-            self._pending[topic] = known
-            return []
-        self._pending.pop(topic, None)
-        return self._announce(known, now_us)
+        self._pending[topic] = known
+        return self._announce(topic, now_us)
 
     def say(self, text: StatusText, now_us: int) -> list[Answer]:
         """Announce a single event, unless there were too many recently."""
@@ -76,17 +92,27 @@ class Announcer:
         """Return the states that changed while their topics were held."""
         if not self._pending:
             return []
-        due = [name for name, topic in self._pending.items() if now_us >= topic.held_until_us]
-        return [a for name in due for a in self._announce(self._pending.pop(name), now_us)]
+        return [a for name in tuple(self._pending) for a in self._announce(name, now_us)]
 
     def next_due_us(self) -> int | None:
         """Return when `poll` has something to announce."""
         return min((topic.held_until_us for topic in self._pending.values()), default=None)
 
-    def _announce(self, topic: _Topic, now_us: int) -> list[Answer]:
+    def _announce(self, name: str, now_us: int) -> list[Answer]:
+        """Announce a pending topic, unless it is held or follows from another."""
+        topic = self._pending[name]
+        if now_us < topic.held_until_us:
+            return []
+        if topic.is_bad and any(self._is_bad(cause) for cause in topic.causes):
+            topic.held_until_us = now_us + GRACE_US
+            return []
+        del self._pending[name]
         topic.announced = topic.state
         topic.held_until_us = now_us + HOLD_US
         return chunks(topic.text, self._number())
+
+    def _is_bad(self, name: str) -> bool:
+        return name in self._topics and self._topics[name].is_bad
 
     def _number(self) -> int:
         self._next_id = self._next_id % 0xFFFF + 1
@@ -132,9 +158,15 @@ FLAG_TEXTS: Final[FlagTexts] = (
     ),
     (NavFlags.MAG_DISTURBED, "Magnetic field disturbed", "Magnetic field normal again"),
     (NavFlags.SENSOR_FAULT, "Sensor fault", "Sensors OK again"),
-    (NavFlags.DEGRADED, "Estimator degraded", "Estimator OK again"),
 )
-"""Of the estimator."""
+"""Of the estimator. DEGRADED only repeats one of the others."""
+CAUSES: Final[dict[NavFlags | ImuFlags, tuple[str, ...]]] = {
+    NavFlags.ATTITUDE_VALID: ("SENSOR_FAULT",),
+    NavFlags.HEADING_VALID: ("ATTITUDE_VALID", "SENSOR_FAULT", "MAG_DISTURBED", "MAG_MISPLACED"),
+    NavFlags.MAG_DISTURBED: ("MAG_MISPLACED",),
+    NavFlags.DEAD_RECKONING: ("GPS", "GPS_REJECTED"),
+}
+"""Topics that a flag may follow from."""
 GOOD_FLAGS: Final = (NavFlags.ATTITUDE_VALID, NavFlags.HEADING_VALID)
 GPS_FIX: Final = Finding("GPS", True, StatusText(INFO, "GPS fix"))
 GPS_LOST: Final = Finding("GPS", False, StatusText(WARNING, "GPS fix lost"))
@@ -146,6 +178,7 @@ CALIBRATION_TEXTS: Final[FlagTexts] = (
 UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
 INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
 
+LATENCY_PARAMETER: Final = "REF_GPS_LATENCY"
 LATENCY_SETTLED_US: Final = 5_000_000
 """A latency that has not changed for so long has converged."""
 RESTART_REPORTS: Final = 10
@@ -190,13 +223,18 @@ class Announcements(Announcer):
                 severity = CRITICAL if flag is NavFlags.SENSOR_FAULT else WARNING
                 bad, good = (fallen, raised) if is_good else (raised, fallen)
                 text = status_text(is_raised != is_good, bad, good, severity)
-                found.append(Finding(str(flag.name), is_raised, text))
+                causes = CAUSES.get(flag, ())
+                found.append(Finding(str(flag.name), is_raised, text, causes))
         return self.on_findings(found, now_us)
 
     def on_fix(self, now_us: int) -> list[Answer]:
         """Announce whether GPS fixes arrive."""
-        finding = GPS_FIX if self._health.has_fix(now_us) else GPS_LOST
-        return self.track(finding, now_us)
+        if self._health.has_fix(now_us):
+            return self.track(GPS_FIX, now_us)
+        causes: tuple[str, ...] = ()
+        if not self._health.is_alive(GPS, now_us):
+            causes = ("link", *(f"node {number}" for number in self._health.gps_nodes()))
+        return self.track(GPS_LOST._replace(causes=causes), now_us)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Answer]:
         """Announce once that the estimated latency of fixes differs from the setting.
@@ -207,7 +245,7 @@ class Announcements(Announcer):
             self._latency_s, self._latency_since_us = used_s, now_us
         if used_s == set_s or now_us - self._latency_since_us < LATENCY_SETTLED_US:
             return []
-        text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set gps_latency_s"
+        text = f"GPS is {used_s:.2f} s late, not {set_s:.2f}: set {LATENCY_PARAMETER}"
         finding = Finding("latency", f"{set_s} s is wrong", StatusText(NOTICE, text))
         return self.track(finding, now_us)
 

@@ -59,6 +59,8 @@ class Finding(NamedTuple):
     state: object
     """False at the start."""
     text: StatusText
+    causes: tuple[str, ...] = ()
+    """Topics that it follows from, if one of them is bad."""
 
 
 def status_text(is_bad: bool, bad: str, good: str, severity: int = WARNING) -> StatusText:
@@ -130,8 +132,6 @@ NODE_SENSORS: Final = (
     (NODE_GPS, GPS),
 )
 """Bits of NodeStatus' masks, and the sensors they stand for."""
-
-BAD_FOR_AHRS: Final = NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
 
 
 class Health:
@@ -287,8 +287,9 @@ class Health:
             healthy &= ~GPS
         if present & GYRO:
             present |= AHRS
-            if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID:
-                healthy |= 0 if self._nav_flags & BAD_FOR_AHRS else AHRS
+            is_faulty = self._nav_flags & NavFlags.SENSOR_FAULT
+            if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID and not is_faulty:
+                healthy |= AHRS
         present |= LOGGING | PREARM
         # There is no fence, so none is breached; MAVProxy reports a breach without this bit.
         healthy |= GEOFENCE
@@ -378,6 +379,10 @@ class Health:
     def restarts(self) -> dict[int, int]:
         """Return how often each node has restarted."""
         return {link.node.node_id: link.restarts for link in self._links}
+
+    def gps_nodes(self) -> list[int]:
+        """Return the nodes that have reported a GPS receiver."""
+        return [s.node.node_id for s in self.statuses if s.sensors_present & NODE_GPS]
 
     def known_nodes(self) -> frozenset[int]:
         """Return the nodes that have sent a payload."""

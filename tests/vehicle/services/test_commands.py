@@ -4,13 +4,14 @@ No acknowledgement of a recording says more than is true.
 """
 
 import math
+import struct
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gateway.vehicle.plan import Location
-from gateway.vehicle.requests import MAX_ENTRIES, RecordingRequest
+from gateway.vehicle.requests import MAX_ENTRIES, NOT_TRUSTED, RecordingRequest
 from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock
@@ -184,8 +185,8 @@ def test_each_station_that_starts_a_recording_gets_its_own_answer(station: Groun
         ),
         (
             ftp_request(4, b"/nothing"),
-            "FILE_TRANSFER_PROTOCOL opcode 4 /nothing",
-            "FTP error 10",
+            "FILE_TRANSFER_PROTOCOL OPENFILERO /nothing",
+            "FILENOTFOUND",
         ),
         (
             mavlink.MAVLink_set_home_position_message(1, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
@@ -215,7 +216,39 @@ def test_only_failed_requests_are_logged(station: GroundStation) -> None:
     station.trusted = False
     station.set_parameter("RATE_ATT", 7.0)
     [entry] = station.vehicle.requests.entries
-    assert (entry.request, entry.outcome) == ("PARAM_SET RATE_ATT", "refused: not trusted")
+    assert (entry.request, entry.outcome) == ("PARAM_SET RATE_ATT", f"refused: {NOT_TRUSTED}")
+
+
+def ftp(opcode: int, data: bytes = b"", offset: int = 0) -> Any:
+    """Return a request of the file transfer; sessions are 0."""
+    payload = struct.pack("<HBBBBBBI", 1, 0, opcode, len(data), 0, 0, 0, offset) + data
+    return mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload.ljust(251, b"\0"))
+
+
+@pytest.mark.parametrize(
+    ("message", "logged"),
+    [
+        (ftp(mavlink.MAV_FTP_OPCODE_LISTDIRECTORY, b"/", offset=1000), []),
+        (ftp(mavlink.MAV_FTP_OPCODE_TERMINATESESSION), []),
+        (
+            ftp(mavlink.MAV_FTP_OPCODE_OPENFILERO, b"/none"),
+            [("FILE_TRANSFER_PROTOCOL OPENFILERO /none", "FILENOTFOUND")],
+        ),
+        (mavlink.MAVLink_log_request_end_message(1, 1), []),
+        (mavlink.MAVLink_command_ack_message(32100, 0, 0, 0, 1, 1), []),
+        (
+            mavlink.MAVLink_rc_channels_override_message(1, 1, *[1500] * 8),
+            [("RC_CHANNELS_OVERRIDE", "no answer")],
+        ),
+    ],
+    ids=["end of list", "end of session", "no such file", "end of logs", "answer", "joystick"],
+)
+def test_normal_end_of_a_protocol_is_no_failed_request(
+    station: GroundStation, message: Any, logged: list[tuple[str, str]]
+) -> None:
+    station.send(message)
+    found = [(entry.request, entry.outcome) for entry in station.vehicle.requests.entries]
+    assert found == logged
 
 
 def test_request_log_is_bounded_and_keeps_the_newest(station: GroundStation) -> None:

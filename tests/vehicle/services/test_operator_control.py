@@ -4,13 +4,14 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming
+from gateway.vehicle.requests import NOT_TRUSTED
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock
 from tests.kit.ground_station import GroundStation, command, decode, kinds, results, texts
 
 REQUEST_CONTROL = 32100
-ACCEPTED, DENIED, FAILED = 0, 2, 4
+ACCEPTED, DENIED, FAILED, NOT_IN_CONTROL = 0, 2, 4, 10
 RELEASE, REQUEST = 0, 1
 
 
@@ -108,7 +109,7 @@ def test_control_status_is_sent_regularly_and_at_every_change(first: GroundStati
     assert statuses(first)[-1] == (3, 255)
     before = len(statuses(first))
     first.wait(20.0)
-    assert len(statuses(first)) - before == pytest.approx(10, abs=1)
+    assert len(statuses(first)) - before == pytest.approx(20, abs=1)
 
 
 def test_control_status_is_not_sent_while_control_is_open(station: GroundStation) -> None:
@@ -141,3 +142,114 @@ def test_untrusted_client_cannot_take_control_or_act_for_another(
     assert control(second) == DENIED
     second.trusted = True
     assert results(second.command(REQUEST_CONTROL, REQUEST, 0, 10, 255)) == [DENIED]
+
+
+FORMER = (0.0, 1.0, 0.0, 10.0)
+"""Request of a definition before 2026-04-15: sender or 0, action, takeover, timeout."""
+
+
+@pytest.mark.parametrize(
+    ("params", "result", "takeover"),
+    [
+        ((1, 0, 10, 255), ACCEPTED, False),
+        ((1, 1, 10, 255), ACCEPTED, True),
+        ((1, 1, 10, 0), ACCEPTED, True),
+        ((1, 0, 10, 250, 255), ACCEPTED, False),
+        ((1, 0, 10, 1, 250), DENIED, False),
+        ((1, 0, 10, 254), DENIED, False),
+        (FORMER, ACCEPTED, False),
+        ((0, 1, 1, 60), ACCEPTED, True),
+        ((255, 1, 1, 3), ACCEPTED, True),
+        ((254, 1, 1, 3), DENIED, False),
+    ],
+    ids=str,
+)
+def test_request_of_either_definition_is_understood(
+    first: GroundStation, params: tuple[float, ...], result: int, takeover: bool
+) -> None:
+    assert results(first.command(REQUEST_CONTROL, *params)) == [result]
+    assert changes(first) == (result == ACCEPTED)
+    if result == ACCEPTED:
+        assert statuses(first)[-1] == (3 if takeover else 1, 255)
+
+
+@pytest.mark.parametrize(
+    "params",
+    [(0, 0, 0, 255), (0, 0, 0, 0), (0, 1, 0, 255), (0, 1, 30, 255), (0, 0, 0, 10)],
+    ids=str,
+)
+def test_release_of_either_definition_is_understood(
+    first: GroundStation, params: tuple[float, ...]
+) -> None:
+    control(first)
+    assert results(first.command(REQUEST_CONTROL, *params)) == [ACCEPTED]
+    assert not changes(first)
+
+
+def test_request_that_both_definitions_allow_is_read_by_the_present_one(
+    first: GroundStation,
+) -> None:
+    """System 10 releases control; formerly this was a request with a timeout of 10 s."""
+    tenth = first.other(system_id=10)
+    control(tenth)
+    assert results(tenth.command(REQUEST_CONTROL, 0, 1, 0, 10)) == [ACCEPTED]
+    assert not changes(tenth)
+
+
+@pytest.mark.parametrize(
+    ("request_of_first", "params"), [(FORMER, (254, 1, 1, 20)), ((1, 0, 10, 255), (1, 1, 20, 254))]
+)
+def test_station_in_control_is_notified_in_its_own_order(
+    first: GroundStation,
+    second: GroundStation,
+    request_of_first: tuple[float, ...],
+    params: tuple[float, ...],
+) -> None:
+    first.command(REQUEST_CONTROL, *request_of_first)
+    frame = second.frame(command(REQUEST_CONTROL, REQUEST, 1, 20, 254))
+    actions = second.vehicle.handle(Incoming(second.client_id, frame, trusted=True), 0)
+    [notice] = decode(a for a in actions if a.client_id == first.client_id)
+    assert (notice.param1, notice.param2, notice.param3, notice.param4) == params
+    first.send(mavlink.MAVLink_command_ack_message(REQUEST_CONTROL, 0, 0, 0, 1, 1))
+    assert "no answer" not in [entry.outcome for entry in first.vehicle.requests.entries]
+
+
+def test_command_of_a_station_without_control_is_answered_with_the_reason(
+    first: GroundStation, second: GroundStation
+) -> None:
+    control(first)
+    found = second.command(mavlink.MAV_CMD_LOGGING_START)
+    assert results(found) == [NOT_IN_CONTROL]
+    assert texts(found) == ["Refused LOGGING_START of system 254: system 255 is in control"]
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_heartbeats_of_another_client_with_the_same_id_do_not_keep_control(
+    first: GroundStation, trusted: bool
+) -> None:
+    control(first)
+    other = first.other(system_id=255, trusted=trusted)
+    reported = []
+    for _ in range(33):
+        other.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3))
+        reported += texts(other.wait(1.0))
+    assert "System 255 lost control: timeout" in reported
+
+
+def test_station_uses_control_by_the_link_that_requested_it_last(first: GroundStation) -> None:
+    control(first)
+    other = first.other(system_id=255)
+    found = other.command(mavlink.MAV_CMD_LOGGING_START)
+    assert results(found) == [NOT_IN_CONTROL]
+    assert "by another link; request it again" in texts(found)[0]
+    assert control(other) == ACCEPTED
+    assert changes(other)
+    assert not changes(first)
+
+
+def test_refused_request_of_control_has_a_reason(
+    first: GroundStation, second: GroundStation
+) -> None:
+    second.trusted = False
+    found = second.command(REQUEST_CONTROL, REQUEST, 0, 10, 254)
+    assert texts(found) == [f"Refused control to system 254: {NOT_TRUSTED}"]
