@@ -38,7 +38,7 @@ def check_output(
         if read is not None and read.exists() and os.path.samestat(read.stat(), path.stat()):
             raise OSError(errno.EINVAL, "is what the output is made of; name another", str(path))
     if not stat.S_ISREG(there.st_mode):
-        raise OSError(errno.EINVAL, "is no regular file, and is not replaced", str(path))
+        raise OSError(errno.EINVAL, "is not a regular file, and is not replaced", str(path))
     if not overwrite:
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     _check_writable(path, path.parent)
@@ -54,7 +54,7 @@ def check_folder(path: Path, *, overwrite: bool = False) -> None:
     """Check that files may be written into a folder; raises OSError as `check_output`."""
     there = next(each for each in (path, *path.parents) if each.exists() or each.is_symlink())
     if not there.is_dir():
-        raise OSError(errno.ENOTDIR, "is no folder", str(there))
+        raise OSError(errno.ENOTDIR, "is not a folder", str(there))
     if there == path and not overwrite and any(path.iterdir()):
         raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
     _check_writable(path, there)

@@ -220,8 +220,10 @@ class Pipeline:
         """
         wanted = [a for a in self.aircraft.values() if vehicle_id in (None, a.vehicle_id)]
         if not wanted:
-            heard = ", ".join(str(known) for known in sorted(self.aircraft)) or "none yet"
-            raise ValueError(f"no such aircraft; heard so far: {heard}")
+            if not self.aircraft:
+                raise ValueError("no aircraft received yet")
+            known = ", ".join(map(str, sorted(self.aircraft)))
+            raise ValueError(f"no aircraft {vehicle_id}; received: {known}")
         out = Outputs()
         for aircraft in wanted:
             aircraft.perform(aircraft.vehicle.put_mark(location, now_us), now_us, out)

@@ -2,6 +2,7 @@
 
 import logging
 import os
+from collections.abc import Iterable
 from typing import Final
 
 
@@ -98,10 +99,19 @@ def reason_of(error: Exception) -> str:
     )
 
 
-def receiver_state(connected: bool, bytes_received: int, frames: int) -> str:
+def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
+    """Return the text for a word that is none of the allowed ones."""
+    return f"unknown {what} {word!r}; choose {', '.join(choices)}"
+
+
+def receiver_state(port: str, connected: bool, bytes_received: int, frames: int) -> str:
     """Describe the receiver's port: a wrong device or speed is open, too, and sends no frames."""
     if not connected:
-        return "not connected"
+        return f"receiver: not connected (serial.port = {port})"
+    return f"receiver: {port} {_reception(bytes_received, frames)}"
+
+
+def _reception(bytes_received: int, frames: int) -> str:
     if frames:
         return "connected"
     if bytes_received < FEW_BYTES:

@@ -188,6 +188,18 @@ class RadioState(IntEnum):
                 return ""
 
 
+NODE_IMU: Final = 1 << 0
+NODE_GPS: Final = 1 << 3
+"""Bits of `NodeStatus.sensors_present`."""
+
+
+def node_role(sensors_present: int) -> str:
+    """Name a node's role by its sensors."""
+    if sensors_present & NODE_IMU:
+        return "IMU node"
+    return "GPS node" if sensors_present & NODE_GPS else "Node"
+
+
 class NodeStatus(msgspec.Struct, frozen=True, gc=False):
     """A node's own once-a-second report."""
 

@@ -23,6 +23,8 @@ class RecorderStatus:
     state: str
     name: str
     part: int
+    duration_s: float
+    """Of the recording so far, or of the last one."""
     part_bytes: int
     free_bytes: int
     reason: str
@@ -111,10 +113,11 @@ def _seen_from(here: Location | None, there: Location | None) -> RelativeLocatio
 def summary_line(snapshot: Snapshot) -> str:
     """Summarise a snapshot in one line for a log."""
     report = snapshot.report
-    receiver = receiver_state(report.connected, report.bytes_received, report.frames)
-    parts = [f"receiver {report.port} {receiver}"]
+    received = report.bytes_received, report.frames
+    parts = [receiver_state(report.port, report.connected, *received)]
     parts += [
-        f"node {node.node.vehicle_id}.{node.node.node_id} {node.rate_hz:.0f} Hz {node.lost} lost"
+        f"aircraft {node.node.vehicle_id} board {node.node.node_id} {node.rate_hz:.0f} Hz "
+        f"{node.lost} lost"
         for node in report.nodes
     ]
     for vehicle_id, state in snapshot.states:

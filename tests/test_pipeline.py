@@ -187,7 +187,7 @@ def test_mark_gives_distance_and_bearing(pipeline: Pipeline) -> None:
 
 
 @pytest.mark.parametrize(
-    ("lat_deg", "vehicle_id", "reason"), [(91.0, 1, "91"), (0.0, 7, "heard so far: 1")]
+    ("lat_deg", "vehicle_id", "reason"), [(91.0, 1, "91"), (0.0, 7, "no aircraft 7; received: 1")]
 )
 def test_invalid_marks_are_rejected(
     pipeline: Pipeline, lat_deg: float, vehicle_id: int, reason: str

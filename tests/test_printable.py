@@ -82,7 +82,7 @@ def test_line_feed_in_a_logged_text_cannot_imitate_a_log_line() -> None:
 @pytest.mark.parametrize(
     ("connected", "received", "frames", "text"),
     [
-        (False, 0, 0, "not connected"),
+        (False, 0, 0, "receiver: not connected (serial.port = auto)"),
         (True, 0, 0, "connected, silent"),
         (True, 5000, 90, "connected"),
         (True, 5000, 0, "serial.baud"),
@@ -91,6 +91,6 @@ def test_line_feed_in_a_logged_text_cannot_imitate_a_log_line() -> None:
 def test_port_without_frames_is_described(
     connected: bool, received: int, frames: int, text: str
 ) -> None:
-    state = receiver_state(connected, received, frames)
+    state = receiver_state("auto", connected, received, frames)
     assert text in state
-    assert (state == "connected") == (frames > 0)
+    assert (state == "receiver: auto connected") == (frames > 0)

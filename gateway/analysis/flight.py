@@ -259,7 +259,7 @@ def flight_of_blocks(
 
     samples = samples_of(noted(), calibration)
     if len(samples.imu) < 2:
-        raise ValueError(f"{name}: {len(samples.imu)} IMU samples are no flight")
+        raise ValueError(f"{name}: {len(samples.imu)} IMU samples are not a flight")
     flight = Flight(name, description, fusion, samples, np.ones(len(samples.imu), np.bool_))
     flight = replace(flight, scored=_settled(flight))
     raw = np.concatenate(counts)
@@ -336,11 +336,11 @@ def track_of(time_us: IntArray, states: FloatArray) -> FlightTrack:
 def judged_by(flight: Flight, blocks: Iterable[TableBlock], name: str) -> Flight:
     """Take the states of a recording as a flight's reference.
 
-    Raises ValueError if the recording holds no state.
+    Raises ValueError if the recording contains no state.
     """
     states = [block.cells[has_group(block.cells, NAV)][:, NAV] for block in blocks]
     if not sum(map(len, states)):
-        raise ValueError(f"{name}: holds no states to judge by")
+        raise ValueError(f"{name}: contains no states to judge by")
     track = at_times(_track_of_cells(np.concatenate(states)), flight.time_us)
     return replace(
         flight, reference=Reference(track, is_exact=False, description=f"the states in {name}")

@@ -81,7 +81,7 @@ def parse_axis(name: str, text: str) -> Axis:
     except ValueError as error:
         raise SweepError(f"{name}: {text!r} is no low:high:count and no list: {error}") from error
     if not values:
-        raise SweepError(f"{name}: {text!r} holds no value")
+        raise SweepError(f"{name}: {text!r} contains no value")
     for value in values:
         with_value(FusionSettings(), key, value)
     return Axis(key, values)

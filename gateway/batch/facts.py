@@ -332,7 +332,7 @@ class TableTally:
         self._nodes[status.node.node_id] = status
 
     def flown(self, header: TableHeader | None) -> list[Flown]:
-        """Return the one flight of the table; none if it holds no row."""
+        """Return the one flight of the table; none if it contains no row."""
         first_us = self._span.first_us
         if first_us is None:
             return []

@@ -75,7 +75,7 @@ class EstimationSettings(Settings, frozen=True):
         """Raise ValueError if there is no such estimator."""
         if self.estimator not in ESTIMATORS:
             known = ", ".join(ESTIMATORS)
-            raise ValueError(f"estimator is {self.estimator!r}, which is none of {known}")
+            raise ValueError(f"unknown estimator {self.estimator!r}; choose {known}")
 
 
 def make_estimator(settings: EstimationSettings) -> Estimator:

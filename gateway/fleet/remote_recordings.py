@@ -55,7 +55,7 @@ class RemoteRecordings:
 
     async def _ask_one(self, site: str, query: RecordingQuery, timeout_s: float) -> bytes | None:
         if not SITE_NAME.fullmatch(site):
-            raise ControlError(f"{site!r} is no name of a site")
+            raise ControlError(f"{site!r} is not the name of a site")
         return (await self._query(site, query, timeout_s)).get(site)
 
     async def _query(self, site: str, query: RecordingQuery, timeout_s: float) -> dict[str, bytes]:

@@ -44,6 +44,7 @@ from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
+from gateway.printable import unknown_choice
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
 
@@ -311,7 +312,7 @@ def _kind_and_rest(address: str) -> tuple[str, str]:
         return word, rest
     word, rest = respell(address)
     if word not in set(EndpointKind):
-        raise ValueError(f"{word!r} is none of {', '.join([*EndpointKind, *sorted(ADDED_KINDS)])}")
+        raise ValueError(unknown_choice("kind", word, [*EndpointKind, *sorted(ADDED_KINDS)]))
     return EndpointKind(word), rest
 
 
@@ -362,7 +363,7 @@ def _options(kind: str, query: str) -> dict[str, str]:
     options: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:
-            raise ValueError(f"option {key!r} is none of {', '.join(sorted(known))}")
+            raise ValueError(unknown_choice("option", key, sorted(known)))
         if key in options:
             raise ValueError(f"option {key!r} is given twice")
         if ";" in value:
@@ -391,7 +392,7 @@ def _origins(text: str) -> frozenset[str]:
 
 def _check_fleet(site: str, keys: str) -> None:
     if keys not in (SITE_KEYS, RAW_KEYS, JSON_KEYS):
-        raise ValueError(f"keys {keys!r} is none of {SITE_KEYS}, {RAW_KEYS}, {JSON_KEYS}")
+        raise ValueError(unknown_choice("keys", keys, (SITE_KEYS, RAW_KEYS, JSON_KEYS)))
     if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):
         raise ValueError(f"site {site!r}: it needs ?site=NAME of letters, digits, . _ and -")
 

@@ -21,7 +21,7 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
-from gateway.printable import PrintableFormatter
+from gateway.printable import PrintableFormatter, receiver_state
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.status import (
     UNKNOWN,
@@ -167,9 +167,9 @@ class _Grid:
 def _link_line(snapshot: Snapshot) -> Text:
     report = snapshot.report
     up = f"{snapshot.time_us // US_PER_S // 60}:{snapshot.time_us // US_PER_S % 60:02d}"
-    line = Text(f"mavgate  up {up}  receiver ")
-    state = ("connected", "green") if report.connected else ("not connected", "red")
-    line.append(f"{report.port} {state[0]}", style=state[1])
+    line = Text(f"up {up}  ")
+    state = receiver_state(report.port, report.connected, report.bytes_received, report.frames)
+    line.append(state, style="green" if report.connected else "red")
     line.append(f"  serial {counted(report.frames, 'frame')}, {report.frames_lost} lost")
     for kind, count in report.faults:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
@@ -196,7 +196,7 @@ def _recorder_line(recorder: RecorderStatus | None) -> list[Text]:
 
 def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
     """Show radio, supply in V, bus errors, failed and repeated sends, overruns, firmware."""
-    heads = ("Hz", "lost", "lost %", "age s", "supply", "bus", "unsent", "resent", "over")
+    heads = ("Hz", "lost %", "age s", "V", "bus", "TX failed", "retries", "overruns")
     grid = _Grid("node", *heads, "restarts", "fw")
     for node in report.nodes:
         pipes = report.receiver.pipes if report.receiver is not None else ()
@@ -205,7 +205,6 @@ def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
         grid.add_row(
             f"{node.node.vehicle_id}.{node.node.node_id}",
             f"{node.rate_hz:.0f}",
-            str(node.lost),
             f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
             _age(report.time_us, node.last_time_us),
             *_board_cells(boards.get(node.node), overruns, node),

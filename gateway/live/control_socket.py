@@ -300,7 +300,7 @@ def request(
 def _plain(value: object) -> object:
     if isinstance(value, Path):
         return str(value)
-    raise NotImplementedError(f"{type(value).__name__} is no JSON")
+    raise NotImplementedError(f"{type(value).__name__} is not JSON")
 
 
 SOCKETS: Final = Path("/proc/self/net/unix")

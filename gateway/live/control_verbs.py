@@ -69,7 +69,8 @@ class RecorderVerbs:
     def _note(self, text: str) -> RecorderStatus:
         if not text.strip():
             raise ControlError("the note is empty: describe what happens now")
-        self._recorder.mark(text)
+        if not self._recorder.mark(text):
+            raise ControlError("sent to the ground stations, but in no file: nothing is recorded")
         return self._recorder.status()
 
 
@@ -127,7 +128,7 @@ class SerialVerbs:
         known = {"auto", self._own, *(each.device for each in ports)}
         if port not in known:
             raise ControlError(
-                f"{port!r} is no serial port of this machine; there are {', '.join(sorted(known))}"
+                f"{port!r} is not a serial port here; there are {', '.join(sorted(known))}"
             )
         await self._port.connect(port)
         return self._port.status(ports)

@@ -158,11 +158,12 @@ class Recorder:
         """Note take-off or landing."""
         self._session.set_in_flight(in_flight)
 
-    def mark(self, text: str) -> None:
-        """Add a remark to the recording at this moment."""
+    def mark(self, text: str) -> bool:
+        """Send a note, and add it to the recording at this moment; return whether one runs."""
         if self._part is not None:
             self._part.add_mark(TableMark(self._clock(), text))
         self._announce(False, REMARK + text)
+        return self._part is not None
 
     async def save(self, name: str) -> None:
         """Rename the present or last session.
@@ -190,6 +191,7 @@ class Recorder:
             state=session.state.value,
             name=session.name,
             part=session.part,
+            duration_s=session.duration_s,
             part_bytes=disk.part_bytes,
             free_bytes=disk.free_bytes,
             reason=session.reason,

@@ -161,6 +161,12 @@ class Session:
         self.part = 0
         self.reason = ""
         """Why it is blocked."""
+        self._begin_us = self._end_us = 0
+
+    @property
+    def duration_s(self) -> float:
+        """How long the session has recorded, or did."""
+        return (self._end_us - self._begin_us) / US_PER_S
 
     @property
     def wanted(self) -> bool:
@@ -190,6 +196,8 @@ class Session:
         """Note that the files of the part are open."""
         self.state, self._opened_us = SessionState.RECORDING, now_us
         resumed, self.reason = bool(self.reason), ""
+        if self.part == 1:
+            self._begin_us = self._end_us = now_us
         if self.part == 1 or resumed:
             return [Announce(is_trouble=False, text=f"Recording {self.name}")]
         return []
@@ -226,6 +234,7 @@ class Session:
     def _poll_recording(
         self, now_us: int, part_bytes: int, free_bytes: int, *, jumped: bool
     ) -> list[SessionAction]:
+        self._end_us = now_us
         if not self.wanted:
             self.state = SessionState.IDLE
             return [ClosePart(), Announce(is_trouble=False, text=f"Recording {self.name} ended")]

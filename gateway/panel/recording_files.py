@@ -125,7 +125,7 @@ def open_regular(path: Path) -> BinaryIO:
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise OSError(f"{path} is no regular file")
+        raise OSError(f"{path} is not a regular file")
     return os.fdopen(handle, "rb")
 
 
@@ -174,7 +174,7 @@ def _recording_name(name: str, path: Path) -> str:
     suffix = KINDS.get(_kind(path))
     if suffix is None:
         allowed = " and ".join(str(kind) for kind in KINDS)
-        raise ValueError(f"this is no recording: {allowed} are taken")
+        raise ValueError(f"this unknown file format: {allowed} are taken")
     return f"{name}{suffix}"
 
 

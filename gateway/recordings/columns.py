@@ -433,7 +433,7 @@ def _faults(cells: FloatArray) -> dict[int, str]:
     whole, is_empty = cells[:, _WHOLE], np.isnan(cells)
     is_sound = is_empty[:, _WHOLE] | ((np.abs(whole) <= LARGEST_WHOLE) & (whole == np.trunc(whole)))
     for row, k in np.argwhere(~is_sound).tolist():
-        text = f"{COLUMNS[_WHOLE[k]]}: {whole[row, k]:.17g} is no whole number that can be"
+        text = f"{COLUMNS[_WHOLE[k]]}: {whole[row, k]:.17g} is not a whole number that can be"
         found.setdefault(row, text)
     for first, needed in _NEEDED:
         is_there = ~is_empty[:, [first]] if first else True
@@ -441,7 +441,7 @@ def _faults(cells: FloatArray) -> dict[int, str]:
             found.setdefault(row, f"{COLUMNS[needed[k]]} is empty")
     fix_types = cells[:, FIX_TYPE]
     for row in np.flatnonzero((fix_types < 0) | (fix_types > max(GpsFixType))).tolist():
-        found.setdefault(row, f"{COLUMNS[FIX_TYPE]}: {fix_types[row]:.0f} is no type of a fix")
+        found.setdefault(row, f"{COLUMNS[FIX_TYPE]}: {fix_types[row]:.0f} is not a type of fix")
     return found
 
 

@@ -182,10 +182,10 @@ def _packaged(module: str, name: str) -> Write:
 
 
 NOT_FUSED: Final = "raw samples, settings and the states' digits"
-NOT_IN_TABLE: Final = "what is no sample, fix or state of one vehicle"
+NOT_IN_TABLE: Final = "all but samples, fixes and states of one vehicle"
 NOT_DRAWN: Final = (
     "samples, velocities and settings",
-    "MAVLink messages, only positions, attitude and texts",
+    "all MAVLink messages but positions, attitude and texts",
 )
 
 add_writer(

@@ -69,7 +69,9 @@ Progress = Callable[[int], None]
 Position = Literal["causal", "interpolated"]
 SettingsChoice = Literal["recorded", "current"]
 
-NO_RECORDING: Final = "is no recording: it holds neither MAVLink nor a table of mavgate's"
+NO_RECORDING: Final = (
+    "unknown file format; readable: tlog, raw MAVLink, CSV, ULog, DataFlash, MCAP, Parquet"
+)
 
 
 class FlightError(UserError):
@@ -133,7 +135,8 @@ def format_of(path: Path) -> str:
     is_binary = b"\0" in first or b"\xfd" in first or b"\xfe" in first
     is_binary |= has_frames and b"\0" in head
     has_cells = any(delimiter in first for delimiter in (b",", b";", b"\t"))
-    return CSV if has_cells and not is_binary else TLOG
+    is_markup = head.lstrip()[:1] in (b"{", b"[", b"<")  # JSON, HTML and other XML
+    return CSV if has_cells and not is_binary and not is_markup else TLOG
 
 
 def first_bytes(path: Path) -> bytes:

@@ -41,11 +41,11 @@ class RecordingError(UserError, ValueError):
 def check_name(name: str) -> str:
     """Check the name under which a user saves a session."""
     if name == NEWEST:
-        raise ValueError(f"{name!r} is no name for a recording: it always means the newest")
+        raise ValueError(f"{name!r} is not a name for a recording: it always means the newest")
     sound = all(c.isalnum() or c in " .-_" for c in name) and len(name.encode()) <= MAX_NAME
     if not sound or not name[:1].isalnum() or name.endswith((" ", ".")):
         raise ValueError(
-            f"{name!r} is no name for a recording: at most {MAX_NAME} letters, digits, spaces, "
+            f"{name!r} is not a name for a recording: at most {MAX_NAME} letters, digits, spaces, "
             "dots, hyphens and underscores, beginning with a letter or digit"
         )
     return name
@@ -55,7 +55,7 @@ def part_of(path: Path) -> int:
     """Return which part of its recording a file is; raises ValueError if it is not one."""
     match = _FILE_NAME.fullmatch(path.name)
     if match is None:
-        raise ValueError(f"{path} is no part of a recording")
+        raise ValueError(f"{path} is not part of a recording")
     return int(match["part"])
 
 

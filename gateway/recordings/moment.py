@@ -8,6 +8,7 @@ from typing import Final
 from gateway.units import US_PER_S
 
 MAX_TEXT: Final = 40
+USE: Final = "use 80, 1:20 or 2026-06-11T14:25:30Z"
 _CLOCK: Final = re.compile(r"([+-]?)(?:(\d+):)?(?:(\d+):)?(\d+(?:\.\d*)?|\.\d+)\s*s?")
 
 
@@ -25,7 +26,7 @@ class Moment:
 def parse_moment(text: str) -> Moment:
     """Read a moment; raises ValueError if it is none of these."""
     if len(text) > MAX_TEXT:
-        raise ValueError(f"a moment of {len(text)} letters; write 80, 1:20 or a date and time")
+        raise ValueError(f"invalid time of {len(text)} letters; {USE}")
     if match := _CLOCK.fullmatch(text.strip()):
         sign, first, second, seconds = match.groups()
         hours, minutes = (first, second) if second is not None else ("0", first or "0")
@@ -34,9 +35,7 @@ def parse_moment(text: str) -> Moment:
     try:
         moment = datetime.fromisoformat(text.strip())
     except ValueError as error:
-        raise ValueError(
-            f"{text!r} is no moment: write 80, 1:20, 1:02:03, +10, -0:30 or 2026-06-11T14:25:30Z"
-        ) from error
+        raise ValueError(f"invalid time {text!r}; {USE}") from error
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
     return Moment(time_us=round(moment.timestamp() * US_PER_S))

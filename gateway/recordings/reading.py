@@ -153,7 +153,7 @@ def is_table(path: Path) -> bool:
 def open_rows(path: Path, options: ReadOptions) -> RecordedTable:
     """Open any file that holds a flight as a table.
 
-    Raises FlightError if it holds no flight that can be read; OSError if it cannot be read at
+    Raises FlightError if it contains no flight that can be read; OSError if it cannot be read at
     all.
     """
     return READERS[format_of(path)](path, options)
@@ -215,7 +215,7 @@ def read_column_map(path: Path) -> ColumnMap:
     except OSError as error:
         raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise FlightError(f"{path}: is no column map: {error}") from error
+        raise FlightError(f"{path}: is not a column map: {error}") from error
 
 
 def csv_reader(options: ReadOptions) -> CsvReader:
@@ -233,7 +233,7 @@ def _lines(path: Path, progress: Progress | None) -> Iterator[str]:
         number += len(lines)
         if len(rest) > MAX_LINE:
             raise FlightError(
-                f"{path}: line {number + 1} is longer than {MAX_LINE >> 20} MB; it is no CSV"
+                f"{path}: line {number + 1} is longer than {MAX_LINE >> 20} MB; it is not a CSV"
             )
     if rest := rest + decoder.decode(b"", final=True):
         yield rest
@@ -261,7 +261,7 @@ def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock
                 )
         if len(block):
             return RecordedTable(reader.header or TableHeader(), chain(head, blocks))
-    raise FlightError(f"{path}: holds no row")
+    raise FlightError(f"{path}: contains no row")
 
 
 def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
@@ -276,7 +276,7 @@ def _open_csv(path: Path, options: ReadOptions) -> RecordedTable:
         ) from error
     if first is None:
         why = f": {reader.first_fault}" if reader.first_fault else ""
-        raise FlightError(f"{path}: holds no row that can be read{why}")
+        raise FlightError(f"{path}: contains no row that can be read{why}")
 
     def counting() -> Iterator[TableBlock]:
         yield from chain([first], blocks)
@@ -323,7 +323,7 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     first = next((cells for cells in stream if len(cells)), None)
     if first is None:
         raise FlightError(
-            f"{path}: holds no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
+            f"{path}: contains no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )
     header = _header_of_today(options, reader.system_id or 1, reader.unix_us_at_zero)
     remarks = [f"{path}: {remark}" for remark in source.remarks]

@@ -161,11 +161,11 @@ def aircraft_for(
         return aircraft
     found = estimate_latency(log)
     if found is None:
-        how = f"{latency_s:.2f} s is assumed, since no manoeuvre shows it"
+        how = f"assumed {latency_s:.2f} s, since no manoeuvre shows it"
     else:
-        how = f"{_in_words(found)} is estimated from its manoeuvres"
+        how = f"estimated {_in_words(found)}"
         aircraft = with_reference(aircraft, gps_latency_s=found.latency_s)
-    table.remarks.append(f"{files[0]}: gives no GPS latency; {how}; gps_latency_s sets it")
+    table.remarks.append(f"{files[0]}: GPS latency not in log; {how} (override: gps_latency_s)")
     return aircraft
 
 
@@ -205,7 +205,7 @@ def _kalman_filter(aircraft: AircraftSettings) -> KernelEstimator:
 
 
 def _in_words(latency: FoundLatency) -> str:
-    return f"{latency.latency_s:.3f} s +- {latency.std_s:.3f} s"
+    return f"{latency.latency_s:.3f} ± {latency.std_s:.3f} s"
 
 
 def facts_of(file: Path) -> dict[str, float]:
@@ -220,7 +220,9 @@ def facts_of(file: Path) -> dict[str, float]:
             try:
                 facts[key] = float(value)
             except ValueError as error:
-                raise FlightError(f"{file}: line {number}: {key}={value} is no number") from error
+                raise FlightError(
+                    f"{file}: line {number}: {key}={value} is not a number"
+                ) from error
     return facts
 
 

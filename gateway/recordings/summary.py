@@ -109,7 +109,7 @@ class FileInfo:
     unfinished_bytes: int = 0
     """Of a last record or line that is not whole: it is being written, or was cut."""
     header: TableHeader | None = None
-    marks: tuple[TableMark, ...] = ()
+    notes: tuple[TableMark, ...] = ()
     remarks: tuple[str, ...] = ()
     """Remarks of its reader for the user."""
 
@@ -275,7 +275,7 @@ class TableSummary:
 
     def __init__(self) -> None:
         self._header: TableHeader | None = None
-        self._marks: list[TableMark] = []
+        self._notes: list[TableMark] = []
         self._counts: Counter[str] = Counter()
         self._damaged_bytes = self._unfinished_bytes = 0
         self._last_us: int | None = None
@@ -287,7 +287,7 @@ class TableSummary:
         self._header = header
         for _, comment in block.comments:
             if isinstance(comment, TableMark):
-                self._marks.append(comment)
+                self._notes.append(comment)
             elif isinstance(comment, TableFault) and comment.is_cut:
                 self._unfinished_bytes += comment.size
             elif isinstance(comment, TableFault):
@@ -323,7 +323,7 @@ class TableSummary:
             damaged_runs=self._counts["damage"],
             unfinished_bytes=self._unfinished_bytes,
             header=self._header,
-            marks=tuple(self._marks),
+            notes=tuple(self._notes),
         )
 
     def _add_rows(self, cells: FloatArray) -> None:

@@ -255,7 +255,7 @@ def _of_enum(kind: Any, name: str, value: Any) -> Any:
     bits = 0
     for word in filter(None, (part.strip() for part in value.split("|"))):
         if word not in numbers:
-            raise BadMessageError(f"{word!r} is none of {enum}")
+            raise BadMessageError(f"unknown {enum} {word!r}")
         bits |= numbers[word]
     return bits
 
@@ -265,7 +265,7 @@ def _bounded(value: Any, form: str) -> int | float:
         if value is None:
             return math.nan
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise BadMessageError(f"{_short(value)} is no number")
+            raise BadMessageError(f"{_short(value)} is not a number")
         number = float(value)
         if form == "float" and math.isfinite(number) and abs(number) > MAX_FLOAT:
             raise BadMessageError(f"{_short(value)} is too large for a 32-bit float")
@@ -274,7 +274,7 @@ def _bounded(value: Any, form: str) -> int | float:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise BadMessageError(f"{_short(value)} is no whole number")
+        raise BadMessageError(f"{_short(value)} is not a whole number")
     if not least <= value <= greatest:
         raise BadMessageError(f"{_short(value)} is not {least} to {greatest}")
     return value

@@ -82,7 +82,7 @@ def test_flight_without_fixes_has_no_local_frame() -> None:
 def test_single_imu_sample_is_rejected() -> None:
     zero = (0.0, 0.0, 0.0)
     row = TableRow(0, imu=ImuCalibrated(0, NodeId(1, 0), zero, zero, None, 20.0, ImuFlags(0)))
-    with pytest.raises(ValueError, match="1 IMU samples are no flight"):
+    with pytest.raises(ValueError, match="1 IMU samples are not a flight"):
         flight_of_blocks(
             [block_of([row])], NodeCalibration(), FusionSettings(), name="x", description=""
         )
@@ -177,7 +177,7 @@ def test_states_of_another_recording_serve_as_reference() -> None:
 
 
 def test_reference_without_states_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"ref\.csv: holds no states"):
+    with pytest.raises(ValueError, match=r"ref\.csv: contains no states"):
         judged_by(short_flight(), [block_of([TableRow(0)])], "ref.csv")
 
 

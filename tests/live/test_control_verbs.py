@@ -80,7 +80,7 @@ async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> Non
 
     def mark(location: Location | None, vehicle_id: int | None) -> None:
         if vehicle_id == 9:
-            raise ValueError("no such aircraft; heard so far: 1")
+            raise ValueError("no such aircraft; no aircraft 7; received: 1")
         marked.append((location, vehicle_id))
 
     server = ControlServer(tmp_path / "s", mark_verbs(mark))
@@ -89,7 +89,7 @@ async def test_location_is_marked_for_one_aircraft_or_all(tmp_path: Path) -> Non
     assert (await ask(server, "mark"))["result"] == "mark cleared"
     assert not (await ask(server, "mark", lat_deg=1.0))["ok"]
     refused = await ask(server, "mark", lat_deg=1.0, lon_deg=2.0, vehicle_id=9)
-    assert refused["error"] == "no such aircraft; heard so far: 1"
+    assert refused["error"] == "no such aircraft; no aircraft 7; received: 1"
     assert marked[0] == (Location(-7.5, 110.0, 90.0), None)
     assert marked[1][0] is not None
     assert math.isnan(marked[1][0].alt_amsl_m)

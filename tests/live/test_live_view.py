@@ -141,7 +141,7 @@ def test_unknown_position_is_shown_as_a_dash(word: str) -> None:
 def test_gateway_without_nodes_is_drawn() -> None:
     report = LinkReport(0, False, "auto", 0, 0, 0, (), (), None)
     text = text_of(Snapshot(0, report, (), (), (), HubCounters()))
-    assert "auto not connected" in text
+    assert "not connected (serial.port = auto)" in text
     assert "No aircraft yet" in text
 
 
@@ -159,7 +159,7 @@ def test_newest_log_lines_are_shown() -> None:
 
 def test_summary_line_contains_receiver_nodes_aircraft_and_clients() -> None:
     assert summary_line(SNAPSHOT) == (
-        "receiver /dev/ttyUSB0 connected; node 1.0 100 Hz 10 lost; "
+        "receiver: /dev/ttyUSB0 connected; aircraft 1 board 0 100 Hz 10 lost; "
         "aircraft 1 at -7.765612 110.372834 171.5 m, roll -12 pitch +3 yaw 270; 1 client"
     )
 
@@ -176,10 +176,10 @@ WELL_KNOWN = replace(
             (BOARD,),
         ),
     ),
-    recorder=RecorderStatus("recording", "alps", 2, 12_300_000, 4_100_000_000, "", ""),
+    recorder=RecorderStatus("recording", "alps", 2, 81.0, 12_300_000, 4_100_000_000, "", ""),
 )  # fmt: skip
 FIGURES = {
-    "supply": "3.29", "bus": "12", "unsent": "3", "resent": "450", "fw": "1.4",
+    "V": "3.29", "bus": "12", "TX failed": "3", "retries": "450", "fw": "1.4",
     "fix": "3D", "satellites": "11", "±h m": "1.2", "home m": "1234", "home at°": "271",
     "mark m": "88", "mark at°": "3", "roll°": "-12.0", "longitude°": "110.372834",
 }  # fmt: skip
@@ -228,7 +228,7 @@ def test_invalid_fix_is_red() -> None:
 def test_unknown_status_is_shown_as_dashes() -> None:
     unknown = AircraftStatus(1, None, None, RelativeLocation(1.0, 2.0, 3.0, None, None), ())
     lines = text_of(replace(SNAPSHOT, aircraft=(unknown,)), width=100).splitlines()
-    for head in ("supply", "fix", "home m", "mark m", "mark at°"):
+    for head in ("bus", "fix", "home m", "mark m", "mark at°"):
         at = next(i for i, line in enumerate(lines) if head in line)
         end = lines[at].index(head) + len(head)
         assert lines[at + 1][:end].split()[-1] == "—", head

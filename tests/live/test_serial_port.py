@@ -382,7 +382,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
     serial.Serial(first, timeout=0, exclusive=True).close()
     for path in ("/dev/watchdog", "/etc/passwd", "", "usb:1a86:7523"):
         refused = await ask(server, "serial.connect", port=path)
-        assert "is no serial port of this machine" in refused["error"]
+        assert "is not a serial port of this machine" in refused["error"]
     closed = (await ask(server, "serial.disconnect"))["result"]
     assert (closed["state"], closed["device"], port.connected) == ("closed", "", False)
     adapters.pull(first)

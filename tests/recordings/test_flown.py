@@ -100,5 +100,5 @@ def test_foreign_csv_is_opened(tmp_path: Path, caplog: pytest.LogCaptureFixture)
 def test_file_without_a_flight_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.tlog"
     path.write_bytes(make_tlog(make_records(9)))
-    with pytest.raises(FlightError, match=r"a\.tlog: holds no HIGHRES_IMU"):
+    with pytest.raises(FlightError, match=r"a\.tlog: contains no HIGHRES_IMU"):
         open_flown([path], OPTIONS)

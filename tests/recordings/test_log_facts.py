@@ -38,8 +38,8 @@ def test_every_command_uses_the_latency_estimated_from_manoeuvres(without_latenc
     table = open_rows(without_latency, OPTIONS)
     latency_s = aircraft_for([without_latency], table, OPTIONS).estimation.reference.gps_latency_s
     assert latency_s == pytest.approx(0.16, abs=0.02)
-    assert "gives no GPS latency; 0.1" in table.remarks[0]
-    assert "s is estimated from its manoeuvres" in table.remarks[0]
+    assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
+    assert "GPS latency not in log; estimated 0.1" in table.remarks[0]
     assert load_flight(without_latency, TODAY, read_options(TODAY)).latency_s == latency_s
     assert read_season_flight([without_latency], OPTIONS, "log").flight.latency_s == latency_s
     fusion = RecordedFusion([without_latency], OPTIONS)

@@ -113,7 +113,7 @@ def test_ground_station_is_no_vehicle(tmp_path: Path) -> None:
 
 
 def test_file_without_frames_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match=r"empty.tlog: is no recording"):
+    with pytest.raises(FlightError, match=r"empty.tlog: unknown file format"):
         laid_out([write(tmp_path, "a.tlog", RECORDS), write(tmp_path, "empty.tlog", [])])
 
 

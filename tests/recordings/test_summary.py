@@ -133,7 +133,7 @@ def test_table_is_summarised(rng: np.random.Generator) -> None:
     assert rates["imu"] == rates["state"] == 100
     assert rates["baro"] == 10
     assert info.vehicles[0].system_id == 3
-    assert [mark.text for mark in info.marks] == ["here"]
+    assert [note.text for note in info.notes] == ["here"]
     assert (info.damaged_runs, info.damaged_bytes) == (1, 12)
 
 

@@ -163,7 +163,7 @@ def test_notations_of_a_text_are_read(text: Any) -> None:
         ({**COMMAND, "target_system": -1}, "0 to 255"),
         ({**COMMAND, "target_system": 1.5}, "whole number"),
         ({**COMMAND, "target_system": True}, "whole number"),
-        ({**COMMAND, "param1": "1"}, "no number"),
+        ({**COMMAND, "param1": "1"}, "not a number"),
         ({**COMMAND, "param1": 1e300}, "param1"),
         ({**template("PARAM_SET"), "param_id": "A" * 17}, "16 bytes"),
         ({**template("PARAM_SET"), "param_id": [1]}, "param_id"),

@@ -156,7 +156,7 @@ def calibrate_each(
             console.print(f"{step}: {error}", style="red")
         except (KeyboardInterrupt, typer.Abort):
             left = ", ".join(steps[number:])
-            console.print(f"\nBroken off. Not done: {left}.", style="yellow")
+            console.print(f"\nCancelled (interrupted). Remaining steps: {left}.", style="yellow")
             break
         else:
             console.print(f"{step}: done", style="green")
@@ -255,7 +255,7 @@ def _read_log(path: Path, settings: GatewaySettings, vehicle: int) -> NodeSample
             raws.append(row.raw)
             moving.append(row.time_us - moved_us < MOVING_US)
     if not raws:
-        refuse(f"{path}: it holds no raw IMU samples of vehicle {vehicle}")
+        refuse(f"{path}: it contains no raw IMU samples of vehicle {vehicle}")
     return node_samples(raws, moving)
 
 

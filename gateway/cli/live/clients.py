@@ -21,7 +21,7 @@ from gateway.cli.support.terminal import (
     table_of,
 )
 from gateway.printable import receiver_state
-from gateway.records import RadioState
+from gateway.records import RadioState, node_role
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 US_PER_MS: Final = 1000
@@ -135,18 +135,18 @@ def reload() -> None:
 def _summary(snapshot: Record) -> str:
     report = snapshot["report"]
     up_s = snapshot["time_us"] // US_PER_S
-    state = receiver_state(report["connected"], report["bytes_received"], report["frames"])
-    receiver = f"{report['port']} {state}"
+    received = report["bytes_received"], report["frames"]
+    receiver = receiver_state(report["port"], report["connected"], *received)
     up = f"{up_s // 3600}:{up_s // 60 % 60:02d}:{up_s % 60:02d}"
     received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     radio = f"radio: {counted(received, 'payload')}, {lost} lost"
-    lines = [f"up {up}, receiver {receiver}", f"{serial}; {radio}"]
+    lines = [f"up {up}, {receiver}", f"{serial}; {radio}"]
     if report["receiver"] is not None:
         problem = RadioState(report["receiver"]["radio"]).problem
         lines += [f"receiver: {problem}"] if problem else []
     lines += [
-        f"node {_node_name(board)}: {', '.join(board['chips'])}"
+        f"{_board_name(board)}: {', '.join(board['chips'])}"
         for one in snapshot["aircraft"]
         for board in one["boards"]
         if board["chips"]
@@ -190,7 +190,7 @@ def _requests(found: Sequence[Record], now_us: int) -> Table:
 
 
 def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
-    heads = ("supply V", "bus errors", "unsent", "resent", "overruns", "firmware")
+    heads = ("supply V", "bus errors", "TX failed", "retries", "overruns", "firmware")
     table = table_of("node", "rate Hz", "received", "lost", "restarts", *heads)
     boards = {_node_name(b): b for one in snapshot["aircraft"] for b in one["boards"]}
     receiver = snapshot["report"]["receiver"]
@@ -203,6 +203,12 @@ def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
             *_board(boards.get(_node_name(node)), str(overruns)),
         )
     return table
+
+
+def _board_name(board: Record) -> str:
+    """Name a board by its aircraft and its sensors."""
+    role = node_role(board["sensors_present"]).removesuffix(" node")
+    return f"aircraft {board['node']['vehicle_id']} {role} board"
 
 
 def _node_name(record: Record) -> str:
@@ -238,7 +244,7 @@ def _listeners(listeners: Sequence[Record]) -> Table:
 
 
 def _clients(clients: Sequence[Record], now_us: int) -> Table:
-    table = table_of("client", "state", "sent", "dropped", "queued", "received", "age s", "trip ms")
+    table = table_of("client", "state", "sent", "dropped", "queued", "received", "age s", "RTT ms")
     for client in clients:
         heard_us, trip_us = client["heard_us"], client["round_trip_us"]
         table.add_row(

@@ -61,9 +61,9 @@ SOON_S: Final = 14 * 86_400
 class Grade(StrEnum):
     """Result of a check."""
 
-    GOOD = "good"
-    NOTE = "note"
-    WRONG = "wrong"
+    OK = "OK"
+    INFO = "INFO"
+    FAIL = "FAIL"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +76,9 @@ class Diagnosis:
     """The result, and how to fix it."""
 
 
-good: Final = partial(Diagnosis, Grade.GOOD)
-note: Final = partial(Diagnosis, Grade.NOTE)
-wrong: Final = partial(Diagnosis, Grade.WRONG)
+ok: Final = partial(Diagnosis, Grade.OK)
+info: Final = partial(Diagnosis, Grade.INFO)
+fail: Final = partial(Diagnosis, Grade.FAIL)
 
 Check = Callable[[GatewaySettings], Iterator[Diagnosis]]
 
@@ -89,7 +89,7 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         found = load_aircraft(settings)
     except ConfigError as error:
-        yield wrong("aircraft", str(error))
+        yield fail("aircraft", str(error))
         return
     yield _writable("aircraft", folder, f"{len(found)} with settings of their own in {folder}")
 
@@ -99,11 +99,11 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         fitting = fitting_ports(settings.serial.port, list_serial_ports())
     except PortNotFoundError as error:
-        yield wrong("receiver", f"{error}; plug it in, or set serial.port")
+        yield fail("receiver", f"{error}; plug it in, or set serial.port")
         return
     if len(fitting) > 1:
         text = f"several adapters fit, the gateway asks each: {', '.join(fitting)}"
-        yield note("receiver", text)
+        yield info("receiver", text)
     for device in fitting:
         yield from _check_port(device)
 
@@ -111,11 +111,11 @@ def check_receiver(settings: GatewaySettings) -> Iterator[Diagnosis]:
 def _check_port(device: str) -> Iterator[Diagnosis]:
     path = Path(device)
     if not path.exists():
-        yield wrong("receiver", f"{device} is not there; `mavgate ports` lists all")
+        yield fail("receiver", f"{device} is not there; `mavgate ports` lists all")
     elif not os.access(path, os.R_OK | os.W_OK):
-        yield wrong("receiver", f"{device} may not be opened: {_membership(path)}")
+        yield fail("receiver", f"{device} may not be opened: {_membership(path)}")
     else:
-        yield good("receiver", device)
+        yield ok("receiver", device)
     yield from _latency(path)
 
 
@@ -137,9 +137,9 @@ def _latency(device: Path) -> Iterator[Diagnosis]:
     except (OSError, ValueError):
         return
     if latency_ms <= SLOW_LATENCY_MS:
-        yield good("latency timer", f"{latency_ms} ms")
+        yield ok("latency timer", f"{latency_ms} ms")
     else:
-        yield wrong(
+        yield fail(
             "latency timer",
             f"the adapter holds bytes back for {latency_ms} ms: `echo 1 | sudo tee {timer}`, and "
             "for good the rule of tools/debian/60-mavgate.rules",
@@ -151,64 +151,62 @@ def check_kernels(_: GatewaySettings) -> Iterator[Diagnosis]:
     try:
         load_entry_points()
     except LibraryError as error:
-        yield wrong("kernels", str(error))
+        yield fail("kernels", str(error))
     else:
-        yield good("kernels", "compiled")
+        yield ok("kernels", "compiled")
 
 
 def check_clock(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether the system time is right, after which recordings are named."""
     if not shutil.which("timedatectl"):
-        yield note("clock", "unknown whether it is right")
+        yield info("clock", "unknown whether it is right")
         return
     asked = ["timedatectl", "show", "--property=NTPSynchronized", "--value"]
     said = subprocess.run(asked, capture_output=True, text=True, check=False, timeout=10)
     if said.stdout.strip() == "yes":
-        yield good("clock", "synchronised")
+        yield ok("clock", "synchronised")
     else:
         text = "not synchronised: recordings get their right times from GPS"
-        yield note("clock", text)
+        yield info("clock", text)
 
 
 def check_disk(settings: GatewaySettings) -> Iterator[Diagnosis]:
-    """Check whether there is room for recordings."""
+    """Check the free space for recordings."""
     folder = folder_of(settings)
     try:
         free_mb = free_bytes_near(folder) / 1e6
     except OSError as error:
-        yield wrong("recordings", f"{folder}: {reason_of(error)}")
+        yield fail("recordings", f"{folder}: {reason_of(error)}")
         return
     room = free_mb - settings.recording.free_floor_mb
     if room < ENOUGH_HOURS * MB_PER_HOUR:
-        text = (
-            f"{folder}: {max(room, 0.0):.0f} MB of room, for {max(room, 0.0) / MB_PER_HOUR:.1f} h"
-        )
-        yield wrong("recordings", f"{text}; delete old ones or set recording.folder")
+        text = f"{folder}: {max(room, 0.0):.0f} MB free, for {max(room, 0.0) / MB_PER_HOUR:.1f} h"
+        yield fail("recordings", f"{text}; delete old ones or set recording.folder")
     else:
-        yield _writable("recordings", folder, f"{folder}: {room / 1e3:.1f} GB of room")
+        yield _writable("recordings", folder, f"{folder}: {room / 1e3:.1f} GB free")
 
 
 def _writable(what: str, folder: Path, text: str) -> Diagnosis:
     existing = next(path for path in (folder, *folder.parents) if path.exists())
     if not existing.is_dir():
-        return wrong(what, f"{existing} is no folder")
+        return fail(what, f"{existing} is not a folder")
     if os.access(existing, os.W_OK):
-        return good(what, text)
-    return wrong(what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}")
+        return ok(what, text)
+    return fail(what, f"{folder} cannot be written by {os.environ.get('USER', 'us')}")
 
 
 def check_ports(settings: GatewaySettings) -> Iterator[Diagnosis]:
     """Check whether a gateway runs already, and otherwise whether its ports are free."""
     if running := live_sockets("run"):
-        yield good("gateway", f"runs, and listens at {', '.join(map(str, running))}")
+        yield ok("gateway", f"runs, and listens at {', '.join(map(str, running))}")
         return
     taken = False
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if reason := _trouble_of(endpoint):
             taken = True
-            yield wrong("ports", f"{endpoint.location}: {reason}")
+            yield fail("ports", f"{endpoint.location}: {reason}")
     if not taken:
-        yield good("ports", "free")
+        yield ok("ports", "free")
 
 
 def _trouble_of(endpoint: Endpoint) -> str:
@@ -247,11 +245,11 @@ def check_certificates(settings: GatewaySettings) -> Iterator[Diagnosis]:
         try:
             end_s = valid_until_s(file, Path(key).expanduser() if key else file)
         except ssl.SSLCertVerificationError as error:
-            yield wrong(what, f"{file}: {error.verify_message}")
+            yield fail(what, f"{file}: {error.verify_message}")
         except OSError as error:
-            yield wrong(what, f"{file}: {reason_of(error)}")
+            yield fail(what, f"{file}: {reason_of(error)}")
         else:
-            grade = Grade.GOOD if end_s - time.time() > SOON_S else Grade.NOTE
+            grade = Grade.OK if end_s - time.time() > SOON_S else Grade.INFO
             until = datetime.fromtimestamp(end_s, UTC)
             yield Diagnosis(grade, what, f"{file}, valid until {until:%Y-%m-%d}")
 
@@ -260,7 +258,7 @@ def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
     """Check which optional parts are installed."""
     for extra, use in EXTRA_USES.items():
         if missing(extra):
-            yield note("extra", how_to_add(use, extra))
+            yield info("extra", how_to_add(use, extra))
 
 
 CHECKS: Final[tuple[Check, ...]] = (
@@ -275,21 +273,21 @@ CHECKS: Final[tuple[Check, ...]] = (
 )
 
 
-STYLES: Final = {Grade.GOOD: "green", Grade.NOTE: "yellow", Grade.WRONG: "red"}
+STYLES: Final = {Grade.OK: "green", Grade.INFO: "yellow", Grade.FAIL: "red"}
 
 
 @app.command()
 def doctor() -> None:
     """Check this machine and suggest fixes: rights, ports, latency, kernels, time, disk.
 
-    It changes nothing. The exit code is 1 if something is wrong.
+    It changes nothing. The exit code is 1 if a check fails.
     """
     console = console_of()
     failed = False
     settings = read_settings()
     for finding in chain.from_iterable(check(settings) for check in CHECKS):
-        failed |= finding.grade is Grade.WRONG
-        console.print(f"{finding.grade:5} ", style=STYLES[finding.grade], end="")
+        failed |= finding.grade is Grade.FAIL
+        console.print(f"{finding.grade:4}  ", style=STYLES[finding.grade], end="")
         console.print(f"{finding.what}: {finding.text}")
     if failed:
         raise typer.Exit(1)

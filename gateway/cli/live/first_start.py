@@ -129,7 +129,7 @@ def _find(serial: SerialSettings) -> SerialSettings:
 def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
     receiver = report.receiver
     if receiver is None and not report.nodes:
-        sent = "bytes that are no frames" if report.bytes_received else "nothing"
+        sent = "bytes that are not frames" if report.bytes_received else "nothing"
         _stop(
             f"{serial.port} sends {sent}",
             f"`mavgate flash --show --port {serial.port}` reads which program is on the board",
@@ -305,11 +305,11 @@ def _head(text: str) -> None:
 
 
 def _good(text: str) -> None:
-    console.print(f"good  {text}", style="green")
+    console.print(f"OK    {text}", style="green")
 
 
 def _hint(text: str) -> None:
-    console.print(f"note  {text}", style="yellow")
+    console.print(f"INFO  {text}", style="yellow")
 
 
 def _stop(text: str, *hints: str) -> NoReturn:

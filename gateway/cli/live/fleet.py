@@ -235,7 +235,7 @@ def status(*, json: JsonOption = False) -> None:
     role = "router at" if found["is_router"] else "connected to"
     lost = "" if found["is_linked"] else ", which does not answer"
     console.print(f"{role} {found['router']}{lost}")
-    table = table_of("site", "", "ms", "system", "id here", "Hz", "age s", "lost", left=2)
+    table = table_of("site", "", "RTT ms", "system", "id here", "Hz", "age s", "lost", left=2)
     for each in found["sites"]:
         _add_site(table, each)
     console.print(table)

@@ -12,6 +12,7 @@ from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_
 from gateway.live.session import SessionState
 from gateway.recordings.index import (
     Recording,
+    RecordingError,
     delete_recording,
     find_recording,
     list_recordings,
@@ -131,6 +132,14 @@ def _folder() -> Path:
 
 def _show(status: dict[str, Any]) -> None:
     console = console_of()
+    free = f"{status['free_bytes'] / 1e9:.1f} GB free"
+    if status["state"] == SessionState.IDLE and status["name"]:
+        length = _clock(status["duration_s"]).removeprefix("0:").removeprefix("0")
+        console.print(
+            f"Stopped: {status['name']}, {length}, "
+            f"{_size(status) / 1e6:.1f} MB, in {status['folder']} ({free})"
+        )
+        return
     line = status["state"]
     if status["name"]:
         line += f": {status['name']}, part {status['part']}"
@@ -139,7 +148,16 @@ def _show(status: dict[str, Any]) -> None:
     if status["reason"]:
         line += f" ({status['reason']})"
     console.print(line)
-    console.print(f"{status['folder']}: {status['free_bytes'] / 1e9:.1f} GB free")
+    console.print(f"{status['folder']}: {free}")
+
+
+def _size(status: dict[str, Any]) -> int:
+    """Return the size of a recording; of its last part where the files are not readable."""
+    try:
+        return find_recording(Path(status["folder"]), status["name"]).size
+    except (RecordingError, OSError):
+        size: int = status["part_bytes"]
+        return size
 
 
 def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]]":

@@ -174,7 +174,7 @@ def _compare(results: Sequence[FlightResult], against: Path) -> "Versus":
 
     found = versus(results, read_results(against))
     if not found.compared:
-        refuse(f"{against}: holds no result of any of these recordings")
+        refuse(f"{against}: contains no result of any of these recordings")
     return found
 
 

@@ -75,7 +75,7 @@ def index(
     settings = read_settings()
     root = (folder or folder_of(settings)).expanduser()
     if not root.is_dir():
-        refuse(f"{root}: is no folder")
+        refuse(f"{root}: is not a folder")
     options = read_options(settings, columns)
     with progress_bar() as progress:
         task = progress.add_task("reading", total=None)
@@ -85,8 +85,8 @@ def index(
 
         report = index_folder(root, options, LocalProcesses(jobs), show)
     console_of().print(
-        f"{root}: {counted(report.read, 'file')} read ({report.broken} of them broken), "
-        f"{report.unchanged} unchanged, {report.gone} gone"
+        f"{root}: {report.unchanged} unchanged, {report.read - report.broken} new, "
+        f"{report.gone} removed, {report.broken} unreadable"
     )
 
 
@@ -147,7 +147,7 @@ def _show_table(rows: list[Row]) -> None:
     )  # fmt: skip
     for row in rows:
         if row["error"] is not None:
-            grid.add_row(row["path"], "broken", row["error"], *[UNKNOWN] * 8)
+            grid.add_row(row["path"], "unreadable", row["error"], *[UNKNOWN] * 8)
             continue
         km = None if row["distance"] is None else row["distance"] / 1000.0
         loss = None if row["loss"] is None else f"{row['loss']:.1%}"
@@ -165,7 +165,7 @@ def _show_table(rows: list[Row]) -> None:
     broken = sum(row["error"] is not None for row in rows)
     console.print(
         f"{counted(len(lasted_s), 'flight')}, {hours:.2f} h, in {counted(files, 'file')}; "
-        f"{broken} broken"
+        f"{broken} unreadable"
     )
 
 

@@ -98,7 +98,7 @@ def convert(
     print_remarks(flight.remarks)
     lacks = LACKS[output.suffix].of_tlogs if flight.is_mavlink else LACKS[output.suffix].of_tables
     if lacks and message is None:
-        print_remarks([f"{output} does not hold {lacks}"])
+        print_remarks([f"Dropped: {lacks}"])
     console_of().print(f"{output}: {size / 1e6:.3f} MB")
 
 
@@ -111,7 +111,7 @@ def _known_estimator(name: str | None) -> str | None:
         name, former = DEPRECATED[name], name
         typer.echo(f"--estimator {former} is deprecated; using {name}", err=True)
     if name is not None and name not in ESTIMATORS:
-        raise typer.BadParameter(f"{name!r} is none of {', '.join(ESTIMATORS)}")
+        raise typer.BadParameter(f"unknown estimator {name!r}; choose {', '.join(ESTIMATORS)}")
     return name
 
 

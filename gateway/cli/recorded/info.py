@@ -142,7 +142,7 @@ def _sound_lines(file: Path, advance: Progress, report: Report) -> Iterator[byte
             report(f"line {fault.line}: {counted(fault.size, 'byte')}: {fault.reason}")
         yield encode_block(block)
     if not begun:
-        raise FlightError(f"{file}: holds no row that can be read")
+        raise FlightError(f"{file}: contains no row that can be read")
 
 
 def _print_some(lines: Sequence[str], more: str) -> None:
@@ -168,8 +168,8 @@ def _show(file: Path, found: FileInfo) -> None:
     begin_us = found.first_us or 0
     gaps = [(gap.duration_s, (gap.time_us - begin_us) / US_PER_S) for gap in found.gaps]
     _print_some([f"gap of {long_s:.1f} s at {_clock(at_s)}" for long_s, at_s in gaps], "more gap")
-    for mark in found.marks:
-        console.print(f"mark at {_clock((mark.time_us - begin_us) / US_PER_S)}: {mark.text}")
+    for note in found.notes:
+        console.print(f"note at {_clock((note.time_us - begin_us) / US_PER_S)}: {note.text}")
     if found.damaged_bytes:
         console.print(
             f"damaged: {counted(found.damaged_bytes, 'byte')} in "

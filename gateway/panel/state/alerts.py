@@ -9,8 +9,8 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.state.fleet import VehicleState
+from gateway.records import node_role
 from gateway.units import US_PER_S
-from gateway.vehicle.telemetry.health import node_role
 
 SILENT_S: Final = 5.0
 FIX_OLD_US: Final = 5 * US_PER_S

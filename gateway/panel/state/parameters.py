@@ -294,7 +294,7 @@ class ParameterClient:
     def change(self, name: str, value: float, now_us: int) -> list[Any]:
         """Set one; return the messages to send now: none while its last change is not answered.
 
-        Raises ValueError if there is no such parameter, or the value is no number that it can hold.
+        Raises ValueError if there is no such parameter, or the value is not a number that fits.
         """
         entry = self.entries.get(name)
         if entry is None:

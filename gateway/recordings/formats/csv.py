@@ -163,7 +163,7 @@ class CsvReader:
         for (ours, column), text in zip(self._columns.items(), texts, strict=True):
             value = self._value(ours, column, text)
             if value is None:
-                why = f"{column.column} is {text[:MAX_CELL]!r}, which is no number"
+                why = f"{column.column} is {text[:MAX_CELL]!r}, which is not a number"
                 if ours == "time_us":
                     self._add_fault(number, why)
                     return None

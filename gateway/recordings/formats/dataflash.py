@@ -356,7 +356,7 @@ def _why_empty(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> str
             )
     if damage.messages or reader.dropped:
         return "none of its IMU messages can be decoded"
-    return "holds no IMU messages, so there is nothing to fuse"
+    return "contains no IMU messages, so there is nothing to fuse"
 
 
 def _sensors_of(log: Any, damage: _PrintedDamage) -> dict[str, int]:

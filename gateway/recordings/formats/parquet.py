@@ -182,7 +182,7 @@ def _lines(path: Path, options: ReadOptions) -> Iterator[bytes]:
         known = file.schema_arrow.metadata or {}
         names = [name for name in COLUMNS if name in file.schema_arrow.names]
         if "time_us" not in names:
-            raise FlightError(f"{path}: has no column time_us, so it is no table of mavgate's")
+            raise FlightError(f"{path}: has no column time_us, so it is not a table of mavgate's")
         if HEADER in known:
             yield f"{FORMAT_LINE}\n{HEADER_PREFIX}{known[HEADER].decode()}\n".encode()
         yield (",".join(names) + "\n").encode()
@@ -246,7 +246,7 @@ def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
                 yield pieces.taken()
                 rows.clear()
         if name not in met:
-            raise FlightError(f"the flight holds no {name}, but {', '.join(sorted(met))}")
+            raise FlightError(f"the flight contains no {name}, but {', '.join(sorted(met))}")
         writer.write_table(_batch(rows, schema))
     yield pieces.taken()
 

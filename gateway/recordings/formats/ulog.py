@@ -113,7 +113,7 @@ class Px4Log:
         ordered = {one: self._in_order(kept[one]) for one in {*sources.values()} if one}
         self._topics = {kind: ordered[one] for kind, one in sources.items() if one}
         if not len(self._topics.get("IMU", {}).get("timestamp", ())):
-            raise ValueError("holds no sensor_combined, the samples of the IMU")
+            raise ValueError("contains no sensor_combined, the samples of the IMU")
         self._vehicle_id = vehicle_id
         begins = (t["timestamp"][0] for t in self._topics.values() if len(t["timestamp"]))
         self._zero_us = int(min(begins))

@@ -23,6 +23,8 @@ from typing import Any, Final, NamedTuple
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import (
+    NODE_GPS,
+    NODE_IMU,
     BaroSample,
     GpsFix,
     ImuFlags,
@@ -33,6 +35,7 @@ from gateway.records import (
     NodeLink,
     NodeStatus,
     ReceiverStatus,
+    node_role,
 )
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
@@ -123,8 +126,6 @@ GEOFENCE: Final = mavlink.MAV_SYS_STATUS_GEOFENCE
 PREARM: Final = mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
 SENSORS: Final = (GYRO, ACCEL, MAG, PRESSURE, GPS)
-NODE_IMU: Final = 1 << 0
-NODE_GPS: Final = 1 << 3
 NODE_SENSORS: Final = (
     (NODE_IMU, GYRO | ACCEL),
     (1 << 1, MAG),
@@ -387,10 +388,3 @@ class Health:
     def known_nodes(self) -> frozenset[int]:
         """Return the nodes that have sent a payload."""
         return frozenset(link.node.node_id for link in self._links if link.received)
-
-
-def node_role(sensors_present: int) -> str:
-    """Name a node's role by its sensors."""
-    if sensors_present & NODE_IMU:
-        return "IMU node"
-    return "GPS node" if sensors_present & NODE_GPS else "Node"

@@ -116,7 +116,7 @@ def test_failed_step_is_reported(config: Path, monkeypatch: pytest.MonkeyPatch) 
 def test_interrupt_keeps_the_finished_steps(config: Path, link: Link) -> None:
     link.breaks_at = 4
     output = run(config, "gyro", "accel", "mag")
-    assert "Broken off. Not done: accel, mag." in output
+    assert "Cancelled (interrupted). Remaining steps: accel, mag." in output
     saved = load_aircraft(load(config))[3].calibration
     assert saved.gyro_bias_radps == pytest.approx((0.05, 0.05, 0.05), abs=1e-3)
     assert saved.accel_bias_mps2 == (0.0, 0.0, 0.0)
@@ -126,7 +126,7 @@ def test_end_of_input_keeps_the_finished_steps(config: Path) -> None:
     command = ["calibrate", "gyro", "mag", "--config", str(config), "--vehicle", "3"]
     result = invoke(*command, answers="\n")
     assert result.exit_code == 0, result.output
-    assert "Not done: mag" in result.output
+    assert "Remaining steps: mag" in result.output
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
 
 

@@ -109,7 +109,7 @@ async def run(*words: object, code: int = 0) -> str:
 
 async def test_status_is_printed_as_text(asked: list[object]) -> None:
     text = await run("status")
-    assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in text
+    assert "up 1:02:03, receiver: /dev/ttyUSB0 connected" in text
     assert "serial: 103 frames, 4 lost; radio: 100 payloads, 7 lost" in text
     assert "aircraft 1: 47.500000 —, — m" in text
     assert "aircraft 1: home 1234 m, 271°" in text
@@ -172,7 +172,7 @@ async def test_piped_tables_and_texts_are_never_wrapped(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "20")
     lines = (await run("status")).splitlines()
-    assert "up 1:02:03, receiver /dev/ttyUSB0 connected" in lines
+    assert "up 1:02:03, receiver: /dev/ttyUSB0 connected" in lines
     assert ["observers", "Address", "already", "in", "use", "0", "8"] in map(str.split, lines)
 
 

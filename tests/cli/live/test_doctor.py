@@ -43,23 +43,23 @@ def one(check: doctor.Check, settings: GatewaySettings) -> Diagnosis:
 
 def test_missing_port_is_wrong_with_a_hint(settings: GatewaySettings) -> None:
     found = one(doctor.check_receiver, settings)
-    assert (found.grade, "`mavgate ports`" in found.text) == (Grade.WRONG, True)
+    assert (found.grade, "`mavgate ports`" in found.text) == (Grade.FAIL, True)
 
 
 def test_port_without_access_rights_names_the_group(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Path(settings.serial.port).touch()
-    assert one(doctor.check_receiver, settings).grade is Grade.GOOD
+    assert one(doctor.check_receiver, settings).grade is Grade.OK
     monkeypatch.setattr(os, "access", lambda *_: False)
     dialout = SimpleNamespace(gr_name="dialout", gr_mem=[])
     monkeypatch.setattr(grp, "getgrgid", lambda _: dialout)
     found = one(doctor.check_receiver, settings)
-    assert found.grade is Grade.WRONG
+    assert found.grade is Grade.FAIL
     assert "sudo usermod -aG dialout" in found.text
 
 
-@pytest.mark.parametrize(("latency_ms", "grade"), [(1, Grade.GOOD), (16, Grade.WRONG)])
+@pytest.mark.parametrize(("latency_ms", "grade"), [(1, Grade.OK), (16, Grade.FAIL)])
 def test_long_latency_timer_of_an_adapter_is_wrong(
     settings: GatewaySettings, tmp_path: Path, latency_ms: int, grade: Grade
 ) -> None:
@@ -75,10 +75,10 @@ def test_long_latency_timer_of_an_adapter_is_wrong(
 def test_invalid_aircraft_file_is_wrong(settings: GatewaySettings) -> None:
     folder = Path(settings.aircraft_folder)
     folder.mkdir()
-    assert one(doctor.check_aircraft, settings).grade is Grade.GOOD
+    assert one(doctor.check_aircraft, settings).grade is Grade.OK
     (folder / "3.toml").write_text("[vehicle]\nnope = 1\n")
     found = one(doctor.check_aircraft, settings)
-    assert found.grade is Grade.WRONG
+    assert found.grade is Grade.FAIL
     assert "3.toml: vehicle.nope" in found.text
 
 
@@ -86,8 +86,8 @@ def test_unwritable_folders_are_wrong(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)
-    assert one(doctor.check_aircraft, settings).grade is Grade.WRONG
-    assert one(doctor.check_disk, settings).grade is Grade.WRONG
+    assert one(doctor.check_aircraft, settings).grade is Grade.FAIL
+    assert one(doctor.check_disk, settings).grade is Grade.FAIL
 
 
 def test_folder_below_a_file_is_wrong(settings: GatewaySettings, tmp_path: Path) -> None:
@@ -95,10 +95,10 @@ def test_folder_below_a_file_is_wrong(settings: GatewaySettings, tmp_path: Path)
     below = replace(settings.recording, folder=str(tmp_path / "aircraft" / "recordings"))
     for check in (doctor.check_aircraft, doctor.check_disk):
         found = one(check, replace(settings, recording=below))
-        assert (found.grade, found.text) == (Grade.WRONG, f"{tmp_path}/aircraft is no folder")
+        assert (found.grade, found.text) == (Grade.FAIL, f"{tmp_path}/aircraft is not a folder")
 
 
-@pytest.mark.parametrize(("room_mb", "grade"), [(300, Grade.WRONG), (500, Grade.GOOD)])
+@pytest.mark.parametrize(("room_mb", "grade"), [(300, Grade.FAIL), (500, Grade.OK)])
 def test_little_free_space_is_wrong(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, room_mb: int, grade: Grade
 ) -> None:
@@ -120,9 +120,9 @@ def test_port_of_another_program_is_wrong(
         url = f"{kind}-listen:127.0.0.1:{other.getsockname()[1]}"
         taken = replace(settings, hub=replace(settings.hub, endpoints=(url,)))
         found = one(doctor.check_ports, taken)
-        assert found.grade is Grade.WRONG
+        assert found.grade is Grade.FAIL
         assert found.text == f"{url}: Address already in use"
-    assert one(doctor.check_ports, taken).grade is Grade.GOOD
+    assert one(doctor.check_ports, taken).grade is Grade.OK
 
 
 def test_ports_of_a_running_gateway_are_good(
@@ -131,10 +131,10 @@ def test_ports_of_a_running_gateway_are_good(
     running = tmp_path / "mavgate" / "run.sock"
     monkeypatch.setattr(control_socket, "_listening", lambda: {running})
     found = one(doctor.check_ports, settings)
-    assert (found.grade, found.what) == (Grade.GOOD, "gateway")
+    assert (found.grade, found.what) == (Grade.OK, "gateway")
 
 
-@pytest.mark.parametrize(("said", "grade"), [("yes\n", Grade.GOOD), ("no\n", Grade.NOTE)])
+@pytest.mark.parametrize(("said", "grade"), [("yes\n", Grade.OK), ("no\n", Grade.INFO)])
 def test_unsynchronised_clock_is_noted(
     settings: GatewaySettings, monkeypatch: pytest.MonkeyPatch, said: str, grade: Grade
 ) -> None:
@@ -153,7 +153,7 @@ def test_missing_kernels_are_wrong_with_a_hint(
 
     monkeypatch.setattr(doctor, "load_entry_points", load)
     found = one(doctor.check_kernels, settings)
-    assert found.grade is (Grade.WRONG if missing else Grade.GOOD)
+    assert found.grade is (Grade.FAIL if missing else Grade.OK)
     assert ("make kernels" in found.text) == missing
 
 
@@ -162,7 +162,7 @@ def test_missing_extras_are_named(
 ) -> None:
     monkeypatch.setattr(extras, "find_spec", lambda name: None if name == "nicegui" else name)
     found = one(doctor.check_extras, settings)
-    assert (found.grade, "needs the extra panel" in found.text) == (Grade.NOTE, True)
+    assert (found.grade, "needs the extra panel" in found.text) == (Grade.INFO, True)
 
 
 @pytest.mark.parametrize("grade", list(Grade))
@@ -175,16 +175,16 @@ def test_exit_code_is_1_if_something_is_wrong(
     checks: tuple[Callable[..., object], ...] = (check,)
     monkeypatch.setattr(doctor, "CHECKS", checks)
     result = invoke("doctor")
-    assert result.exit_code == (1 if grade is Grade.WRONG else 0)
-    assert result.output == f"{grade:5} thing: is so\n"
+    assert result.exit_code == (1 if grade is Grade.FAIL else 0)
+    assert result.output == f"{grade:4}  thing: is so\n"
 
 
 @pytest.mark.parametrize(
     ("days", "grade", "word"),
     [
-        (0, Grade.WRONG, "certificate has expired"),
-        (3, Grade.NOTE, "valid until"),
-        (300, Grade.GOOD, "valid until"),
+        (0, Grade.FAIL, "certificate has expired"),
+        (3, Grade.INFO, "valid until"),
+        (300, Grade.OK, "valid until"),
     ],
 )
 def test_expiring_certificate_is_noted_and_expired_one_wrong(
@@ -209,6 +209,6 @@ def test_missing_or_broken_certificate_is_wrong(settings: GatewaySettings, tmp_p
     file.write_text("no certificate")
     broken = one(doctor.check_certificates, replace(settings, hub=hub))
     assert missing == Diagnosis(
-        Grade.WRONG, "hub.tls_certificate", f"{file}: No such file or directory"
+        Grade.FAIL, "hub.tls_certificate", f"{file}: No such file or directory"
     )
     assert "no certificate" in broken.text.replace(str(file), "").lower()

@@ -91,7 +91,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 @pytest.mark.parametrize(
     ("sent", "said"),
-    [(b"", "sends nothing"), (b"\x01\x02\x00" * 9, "sends bytes that are no frames")],
+    [(b"", "sends nothing"), (b"\x01\x02\x00" * 9, "sends bytes that are not frames")],
     ids=["nothing", "garbage"],
 )
 def test_port_that_is_no_receiver_is_named_with_what_to_do(

@@ -50,8 +50,9 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: 
     assert "first" in await run("rename", "first")
     await gateway.recorder.settle()
     assert "stop it first" in await run("delete", "first", "--yes", code=2)
-    assert "idle" in await run("stop")
-    assert "idle: first, part 1" in await run("status")
+    assert re.match(r"Stopped: first, 0:\d\d, \d\.\d MB, in /.* GB free", await run("stop"))
+    assert "Stopped: first, " in await run("status")
+    assert "in no file: nothing is recorded" in await run("note", "over the lake", code=2)
     # The folder is the one of the gateway that runs, whatever the user's settings say.
     [listed] = [line for line in (await run("list")).splitlines() if "first" in line]
     assert re.search(r" 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d ", listed), listed

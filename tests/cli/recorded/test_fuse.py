@@ -122,7 +122,7 @@ def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> Non
     config = tmp_path / "c.toml"
     config.write_text('[estimation]\nestimator = "eskf"\n')
     words = run_words("fuse", log, "-o", out, "--config", config)
-    estimate = re.search(r"(0\.\d+) s \+- 0\.\d+ s is estimated from its manoeuvres", words)
+    estimate = re.search(r"estimated (0\.\d+) ± 0\.\d+ s \(override: gps_latency_s\)", words)
     assert estimate is not None, words
     assert float(estimate[1]) == pytest.approx(0.16, abs=0.02)
     assert f'"gps_latency_s":{estimate[1][:4]}' in out.read_text().replace(" ", "")
@@ -131,5 +131,5 @@ def test_latency_in_neither_log_nor_settings_is_estimated(tmp_path: Path) -> Non
 def test_latency_without_manoeuvres_is_assumed(log: Path) -> None:
     log.write_text(log.read_text().replace("gps_latency_s=0.3", ""))
     arguments = ("fuse", log, "-o", log.with_name("out.csv"), "--force")
-    assert "0.15 s is assumed, since no manoeuvre shows it" in run_words(*arguments)
-    assert "gives no GPS latency" not in run_words(*arguments, "--gps-latency", 0.2)
+    assert "assumed 0.15 s, since no manoeuvre shows it" in run_words(*arguments)
+    assert "GPS latency not in log" not in run_words(*arguments, "--gps-latency", 0.2)

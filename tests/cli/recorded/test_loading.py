@@ -47,9 +47,12 @@ def test_latency_contradicted_by_the_motion_is_reported(
 ) -> None:
     monkeypatch.setattr(log_facts, "estimate_latency", lambda log: FoundLatency(0.9, 0.01))
     load_flight(recording(tmp_path / "flight.csv", 20), TODAY, read_options(TODAY))
-    assert "flight.csv: its manoeuvres show a GPS latency of 0.900 s" in capsys.readouterr().err
+    assert (
+        "flight.csv: its manoeuvres show a GPS latency of 0.900 ± 0.010 s"
+        in capsys.readouterr().err
+    )
 
 
 def test_recording_of_one_sample_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FlightError, match=r"flight\.csv: 1 IMU samples are no flight"):
+    with pytest.raises(FlightError, match=r"flight\.csv: 1 IMU samples are not a flight"):
         load_flight(recording(tmp_path / "flight.csv", 1), TODAY, read_options(TODAY))

@@ -76,7 +76,7 @@ def test_height_beyond_the_atmosphere_gives_no_barometer_sample(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (b"# gps_latency_s=1.1.1\n", "line 1: gps_latency_s=1.1.1 is no number"),
+        (b"# gps_latency_s=1.1.1\n", "line 1: gps_latency_s=1.1.1 is not a number"),
         (b"# gps_latency_s=99\n", "Expected `float` <= 2.0"),
         (b"# \xe4\xf6\xfc gps_latency_s=0.2\n", "fused by eskf"),
         (b"\xef\xbb\xbf", "fused by eskf"),
@@ -189,7 +189,7 @@ def test_times_beyond_the_calendar_are_written_and_reported(
 def test_tlog_of_the_far_future_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "future.tlog"
     path.write_bytes(b"".join(struct.pack(">Q", 10**18) + frame for frame in make_frames(20)))
-    assert "is no recording" in run("info", path, code=2)
+    assert "unknown file format" in run("info", path, code=2)
 
 
 def test_table_of_a_newer_version_is_refused(tmp_path: Path) -> None:
@@ -218,9 +218,9 @@ def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
     [
         (bytes(range(128, 200)), "map.toml: line 1: is not UTF-8 text; save it as UTF-8"),
         (b'[columns]\ntime_us = "t"\n\xe4 = "x"\n', "map.toml: line 3: is not UTF-8"),
-        (b"[columns]\nfoo = 3\n", "map.toml: is no column map"),
-        (b"[columns", "map.toml: is no column map"),
-        (b"x = " + b"[" * 10_000, "map.toml: is no column map"),
+        (b"[columns]\nfoo = 3\n", "map.toml: is not a column map"),
+        (b"[columns", "map.toml: is not a column map"),
+        (b"x = " + b"[" * 10_000, "map.toml: is not a column map"),
     ],
 )
 def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
@@ -234,7 +234,7 @@ def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: st
 def test_invalid_moment_is_refused(tmp_path: Path, moment: str) -> None:
     path = table(tmp_path / "table.csv")
     printed = run("convert", path, "--from", moment, "-o", tmp_path / "o.csv", code=2)
-    assert "write 80, 1:20" in printed
+    assert "use 80, 1:20 or 2026-06-11T14:25:30Z" in printed
 
 
 @pytest.mark.parametrize("words", [("nan", "nan"), ("inf", "0"), ("47", "8", "--alt", "nan")])
@@ -299,7 +299,7 @@ def test_text_of_a_recording_cannot_control_the_terminal(tmp_path: Path) -> None
     refused = run("info", tmp_path / "b\x1b[31m.csv", code=2)
     assert r"b\x1b[31m.csv: No such file" in refused
     as_json = run("info", recorded, "--json")
-    assert msgspec.json.decode(as_json)["marks"][0]["text"] == evil
+    assert msgspec.json.decode(as_json)["notes"][0]["text"] == evil
     assert not set("\x1b\x07\x9b\u202e") & set(printed + refused + as_json)
 
 

@@ -39,7 +39,7 @@ def test_file_without_rows_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty.csv"
     empty.write_text(encode_head(TableHeader()))
     result = invoke("report", empty, "-o", tmp_path / "out", code=2)
-    assert "holds no row" in result.output
+    assert "contains no row" in result.output
     assert not (tmp_path / "out").exists()
 
 

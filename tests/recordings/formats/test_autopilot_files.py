@@ -257,7 +257,7 @@ def test_log_cut_before_its_samples_is_refused(
 def test_ulog_cut_in_its_formats_is_refused(tmp_path: Path, end: bytes) -> None:
     head = b"".join(flown.Ulog(flown.FORMATS, {"MAV_SYS_ID": 7}).parts[:6])
     stub = flown.write(tmp_path / "cut.ulg", head + end)
-    with pytest.raises(FlightError, match=r"cut.ulg: holds no sensor_combined"):
+    with pytest.raises(FlightError, match=r"cut.ulg: contains no sensor_combined"):
         rows_of(stub)
 
 

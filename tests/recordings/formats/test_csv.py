@@ -103,7 +103,7 @@ def test_unreadable_cell_drops_only_its_record(cells: dict[str, str], lost: str)
 
 @pytest.mark.parametrize(
     ("line", "fault"),
-    [("soon,0,0,-9.8,0,0,0", "line 3: time_s is 'soon', which is no number"), ("", "")],
+    [("soon,0,0,-9.8,0,0,0", "line 3: time_s is 'soon', which is not a number"), ("", "")],
 )
 def test_line_without_a_time_is_named(line: str, fault: str) -> None:
     reader, rows = read(line)

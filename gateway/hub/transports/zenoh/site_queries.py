@@ -175,11 +175,11 @@ class RecordingAnswers:
     def _open(self, name: str) -> BinaryIO:
         """Open a regular file of a recording in the folder itself."""
         if not is_file_name(name):
-            raise RefusedQueryError(f"{name!r} is no file of a recording")
+            raise RefusedQueryError(f"{name!r} is not a file of a recording")
         # Without O_NONBLOCK, opening a FIFO would wait for its writer.
         flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
         descriptor = os.open(self._folder / name, flags)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
-            raise RefusedQueryError(f"{name!r} is no regular file")
+            raise RefusedQueryError(f"{name!r} is not a regular file")
         return os.fdopen(descriptor, "rb")
