@@ -25,7 +25,7 @@ from gateway.analysis.pilot_figures import PilotFigures, pilot_figures
 from gateway.analysis.signals import apply
 from gateway.estimation.select import OWN_ESTIMATORS, EstimationSettings
 from gateway.recordings.fuse import FusionSettings, with_estimator
-from gateway.recordings.summary import ground_distance_m
+from gateway.recordings.positions import ground_distance_m
 from gateway.settings import Settings, fields_of
 from gateway.units import US_PER_S
 

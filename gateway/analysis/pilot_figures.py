@@ -5,8 +5,9 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.flight import Flight, FlightTrack, FloatArray, LocalFrame, fixes_of
+from gateway.analysis.flight import Flight, FlightTrack, FloatArray, LocalFrame
 from gateway.analysis.metrics import greatest
+from gateway.recordings.figures import gps_outages_us
 from gateway.units import US_PER_S
 
 AIRBORNE_MPS: Final = 3.0
@@ -14,8 +15,6 @@ AIRBORNE_MPS: Final = 3.0
 AIRBORNE_M: Final = 3.0
 HELD_S: Final = 2.0
 """Least time in the air, or on the ground, to count."""
-OUTAGE_S: Final = 1.0
-"""A longer gap between fixes is an outage."""
 LINK_LOSS_S: Final = 0.5
 """A longer gap between IMU samples is a loss of the link."""
 LONGEST_STEP_M: Final = 200.0
@@ -63,7 +62,7 @@ def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> Pilo
     height_m = np.where(np.isfinite(track.lat_deg), track.alt_amsl_m - frame.alt_m, np.nan)
     speed_mps = np.hypot(track.vel_n_mps[:, 0], track.vel_n_mps[:, 1])
     airborne = _held(seconds, (speed_mps > AIRBORNE_MPS) & (height_m > AIRBORNE_M))
-    outages = _gaps(flight.seconds(fixes_of(flight).arrival_us), flight.duration_s, OUTAGE_S)
+    outages = _outages_s(flight)
     losses = _gaps(seconds, flight.duration_s, LINK_LOSS_S)
     events = [
         *_flight_events(seconds, airborne, height_m, speed_mps),
@@ -82,6 +81,15 @@ def pilot_figures(flight: Flight, track: FlightTrack, frame: LocalFrame) -> Pilo
         link_losses_s=losses,
         events=tuple(sorted(events, key=lambda event: event.time_s)),
     )
+
+
+def _outages_s(flight: Flight) -> tuple[tuple[float, float], ...]:
+    fixes = flight.fixes
+    reported_us = np.array([fix.time_us for fix in fixes], np.int64)
+    fixed = np.array([fix.fix_ok for fix in fixes], bool)
+    found = gps_outages_us(reported_us, fixed, int(flight.time_us[-1])) or []
+    seconds = flight.seconds(np.array(found, np.int64).reshape(-1, 2))
+    return tuple((begin, end) for begin, end in seconds.tolist())
 
 
 def _began_unix_s(flight: Flight) -> float:

@@ -1,5 +1,6 @@
 """The catalogue of the recordings under a folder: a SQLite file, kept up to date and queried."""
 
+import math
 import os
 import sqlite3
 import struct
@@ -17,7 +18,7 @@ from urllib.parse import quote
 import msgspec
 
 from gateway.batch.executors import Executor, WorkFailed
-from gateway.batch.facts import FlightFacts, Flown, Position, TableTally, TlogTally, feature
+from gateway.batch.facts import FlightFacts, Flown, Segments, TableTally, TlogTally
 from gateway.printable import UserError
 from gateway.recordings.files import (
     GZIP,
@@ -32,12 +33,15 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
+from gateway.recordings.formats.maps import TrackPoint, track_feature
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.reading import ReadOptions, open_rows
 from gateway.recordings.table import TableBlock, TableReader
+from gateway.records import NAN
+from gateway.units import DEG_PER_DEGE7, M_PER_CM
 
 CATALOGUE_NAME: Final = "catalogue.sqlite"
-SCHEMA: Final = 1
+SCHEMA: Final = 2
 """A catalogue of another schema is made again."""
 BUSY_S: Final = 10.0
 """How long a writer waits for another one to end."""
@@ -68,6 +72,9 @@ COLUMNS: Final = (*_FILE_COLUMNS, *_FACT_COLUMNS)
 """Columns that a query may use."""
 _POSITION: Final = struct.Struct("<iii")
 """Latitude and longitude in 1e-7 deg, height in cm."""
+_UNKNOWN: Final = -(1 << 31)
+"""Height that is not known; latitude where the track is broken."""
+_BREAK: Final = _POSITION.pack(_UNKNOWN, 0, 0)
 _ALLOWED: Final = {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION}
 _DAMAGED: Final = "if it is no catalogue or damaged, delete it and index again"
 _NOT_WRITABLE: Final = "make the folder of the recordings writable, or copy them"
@@ -177,7 +184,7 @@ class Catalogue:
                 (*of_file, file.error, *msgspec.structs.astuple(facts)),
             )
             if track:
-                packed = b"".join(_POSITION.pack(*_counts(position)) for position in track)
+                packed = _BREAK.join(b"".join(map(_packed, points)) for points in track)
                 self._db.execute("INSERT INTO tracks VALUES (?, ?)", (cursor.lastrowid, packed))
 
 
@@ -241,7 +248,9 @@ def geojson_of(folder: Path, where: str = "") -> dict[str, Any]:
             (row[0], dict(zip(COLUMNS, row[1:], strict=True)))
             for row in _select(db, f"id, {', '.join(COLUMNS)}", where)
         ]
-    tracks = [feature(_unpacked(packed[number]), row) for number, row in found if number in packed]
+    tracks = [
+        track_feature(_unpacked(packed[number]), row) for number, row in found if number in packed
+    ]
     return {"type": "FeatureCollection", "features": tracks}
 
 
@@ -323,15 +332,23 @@ def _with_advice(path: Path) -> Iterator[None]:
         raise CatalogueError(f"{path}: {error}; {_WAYS_OUT.get(code, _DAMAGED)}") from error
 
 
-def _counts(position: Position) -> tuple[int, int, int]:
-    lat, lon, alt = position
-    return round(lat * 1e7), round(lon * 1e7), round(alt * 100.0) if alt == alt else 0
+def _packed(at: TrackPoint) -> bytes:
+    alt_cm = round(at.alt_amsl_m * 100.0) if math.isfinite(at.alt_amsl_m) else _UNKNOWN
+    return _POSITION.pack(
+        round(at.lat_deg / DEG_PER_DEGE7), round(at.lon_deg / DEG_PER_DEGE7), alt_cm
+    )
 
 
-def _unpacked(packed: bytes) -> list[Position]:
-    return [
-        (lat * 1e-7, lon * 1e-7, alt / 100.0) for lat, lon, alt in _POSITION.iter_unpack(packed)
-    ]
+def _unpacked(packed: bytes) -> Segments:
+    segments: Segments = [[]]
+    for lat, lon, alt_cm in _POSITION.iter_unpack(packed):
+        if lat == _UNKNOWN:
+            segments.append([])
+            continue
+        alt_m = NAN if alt_cm == _UNKNOWN else alt_cm * M_PER_CM
+        at = TrackPoint(0, lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt_m)
+        segments[-1].append(at)
+    return segments
 
 
 ENDINGS: Final = (".tlog", ".csv")
@@ -482,8 +499,9 @@ def _may_be_recording(path: Path) -> bool:
 def _flights_in(path: Path, options: ReadOptions) -> list[Flown]:
     kind = format_of(path)
     if kind == TLOG:
-        tlog = TlogTally()
-        for batch in open_tlog(path).batches():
+        source = open_tlog(path)
+        tlog = TlogTally(source.senders)
+        for batch in source.batches():
             tlog.add(batch)
         return tlog.flown()
     tally = TableTally()

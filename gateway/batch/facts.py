@@ -2,18 +2,19 @@
 
 import math
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
-from typing import Any, Final
+from itertools import chain
+from typing import Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gateway.analysis.flight import LocalFrame
-from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS, OUTAGE_S
+from gateway.analysis.pilot_figures import AIRBORNE_M, AIRBORNE_MPS
 from gateway.geometry.angle import wrap_180
-from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID, is_station
+from gateway.recordings.answers import AUTOPILOT_VERSION_ID, PARAM_VALUE_ID
 from gateway.recordings.columns import (
     COLUMNS,
     GPS,
@@ -21,49 +22,43 @@ from gateway.recordings.columns import (
     NODE_TIME,
     RAW,
     FloatArray,
+    has_fix,
     has_group,
     has_position,
 )
+from gateway.recordings.figures import gps_outages_us, lost_share
+from gateway.recordings.formats.maps import TrackPoint, point_of_fix
 from gateway.recordings.moment import civil_time
-from gateway.recordings.summary import GLOBAL_POSITION_INT_ID, GroundDistance, TimesSpan
+from gateway.recordings.positions import FIX_2D, GPS_IDS, Continuity, GroundDistance
+from gateway.recordings.senders import RecordedSender, Senders
+from gateway.recordings.summary import TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader
-from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, payload_of
+from gateway.recordings.tlog import Batch
+from gateway.recordings.tlog_index import TlogIndex
+from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.records import NodeStatus
-from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 TOLERANCE_M: Final = 3.0
 """Less than the error of the GPS."""
 MAX_POSITIONS: Final = 400
 """Of one track; a day in circles gets coarser instead of larger."""
 
-Position = tuple[float, float, float]
-"""Latitude and longitude in deg, height above mean sea level in m."""
+Segments = list[list[TrackPoint]]
+"""A track; it is broken between two of them."""
 
 
-def simplified(positions: Sequence[Position]) -> list[Position]:
-    """Leave out positions that the straight lines between the others pass within a few metres."""
-    if len(positions) < 3:
-        return list(positions)
-    lat_deg, lon_deg, _ = np.array(positions, np.float64).T
-    plane, tolerance_m = LocalFrame(*positions[0]).local_m(lat_deg, lon_deg), TOLERANCE_M
+def simplified(points: Sequence[TrackPoint]) -> list[TrackPoint]:
+    """Leave out points that the straight lines between the others pass within a few metres."""
+    if len(points) < 3:
+        return list(points)
+    lat_deg, lon_deg = np.array([(point.lat_deg, point.lon_deg) for point in points]).T
+    frame = LocalFrame(points[0].lat_deg, points[0].lon_deg, 0.0)
+    plane, tolerance_m = frame.local_m(lat_deg, lon_deg), TOLERANCE_M
     while np.count_nonzero(kept := _kept(plane, tolerance_m)) > MAX_POSITIONS:
         tolerance_m *= 2.0
-    return [position for position, keep in zip(positions, kept.tolist(), strict=True) if keep]
-
-
-def feature(positions: Sequence[Position], properties: Mapping[str, Any]) -> dict[str, Any]:
-    """Write a track as a GeoJSON feature (RFC 7946); cut in two where it crosses 180 degrees."""
-    lines: list[list[list[float]]] = [[]]
-    for lat, lon, alt in positions:
-        if lines[-1] and abs(lon - lines[-1][-1][0]) > 180.0:
-            lines.append([])
-        lines[-1].append([round(lon, 7), round(lat, 7), round(alt, 2)])
-    lines = [line if len(line) > 1 else line * 2 for line in lines if line]
-    return {
-        "type": "Feature",
-        "geometry": {"type": "MultiLineString", "coordinates": lines} if lines else None,
-        "properties": dict(properties),
-    }
+    return [point for point, keep in zip(points, kept.tolist(), strict=True) if keep]
 
 
 def _kept(plane: NDArray[np.float64], tolerance_m: float) -> NDArray[np.bool_]:
@@ -95,12 +90,8 @@ def _distances_m(
 
 POINT_US: Final = US_PER_S // 10
 """Positions nearer in time than this add nothing new of a flight."""
-OUTAGE_STEPS: Final = 2.5
-"""So many usual intervals without a fix are an outage, where fixes come seldom."""
 EARLIEST_US: Final = 315_532_800 * US_PER_S
 """1980, when GPS began: an earlier time counts from the start of a clock."""
-LOST_STEP: Final = 1.5
-"""So many usual intervals between two samples are a loss."""
 
 
 class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -162,22 +153,31 @@ class FlightTally:
 
     def __init__(self) -> None:
         self.distance = GroundDistance()
-        self.points: list[tuple[int, float, float, float, float]] = []
+        self.segments: Segments = []
+        self.speeds_mps: list[float] = []
+        self._continuity = Continuity()
+        self._newest_us = -POINT_US
         self._gps_us: list[int] = []
         self._fixed: list[bool] = []
         self.faults = 0
 
-    def add_position(self, time_us: int, position: Position, speed_mps: float) -> None:
-        """Take a position in: latitude and longitude in deg, height in m, ground speed in m/s."""
-        self.distance.add(time_us, position[0], position[1])
-        if self.points and 0 <= time_us - self.points[-1][0] < POINT_US:
+    def add_position(self, point: TrackPoint, speed_mps: float, boot_us: int | None = None) -> None:
+        """Take a position in, with the speed over ground; see `Continuity`."""
+        at = (point.time_us, point.lat_deg, point.lon_deg)
+        self.distance.update(*at, boot_us)
+        if self.segments and 0 <= point.time_us - self._newest_us < POINT_US:
             return
-        self.points.append((time_us, *position, speed_mps))
+        self._newest_us = point.time_us
+        if self._continuity.is_broken_at(*at, boot_us) or not self.segments:
+            self.segments.append([])
+        self.segments[-1].append(point)
+        self.speeds_mps.append(speed_mps)
 
     def prefer_positions_of(self, other: "FlightTally") -> None:
         """Use the positions of another tally, if it has any."""
-        if other.points:
-            self.points, self.distance = other.points, other.distance
+        if other.segments:
+            self.segments, self.speeds_mps = other.segments, other.speeds_mps
+            self.distance = other.distance
 
     def add_gps(self, time_us: int, *, fixed: bool) -> None:
         """Note that the receiver sent something, and whether it had a fix."""
@@ -186,12 +186,16 @@ class FlightTally:
 
     def facts(self, end_us: int | None) -> FlightFacts:
         """Sum up, with all that depends on positions and fixes alone."""
-        outages, lost_s = self._outages(end_us)
-        known = FlightFacts(gps_outages=outages, gps_lost=lost_s, faults=self.faults)
-        if not self.points:
+        outages = gps_outages_us(np.array(self._gps_us), np.array(self._fixed, bool), end_us or 0)
+        known = FlightFacts(faults=self.faults)
+        if outages is not None:
+            lost_s = sum(end - begin for begin, end in outages) / US_PER_S
+            known = msgspec.structs.replace(known, gps_outages=len(outages), gps_lost=lost_s)
+        if not self.segments:
             return known
-        points = np.array(self.points, np.float64)
-        lat, lon, alt, speed = points[:, 1:].T
+        points = chain.from_iterable(self.segments)
+        lat, lon, alt = np.array([(p.lat_deg, p.lon_deg, p.alt_amsl_m) for p in points]).T
+        speed = np.array(self.speeds_mps)
         height = alt - alt[0]
         west, east = _longitudes(lon)
         flying = np.flatnonzero((speed > AIRBORNE_MPS) & (height > AIRBORNE_M))
@@ -209,39 +213,15 @@ class FlightTally:
             takeoff_lon=None if takeoff is None else float(lon[takeoff]),
         )
 
-    def track(self) -> list[Position]:
-        """Return the track in as few positions as show it."""
-        return simplified([(lat, lon, alt) for _, lat, lon, alt, _ in self.points])
-
-    def _outages(self, end_us: int | None) -> tuple[int | None, float | None]:
-        times = np.array(self._gps_us, np.int64)
-        fixed = times[np.array(self._fixed, np.bool_)]
-        if not len(fixed):
-            return None, None
-        usual_s = float(np.median(np.diff(times))) / US_PER_S if len(times) > 1 else 0.0
-        longest_s = max(OUTAGE_S, OUTAGE_STEPS * usual_s)
-        last_us = max(end_us or 0, int(fixed[-1]))
-        gaps_s = np.diff(np.append(fixed, last_us)) / US_PER_S
-        # A clock that jumps by days is no gap.
-        outages = gaps_s[(gaps_s > longest_s) & (gaps_s <= DAY_US / US_PER_S)]
-        return len(outages), float(outages.sum())
+    def track(self) -> Segments:
+        """Return the track in as few points as show it."""
+        return [*map(simplified, self.segments)]
 
 
 def began_text(unix_us: int | None) -> str | None:
     """Write a civil time as the catalogue does; None if it can be none."""
     moment = None if unix_us is None or unix_us < EARLIEST_US else civil_time(unix_us)
     return None if moment is None else f"{moment:%Y-%m-%d %H:%M:%S}"
-
-
-def lost_share(times_us: NDArray[np.int64]) -> float | None:
-    """Estimate which share of samples is missing between those that came at a steady rate."""
-    steps = np.diff(times_us)
-    steps = steps[steps > 0]
-    if not len(steps):
-        return None
-    counts = steps / np.median(steps)
-    lost = float((np.rint(counts[counts > LOST_STEP]) - 1.0).sum())
-    return lost / (lost + len(times_us))
 
 
 def _greatest(values: NDArray[np.float64]) -> float | None:
@@ -256,25 +236,10 @@ def _longitudes(lon_deg: NDArray[np.float64]) -> tuple[float, float]:
     return (wrap_180(west), wrap_180(east))
 
 
-SYS_STATUS_ID: Final = 1
-GPS_RAW_INT_ID: Final = 24
-STATUSTEXT_ID: Final = 253
-USED_IDS: Final = np.array(
-    [
-        HEARTBEAT_ID, SYS_STATUS_ID, PARAM_VALUE_ID, GPS_RAW_INT_ID, GLOBAL_POSITION_INT_ID,
-        AUTOPILOT_VERSION_ID, STATUSTEXT_ID,
-    ]
-)  # fmt: skip
+SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
+USED_IDS: Final = frozenset({SYS_STATUS_ID, PARAM_VALUE_ID, AUTOPILOT_VERSION_ID, *GPS_IDS})
 ERROR: Final = 3
 """MAV_SEVERITY_ERROR; lower numbers are more severe."""
-FIX_2D: Final = 2
-
-_POSITION: Final = struct.Struct("<Iiiiihh")
-_DROP_RATE: Final = struct.Struct("<18xH")
-"""SYS_STATUS: hundredths of a percent."""
-_FIX_TYPE: Final = struct.Struct("<28xB")
-_FIRMWARE: Final = struct.Struct("<16xI")
-_PARAMETER: Final = struct.Struct("<4s4x16s")
 CHECKSUM_DIGITS: Final = 12
 
 _POSITION_AND_SPEED: Final = [
@@ -282,7 +247,7 @@ _POSITION_AND_SPEED: Final = [
     *(COLUMNS.index(name) for name in ("nav_vel_north_mps", "nav_vel_east_mps")),
 ]
 
-Flown = tuple[FlightFacts, list[Position]]
+Flown = tuple[FlightFacts, Segments]
 """The facts of a flight, and its track."""
 
 
@@ -314,13 +279,12 @@ class TableTally:
         for values in cells[has_group(cells, GPS), GPS].tolist():
             fix = GPS_CODEC.read(values)
             self._fixes.add_gps(fix.time_us, fixed=fix.fix_ok)
-            if fix.fix_ok:
-                position = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7)
-                speed_mps = math.hypot(*fix.vel_n_mps[:2])
-                self._fixes.add_position(fix.time_us, (*position, fix.alt_amsl_m), speed_mps)
+        for fix in map(GPS_CODEC.read, cells[has_fix(cells), GPS].tolist()):
+            self._fixes.add_position(point_of_fix(fix), math.hypot(*fix.vel_n_mps[:2]))
         placed = cells[has_position(cells)]
         for time_us, *position, north, east in placed[:, _POSITION_AND_SPEED].tolist():
-            self._states.add_position(int(time_us), tuple(position), math.hypot(north, east))
+            point = TrackPoint(int(time_us), *position)
+            self._states.add_position(point, math.hypot(north, east))
 
     def _add_status(self, status: NodeStatus) -> None:
         """Count the failures of a node since its last report."""
@@ -355,26 +319,33 @@ class TableTally:
 class TlogTally:
     """Sums up a tlog batch by batch, a flight a vehicle."""
 
-    def __init__(self) -> None:
+    def __init__(self, senders: Senders) -> None:
         self._index, self._span = TlogIndex(), TimesSpan()
-        self._vehicles: dict[int, _Sent] = {}
+        self._reader = VehicleReader(senders, USED_IDS, with_attitude=False)
+        self._senders = senders
+        self._vehicles = {system: _Sent(senders.vehicle(system)) for system in senders.systems()}
 
     def add(self, batch: Batch) -> None:
         """Take in the next batch of the file."""
         self._index.add(batch)
-        if len(batch):
-            self._span.add_all(batch.time_us)
-        for i in np.flatnonzero(np.isin(batch.message_ids, USED_IDS)).tolist():
-            origin = int(batch.origins[i])
-            if is_station(origin, self._index.stations):
-                continue
-            sent = self._vehicles.setdefault(origin >> 8, _Sent())
-            time_us = int(batch.time_us[i])
-            sent.update(int(batch.message_ids[i]), time_us, batch.frame(i))
+        if not len(batch):
+            return
+        self._span.add_all(batch.time_us)
+        for system, sent in self._vehicles.items():
+            own = batch.time_us[batch.origins >> 8 == system]
+            if len(own):
+                sent.span.add_all(own)
+        self._update(self._reader.feed_batch(batch))
+
+    def _update(self, messages: Iterable[VehicleMessage]) -> None:
+        for message in messages:
+            if (sent := self._vehicles.get(message.system_id)) is not None:
+                sent.update(message)
 
     def flown(self) -> list[Flown]:
         """Return a flight for each vehicle; one without a vehicle where there is none."""
         index = self._index
+        self._update(self._reader.flush())
         if not index.count:
             return []
         if not self._vehicles:
@@ -393,44 +364,40 @@ class TlogTally:
 class _Sent:
     """Facts of one vehicle from the messages that it sent."""
 
-    def __init__(self) -> None:
+    def __init__(self, vehicle: RecordedSender) -> None:
+        self.span = TimesSpan()
         self._tally = FlightTally()
-        self._span = TimesSpan()
-        self._last_us = 0
+        first, _ = GPS_IDS
+        self._gps_id = vehicle.position_id if vehicle.position_id in GPS_IDS else first
         self._drops: list[int] = []
         self._firmware: str | None = None
         self._parameters: dict[bytes, bytes] = {}
 
-    def update(self, message_id: int, time_us: int, frame: bytes) -> None:
-        self._span.add(time_us)
-        self._last_us = max(time_us, self._last_us)
-        if message_id == GLOBAL_POSITION_INT_ID:
-            _, lat, lon, alt, _, north, east = _POSITION.unpack(payload_of(frame, _POSITION.size))
-            if lat or lon:
-                position = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
-                self._tally.add_position(time_us, position, float(np.hypot(north, east)) / 100.0)
-        elif message_id == GPS_RAW_INT_ID:
-            (fix_type,) = _FIX_TYPE.unpack(payload_of(frame, _FIX_TYPE.size))
-            self._tally.add_gps(time_us, fixed=fix_type >= FIX_2D)
-        elif message_id == SYS_STATUS_ID:
-            self._drops += _DROP_RATE.unpack(payload_of(frame, _DROP_RATE.size))
-        elif message_id == STATUSTEXT_ID:
-            self._tally.faults += payload_of(frame, 1)[0] <= ERROR
-        elif message_id == AUTOPILOT_VERSION_ID:
-            (version,) = _FIRMWARE.unpack(payload_of(frame, _FIRMWARE.size))
+    def update(self, message: VehicleMessage) -> None:
+        m, at = message.fields, message.position
+        if at is not None:
+            point = TrackPoint(message.time_us, at.lat_deg, at.lon_deg, at.alt_amsl_m)
+            self._tally.add_position(point, at.groundspeed_mps, message.boot_us)
+        if message.text is not None:
+            self._tally.faults += message.text.severity <= ERROR
+        elif message.message_id == self._gps_id:
+            self._tally.add_gps(message.time_us, fixed=m["fix_type"] >= FIX_2D)
+        elif message.message_id == SYS_STATUS_ID:
+            self._drops.append(m["drop_rate_comm"])
+        elif message.message_id == AUTOPILOT_VERSION_ID:
+            version = m["flight_sw_version"]
             self._firmware = ".".join(str(version >> shift & 0xFF) for shift in (24, 16, 8))
-        elif message_id == PARAM_VALUE_ID:
-            value, name = _PARAMETER.unpack(payload_of(frame, _PARAMETER.size))
-            self._parameters[name] = value
+        elif message.message_id == PARAM_VALUE_ID:
+            self._parameters[m["param_id"].ljust(16, b"\0")] = struct.pack("<f", m["param_value"])
 
     def flown(self, system_id: int, damaged: int) -> Flown:
         drops = [drop for drop in self._drops if drop <= 10_000]
         sent = sorted(self._parameters.items())
         known = msgspec.structs.replace(
-            self._tally.facts(self._last_us),
+            self._tally.facts(self.span.last_us),
             vehicle=system_id,
-            began=began_text(self._span.first_us),
-            duration=self._span.length_us / US_PER_S,
+            began=began_text(self.span.first_us),
+            duration=self.span.length_us / US_PER_S,
             loss=float(np.mean(drops)) / 10_000.0 if drops else None,
             damaged=damaged,
             version=self._firmware,

@@ -9,8 +9,9 @@ import logging
 import math
 import os
 import tempfile
+from collections import defaultdict
 from collections.abc import Collection, Sequence
-from contextlib import closing, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,14 +20,14 @@ from gateway.live.control_socket import ControlError
 from gateway.live.terminal import own_command
 from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import ControlClient, Uplink
-from gateway.recordings.answers import FIRST_GROUND_STATION, is_station
 from gateway.recordings.columns import TableRow
-from gateway.recordings.files import TLOG, format_of, read_chunks
-from gateway.recordings.formats.maps import TrackPoint, VehicleTrack, tracks_of_frames
+from gateway.recordings.files import TLOG, format_of, open_tlog, read_chunks
+from gateway.recordings.formats.maps import TrackPoint
 from gateway.recordings.index import RecordingError, find_recording, parts_together
-from gateway.recordings.opening import TlogFile
 from gateway.recordings.reading import recorded_frames
+from gateway.recordings.senders import FIRST_GROUND_STATION, Senders
 from gateway.recordings.table import TableHeader, TableReader
+from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S
 
 PROFILE_POINTS: Final = 400
@@ -83,20 +84,20 @@ def free_ids(count: int, taken: Collection[int]) -> range:
 
 
 def _of_tlogs(parts: Sequence[Path]) -> list[RecordedAircraft]:
-    begins, origins, stations = list[int](), set[int](), set[int]()
-    for part in parts:
-        with closing(TlogFile(part)) as tlog:
-            begins.append(tlog.index.first_us or 0)
-            origins |= tlog.index.origins
-            stations |= tlog.index.stations
-    vehicles = sorted({origin >> 8 for origin in origins if not is_station(origin, stations)})
-    tracks = {track.name: track for track in tracks_of_frames(recorded_frames(parts, None), None)}
-    none = VehicleTrack("")
+    sources, senders = [open_tlog(part) for part in parts], Senders()
+    for source in sources:
+        senders.merge(source.senders)
+    reader, begin_us = VehicleReader(senders), None
+    points: defaultdict[int, list[TrackPoint]] = defaultdict(list)
+    for record in recorded_frames(sources):
+        begin_us = record.time_us if begin_us is None else begin_us
+        for message in reader.feed(record):
+            if (at := message.position) is not None:
+                point = TrackPoint(message.time_us, at.lat_deg, at.lon_deg, at.alt_amsl_m)
+                _note_height(point, points[message.system_id])
     return [
-        RecordedAircraft(
-            system_id, RECORDED, _profile(tracks.get(f"system {system_id}", none).points, begins[0])
-        )
-        for system_id in vehicles
+        RecordedAircraft(system_id, RECORDED, _profile(points[system_id], begin_us or 0))
+        for system_id in senders.systems()
     ]
 
 
@@ -110,17 +111,16 @@ def _of_tables(parts: Sequence[Path]) -> RecordedAircraft:
                     vehicle_id = event.vehicle_id
                 elif isinstance(event, TableRow):
                     begin_us = event.time_us if begin_us is None else begin_us
-                    _note_height(event, points)
+                    if event.state is not None:
+                        at = (event.state.lat_deg, event.state.lon_deg, event.state.alt_amsl_m)
+                        _note_height(TrackPoint(event.time_us, *at), points)
     return RecordedAircraft(vehicle_id, FUSED_AGAIN, _profile(points, begin_us or 0))
 
 
-def _note_height(row: TableRow, points: list[TrackPoint]) -> None:
-    state = row.state
-    if state is None or not math.isfinite(state.alt_amsl_m):
-        return
-    if points and row.time_us - points[-1].time_us < HEIGHT_GAP_US:
-        return
-    points.append(TrackPoint(row.time_us, state.lat_deg, state.lon_deg, state.alt_amsl_m))
+def _note_height(point: TrackPoint, points: list[TrackPoint]) -> None:
+    is_due = not points or point.time_us - points[-1].time_us >= HEIGHT_GAP_US
+    if is_due and math.isfinite(point.alt_amsl_m):
+        points.append(point)
 
 
 def _profile(points: Sequence[TrackPoint], begin_us: int) -> Profile:

@@ -23,16 +23,13 @@ from typing import Final, Generic, TypeVar
 
 import numpy as np
 
+from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION, is_station
+from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import Batch, fields_of, payload_of
 from gateway.recordings.tlog_scan import IntArray
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
-
-FIRST_GROUND_STATION: Final = 250
-"""System ids from here on are by custom ground stations, which keep their id."""
-AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1."""
 
 
 def _ids(*names: str) -> frozenset[int]:
@@ -65,11 +62,6 @@ ANSWERS: Final = np.array(sorted(_ids(
 )))  # fmt: skip
 """Answers to a station that asked in flight: one of today could take them for its own."""
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
-
-
-def is_station(origin: int, stations: Set[int]) -> bool:
-    """Return whether a sender (system << 8 | component) is a ground station."""
-    return origin >> 8 >= FIRST_GROUND_STATION or origin in stations
 
 
 def is_command(frame: bytes, stations: Set[int]) -> bool:
@@ -273,9 +265,7 @@ class VehicleAnswers:
             (*_VALUE.unpack(payload_of(frame, _VALUE.size))[2:4], frame) for frame in frames
         )
         return {
-            name.split(b"\0", 1)[0].decode("ascii", "replace"): self._edited(
-                frame, param_count=len(values), param_index=number
-            )
+            text_of(name): self._edited(frame, param_count=len(values), param_index=number)
             for number, (_, name, frame) in enumerate(values)
         }
 

@@ -378,6 +378,12 @@ def has_position(cells: FloatArray) -> BoolArray:
     return np.asarray((flags & int(NavFlags.POSITION_VALID)) != 0)
 
 
+def has_fix(cells: FloatArray) -> BoolArray:
+    """Return which rows hold a GPS fix; latitude 0, longitude 0 is sent before the first one."""
+    is_somewhere = (cells[:, FIX_LAT] != 0.0) | (cells[:, FIX_LON] != 0.0)
+    return np.asarray((cells[:, FIX_OK] == 1.0) & is_somewhere)
+
+
 def read_lines(text: bytes, width: int) -> FloatArray | None:
     """Read lines of `width` numbers each; None if one is not: `read_cells` finds which."""
     # JSON's whole zero has no sign, a float's has one.

@@ -8,13 +8,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.files import NO_RECORDING, TLOG, FlightError, format_of
+from gateway.recordings.files import NO_RECORDING, TLOG, FlightError, format_of, open_tlog
 from gateway.recordings.formats.maps import (
+    DRAWN_IDS,
     VehicleTrack,
     to_geojson,
     to_gpx,
     to_kml,
-    tracks_of_frames,
+    tracks_of_messages,
     tracks_of_table,
 )
 from gateway.recordings.moment import time_us_of
@@ -32,8 +33,10 @@ from gateway.recordings.reading import (
     trimmed,
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Stamper, TlogRecord, encode_record
+from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 
 class FlightToWrite:
@@ -61,16 +64,32 @@ class FlightToWrite:
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self._sources: list[RecordedFusion | RecordedTable] = []
         self._remarks: list[str] = []
+        self.senders = Senders()
+        """Those of MAVLink, once its frames are requested."""
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
         if not self.is_mavlink:
             return _within(self._sent(), self._limits)
-        recorded = recorded_frames(self.files, self.options.progress, self._remarks)
+        sources = [open_tlog(file) for file in self.files]
+        for source in sources:
+            self.senders.merge(source.senders)
+            self._remarks += [f"{source.path}: {text}" for text in source.remarks]
+        recorded = recorded_frames(sources, self.options.progress)
         first = next(recorded, None)
         if first is None:
             raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
         return _within(chain([first], recorded), self._limits)
+
+    def vehicle_messages(
+        self, wanted: Iterable[int] = (), system_id: int | None = None
+    ) -> Iterator[VehicleMessage]:
+        """Yield the positions, attitudes and texts of the vehicles, and other messages by id."""
+        frames = self.frames()
+        reader = VehicleReader(self.senders, wanted, system_id)
+        for record in frames:
+            yield from reader.feed(record)
+        yield from reader.flush()
 
     def table(self) -> RecordedTable:
         """Return the rows: as recorded, or fused again from the start and then cut."""
@@ -157,7 +176,7 @@ def _drawn(draw: Callable[[str, list[VehicleTrack]], Iterator[str]]) -> Write:
 
 def _vehicles(flight: FlightToWrite) -> list[VehicleTrack]:
     if flight.is_mavlink:
-        found = tracks_of_frames(flight.frames(), flight.options.system_id)
+        found = tracks_of_messages(flight.vehicle_messages(DRAWN_IDS, flight.options.system_id))
     else:
         tables = (one.table() for one in flight.by_aircraft())
         found = [

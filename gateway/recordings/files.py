@@ -25,9 +25,8 @@ from pathlib import Path
 from tempfile import NamedTemporaryFile, gettempdir
 from typing import IO, BinaryIO, Final, Literal, cast
 
-from pymavlink.dialects.v20 import all as mavlink
-
 from gateway.printable import UserError
+from gateway.recordings.senders import Senders
 from gateway.recordings.table import MAX_LINE, TableBlock, TableReader
 from gateway.recordings.tlog import (
     DAY_US,
@@ -40,6 +39,7 @@ from gateway.recordings.tlog import (
 )
 from gateway.recordings.tlog_scan import TIME_SIZE
 from gateway.units import US_PER_S, counted
+from gateway.wire.mavlink_messages import DEFINITIONS
 from gateway.wire.mavlink_splitter import MavlinkSplitter, SplitFault, message_id_of, origin_of
 
 CHUNK: Final = 1 << 20
@@ -301,7 +301,7 @@ _UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "time_unix_usec": 1}
 """Fields with the sender's time, and their unit."""
 _TIMES: Final = {
     message_id: names
-    for message_id, kind in mavlink.mavlink_map.items()
+    for message_id, kind in DEFINITIONS.items()
     if (names := [name for name in _UNITS_US if name in kind.fieldnames])
 }
 """Fields of each message with a time."""
@@ -364,6 +364,7 @@ class TlogSource:
     path: Path
     layout: Layout
     timeline: Timeline
+    senders: Senders
     remarks: tuple[str, ...] = ()
     """Remarks for the user about its times."""
     civil_us_at_zero: int = 0
@@ -400,13 +401,13 @@ def open_tlog(path: Path) -> TlogSource:
     layout = file_layout(first_bytes(path))
     if layout is Layout.BARE:
         return _open_bare(path)
-    timeline, scanner = Timeline(), TlogScanner()
-    for data in TlogSource(path, layout, timeline).chunks():
-        timeline.add(scanner.feed(data))
-    timeline.add(scanner.feed(b"", final=True))
+    timeline, senders = Timeline(), Senders()
+    for batch in TlogSource(path, layout, Timeline(), senders).batches():
+        timeline.add(batch)
+        senders.add(batch)
     padded = ("has eight zero bytes more in each record; left out",)
     remarks = padded if layout is Layout.PADDED else ()
-    return TlogSource(path, layout, timeline, (*remarks, *_jumps_in_words(timeline)))
+    return TlogSource(path, layout, timeline, senders, (*remarks, *_jumps_in_words(timeline)))
 
 
 def file_layout(head: bytes) -> Layout:
@@ -439,9 +440,13 @@ def _open_bare(path: Path) -> TlogSource:
     if left_out:
         remarks.append(f"left out {counted(left_out, 'byte')} between frames")
     zero_us = clock.civil_us_at_zero or 0
-    return TlogSource(
-        path, Layout.BARE, Timeline(), tuple(remarks), zero_us, by_size=not clock.is_timed
-    )
+    source = TlogSource(
+        path, Layout.BARE, Timeline(), Senders(), tuple(remarks), zero_us,
+        by_size=not clock.is_timed,
+    )  # fmt: skip
+    for batch in source.batches():
+        source.senders.add(batch)
+    return source
 
 
 def _frames(data: Iterator[bytes]) -> Iterator[list[tuple[int, bytes, bytes]]]:

@@ -10,7 +10,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.answers import FIRST_GROUND_STATION, LogAnswers, is_station
+from gateway.recordings.answers import LogAnswers
 from gateway.recordings.files import (
     MAX_UNPACKED,
     NO_RECORDING,
@@ -28,7 +28,9 @@ from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.recorded_fusion import RecordedFusion, end_of
-from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner, encode_record
+from gateway.recordings.senders import FIRST_GROUND_STATION
+from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog_index import TlogIndex
 
 READ_SIZE: Final = 1 << 20
 
@@ -67,7 +69,7 @@ class TlogFile:
             batch = source.timeline.apply(scanner.feed(data, final=not data))
             self.index.add(batch)
             if answers is not None:
-                answers.note(batch, self.index.stations)
+                answers.note(batch, self.index.senders.stations)
             offset += len(data)
             if progress is not None:
                 progress(len(data))
@@ -156,7 +158,7 @@ class FusedTlog:
         batch = self._scanner.feed(made, final=self._ended)
         self.index.add(batch)
         if self._answers is not None:
-            self._answers.note(batch, self.index.stations)
+            self._answers.note(batch, self.index.senders.stations)
         self._size += len(made)
         return not self._ended
 
@@ -183,14 +185,8 @@ class OpenFlight:
     @property
     def vehicles(self) -> list[int]:
         """System ids of all senders that are not ground stations."""
-        return sorted(
-            {
-                origin >> 8
-                for source in self.sources
-                for origin in source.index.origins
-                if not is_station(origin, source.index.stations)
-            }
-        )
+        systems = (source.index.senders.systems() for source in self.sources)
+        return sorted(set().union(*systems))
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,8 @@ from typing import Final, Protocol
 import numpy as np
 
 from gateway.recordings.answers import answers_of, telemetry_of
-from gateway.recordings.tlog import SEEK_BYTES, STRIDE, Batch, TlogIndex, TlogRecord, TlogScanner
+from gateway.recordings.tlog import SEEK_BYTES, STRIDE, Batch, TlogRecord, TlogScanner
+from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_scan import IntArray
 from gateway.units import US_PER_S
 from gateway.wire.frame_editing import edit_frame
@@ -141,7 +142,7 @@ class Track:
     def _wanted(self, batch: Batch, begin: int) -> IntArray:
         if self._with_commands:
             return np.arange(begin, len(batch))
-        return telemetry_of(batch, begin, self._source.index.stations)
+        return telemetry_of(batch, begin, self._source.index.senders.stations)
 
     def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
         """Yield the records to play; sequence numbers have no gap where answers are left out.
@@ -172,7 +173,7 @@ class Track:
     def _left_out(self, batch: Batch) -> IntArray:
         if self._with_commands:
             return np.empty(0, np.int64)
-        return answers_of(batch, self._source.index.stations)
+        return answers_of(batch, self._source.index.senders.stations)
 
     def _addressed(self, frame: bytes) -> bytes:
         system_id = self._system_ids.get(origin_of(frame)[0])

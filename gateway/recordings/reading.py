@@ -35,6 +35,7 @@ from gateway.recordings.files import (
     Position,
     Progress,
     SettingsChoice,
+    TlogSource,
     encoding_of,
     format_of,
     open_tlog,
@@ -192,12 +193,9 @@ def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
 
 
 def recorded_frames(
-    paths: Iterable[Path], progress: Progress | None, remarks: list[str] | None = None
+    sources: Iterable[TlogSource], progress: Progress | None = None
 ) -> Iterator[TlogRecord]:
-    """Yield the records of tlogs, merged by time; remarks about their times are added."""
-    sources = [open_tlog(path) for path in paths]
-    if remarks is not None:
-        remarks += [f"{source.path}: {text}" for source in sources for text in source.remarks]
+    """Yield the records of tlogs, merged by time."""
     streams = [
         (record for batch in source.batches(progress) for record in batch.records())
         for source in sources

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,12 +10,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from gateway.geometry.geodesy import displacement_m
 from gateway.recordings.columns import (
     BARO,
     FIX_LAT,
     FIX_LON,
-    FIX_OK,
     GPS,
     MAG,
     NAV,
@@ -25,6 +22,7 @@ from gateway.recordings.columns import (
     RAW,
     SI,
     FloatArray,
+    has_fix,
     has_group,
     has_position,
 )
@@ -38,9 +36,13 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
+from gateway.recordings.positions import GroundDistance
+from gateway.recordings.senders import Senders
 from gateway.recordings.table import TableBlock, TableFault, TableHeader, TableMark, TableReader
-from gateway.recordings.tlog import DAY_US, HEARTBEAT_ID, Batch, TlogIndex, fields_of
+from gateway.recordings.tlog import DAY_US, Batch
+from gateway.recordings.tlog_index import TlogIndex
 from gateway.recordings.tlog_scan import IntArray
+from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 
@@ -51,13 +53,7 @@ if TYPE_CHECKING:
 GAP_US: Final = 2 * US_PER_S
 """Every vehicle sends a heartbeat a second: a longer pause is a gap."""
 MAX_GAPS: Final = 1000
-STEP_US: Final = US_PER_S // 2
-"""Interval of the positions between which the distance is summed."""
-LEAST_STEP_M: Final = 1.0
-"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
-
 MENDED: Final = "{} with a damaged time, each taken to be as old as the one before"
-GLOBAL_POSITION_INT_ID: Final = 33
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +81,10 @@ class VehicleInfo:
     system_id: int
     mav_type: int | None
     autopilot: int | None
-    distance_m: float
-    """Along the ground."""
+    distance_m: float | None
+    """Along the ground; None without a position."""
+    positions: str | None
+    """What the positions are of: a MAVLink message, or states or fixes of a table."""
     rates: tuple[Rate, ...]
 
 
@@ -115,51 +113,14 @@ class FileInfo:
 
 
 @dataclass(slots=True)
-class GroundDistance:
-    """The distance over ground: the one definition, for every command and page.
-
-    Steps of `LEAST_STEP_M` or more between positions `STEP_US` apart are summed. The positions are
-    the fused ones (GLOBAL_POSITION_INT, or the states of a table); the GPS fixes of a table that
-    has no states.
-    """
-
-    distance_m: float = 0.0
-    _sampled_us: int | None = None
-    _last: tuple[float, float] | None = None
-
-    def is_due(self, time_us: int) -> bool:
-        """Return whether a position of this time counts."""
-        return self._sampled_us is None or not 0 <= time_us - self._sampled_us < STEP_US
-
-    def add(self, time_us: int, lat_deg: float, lon_deg: float) -> None:
-        """Add a position, if it is due."""
-        if not self.is_due(time_us):
-            return
-        self._sampled_us = time_us
-        if self._last is not None:
-            step_m = math.hypot(*displacement_m(*self._last, lat_deg, lon_deg, 0.0))
-            if step_m < LEAST_STEP_M:
-                return
-            self.distance_m += step_m
-        self._last = (lat_deg, lon_deg)
-
-
-def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
-    """Return the distance over ground along positions; unknown ones are NaN."""
-    distance, known = GroundDistance(), np.isfinite(lat_deg)
-    columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
-    for at_us, lat, lon in zip(*columns, strict=True):
-        distance.add(at_us, lat, lon)
-    return distance.distance_m
-
-
-@dataclass(slots=True)
 class TimesSpan:
     """Sum up how long records last; a clock that leaps by days adds nothing."""
 
     first_us: int | None = None
     gaps: list[Gap] = field(default_factory=list)
     """The first `MAX_GAPS` between records of `add_all`."""
+    last_us: int | None = None
+    """Greatest time."""
     _begin_us: int = 0
     """Begin of the stretch since the last leap."""
     _newest_us: int = 0
@@ -194,17 +155,18 @@ class TimesSpan:
             if len(between):
                 self.add(int(between[0]))
                 self._newest_us = max(self._newest_us, int(between.max()))
+                self.last_us = max(self.last_us or self._newest_us, self._newest_us)
                 self._last_us = int(between[-1])
 
 
 class TlogSummary:
     """Summarise a tlog, batch by batch."""
 
-    def __init__(self) -> None:
-        self._index = TlogIndex()
+    def __init__(self, senders: Senders) -> None:
+        self._index, self._senders = TlogIndex(), senders
+        self._reader = VehicleReader(senders, with_attitude=False)
         self._counts: Counter[tuple[int, int]] = Counter()
-        self._kinds: dict[int, tuple[int, int]] = {}
-        self._distances: dict[int, GroundDistance] = {}
+        self._distances: defaultdict[int, GroundDistance] = defaultdict(GroundDistance)
         self._span = TimesSpan()
 
     def add(self, batch: Batch) -> None:
@@ -216,13 +178,11 @@ class TlogSummary:
         keys, counts = np.unique((batch.origins >> 8) << 24 | batch.message_ids, return_counts=True)
         for key, count in zip(keys.tolist(), counts.tolist(), strict=True):
             self._counts[key >> 24, key & 0xFFFFFF] += count
-        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
-            system_id, component_id = divmod(int(batch.origins[i]), 256)
-            if component_id == 1 and system_id not in self._kinds:
-                heartbeat = fields_of(batch.frame(i))
-                self._kinds[system_id] = (heartbeat["type"], heartbeat["autopilot"])
-        for i in np.flatnonzero(batch.message_ids == GLOBAL_POSITION_INT_ID).tolist():
-            self._add_position(batch, i)
+        for message in self._reader.feed_batch(batch):
+            if (at := message.position) is not None:
+                self._distances[message.system_id].update(
+                    message.time_us, at.lat_deg, at.lon_deg, message.boot_us
+                )
 
     def result(self, size: int) -> FileInfo:
         """Return the summary of a file of that size."""
@@ -246,23 +206,17 @@ class TlogSummary:
             remarks=(MENDED.format(counted(index.mended, "record")),) if index.mended else (),
         )
 
-    def _add_position(self, batch: Batch, i: int) -> None:
-        distance = self._distances.setdefault(int(batch.origins[i]) >> 8, GroundDistance())
-        time_us = int(batch.time_us[i])
-        if not distance.is_due(time_us):
-            return
-        m = fields_of(batch.frame(i))
-        if m["lat"] or m["lon"]:
-            distance.add(time_us, m["lat"] * DEG_PER_DEGE7, m["lon"] * DEG_PER_DEGE7)
-
     def _vehicle(self, system_id: int, duration_s: float) -> VehicleInfo:
-        mav_type, autopilot = self._kinds.get(system_id, (None, None))
+        vehicle = self._senders.vehicle(system_id)
+        mav_type, autopilot = vehicle.heartbeat or (None, None)
         counts = {key: n for (system, key), n in self._counts.items() if system == system_id}
+        distance_m = self._distances[system_id].distance_m
         return VehicleInfo(
             system_id=system_id,
             mav_type=mav_type,
             autopilot=autopilot,
-            distance_m=self._distances.get(system_id, GroundDistance()).distance_m,
+            distance_m=distance_m,
+            positions=None if distance_m is None else MESSAGE_NAMES[vehicle.position_id or 0],
             rates=tuple(
                 _rate(MESSAGE_NAMES.get(key, f"message {key}"), counts[key], duration_s)
                 for key in sorted(counts)
@@ -299,11 +253,15 @@ class TableSummary:
     def result(self, size: int) -> FileInfo:
         """Return the summary of a file of that size."""
         duration_s = self._span.length_us / US_PER_S
+        has_states = self._of_states.distance_m is not None
+        distance_m = (self._of_states if has_states else self._of_fixes).distance_m
+        positions = "states" if has_states else "GPS fixes"
         vehicle = VehicleInfo(
             system_id=self._header.vehicle_id if self._header else 1,
             mav_type=None,
             autopilot=None,
-            distance_m=(self._of_states if self._counts["state"] else self._of_fixes).distance_m,
+            distance_m=distance_m,
+            positions=None if distance_m is None else positions,
             rates=tuple(
                 _rate(name, self._counts[name], duration_s)
                 for name in ("imu", "mag", "baro", "gps", "state")
@@ -337,12 +295,12 @@ class TableSummary:
         times_us = cells[:, 0].astype(np.int64)
         self._last_us = max(int(times_us.max()), self._last_us or 0)
         self._span.add_all(times_us)
-        fixed = cells[:, FIX_OK] == 1.0
-        for time_us, lat, lon in cells[fixed][:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
-            self._of_fixes.add(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
+        fixed = cells[has_fix(cells)]
+        for time_us, lat, lon in fixed[:, [GPS.start, FIX_LAT, FIX_LON]].tolist():
+            self._of_fixes.update(int(time_us), lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7)
         placed = cells[has_position(cells)]
         for time_us, lat_deg, lon_deg in placed[:, [0, NAV_LAT, NAV_LON]].tolist():
-            self._of_states.add(int(time_us), lat_deg, lon_deg)
+            self._of_states.update(int(time_us), lat_deg, lon_deg)
 
 
 def _rate(name: str, count: int, duration_s: float) -> Rate:
@@ -356,7 +314,8 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
     """
     kind, size = format_of(file), file.stat().st_size
     if kind == TLOG:
-        tlog, source = TlogSummary(), open_tlog(file)
+        source = open_tlog(file)
+        tlog = TlogSummary(source.senders)
         for batch in source.batches(progress):
             tlog.add(batch)
         found = tlog.result(size)

@@ -5,8 +5,6 @@ offset from the gateway clock to civil time stays fixed as long as a file is ope
 a new file.
 """
 
-from array import array
-from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final, TypeVar
@@ -27,7 +25,7 @@ from gateway.recordings.tlog_scan import (
 )
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
-from gateway.wire.mavlink_splitter import START_V2, frame_of, message_id_of
+from gateway.wire.mavlink_splitter import PAYLOAD_V1, PAYLOAD_V2, START_V2, message_id_of
 from gateway.wire.timesync import GpsTime
 
 DAY_US: Final = 86_400 * US_PER_S
@@ -49,8 +47,6 @@ def is_damaged(before_us: Times, time_us: Times, after_us: Times) -> bool | NDAr
 STRIDE: Final = 256
 """Records between two entries of the index: a seek scans at most this many, some 15 kB."""
 SEEK_BYTES: Final = STRIDE * LARGEST_RECORD
-MAX_DAMAGE_RUNS: Final = 1000
-"""Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
 
 BACK_US: Final = 60 * US_PER_S
 """Frames of two links may be out of order by seconds; a clock that was set back shows more."""
@@ -59,6 +55,8 @@ FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
 MAX_JUMPS: Final = 1000
 
 HEARTBEAT_ID: Final = 0
+LENGTH_AT: Final = 1
+"""Offset of the payload's length in a frame."""
 UNRECORDED: Final = frozenset({235})
 """HIGH_LATENCY2, for links too narrow for the rest: next to these in a recording a ground station
 would take each one for another state of the vehicle."""
@@ -78,8 +76,8 @@ _EXTRA: Final = _crc_extra_table()
 
 def payload_of(frame: bytes, size: int) -> bytes:
     """Return the first bytes of a frame's payload, with the zeros that version 2 cuts off."""
-    begin = 10 if frame[0] == START_V2 else 6
-    return frame[begin : begin + min(frame[1], size)].ljust(size, b"\0")
+    begin = PAYLOAD_V2 if frame[0] == START_V2 else PAYLOAD_V1
+    return frame[begin : begin + min(frame[LENGTH_AT], size)].ljust(size, b"\0")
 
 
 def fields_of(frame: bytes) -> dict[str, Any]:
@@ -87,6 +85,20 @@ def fields_of(frame: bytes) -> dict[str, Any]:
     layout = layout_of(message_id_of(frame))
     values = np.frombuffer(payload_of(frame, layout.itemsize), layout)[0].item()
     return dict(zip(layout.names or (), values, strict=True))
+
+
+def columns_of(batch: "Batch", wanted: IntArray, message_id: int) -> NDArray[np.void]:
+    """Read the fields of some frames of one message; those cut off or unknown are zero."""
+    layout = layout_of(message_id)
+    data = np.frombuffer(batch.data, np.uint8)
+    starts = batch.starts[wanted] + TIME_SIZE
+    begins = starts + np.where(data[starts] == START_V2, PAYLOAD_V2, PAYLOAD_V1)
+    offsets = np.arange(layout.itemsize)
+    is_there = offsets < data[starts + LENGTH_AT][:, None]
+    payloads = np.zeros((len(wanted), layout.itemsize), np.uint8)
+    payloads[is_there] = data[(begins[:, None] + offsets)[is_there]]
+    found: NDArray[np.void] = payloads.view(layout)[:, 0]
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,83 +300,6 @@ class Timeline:
         at = np.searchsorted(self._begins, batch.starts + batch.offset, side="right") - 1
         corrected: IntArray = batch.time_us + shifts_us[np.maximum(at, 0)]
         return replace(batch, time_us=corrected)
-
-
-class TlogIndex:
-    """Index of a file: where to begin reading for a time, and a summary.
-
-    One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
-    it. The time stamps of other programs' files may jump back; the index searches by the greatest
-    time so far, which never does.
-    """
-
-    def __init__(self, timeline: Timeline | None = None) -> None:
-        self.timeline = timeline or Timeline()
-        """Corrects the times of batches that are read again."""
-        self.count = 0
-        """Records."""
-        self.size = 0
-        """Bytes that were seen, damage included."""
-        self.first_us: int | None = None
-        self.last_us: int | None = None
-        """Greatest time."""
-        self.origins: set[int] = set()
-        """All that sent: system << 8 | component."""
-        self.stations: set[int] = set()
-        """Those among them with heartbeats of a ground station."""
-        self.damage: list[Damage] = []
-        """The first `MAX_DAMAGE_RUNS` runs."""
-        self.damaged_bytes = 0
-        self.mended = 0
-        """Records whose time was damaged."""
-        self.unfinished = 0
-        """Bytes of a last record that is not whole."""
-        self._offsets = array("q")
-        self._times = array("q")
-
-    def add(self, batch: Batch) -> None:
-        """Take in the next batch of the file."""
-        for run in batch.damage:
-            self._add_damage(run)
-        self.mended += batch.mended
-        self.unfinished += batch.unfinished
-        if not len(batch):
-            return
-        self.origins |= set(np.unique(batch.origins).tolist())
-        self._add_stations(batch)
-        if self.first_us is None or self.last_us is None:
-            self.first_us = self.last_us = int(batch.time_us[0])
-        greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))
-        first = -self.count % STRIDE
-        self._offsets.frombytes((batch.starts[first::STRIDE] + batch.offset).tobytes())
-        self._times.frombytes(greatest[first::STRIDE].tobytes())
-        self.count += len(batch)
-        self.last_us = int(greatest[-1])
-        end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
-        self.size = max(self.size, batch.offset + end)
-
-    def _add_stations(self, batch: Batch) -> None:
-        for i in np.flatnonzero(batch.message_ids == HEARTBEAT_ID).tolist():
-            origin = int(batch.origins[i])
-            if origin not in self.stations and frame_of(batch.frame(i)).is_station_heartbeat:
-                self.stations.add(origin)
-
-    def offset_before(self, time_us: int, records: int = 0) -> int:
-        """Return where to begin reading to find the first record that is not before a time."""
-        if not self._offsets:
-            return 0
-        entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
-        return self._offsets[max(entry, 0)]
-
-    def _add_damage(self, run: Damage) -> None:
-        self.damaged_bytes += run.size
-        self.size = max(self.size, run.offset + run.size)
-        last = self.damage[-1] if self.damage else None
-        if last is not None and last.offset + last.size == run.offset:
-            # A run across two chunks arrives in two pieces.
-            self.damage[-1] = Damage(last.offset, last.size + run.size)
-        elif len(self.damage) < MAX_DAMAGE_RUNS:
-            self.damage.append(run)
 
 
 JUMP_US: Final = 2 * US_PER_S

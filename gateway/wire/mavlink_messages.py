@@ -12,29 +12,44 @@ import numpy as np
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
-_HASH: Final = "(8,)u1"
-MISSING: Final[dict[int, tuple[str, int, list[tuple[str, str]]]]] = {
-    300: (
-        "PROTOCOL_VERSION",
-        217,
-        [
-            *(("version", "<u2"), ("min_version", "<u2"), ("max_version", "<u2")),
-            *(("spec_version_hash", _HASH), ("library_version_hash", _HASH)),
-        ],
+_TYPES: Final = {"uint8_t": "B", "uint16_t": "H", "uint32_t": "I", "char": "c"}
+
+
+class MissingMessage:
+    """The definition of a message that the dialects lack, with the attributes of pymavlink's.
+
+    Fields are given in their order of the payload: name, type, and length of an array or 0.
+    """
+
+    def __init__(self, name: str, crc_extra: int, *fields: tuple[str, str, int]) -> None:
+        names, types, lengths = zip(*fields, strict=True)
+        self.msgname, self.crc_extra = name, crc_extra
+        self.fieldnames, self.ordered_fieldnames = list(names), list(names)
+        self.fieldtypes, self.array_lengths = list(types), list(lengths)
+        self.native_format = bytearray("<" + "".join(_TYPES[one] for one in types), "ascii")
+        self.fieldunits_by_name: dict[str, str] = {}
+        self.fieldenums_by_name: dict[str, str] = {}
+
+
+MISSING: Final = {
+    300: MissingMessage(
+        "PROTOCOL_VERSION", 217, ("version", "uint16_t", 0), ("min_version", "uint16_t", 0),
+        ("max_version", "uint16_t", 0), ("spec_version_hash", "uint8_t", 8),
+        ("library_version_hash", "uint8_t", 8),
     ),
-    397: (
-        "COMPONENT_METADATA",
-        182,
-        [("time_boot_ms", "<u4"), ("file_crc", "<u4"), ("uri", "S100")],
+    397: MissingMessage(
+        "COMPONENT_METADATA", 182, ("time_boot_ms", "uint32_t", 0), ("file_crc", "uint32_t", 0),
+        ("uri", "char", 100),
     ),
-    512: (
-        "CONTROL_STATUS",
-        21,
-        [("flags", "u1"), ("gcs_main", "u1"), ("gcs_secondary", "(10,)u1")],
+    512: MissingMessage(
+        "CONTROL_STATUS", 21, ("flags", "uint8_t", 0), ("gcs_main", "uint8_t", 0),
+        ("gcs_secondary", "uint8_t", 10),
     ),
-}
-"""Name, checksum seed and fields of messages that the dialects lack and a vehicle of the gateway
-sends."""
+}  # fmt: skip
+"""Messages that the dialects lack and a vehicle of the gateway sends."""
+
+DEFINITIONS: Final[dict[int, Any]] = {**dialect.mavlink_map, **MISSING}
+"""Every message that is known here, by id: name and fields as pymavlink lays them out."""
 
 NO_TARGET: Final = -1
 MAX_ID_V1: Final = 255
@@ -46,9 +61,7 @@ WIDEST: Final = 8
 @cache
 def layout_of(message_id: int) -> np.dtype[np.void]:
     """Return a message's fields as they lie in its payload."""
-    if message_id in MISSING:
-        return np.dtype(MISSING[message_id][2])
-    kind = dialect.mavlink_map[message_id]
+    kind = DEFINITIONS[message_id]
     fields = []
     for name, code, length in zip(
         kind.ordered_fieldnames, kind.native_format[1:], kind.array_lengths, strict=True
@@ -67,8 +80,8 @@ def offset_of(message_id: int, field: str) -> int:
 
 
 CRC_EXTRA: Final[dict[int, bytes]] = {
-    message_id: bytes((message.crc_extra,)) for message_id, message in dialect.mavlink_map.items()
-} | {message_id: bytes((extra,)) for message_id, (_, extra, _) in MISSING.items()}
+    message_id: bytes((message.crc_extra,)) for message_id, message in DEFINITIONS.items()
+}
 """The byte that closes each message's checksum, as the checksum function wants it."""
 
 TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
@@ -84,8 +97,8 @@ TARGET_OFFSETS: Final[dict[int, tuple[int, int]]] = {
 """Payload offsets of target system and target component (`NO_TARGET` if it has none)."""
 
 MESSAGE_NAMES: Final[dict[int, str]] = {
-    message_id: message.msgname for message_id, message in dialect.mavlink_map.items()
-} | {message_id: name for message_id, (name, *_) in MISSING.items()}
+    message_id: message.msgname for message_id, message in DEFINITIONS.items()
+}
 
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
 

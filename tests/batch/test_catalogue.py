@@ -24,8 +24,9 @@ from gateway.batch.catalogue import (
     recordings_below,
 )
 from gateway.batch.executors import LocalProcesses, ThisProcess
-from gateway.batch.facts import FlightFacts, FlightTally, feature, lost_share, simplified
+from gateway.batch.facts import FlightFacts, FlightTally, simplified
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.formats.maps import TrackPoint
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S
@@ -339,32 +340,24 @@ def test_damaged_catalogue_is_reported(tmp_path: Path) -> None:
 def test_tracks_are_returned_as_geojson(folder: Path) -> None:
     found = geojson_of(folder, "kind = 'tlog'")
     (flight,) = found["features"]
-    (line,) = flight["geometry"]["coordinates"]
+    line = flight["geometry"]["coordinates"]
     assert line[0][:2] == pytest.approx([8.0, 47.0])
     # Two sides of a square need one corner, and the climb at the start one more position.
     assert 3 <= len(line) <= 5
     assert flight["properties"]["vehicle"] == 1
 
 
-def test_track_across_date_line_is_split() -> None:
-    line = feature([(0.0, 179.9, 0.0), (0.0, -179.9, 0.0)], {})["geometry"]["coordinates"]
-    assert [[position[0] for position in part] for part in line] == [
-        [179.9, 179.9],
-        [-179.9, -179.9],
-    ]
-
-
 def test_simplified_track_is_within_tolerance(rng: np.random.Generator) -> None:
     turn = np.linspace(0.0, 20.0, 3000)
-    positions = [(1e-3 * a * np.cos(a), 1e-3 * a * np.sin(a), 10.0) for a in turn]
+    positions = [TrackPoint(0, 1e-3 * a * np.cos(a), 1e-3 * a * np.sin(a), 10.0) for a in turn]
     kept = simplified(positions)
     assert kept[0] == positions[0]
     assert kept[-1] == positions[-1]
     assert 20 < len(kept) < 400
     lost = np.interp(
-        turn, [turn[positions.index(position)] for position in kept], [p[0] for p in kept]
+        turn, [turn[positions.index(position)] for position in kept], [p.lat_deg for p in kept]
     )
-    assert np.abs(lost - np.array(positions)[:, 0]).max() * 111_000.0 < 15.0
+    assert np.abs(lost - np.array([p.lat_deg for p in positions])).max() * 111_000.0 < 15.0
 
 
 def test_slow_fix_rate_is_not_an_outage() -> None:
@@ -373,12 +366,6 @@ def test_slow_fix_rate_is_not_an_outage() -> None:
         tally.add_gps(second * US_PER_S, fixed=True)
     facts = tally.facts(35 * US_PER_S)
     assert (facts.gps_outages, facts.gps_lost) == (1, 15.0)
-
-
-def test_loss_is_counted_in_steps_of_the_usual_interval() -> None:
-    times = np.array([0, 10, 20, 50, 60, 5, 15, 25])
-    assert lost_share(times) == pytest.approx(2 / 10)
-    assert lost_share(np.array([1])) is None
 
 
 def test_commands_index_list_and_show(tmp_path: Path, folder: Path) -> None:

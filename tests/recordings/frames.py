@@ -1,8 +1,12 @@
 """MAVLink frames and tlogs for the tests of recordings."""
 
+from collections.abc import Iterable
+
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.recordings.tlog import TlogRecord, encode_record
+from gateway.recordings.senders import Senders
+from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
+from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from tests.kit.mavlink import Sender
 
 START_US = 1_760_000_000_000_000
@@ -31,3 +35,19 @@ def make_records(count: int, system_id: int = 1) -> list[TlogRecord]:
 
 def make_tlog(records: list[TlogRecord]) -> bytes:
     return b"".join(encode_record(record.time_us, record.frame) for record in records)
+
+
+def senders_of(data: bytes) -> Senders:
+    """Survey the senders of a tlog."""
+    senders = Senders()
+    senders.add(TlogScanner().feed(data, final=True))
+    return senders
+
+
+def messages_of(
+    records: list[TlogRecord], wanted: Iterable[int] = (), system_id: int | None = None
+) -> list[VehicleMessage]:
+    """Read the vehicles of a recording."""
+    reader = VehicleReader(senders_of(make_tlog(records)), wanted, system_id)
+    found = [message for record in records for message in reader.feed(record)]
+    return [*found, *reader.flush()]

@@ -7,7 +7,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.answers import LogAnswers, VehicleAnswers
-from gateway.recordings.tlog import TlogIndex, TlogScanner, encode_record
+from gateway.recordings.tlog import TlogScanner, encode_record
+from gateway.recordings.tlog_index import TlogIndex
 from tests.recordings.frames import START_US
 
 SECOND_US = 1_000_000
@@ -39,7 +40,7 @@ class Day:
         batch = TlogScanner().feed(self.data, final=True)
         index, found = TlogIndex(), LogAnswers()
         index.add(batch)
-        found.note(batch, index.stations)
+        found.note(batch, index.senders.stations)
         time_us = self.now_us if at_us is None else at_us
         return VehicleAnswers(found, 3, played_as, lambda: time_us)
 

@@ -50,7 +50,11 @@ def tlog(making: Making) -> Iterator[FusedTlog]:
 def test_frames_are_made_on_demand(making: Making, tlog: FusedTlog) -> None:
     assert making.made <= 2 * PIECE
     track = Track(tlog)
-    assert (track.first_us, track.last_us, tlog.index.origins) == (START_US, END_US, {0x101})
+    assert (track.first_us, track.last_us, tlog.index.senders.origins) == (
+        START_US,
+        END_US,
+        {0x101},
+    )
     for record in RECORDS[:100]:
         assert track.peek_us() == record.time_us
         assert track.take() == record.frame

@@ -9,7 +9,7 @@ from gateway.recordings.summary import FileInfo, Rate, TableSummary, TlogSummary
 from gateway.recordings.table import TableHeader, TableMark, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord, TlogScanner
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US, make_tlog
+from tests.recordings.frames import START_US, make_tlog, senders_of
 from tests.recordings.samples import make_baro, make_fused
 
 SECOND_US = 1_000_000
@@ -33,7 +33,7 @@ def make_flight(seconds: int, system_id: int, gap_at: int | None = None) -> list
 
 
 def sum_up(data: bytes, chunk: int = 777) -> FileInfo:
-    summary, scanner = TlogSummary(), TlogScanner()
+    summary, scanner = TlogSummary(senders_of(data)), TlogScanner()
     for begin in range(0, len(data), chunk):
         summary.add(scanner.feed(data[begin : begin + chunk]))
     summary.add(scanner.feed(b"", final=True))

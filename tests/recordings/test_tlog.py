@@ -18,13 +18,13 @@ from gateway.recordings.tlog import (
     CivilClock,
     Damage,
     Stamper,
-    TlogIndex,
     TlogRecord,
     TlogScanner,
     encode_record,
     is_damaged,
 )
 from gateway.recordings.tlog import STEP_US as STAMP_STEP_US
+from gateway.recordings.tlog_index import TlogIndex
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_splitter import message_id_of
 from gateway.wire.timesync import ENOUGH

@@ -3,7 +3,8 @@
 import pytest
 
 from gateway.recordings.play import Track
-from gateway.recordings.tlog import TlogIndex, TlogRecord, TlogScanner
+from gateway.recordings.tlog import TlogRecord, TlogScanner
+from gateway.recordings.tlog_index import TlogIndex
 from gateway.wire.mavlink_splitter import message_id_of
 from tests.recordings.frames import START_US, STEP_US, make_records, make_tlog
 

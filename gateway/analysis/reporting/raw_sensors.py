@@ -21,7 +21,7 @@ from gateway.analysis.signals import (
     power_density,
     response,
 )
-from gateway.units import US_PER_S
+from gateway.recordings.figures import NODE_WRAP_US, lost_share, missing_samples
 
 EXCERPT_S: Final = 6.0
 COLOURS: Final = {"butterworth": style.BLUE, "chebyshev": style.RED}
@@ -143,8 +143,6 @@ def _draw_response(case: Case, width_in: float) -> Figure:
 AXIS_COLOURS: Final = (style.BLUE, style.RED, style.GREEN)
 MIN_REST_S: Final = 5.0
 MAX_DOTS: Final = 800
-NODE_WRAP_US: Final = 1 << 32
-LONGEST_LOSS_US: Final = 60 * US_PER_S
 
 
 def noise(case: Case) -> Section:
@@ -215,20 +213,12 @@ def loss_table(flight: Flight, node_time_us: IntArray) -> pd.DataFrame:
                 "samples": count,
                 "nominal interval, ms": nominal_us * 1e-3,
                 "lost": int(missing.sum()),
-                "lost, %": 100.0 * float(missing.sum()) / (count + float(missing.sum())),
+                "lost, %": 100.0 * (lost_share(node_time_us) or 0.0),
                 "longest gap, ms": float(np.diff(flight.time_us).max()) * 1e-3,
                 "jitter of gateway time, ms RMS": float(np.sqrt(np.mean(jitter_ms**2))),
             }
         ]
     )
-
-
-def missing_samples(node_time_us: IntArray) -> FloatArray:
-    """Count the samples missing before each but the first, by the node's own clock."""
-    interval_us = np.diff(node_time_us) % NODE_WRAP_US
-    missing = np.maximum(np.rint(interval_us / np.median(interval_us)) - 1.0, 0.0)
-    # In a gap this long the node was switched off.
-    return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
 
 
 def magnetometer(case: Case) -> Section | None:

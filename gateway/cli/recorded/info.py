@@ -192,7 +192,9 @@ def _heading(vehicle: VehicleInfo, kind: str) -> str:
     if vehicle.mav_type is not None:
         title += f": {_enum_name('MAV_TYPE', vehicle.mav_type)}"
         title += f", {_enum_name('MAV_AUTOPILOT', vehicle.autopilot or 0)}"
-    return f"{title}; {vehicle.distance_m / 1000:.3f} km"
+    if vehicle.distance_m is None:
+        return title
+    return f"{title}; {vehicle.distance_m / 1000:.3f} km by {vehicle.positions}"
 
 
 def _rates(vehicle: VehicleInfo) -> Table:

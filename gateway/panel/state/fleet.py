@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
-from gateway.recordings.answers import FIRST_GROUND_STATION
+from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import DEGE7, is_on_earth

@@ -3,25 +3,26 @@
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from bisect import bisect_right
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import StrEnum
+from itertools import chain, groupby
 from typing import Any, Final
 from xml.sax import saxutils
 
 from gateway.aircraft import AircraftSettings
 from gateway.geometry.quaternion import to_euler
-from gateway.recordings.answers import HOME_POSITION_ID, is_station
+from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
+from gateway.recordings.positions import Continuity, named_position
 from gateway.recordings.reading import RecordedTable
-from gateway.recordings.summary import GLOBAL_POSITION_INT_ID
 from gateway.recordings.table import REMARK, TableMark
-from gateway.recordings.tlog import HEARTBEAT_ID, TlogRecord, fields_of
-from gateway.records import FusionState, GpsFix, NavFlags, Quat
-from gateway.units import DEG_PER_DEGE7, M_PER_MM, US_PER_S
+from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.records import NAN, FusionState, GpsFix, NavFlags, Quat
+from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.plan import is_good_enough
-from gateway.wire.mavlink_splitter import frame_of, message_id_of
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
@@ -36,7 +37,7 @@ class TrackPoint:
     """µs since 1970, or since the start where civil time is not known."""
     lat_deg: float
     lon_deg: float
-    alt_amsl_m: float
+    alt_amsl_m: float = NAN
     attitude_deg: tuple[float, float, float] | None = None
     """Roll, pitch and yaw, where they are known."""
 
@@ -63,8 +64,14 @@ class VehicleTrack:
     """One vehicle on the map."""
 
     name: str
-    points: list[TrackPoint] = field(default_factory=list)
+    segments: list[list[TrackPoint]] = field(default_factory=list)
+    """None is empty; between two of them the track is broken."""
     markers: list[MapMarker] = field(default_factory=list)
+
+    @property
+    def points(self) -> list[TrackPoint]:
+        """All points of the track."""
+        return [*chain.from_iterable(self.segments)]
 
 
 FIRST_US: Final = 0
@@ -94,16 +101,26 @@ def to_kml(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
 
 
 def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
-    yield (
-        f"<Placemark><name>{_escaped(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
-        "<gx:Track><altitudeMode>absolute</altitudeMode>\n"
-    )
-    yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in vehicle.points)
-    yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in vehicle.points)
-    if any(point.attitude_deg is not None for point in vehicle.points):
-        # Heading, tilt, roll; an empty element means "not known here".
-        yield from (f"<gx:angles>{_kml_angles(p)}</gx:angles>\n" for p in vehicle.points)
-    yield "</gx:Track></Placemark>\n"
+    # A track has angles for all of its points or for none.
+    tracks = [
+        [*points]
+        for segment in vehicle.segments
+        for _, points in groupby(segment, lambda point: point.attitude_deg is None)
+    ]
+    has_heights = any(math.isfinite(point.alt_amsl_m) for point in vehicle.points)
+    mode = f"<altitudeMode>{'absolute' if has_heights else 'clampToGround'}</altitudeMode>"
+    yield f"<Placemark><name>{_escaped(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
+    yield f"<gx:MultiTrack>{mode}<gx:interpolate>0</gx:interpolate>\n" if len(tracks) > 1 else ""
+    for points in tracks:
+        yield f"<gx:Track>{mode}\n"
+        yield from (f"<when>{iso_time(point.time_us)}</when>\n" for point in points)
+        yield from (f"<gx:coord>{_kml_coordinates(p, ' ')}</gx:coord>\n" for p in points)
+        for roll, pitch, yaw in (p.attitude_deg for p in points if p.attitude_deg is not None):
+            # Heading, tilt, roll.
+            yield f"<gx:angles>{yaw % 360.0:.1f} {pitch:.1f} {roll:.1f}</gx:angles>\n"
+        yield "</gx:Track>\n"
+    yield "</gx:MultiTrack>" if len(tracks) > 1 else ""
+    yield "</Placemark>\n"
 
 
 def _kml_marker(marker: MapMarker) -> str:
@@ -116,15 +133,8 @@ def _kml_marker(marker: MapMarker) -> str:
 
 
 def _kml_coordinates(point: TrackPoint, separator: str) -> str:
-    figures = (f"{point.lon_deg:.7f}", f"{point.lat_deg:.7f}", f"{point.alt_amsl_m:.2f}")
-    return separator.join(figures)
-
-
-def _kml_angles(point: TrackPoint) -> str:
-    if point.attitude_deg is None:
-        return ""
-    roll, pitch, yaw = point.attitude_deg
-    return f"{yaw % 360.0:.1f} {pitch:.1f} {roll:.1f}"
+    height = [f"{point.alt_amsl_m:.2f}"] if math.isfinite(point.alt_amsl_m) else []
+    return separator.join([f"{point.lon_deg:.7f}", f"{point.lat_deg:.7f}", *height])
 
 
 def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
@@ -148,12 +158,15 @@ def to_gpx(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
             for marker in vehicle.markers
         )
     for vehicle in vehicles:
-        yield f"<trk><name>{_escaped(vehicle.name)}</name><trkseg>\n"
-        yield from (
-            f"<trkpt {_gpx_position(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
-            for p in vehicle.points
-        )
-        yield "</trkseg></trk>\n"
+        yield f"<trk><name>{_escaped(vehicle.name)}</name>"
+        for points in vehicle.segments:
+            yield "<trkseg>\n"
+            yield from (
+                f"<trkpt {_gpx_position(p)}{_gpx_time(p)}{_gpx_attitude(p)}</trkpt>\n"
+                for p in points
+            )
+            yield "</trkseg>"
+        yield "</trk>\n"
     yield "</gpx>\n"
 
 
@@ -163,7 +176,8 @@ def _escaped(text: str) -> str:
 
 
 def _gpx_position(point: TrackPoint) -> str:
-    return f'lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}"><ele>{point.alt_amsl_m:.2f}</ele>'
+    height = f"<ele>{point.alt_amsl_m:.2f}</ele>" if math.isfinite(point.alt_amsl_m) else ""
+    return f'lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}">{height}'
 
 
 def _gpx_time(point: TrackPoint) -> str:
@@ -202,27 +216,35 @@ def to_geojson(name: str, vehicles: Iterable[VehicleTrack]) -> Iterator[str]:
 
 
 def _features(vehicle: VehicleTrack) -> Iterator[dict[str, Any]]:
-    parts = _parts(vehicle.points)
-    lines = [[_position(point) for point in part] for part in parts]
-    times = [[iso_time(point.time_us) for point in part] for part in parts]
-    kind = "MultiLineString"
-    coordinates: Any = lines
-    coord_times: Any = times
-    if len(parts) == 1:
-        # A line must have two points, even a track of one.
-        single = len(parts[0]) == 1
-        kind, coordinates = ("Point", lines[0][0]) if single else ("LineString", lines[0])
-        coord_times = times[0]
-    properties: dict[str, Any] = {"name": vehicle.name, "kind": "track", "time": times[0][0]}
-    yield _feature(kind, coordinates, properties | {"coordTimes": coord_times})
+    begin = iso_time(vehicle.segments[0][0].time_us)
+    yield track_feature(
+        vehicle.segments, {"name": vehicle.name, "kind": "track", "time": begin}, with_times=True
+    )
     for marker in vehicle.markers:
         time = iso_time(marker.at.time_us)
         properties = {"name": marker.name, "kind": str(marker.kind), "vehicle": vehicle.name}
         yield _feature("Point", _position(marker.at), properties | {"time": time})
 
 
+def track_feature(
+    segments: Iterable[list[TrackPoint]], properties: dict[str, Any], *, with_times: bool = False
+) -> dict[str, Any]:
+    """Lay a track out as a GeoJSON feature (RFC 7946), cut where it crosses the antimeridian."""
+    parts = [part for segment in segments for part in _parts(segment)]
+    if with_times:
+        times: list[Any] = [[iso_time(point.time_us) for point in part] for part in parts]
+        properties = properties | {"coordTimes": times[0] if len(parts) == 1 else times}
+    lines = [[_position(point) for point in part] for part in parts]
+    if len(lines) == 1:
+        if len(lines[0]) == 1:
+            return _feature("Point", lines[0][0], properties)
+        return _feature("LineString", lines[0], properties)
+    # A line must have two points, even a track of one.
+    lines = [line if len(line) > 1 else line * 2 for line in lines]
+    return _feature("MultiLineString", lines, properties)
+
+
 def _parts(points: list[TrackPoint]) -> list[list[TrackPoint]]:
-    """Cut a track at the antimeridian, as RFC 7946 requires."""
     parts: list[list[TrackPoint]] = [[]]
     before: TrackPoint | None = None
     for point in points:
@@ -250,7 +272,7 @@ def _crossing(before: TrackPoint, after: TrackPoint) -> TrackPoint:
 
 
 def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
-    geometry = {"type": kind, "coordinates": coordinates}
+    geometry = {"type": kind, "coordinates": coordinates} if coordinates else None
     return {"type": "Feature", "geometry": geometry, "properties": properties}
 
 
@@ -259,15 +281,6 @@ def _position(point: TrackPoint) -> list[float]:
     return [*position, round(point.alt_amsl_m, 2)] if math.isfinite(point.alt_amsl_m) else position
 
 
-ATTITUDE_ID: Final = 30
-ATTITUDE_QUATERNION_ID: Final = 31
-STATUSTEXT_ID: Final = 253
-_READ: Final = frozenset(
-    {
-        ATTITUDE_ID, ATTITUDE_QUATERNION_ID, GLOBAL_POSITION_INT_ID, HOME_POSITION_ID,
-        STATUSTEXT_ID,
-    }
-)  # fmt: skip
 INFO: Final = 6
 """MAV_SEVERITY_INFO; texts that are less severe are for programmers."""
 _MARKED: Final = re.compile(r"Marked (-?\d+\.\d+), (-?\d+\.\d+)")
@@ -278,150 +291,140 @@ MAX_MARKERS: Final = 10_000
 """Of one vehicle; a flood of texts must not fill the memory."""
 
 
-@dataclass(slots=True)
-class _Drawn:
-    """One vehicle while its frames are read."""
+ATTITUDE_AGE_US: Final = US_PER_S
+"""An attitude counts for the positions of so much time before it."""
 
-    track: VehicleTrack
-    attitude_deg: tuple[float, float, float] | None = None
-    home: tuple[int, int] | None = None
-    early: list[tuple[int, str]] = field(default_factory=list)
-    """Events before the first position."""
-    text_id: int = 0
 
-    def add(self, point: TrackPoint) -> None:
+class _Drawing:
+    """One vehicle while its flight is read."""
+
+    def __init__(self, name: str) -> None:
+        self.track = VehicleTrack(name)
+        self.homes: set[tuple[float, float]] = set()
+        self._attitude_deg: tuple[float, float, float] | None = None
+        self._texts: list[tuple[int, str]] = []
+        self._continuity = Continuity()
+
+    def turn(self, time_us: int, q_nb: Quat) -> None:
+        """Take the attitude for the following points, and those just before the first one."""
+        is_first, self._attitude_deg = self._attitude_deg is None, angles_deg(q_nb)
+        if not is_first or not self.track.segments:
+            return
+        points = self.track.segments[-1]
+        for k in range(len(points) - 1, -1, -1):
+            if time_us - points[k].time_us > ATTITUDE_AGE_US:
+                break
+            points[k] = replace(points[k], attitude_deg=self._attitude_deg)
+
+    def add(self, point: TrackPoint, boot_us: int | None = None) -> None:
+        segments = self.track.segments
+        newest = segments[-1][-1] if segments else None
+        if newest is not None and 0 <= point.time_us - newest.time_us < INTERVAL_US:
+            return
+        at = (point.time_us, point.lat_deg, point.lon_deg)
+        if self._continuity.is_broken_at(*at, boot_us) or newest is None:
+            segments.append([])
+        known = point.attitude_deg or self._attitude_deg
+        segments[-1].append(replace(point, attitude_deg=known))
+
+    def add_home(self, at: TrackPoint) -> None:
+        """Mark a home, unless it is one of those before."""
+        if (at.lat_deg, at.lon_deg) not in self.homes and len(self.homes) < MAX_MARKERS:
+            self.homes.add((at.lat_deg, at.lon_deg))
+            self.track.markers.append(MapMarker(MarkerKind.HOME, "Home", at))
+
+    def add_text(self, time_us: int, text: str) -> None:
+        if len(self._texts) < MAX_MARKERS:
+            self._texts.append((time_us, text))
+
+    def drawn(self) -> VehicleTrack | None:
+        """Return the track, with its texts at the vehicle's positions; None without a position."""
         points = self.track.points
-        if points and 0 <= point.time_us - points[-1].time_us < INTERVAL_US:
-            return
-        points.append(point)
-        for time_us, text in self.early:
-            self.add_event(time_us, text)
-        self.early.clear()
-
-    def add_event(self, time_us: int, text: str) -> None:
-        """Put an event at the vehicle's position."""
-        if not self.track.points:
-            if len(self.early) < MAX_MARKERS:
-                self.early.append((time_us, text))
-            return
-        here = self.track.points[-1]
-        at = TrackPoint(time_us, here.lat_deg, here.lon_deg, here.alt_amsl_m)
-        if marked := _MARKED.fullmatch(text):
-            lat_deg, lon_deg = map(float, marked.groups())
-            at = TrackPoint(time_us, lat_deg, lon_deg, here.alt_amsl_m)
-            self.put(MarkerKind.MARK, text, at)
-        else:
-            is_mark = text.startswith(REMARK)
-            kind = MarkerKind.MARK if is_mark else MarkerKind.EVENT
-            self.put(kind, text.removeprefix(REMARK), at)
-
-    def put(self, kind: MarkerKind, name: str, at: TrackPoint) -> None:
-        if len(self.track.markers) < MAX_MARKERS:
-            self.track.markers.append(MapMarker(kind, name, at))
+        times_us = [point.time_us for point in points]
+        for time_us, text in sorted(self._texts) if points else ():
+            here = points[max(bisect_right(times_us, time_us) - 1, 0)]
+            at = TrackPoint(time_us, here.lat_deg, here.lon_deg, here.alt_amsl_m)
+            if marked := _MARKED.fullmatch(text):
+                lat_deg, lon_deg = map(float, marked.groups())
+                at = replace(at, lat_deg=lat_deg, lon_deg=lon_deg)
+            kind = MarkerKind.MARK if marked or text.startswith(REMARK) else MarkerKind.EVENT
+            self.track.markers.append(MapMarker(kind, text.removeprefix(REMARK), at))
+        return self.track if points else None
 
 
-def tracks_of_frames(records: Iterable[TlogRecord], system_id: int | None) -> list[VehicleTrack]:
-    """Collect the tracks of the vehicles of a tlog."""
-    drawn: dict[int, _Drawn] = {}
-    stations: set[int] = set()
-    for record in records:
-        frame = frame_of(record.frame)
-        system, component = frame.origin
-        origin = system << 8 | component
-        if frame.message_id == HEARTBEAT_ID and frame.is_station_heartbeat:
-            stations.add(origin)
-        if system_id in (None, system) and not is_station(origin, stations):
-            one = drawn.setdefault(system, _Drawn(VehicleTrack(f"system {system}")))
-            _take(one, record)
-    return [one.track for _, one in sorted(drawn.items()) if one.track.points]
+DRAWN_IDS: Final = (HOME_POSITION_ID,)
+"""Messages that are drawn besides positions, attitude and texts."""
 
 
-def _take(one: _Drawn, record: TlogRecord) -> None:
-    message_id, time_us = message_id_of(record.frame), record.time_us
-    if message_id not in _READ:
-        return
-    m = fields_of(record.frame)
-    if message_id == ATTITUDE_ID:
-        one.attitude_deg = _finite(m["roll"], m["pitch"], m["yaw"])
-    elif message_id == ATTITUDE_QUATERNION_ID:
-        one.attitude_deg = _angles((m["q1"], m["q2"], m["q3"], m["q4"]))
-    elif message_id == GLOBAL_POSITION_INT_ID:
-        if m["lat"] or m["lon"]:
-            one.add(_point(time_us, m["lat"], m["lon"], m["alt"], one.attitude_deg))
-    elif message_id == HOME_POSITION_ID:
-        lat, lon = m["latitude"], m["longitude"]
-        if (lat or lon) and one.home != (lat, lon):
-            one.home = (lat, lon)
-            one.put(MarkerKind.HOME, "Home", _point(time_us, lat, lon, m["altitude"], None))
-    elif m["severity"] <= INFO:
-        _take_text(one, m, time_us)
-
-
-def _take_text(one: _Drawn, m: Mapping[str, Any], time_us: int) -> None:
-    text, number = m["text"].split(b"\0", 1)[0].decode("ascii", "replace"), m["id"]
-    if number and m["chunk_seq"]:
-        markers = one.track.markers
-        if number == one.text_id and markers and markers[-1].kind is MarkerKind.EVENT:
-            last = markers.pop()
-            markers.append(replace(last, name=last.name + text))
-        return
-    one.text_id = number
-    one.add_event(time_us, text)
+def tracks_of_messages(messages: Iterable[VehicleMessage]) -> list[VehicleTrack]:
+    """Collect the tracks of the vehicles in MAVLink; `DRAWN_IDS` are to be among the messages."""
+    drawings: dict[int, _Drawing] = {}
+    for message in messages:
+        system_id, time_us = message.system_id, message.time_us
+        one = drawings.get(system_id)
+        if one is None:
+            one = drawings[system_id] = _Drawing(f"system {system_id}")
+        if (at := message.position) is not None:
+            one.add(TrackPoint(time_us, at.lat_deg, at.lon_deg, at.alt_amsl_m), message.boot_us)
+        elif message.q_nb is not None:
+            one.turn(time_us, message.q_nb)
+        elif message.text is not None and message.text.severity <= INFO:
+            one.add_text(time_us, message.text.text)
+        elif message.message_id == HOME_POSITION_ID and (home := named_position(message.fields)):
+            one.add_home(TrackPoint(time_us, home.lat_deg, home.lon_deg, home.alt_amsl_m))
+    found = (one.drawn() for _, one in sorted(drawings.items()))
+    return [track for track in found if track is not None]
 
 
 def tracks_of_table(table: RecordedTable, aircraft: AircraftSettings) -> list[VehicleTrack]:
-    """Collect the track of a table's aircraft: fused, or its fixes if it has no states."""
+    """Collect the track of a table's aircraft: fused, or its fixes if no state has a position."""
     zero_us = table.header.unix_us_at_zero or 0
-    one = _Drawn(VehicleTrack(f"aircraft {table.header.vehicle_id}"))
-    has_home = False
+    name = f"aircraft {table.header.vehicle_id}"
+    one, of_fixes = _Drawing(name), _Drawing(name)
     for row in table.rows:
         if isinstance(row, TableMark):
-            one.add_event(zero_us + row.time_us, REMARK + row.text)
-        elif isinstance(row, FusionState) and row.home is not None and not has_home:
+            one.add_text(zero_us + row.time_us, REMARK + row.text)
+        elif isinstance(row, FusionState) and row.home is not None and not one.homes:
             lat_deg, lon_deg, alt_m, since_us = row.home
-            at = TrackPoint(zero_us + since_us, lat_deg, lon_deg, alt_m)
-            one.put(MarkerKind.HOME, "Home", at)
-            has_home = True
+            one.add_home(TrackPoint(zero_us + since_us, lat_deg, lon_deg, alt_m))
         elif isinstance(row, TableRow):
-            if not has_home and row.gps is not None:
-                limits = aircraft.vehicle
-                has_home = is_good_enough(row.gps, limits.home_accuracy_m, limits.home_satellites)
-                if has_home:
-                    one.put(MarkerKind.HOME, "Home", _point_of_fix(row.gps, zero_us))
-            if (point := _point_of(row, zero_us)) is not None:
-                one.add(point)
-    return [one.track] if one.track.points else []
+            _add_row(row, one, of_fixes, aircraft, zero_us)
+    if not one.track.segments:
+        one.track.segments = of_fixes.track.segments
+    track = one.drawn()
+    return [] if track is None else [track]
 
 
-def _point_of(row: TableRow, zero_us: int) -> TrackPoint | None:
-    state, fix = row.state, row.gps
-    if state is not None and NavFlags.POSITION_VALID in state.flags:
-        attitude_deg = _angles(state.q_nb) if NavFlags.ATTITUDE_VALID in state.flags else None
+def _add_row(
+    row: TableRow, one: _Drawing, of_fixes: _Drawing, aircraft: AircraftSettings, zero_us: int
+) -> None:
+    state, fix, limits = row.state, row.gps, aircraft.vehicle
+    if fix is not None:
+        point = point_of_fix(fix, zero_us)
+        if not one.homes and is_good_enough(fix, limits.home_accuracy_m, limits.home_satellites):
+            one.add_home(point)
+        if fix.fix_ok and (fix.lat_dege7 or fix.lon_dege7):
+            of_fixes.add(point)
+    if state is None:
+        return
+    has_attitude = NavFlags.ATTITUDE_VALID in state.flags
+    attitude_deg = angles_deg(state.q_nb) if has_attitude else None
+    if NavFlags.POSITION_VALID in state.flags:
         position = (state.lat_deg, state.lon_deg, state.alt_amsl_m)
-        return TrackPoint(zero_us + row.time_us, *position, attitude_deg)
-    if state is None and fix is not None and fix.fix_ok:
-        return _point_of_fix(fix, zero_us)
-    return None
+        one.add(TrackPoint(zero_us + row.time_us, *position, attitude_deg))
+    elif has_attitude and math.isfinite(sum(state.q_nb)):
+        of_fixes.turn(zero_us + row.time_us, state.q_nb)
 
 
-def _point_of_fix(fix: GpsFix, zero_us: int) -> TrackPoint:
+def point_of_fix(fix: GpsFix, zero_us: int = 0) -> TrackPoint:
+    """Return the position of a fix, given the civil time of the gateway's zero."""
     lat_deg, lon_deg = fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7
     return TrackPoint(zero_us + fix.time_us, lat_deg, lon_deg, fix.alt_amsl_m)
 
 
-def _point(
-    time_us: int, lat: int, lon: int, alt: int, attitude: tuple[float, float, float] | None
-) -> TrackPoint:
-    position = (lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, alt * M_PER_MM)
-    return TrackPoint(time_us, *position, attitude)
-
-
-def _angles(q_nb: Quat) -> tuple[float, float, float] | None:
-    return _finite(*to_euler(q_nb)) if math.isfinite(sum(q_nb)) and any(q_nb) else None
-
-
-def _finite(roll: float, pitch: float, yaw: float) -> tuple[float, float, float] | None:
-    """Convert angles in rad to degrees; None if one of them is not known."""
-    if not math.isfinite(roll + pitch + yaw):
+def angles_deg(q_nb: Quat) -> tuple[float, float, float] | None:
+    """Return roll, pitch and yaw; None if the attitude is not known."""
+    if not math.isfinite(sum(q_nb)) or not any(q_nb):
         return None
-    return math.degrees(roll), math.degrees(pitch), math.degrees(yaw)
+    roll, pitch, yaw = map(math.degrees, to_euler(q_nb))
+    return roll, pitch, yaw

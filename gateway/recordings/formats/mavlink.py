@@ -13,7 +13,7 @@ estimates (ATTITUDE, with the position known then) the last before each sample i
 
 import math
 from collections import defaultdict
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,31 +22,11 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
-from gateway.recordings.tlog import FIRST_CIVIL_US, Batch
-from gateway.recordings.tlog_scan import TIME_SIZE, IntArray
+from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, columns_of
+from gateway.recordings.tlog_scan import IntArray
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
 from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
 from gateway.wire.mavlink_messages import layout_of
-from gateway.wire.mavlink_splitter import START_V2
-
-HEAD_V1: Final = 6
-HEAD_V2: Final = 10
-LENGTH_AT: Final = 1
-
-
-def columns_of(batch: Batch, wanted: IntArray, kind: Any) -> NDArray[np.void]:
-    """Read the fields of some frames of one message; those cut off or unknown are zero."""
-    layout = layout_of(kind.id)
-    data = np.frombuffer(batch.data, np.uint8)
-    starts = batch.starts[wanted] + TIME_SIZE
-    begins = starts + np.where(data[starts] == START_V2, HEAD_V2, HEAD_V1)
-    offsets = np.arange(layout.itemsize)
-    is_there = offsets < data[starts + LENGTH_AT][:, None]
-    payloads = np.zeros((len(wanted), layout.itemsize), np.uint8)
-    payloads[is_there] = data[(begins[:, None] + offsets)[is_there]]
-    found: NDArray[np.void] = payloads.view(layout)[:, 0]
-    return found
-
 
 UT_PER_GAUSS: Final = 100.0
 MILLI: Final = 1e-3
@@ -248,7 +228,7 @@ class AutopilotReader:
         taken = self._taken(batch)
         message_ids, recorded_us = batch.message_ids[taken], batch.time_us[taken]
         fields = {
-            int(one): columns_of(batch, taken[message_ids == one], mavlink.mavlink_map[int(one)])
+            int(one): columns_of(batch, taken[message_ids == one], int(one))
             for one in np.unique(message_ids)
         }
         time_us = self._times(message_ids, recorded_us, fields)

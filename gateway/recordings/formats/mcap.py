@@ -4,7 +4,7 @@
 | ---------------------------------- | ------------------------- | ------------------------------- |
 | `/tf`                              | foxglove.FrameTransform   | attitude and position           |
 | `/vehicle_N/pose`                  | foxglove.PoseInFrame      | the same                        |
-| `/vehicle_N/location`              | foxglove.LocationFix      | GLOBAL_POSITION_INT             |
+| `/vehicle_N/location`              | foxglove.LocationFix      | the best positions              |
 | `/vehicle_N/gps`                   | foxglove.LocationFix      | GPS_RAW_INT                     |
 | `/vehicle_N/state`                 | mavgate.State             | angles, height, speeds          |
 | `/log`                             | foxglove.Log              | STATUSTEXT                      |
@@ -15,28 +15,31 @@ forward, left, up: with these the view is upright in Foxglove's 3D panel.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
 import msgspec
+import numpy as np
 from mcap.writer import Writer
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
 from gateway.geometry.geodesy import displacement_m
-from gateway.geometry.quaternion import from_euler, multiply, normalise, to_euler
-from gateway.recordings.answers import is_station
+from gateway.geometry.quaternion import multiply, to_euler
 from gateway.recordings.columns import unit_of
 from gateway.recordings.convert import FlightToWrite
-from gateway.recordings.formats.parquet import Pieces, decoded
+from gateway.recordings.formats.parquet import Pieces
+from gateway.recordings.positions import Position, position_of
+from gateway.recordings.status_texts import JoinedText, text_of
+from gateway.recordings.tlog import fields_of
+from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 from gateway.records import Quat
-from gateway.units import DEG_PER_DEGE7, M_PER_CM, M_PER_MM, US_PER_S
+from gateway.units import M_PER_MM, US_PER_S, counted
+from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
 from gateway.wire.mavlink_splitter import frame_of
 
 MAP: Final = "map"
-AUTOPILOT: Final = 1
 LOG_TOPIC: Final = "/log"
 TF_TOPIC: Final = "/tf"
 
@@ -45,8 +48,6 @@ _FRD_OF_FLU: Final[Quat] = (0.0, 1.0, 0.0, 0.0)
 LOG_LEVELS: Final = (5, 5, 5, 4, 3, 2, 2, 1)
 """foxglove.LogLevel by MAV_SEVERITY: emergency, alert, critical, error, warning, notice, info,
 debug."""
-TEXT_LENGTH: Final = 50
-"""Of a STATUSTEXT's chunk; a shorter one is the last."""
 COVARIANCE_UNKNOWN, COVARIANCE_APPROXIMATED, COVARIANCE_DIAGONAL = 0, 1, 2
 """foxglove.PositionCovarianceType."""
 UNKNOWN_U32: Final = 0xFFFFFFFF
@@ -142,17 +143,13 @@ def schema_of_message(kind: Any) -> dict[str, Any]:
     return {"title": f"mavlink.{kind.msgname}", "type": "object", "properties": fields}
 
 
-def fields_of_message(message: Any) -> dict[str, Any]:
-    """Convert a decoded message to JSON; NaN and infinity become null."""
-    return {name: _plain(getattr(message, name)) for name in message.fieldnames}
-
-
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Convert a field to JSON: text, numbers and lists; NaN and infinity become null."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.decode("ascii", "replace") if isinstance(value, bytes) else value
+    if isinstance(value, np.ndarray):
+        return [plain(item) for item in value.tolist()]
+    return text_of(value) if isinstance(value, bytes) else value
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,156 +169,121 @@ class _Vehicle:
     frame: str
     q_nb: Quat = (1.0, 0.0, 0.0, 0.0)
     has_attitude: bool = False
-    has_quaternion: bool = False
-    """It sends its attitude as a quaternion too: the angles are then left out."""
-    position: Any = None
-    """The newest GLOBAL_POSITION_INT."""
+    position: Position | None = None
     accuracy_m: tuple[float, float] | None = None
     """Standard deviations along each level axis, and of the height, by the estimator."""
     gps_accuracy_m: tuple[float, float] | None = None
     """The same by the GPS receiver."""
-    text: str = ""
-    text_id: int = 0
+
+
+GPS_ID: Final = MESSAGE_IDS["GPS_RAW_INT"]
+ESTIMATOR_ID: Final = MESSAGE_IDS["ESTIMATOR_STATUS"]
 
 
 class FoxgloveView:
     """Convert the messages of all vehicles to those of Foxglove's panels."""
 
     def __init__(self) -> None:
-        self.origin: tuple[float, float, float] | None = None
-        """Latitude, longitude and height of the frame `map`."""
+        self.origin: Position | None = None
+        """Of the frame `map`."""
         self._vehicles: dict[int, _Vehicle] = {}
-        self._handlers: dict[str, Callable[[_Vehicle, Any, int], list[Shown]]] = {
-            "ATTITUDE": self._attitude,
-            "ATTITUDE_QUATERNION": self._quaternion,
-            "GLOBAL_POSITION_INT": self._position,
-            "GPS_RAW_INT": self._gps,
-            "ESTIMATOR_STATUS": self._accuracy,
-            "STATUSTEXT": self._text,
-        }
 
-    def feed(self, system_id: int, component_id: int, message: Any, time_us: int) -> list[Shown]:
-        """Take the next message of a vehicle."""
-        handler = self._handlers.get(message.msgname)
-        if handler is None or component_id != AUTOPILOT:
-            return []
-        vehicle = self._vehicles.setdefault(system_id, _Vehicle(f"vehicle_{system_id}"))
-        return handler(vehicle, message, time_us)
+    def feed(self, message: VehicleMessage) -> Iterator[Shown]:
+        """Take the next message of a vehicle; GPS_RAW_INT and ESTIMATOR_STATUS are used too."""
+        frame, time_us = f"vehicle_{message.system_id}", message.time_us
+        vehicle = self._vehicles.setdefault(message.system_id, _Vehicle(frame))
+        if message.text is not None:
+            yield _log(frame, message.text)
+        if message.q_nb is not None:
+            yield from self._turned(vehicle, message.q_nb, time_us)
+        if message.message_id == GPS_ID:
+            yield from self._gps(vehicle, message.fields, time_us)
+        if message.position is not None:
+            yield from self._located(vehicle, message.position, time_us)
+        if message.message_id == ESTIMATOR_ID:
+            names = ("pos_horiz_accuracy", "pos_vert_accuracy")
+            level_m, height_m = (message.fields[name] for name in names)
+            known = math.isfinite(level_m) and math.isfinite(height_m)
+            vehicle.accuracy_m = (level_m / math.sqrt(2.0), height_m) if known else None
 
-    def _attitude(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
-        if vehicle.has_quaternion or not math.isfinite(m.roll + m.pitch + m.yaw):
-            return []
-        return self._turned(vehicle, from_euler(m.roll, m.pitch, m.yaw), time_us)
-
-    def _quaternion(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
-        q: Quat = (m.q1, m.q2, m.q3, m.q4)
-        if not math.isfinite(sum(q)) or not any(q):
-            return []
-        vehicle.has_quaternion = True
-        return self._turned(vehicle, normalise(q), time_us)
-
-    def _turned(self, vehicle: _Vehicle, q_nb: Quat, time_us: int) -> list[Shown]:
+    def _turned(self, vehicle: _Vehicle, q_nb: Quat, time_us: int) -> Iterator[Shown]:
         vehicle.q_nb, vehicle.has_attitude = q_nb, True
         w, x, y, z = multiply(multiply(_ENU_OF_NED, q_nb), _FRD_OF_FLU)
         turned = {"x": x, "y": y, "z": z, "w": w}
         at = {"timestamp": _time(time_us)}
         on_map_m = self._on_map_m(vehicle)
-        shown = [
-            Shown(
-                TF_TOPIC,
-                "foxglove.FrameTransform",
-                at
-                | {"parent_frame_id": MAP, "child_frame_id": vehicle.frame}
-                | {"translation": on_map_m, "rotation": turned},
-            )
-        ]
+        frames = {"parent_frame_id": MAP, "child_frame_id": vehicle.frame}
+        transform = at | frames | {"translation": on_map_m, "rotation": turned}
+        yield Shown(TF_TOPIC, "foxglove.FrameTransform", transform)
         if vehicle.position is not None:
             pose = {"position": on_map_m, "orientation": turned}
             content = at | {"frame_id": MAP, "pose": pose}
-            shown.append(Shown(f"/{vehicle.frame}/pose", "foxglove.PoseInFrame", content))
-        return [*shown, self._state(vehicle)]
+            yield Shown(f"/{vehicle.frame}/pose", "foxglove.PoseInFrame", content)
+        yield self._state(vehicle)
 
     def _on_map_m(self, vehicle: _Vehicle) -> dict[str, float]:
         """Return the position in the frame `map`; its origin before the first position."""
-        if vehicle.position is None or self.origin is None:
+        at, zero = vehicle.position, self.origin
+        if at is None or zero is None:
             return {"x": 0.0, "y": 0.0, "z": 0.0}
-        lat_deg, lon_deg, alt_m = _degrees(vehicle.position)
-        north, east = displacement_m(*self.origin[:2], lat_deg, lon_deg, self.origin[2])
-        return {"x": east, "y": north, "z": alt_m - self.origin[2]}
+        ground = (zero.lat_deg, zero.lon_deg, at.lat_deg, at.lon_deg, _or_zero(zero.alt_amsl_m))
+        north, east = displacement_m(*ground)
+        return {"x": east, "y": north, "z": _or_zero(at.alt_amsl_m - zero.alt_amsl_m)}
 
     def _state(self, vehicle: _Vehicle) -> Shown:
         roll, pitch, yaw = map(math.degrees, to_euler(vehicle.q_nb))
         content: dict[str, float | None] = dict.fromkeys(SCHEMAS["mavgate.State"]["properties"])
         if vehicle.has_attitude:
             content |= {"roll_deg": roll, "pitch_deg": pitch, "heading_deg": yaw % 360.0}
-        position = vehicle.position
-        if position is not None:
+        at = vehicle.position
+        if at is not None:
             content |= {
-                "alt_amsl_m": position.alt * M_PER_MM,
-                "height_m": position.relative_alt * M_PER_MM,
-                "speed_mps": math.hypot(position.vx, position.vy) * M_PER_CM,
-                "climb_mps": -position.vz * M_PER_CM,
+                "alt_amsl_m": plain(at.alt_amsl_m),
+                "height_m": plain(at.alt_home_m),
+                "speed_mps": plain(at.groundspeed_mps),
+                "climb_mps": plain(-at.vel_n_mps[2]),
             }
         return Shown(f"/{vehicle.frame}/state", "mavgate.State", content)
 
-    def _position(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
-        if not m.lat and not m.lon:
-            return []
-        vehicle.position = m
-        if self.origin is None:
-            self.origin = _degrees(m)
+    def _located(self, vehicle: _Vehicle, at: Position, time_us: int) -> Iterator[Shown]:
+        vehicle.position = at
+        self.origin = self.origin or at
         known = COVARIANCE_DIAGONAL if vehicle.accuracy_m else COVARIANCE_APPROXIMATED
         accuracy_m = vehicle.accuracy_m or vehicle.gps_accuracy_m
-        fix = _fix(vehicle.frame, time_us, _degrees(m), accuracy_m, known)
-        shown = [Shown(f"/{vehicle.frame}/location", "foxglove.LocationFix", fix)]
-        return shown if vehicle.has_attitude else [*shown, self._state(vehicle)]
+        fix = _fix(vehicle.frame, time_us, at, accuracy_m, known)
+        yield Shown(f"/{vehicle.frame}/location", "foxglove.LocationFix", fix)
+        if not vehicle.has_attitude:
+            yield self._state(vehicle)
 
-    def _gps(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
-        if m.fix_type < 2 or (not m.lat and not m.lon):
-            return []
+    def _gps(self, vehicle: _Vehicle, m: Mapping[str, Any], time_us: int) -> Iterator[Shown]:
+        at = position_of(GPS_ID, m)
+        if at is None:
+            return
         vehicle.gps_accuracy_m = None
-        if 0 < m.h_acc < UNKNOWN_U32 and 0 < m.v_acc < UNKNOWN_U32:
-            level_m = m.h_acc * M_PER_MM / math.sqrt(2.0)
-            vehicle.gps_accuracy_m = (level_m, m.v_acc * M_PER_MM)
-        fix = _fix(vehicle.frame, time_us, _degrees(m), vehicle.gps_accuracy_m, COVARIANCE_DIAGONAL)
-        return [Shown(f"/{vehicle.frame}/gps", "foxglove.LocationFix", fix)]
-
-    def _accuracy(self, vehicle: _Vehicle, m: Any, _time_us: int) -> list[Shown]:
-        level_m, height_m = m.pos_horiz_accuracy, m.pos_vert_accuracy
-        known = math.isfinite(level_m) and math.isfinite(height_m)
-        vehicle.accuracy_m = (level_m / math.sqrt(2.0), height_m) if known else None
-        return []
-
-    def _text(self, vehicle: _Vehicle, m: Any, time_us: int) -> list[Shown]:
-        """Put the chunks of a long text together."""
-        part = str(_plain(m.text)).partition("\0")[0]
-        begun = vehicle.text if m.id and m.id == vehicle.text_id and m.chunk_seq else ""
-        vehicle.text, vehicle.text_id = begun + part, m.id
-        if m.id and len(part) == TEXT_LENGTH:
-            return []
-        content = {
-            "timestamp": _time(time_us),
-            "level": LOG_LEVELS[min(m.severity, len(LOG_LEVELS) - 1)],
-            "message": vehicle.text,
-            "name": vehicle.frame,
-            "file": "",
-            "line": 0,
-        }
-        return [Shown(LOG_TOPIC, "foxglove.Log", content)]
+        if 0 < m["h_acc"] < UNKNOWN_U32 and 0 < m["v_acc"] < UNKNOWN_U32:
+            level_m = m["h_acc"] * M_PER_MM / math.sqrt(2.0)
+            vehicle.gps_accuracy_m = (level_m, m["v_acc"] * M_PER_MM)
+        fix = _fix(vehicle.frame, time_us, at, vehicle.gps_accuracy_m, COVARIANCE_DIAGONAL)
+        yield Shown(f"/{vehicle.frame}/gps", "foxglove.LocationFix", fix)
 
 
-def _degrees(m: Any) -> tuple[float, float, float]:
-    return (m.lat * DEG_PER_DEGE7, m.lon * DEG_PER_DEGE7, m.alt * M_PER_MM)
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+def _log(frame: str, text: JoinedText) -> Shown:
+    level = LOG_LEVELS[min(text.severity, len(LOG_LEVELS) - 1)]
+    content = {"timestamp": _time(text.time_us), "level": level, "message": text.text}
+    return Shown(LOG_TOPIC, "foxglove.Log", content | {"name": frame, "file": "", "line": 0})
 
 
 def _fix(
     frame: str,
     time_us: int,
-    position: tuple[float, float, float],
+    at: Position,
     accuracy_m: tuple[float, float] | None,
     covariance_type: int,
 ) -> dict[str, Any]:
-    lat_deg, lon_deg, alt_m = position
     covariance = [0.0] * 9
     if accuracy_m is not None:
         level_m, height_m = accuracy_m
@@ -330,9 +292,9 @@ def _fix(
     return {
         "timestamp": _time(time_us),
         "frame_id": frame,
-        "latitude": lat_deg,
-        "longitude": lon_deg,
-        "altitude": alt_m,
+        "latitude": at.lat_deg,
+        "longitude": at.lon_deg,
+        "altitude": plain(at.alt_amsl_m),
         "position_covariance": covariance,
         "position_covariance_type": covariance_type if accuracy_m else COVARIANCE_UNKNOWN,
     }
@@ -367,6 +329,10 @@ class _Topics:
         data = msgspec.json.encode(content)
         self._writer.add_message(channel, time_ns, data, time_ns, sequence)
 
+    def add_shown(self, shown: Iterable[Shown], time_us: int) -> None:
+        for one in shown:
+            self.add(one.topic, SCHEMAS[one.schema], one.content, time_us)
+
     def _schema(self, schema: dict[str, Any]) -> int:
         name = schema["title"]
         if name not in self._schemas:
@@ -380,24 +346,29 @@ def write(flight: FlightToWrite) -> Iterator[bytes]:
     pieces = Pieces()
     writer = Writer(pieces)  # type: ignore[arg-type]
     writer.start(library=f"mavgate {__version__}")
-    topics, view = _Topics(writer), FoxgloveView()
-    stations: set[int] = set()
-    for record, message in decoded(flight):
+    topics, view, unknown = _Topics(writer), FoxgloveView(), 0
+    records = flight.frames()
+    reader = VehicleReader(flight.senders, (GPS_ID, ESTIMATOR_ID))
+    for record in records:
         frame, time_us = frame_of(record.frame), record.time_us
-        system, component = frame.origin
-        origin = system << 8 | component
-        if frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT and frame.is_station_heartbeat:
-            stations.add(origin)
-        topic = f"/mavlink/{system}/{component}/{message.msgname}"
-        kind, fields = mavlink.mavlink_map[frame.message_id], fields_of_message(message)
-        topics.add(topic, schema_of_message(kind), fields, time_us, frame.sequence)
-        if not is_station(origin, stations):
-            for shown in view.feed(system, component, message, time_us):
-                topics.add(shown.topic, SCHEMAS[shown.schema], shown.content, time_us)
+        kind = DEFINITIONS.get(frame.message_id)
+        unknown += kind is None
+        if kind is not None:
+            system, component = frame.origin
+            topic = f"/mavlink/{system}/{component}/{kind.msgname}"
+            fields = {name: plain(value) for name, value in fields_of(record.frame).items()}
+            topics.add(topic, schema_of_message(kind), fields, time_us, frame.sequence)
+        for message in reader.feed(record):
+            topics.add_shown(view.feed(message), message.time_us)
         if data := pieces.taken():
             yield data
+    for message in reader.flush():
+        topics.add_shown(view.feed(message), message.time_us)
+    if unknown:
+        flight.remark(f"left out {counted(unknown, 'message')} that no MAVLink dialect here knows")
     if view.origin is not None:
-        lat_deg, lon_deg, alt_m = map(str, view.origin)
+        zero = view.origin
+        lat_deg, lon_deg, alt_m = map(str, (zero.lat_deg, zero.lon_deg, zero.alt_amsl_m))
         origin_facts = {"latitude": lat_deg, "longitude": lon_deg, "altitude_amsl_m": alt_m}
         writer.add_metadata("origin of the frame map", origin_facts)
     writer.finish()  # type: ignore[no-untyped-call]

@@ -12,12 +12,12 @@ from typing import IO, Any, Final
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
+from gateway.recordings.status_texts import text_of
 from gateway.recordings.table import (
     FORMAT_LINE,
     HEADER_PREFIX,
@@ -25,10 +25,9 @@ from gateway.recordings.table import (
     TableReader,
     encode_line,
 )
-from gateway.recordings.tlog import TlogRecord
-from gateway.units import counted
-from gateway.wire.mavlink_messages import MESSAGE_IDS
-from gateway.wire.mavlink_splitter import origin_of
+from gateway.recordings.tlog import fields_of
+from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
 
 
 class Pieces:
@@ -61,18 +60,6 @@ class Pieces:
         data = b"".join(self._written)
         self._written.clear()
         return data
-
-
-def decoded(flight: FlightToWrite) -> Iterator[tuple[TlogRecord, Any]]:
-    """Yield a flight's frames with their messages; unknown ones are mentioned in a remark."""
-    decoder, unknown = mavlink.MAVLink(None), 0
-    for record in flight.frames():
-        try:
-            yield record, decoder.decode(bytearray(record.frame))
-        except mavlink.MAVError:
-            unknown += 1
-    if unknown:
-        flight.remark(f"left out {counted(unknown, 'message')} that no MAVLink dialect here knows")
 
 
 ROWS: Final = 16_384
@@ -221,9 +208,10 @@ def _text(cell: Any) -> str:
 
 def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
     """Write every message of one type, of any sender; raises FlightError if there is none."""
-    kind = mavlink.mavlink_map.get(MESSAGE_IDS.get(name))
-    if kind is None:
+    message_id = MESSAGE_IDS.get(name)
+    if message_id is None:
         raise FlightError(f"no MAVLink message is called {name}")
+    kind = DEFINITIONS[message_id]
     schema = pa.schema(
         [
             pa.field(TIME, pa.timestamp("us", "UTC")),
@@ -236,11 +224,13 @@ def _write_messages(flight: FlightToWrite, name: str) -> Iterator[bytes]:
     met: set[str] = set()
     pieces, rows = Pieces(), []
     with _writer(pieces, schema) as writer:
-        for record, message in decoded(flight):
-            met.add(message.msgname)
-            if message.msgname == name:
-                fields = (_value(getattr(message, field)) for field in kind.fieldnames)
-                rows.append((record.time_us, *origin_of(record.frame), *fields))
+        for record in flight.frames():
+            found_id = message_id_of(record.frame)
+            met.add(MESSAGE_NAMES.get(found_id, f"message {found_id}"))
+            if found_id == message_id:
+                fields = fields_of(record.frame)
+                values = (_value(fields[field]) for field in kind.fieldnames)
+                rows.append((record.time_us, *origin_of(record.frame), *values))
             if len(rows) == ROWS:
                 writer.write_table(_batch(rows, schema))
                 yield pieces.taken()
@@ -262,5 +252,5 @@ def _message_field(kind: Any, name: str) -> pa.Field:
 
 def _value(value: Any) -> Any:
     if isinstance(value, bytes):
-        return value.decode("ascii", "replace")
+        return text_of(value)
     return value

@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.config import GatewaySettings
 from gateway.recordings.formats.maps import (
+    DRAWN_IDS,
     MapMarker,
     MarkerKind,
     TrackPoint,
@@ -21,7 +22,7 @@ from gateway.recordings.formats.maps import (
     to_geojson,
     to_gpx,
     to_kml,
-    tracks_of_frames,
+    tracks_of_messages,
     tracks_of_table,
 )
 from gateway.recordings.reading import RecordedTable
@@ -30,19 +31,19 @@ from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags
 from tests.kit.mavlink import packed
 from tests.recordings.flights import fly, make_flight, read
-from tests.recordings.frames import START_US
+from tests.recordings.frames import START_US, messages_of
 
 POINTS = [
     TrackPoint(1_760_000_000_123_000 + i * 100_000, 47.1 + 1e-6 * i, -8.5, 430.25) for i in range(5)
 ]
 ATTITUDE = TrackPoint(POINTS[-1].time_us + 10**6, 47.2, -8.5, 431.0, (-10.0, 5.0, -90.0))
 VEHICLES = [
-    VehicleTrack("wood & <field>", [*POINTS, ATTITUDE], [
+    VehicleTrack("wood & <field>", [[*POINTS, ATTITUDE]], [
         MapMarker(MarkerKind.HOME, "Home", POINTS[0]),
         MapMarker(MarkerKind.MARK, "over <the> gate", POINTS[2]),
         MapMarker(MarkerKind.EVENT, "GPS fix lost", POINTS[3]),
     ]),
-    VehicleTrack("system 7", POINTS[:2]),
+    VehicleTrack("system 7", [POINTS[:2]]),
 ]  # fmt: skip
 KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
 GPX = {"g": "http://www.topografix.com/GPX/1/1", "a": "urn:mavgate:attitude:1"}
@@ -53,14 +54,15 @@ def test_kml_contains_every_vehicle_with_times_and_attitude() -> None:
     assert [e.text for e in root.findall(".//k:Folder/k:name", KML)] == [
         "wood & <field>", "system 7",
     ]  # fmt: skip
-    first, second = root.findall(".//gx:Track", KML)
+    first, turned, second = root.findall(".//gx:Track", KML)
     positions = [e.text for e in first.findall("gx:coord", KML)]
     assert positions[1] == "-8.5000000 47.1000010 430.25"
     times = [e.text for e in first.findall("k:when", KML)]
     assert times[0] == "2025-10-09T08:53:20.123Z"
-    angles = [e.text for e in first.findall("gx:angles", KML)]
-    assert angles == [None] * 5 + ["270.0 5.0 -10.0"]
-    assert len(times) == len(positions) == len(angles) == 6
+    assert len(times) == len(positions) == 5
+    assert first.findall("gx:angles", KML) == []
+    assert [e.text for e in turned.findall("gx:angles", KML)] == ["270.0 5.0 -10.0"]
+    assert len(turned.findall("gx:coord", KML)) == 1
     assert len(second.findall("gx:coord", KML)) == 2
     assert second.findall("gx:angles", KML) == []
     styles = {e.get("id") for e in root.findall(".//k:Style", KML)}
@@ -106,7 +108,7 @@ def test_map_without_points_is_valid_xml() -> None:
 @pytest.mark.parametrize("write", [to_kml, to_gpx])
 def test_characters_not_allowed_in_xml_are_replaced(write: Callable[..., Iterator[str]]) -> None:
     odd = "".join(map(chr, range(0x20))) + "\x7f\ud800\udcff\ufffe\uffff]]>\N{HELICOPTER}"
-    vehicles = [VehicleTrack(odd, POINTS, [MapMarker(MarkerKind.MARK, odd, POINTS[0])])]
+    vehicles = [VehicleTrack(odd, [POINTS], [MapMarker(MarkerKind.MARK, odd, POINTS[0])])]
     text = "".join(write(odd, vehicles))
     names = [e.text or "" for e in ET.fromstring(text.encode()).iter() if e.tag.endswith("name")]
     assert len(names) >= 3
@@ -139,7 +141,7 @@ def test_geojson_contains_every_vehicle_with_times_and_markers() -> None:
 def test_track_is_cut_at_the_antimeridian() -> None:
     lons = (179.0, 179.8, -179.8, -179.0, 179.9)
     points = [TrackPoint(1_000_000 * k, 10.0 + k, lon, 100.0) for k, lon in enumerate(lons)]
-    (track,) = written([VehicleTrack("x", points)])["features"]
+    (track,) = written([VehicleTrack("x", [points])])["features"]
     assert track["geometry"]["type"] == "MultiLineString"
     parts = track["geometry"]["coordinates"]
     assert [len(part) for part in parts] == [3, 4, 2]
@@ -154,7 +156,7 @@ def test_track_is_cut_at_the_antimeridian() -> None:
 
 @pytest.mark.parametrize(("alt_m", "length"), [(math.nan, 2), (5.0, 3)])
 def test_track_of_one_point_is_a_point_without_an_unknown_height(alt_m: float, length: int) -> None:
-    (track,) = written([VehicleTrack("x", [TrackPoint(0, 47.0, 8.0, alt_m)])])["features"]
+    (track,) = written([VehicleTrack("x", [[TrackPoint(0, 47.0, 8.0, alt_m)]])])["features"]
     assert track["geometry"]["type"] == "Point"
     assert len(track["geometry"]["coordinates"]) == length
 
@@ -205,20 +207,24 @@ def records() -> list[TlogRecord]:
     ]
 
 
+def drawn(recorded: list[TlogRecord], system_id: int | None = None) -> list[VehicleTrack]:
+    return tracks_of_messages(messages_of(recorded, DRAWN_IDS, system_id))
+
+
 def markers(track: VehicleTrack) -> list[tuple[MarkerKind, str]]:
     return [(marker.kind, marker.name) for marker in track.markers]
 
 
 def test_tracks_are_only_those_of_vehicles() -> None:
-    one, two = tracks_of_frames(records(), None)
+    one, two = drawn(records())
     assert (one.name, two.name) == ("system 1", "system 7")
     assert [round(p.lat_deg * 1e7) for p in two.points] == [480_000_000, 480_000_001]
-    assert [track.name for track in tracks_of_frames(records(), 7)] == ["system 7"]
-    assert tracks_of_frames(records(), 9) == []
+    assert [track.name for track in drawn(records(), 7)] == ["system 7"]
+    assert drawn(records(), 9) == []
 
 
 def test_points_have_the_attitude_of_their_time() -> None:
-    one, two = tracks_of_frames(records(), None)
+    one, two = drawn(records())
     assert one.points[0].attitude_deg == pytest.approx(
         (math.degrees(0.1), math.degrees(-0.2), math.degrees(1.5)), abs=1e-4
     )
@@ -226,7 +232,7 @@ def test_points_have_the_attitude_of_their_time() -> None:
 
 
 def test_tracks_of_frames_have_home_marks_and_events() -> None:
-    one, _ = tracks_of_frames(records(), None)
+    one, _ = drawn(records())
     assert markers(one) == [
         (MarkerKind.HOME, "Home"),
         (MarkerKind.EVENT, "Attitude valid"),

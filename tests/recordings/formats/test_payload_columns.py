@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.recordings.formats.mavlink import columns_of
-from gateway.recordings.tlog import Batch, TlogScanner, encode_record
+from gateway.recordings.tlog import Batch, TlogScanner, columns_of, encode_record
 from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
 
 KINDS = sorted(mavlink.mavlink_map.items())
@@ -53,7 +52,7 @@ def test_columns_of_every_message_match_pymavlink(seed: int) -> None:
     link = mavlink.MAVLink(None)
     for message_id, kind in KINDS:
         frames = some_frames(message_id, kind, chance)
-        rows = columns_of(batch_of(frames), np.arange(FRAMES), kind)
+        rows = columns_of(batch_of(frames), np.arange(FRAMES), kind.id)
         for frame, row in zip(frames, rows, strict=True):
             message = link.decode(bytearray(frame))
             for name in kind.ordered_fieldnames:
@@ -72,10 +71,10 @@ def test_columns_of_every_message_match_pymavlink(seed: int) -> None:
 def test_only_requested_frames_are_read() -> None:
     kind = mavlink.MAVLink_heartbeat_message
     frames = [frame_of(0, bytes([n, 0, 0, 0, 6]), 2) for n in range(4)]
-    rows = columns_of(batch_of(frames), np.array([1, 3]), kind)
+    rows = columns_of(batch_of(frames), np.array([1, 3]), kind.id)
     assert rows["custom_mode"].tolist() == [1, 3]
     assert rows["mavlink_version"].tolist() == [0, 0]
-    assert len(columns_of(batch_of(frames), np.array([], np.int64), kind)) == 0
+    assert len(columns_of(batch_of(frames), np.array([], np.int64), kind.id)) == 0
 
 
 @pytest.mark.parametrize("message_id", [0, 30, 331])
@@ -83,5 +82,7 @@ def test_extra_fields_at_the_end_are_ignored(message_id: int) -> None:
     """A later dialect may have added fields at the end."""
     kind = mavlink.mavlink_map[message_id]
     payload = bytes(range(1, layout_of(kind.id).itemsize + 1))
-    rows = columns_of(batch_of([frame_of(message_id, payload + b"\7\7", 2)]), np.array([0]), kind)
+    rows = columns_of(
+        batch_of([frame_of(message_id, payload + b"\7\7", 2)]), np.array([0]), kind.id
+    )
     assert rows.tobytes() == payload

@@ -25,7 +25,7 @@ from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
-from gateway.recordings.formats.maps import tracks_of_frames, tracks_of_table
+from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
 from gateway.recordings.reading import aircraft_of, header_for, open_rows
 from gateway.recordings.table import TableMark, encode_line
 from gateway.recordings.tlog import TlogRecord, encode_record
@@ -133,7 +133,7 @@ def points_of(path: Path) -> int:
     """Count the points of the tracks that a map has to show."""
     flight = FlightToWrite([path], OPTIONS)
     if flight.is_mavlink:
-        tracks = tracks_of_frames(flight.frames(), None)
+        tracks = tracks_of_messages(flight.vehicle_messages())
     else:
         table = flight.table()
         tracks = tracks_of_table(table, aircraft_of(table, OPTIONS))

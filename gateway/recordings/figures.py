@@ -1,0 +1,68 @@
+"""Figures of a flight that reports, catalogue and lists share: GPS outages and lost samples."""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.recordings.tlog import DAY_US
+from gateway.units import US_PER_S
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+OUTAGE_US: Final = US_PER_S
+"""A longer gap between fixes is an outage."""
+OUTAGE_STEPS: Final = 2.5
+"""So many usual intervals without a fix are an outage, where fixes come seldom."""
+NODE_WRAP_US: Final = 1 << 32
+"""The clock of a node starts again at zero after so much time."""
+LONGEST_LOSS_US: Final = 60 * US_PER_S
+"""In a longer gap the node was switched off."""
+
+
+def gps_outages_us(
+    gps_us: IntArray, fixed: NDArray[np.bool_], end_us: int
+) -> list[tuple[int, int]] | None:
+    """Find the times without a fix, from the first fix on.
+
+    Parameters
+    ----------
+    gps_us : ndarray, shape (N,)
+        Times of all reports of the receiver.
+    fixed : ndarray, shape (N,)
+        Which of them had a fix.
+    end_us : int
+        End of the flight.
+
+    Returns
+    -------
+    list of (int, int) or None
+        Begin and end of each; None if there was no fix at all.
+    """
+    fixes_us = gps_us[fixed]
+    if not len(fixes_us):
+        return None
+    usual_us = float(np.median(np.diff(gps_us))) if len(gps_us) > 1 else 0.0
+    ends_us = np.append(fixes_us[1:], max(end_us, int(fixes_us[-1])))
+    gaps_us = ends_us - fixes_us
+    # A clock that jumps by days is no gap.
+    is_outage = (gaps_us > max(OUTAGE_US, OUTAGE_STEPS * usual_us)) & (gaps_us <= DAY_US)
+    begins, ends = fixes_us[is_outage].tolist(), ends_us[is_outage].tolist()
+    return list(zip(begins, ends, strict=True))
+
+
+def missing_samples(node_time_us: IntArray) -> FloatArray:
+    """Count the samples missing before each but the first, by the node's own clock."""
+    interval_us = np.diff(node_time_us) % NODE_WRAP_US
+    usual_us = np.median(interval_us[interval_us > 0]) if interval_us.any() else 1.0
+    missing = np.maximum(np.rint(interval_us / usual_us) - 1.0, 0.0)
+    return np.where(interval_us > LONGEST_LOSS_US, 0.0, missing)
+
+
+def lost_share(node_time_us: IntArray) -> float | None:
+    """Return the share of samples that are missing; None for fewer than two samples."""
+    if len(node_time_us) < 2:
+        return None
+    lost = float(missing_samples(node_time_us).sum())
+    return lost / (lost + len(node_time_us))

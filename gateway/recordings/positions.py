@@ -1,0 +1,248 @@
+"""Positions of vehicles: which MAVLink messages hold them, when one is valid, how far it is.
+
+One definition for every command, file and page: a position is on the earth, is not latitude 0,
+longitude 0 (sent before the first fix), and of a GPS receiver only with a fix. A track is broken
+where its positions are interrupted, the vehicle restarted, or the position jumped; no distance is
+counted there.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.geometry.geodesy import displacement_m, offset_deg
+from gateway.records import NAN, UNKNOWN_VEC3, Vec3
+from gateway.units import DEG_PER_DEGE7, M_PER_CM, M_PER_MM, US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+
+IntArray = NDArray[np.int64]
+FloatArray = NDArray[np.float64]
+
+FIX_2D: Final = 2
+"""GPS_FIX_TYPE_2D_FIX."""
+UNKNOWN_U16: Final = 65535
+MAX_LAT_DEGE7, MAX_LON_DEGE7 = 900_000_000, 1_800_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class PositionSource:
+    """A message that holds positions: the names and units of its fields."""
+
+    lat: str = "lat"
+    lon: str = "lon"
+    alt: str = "alt"
+    alt_unit_m: float = M_PER_MM
+    fix: str = ""
+    """Field with the type of the fix; empty where there is none."""
+    velocity_unit_mps: float = 0.0
+    """Of `vx`, `vy` and `vz`; 0 where the message has none."""
+    speed: tuple[str, float, int] = ("", 1.0, 0)
+    """Field with the speed over ground, its unit in m/s, and its value for unknown."""
+
+
+_GPS: Final = PositionSource(fix="fix_type", speed=("vel", M_PER_CM, UNKNOWN_U16))
+_SOURCES: Final = {
+    "GLOBAL_POSITION_INT": PositionSource(velocity_unit_mps=M_PER_CM),
+    "GLOBAL_POSITION_INT_COV": PositionSource(velocity_unit_mps=1.0),
+    "GPS_RAW_INT": _GPS,
+    "GPS2_RAW": _GPS,
+    "LOCAL_POSITION_NED": PositionSource(velocity_unit_mps=1.0),
+    "HIGH_LATENCY2": PositionSource(
+        "latitude", "longitude", "altitude", 1.0, speed=("groundspeed", 0.2, -1)
+    ),
+    "HIGH_LATENCY": PositionSource(
+        "latitude", "longitude", "altitude_amsl", 1.0, "gps_fix_type", 0.0, ("groundspeed", 1.0, -1)
+    ),
+}  # fmt: skip
+POSITION_SOURCES: Final = {MESSAGE_IDS[name]: source for name, source in _SOURCES.items()}
+"""By message id, the best first: estimates of the vehicle, receivers, narrow links."""
+GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
+"""Of the first and of the second GPS receiver."""
+GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]
+LOCAL_POSITION_NED_ID: Final = MESSAGE_IDS["LOCAL_POSITION_NED"]
+ORIGIN_ID: Final = MESSAGE_IDS["GPS_GLOBAL_ORIGIN"]
+
+
+@dataclass(frozen=True, slots=True)
+class Position:
+    """A position of a vehicle; what is unknown is NaN."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float = NAN
+    alt_home_m: float = NAN
+    """Above home."""
+    groundspeed_mps: float = NAN
+    vel_n_mps: Vec3 = UNKNOWN_VEC3
+
+
+def is_located(lat_dege7: Any, lon_dege7: Any) -> Any:
+    """Return whether coordinates, or which of several, are those of a known position."""
+    is_somewhere = (lat_dege7 != 0) | (lon_dege7 != 0)
+    is_lat = (lat_dege7 >= -MAX_LAT_DEGE7) & (lat_dege7 <= MAX_LAT_DEGE7)
+    return is_somewhere & is_lat & (lon_dege7 >= -MAX_LON_DEGE7) & (lon_dege7 <= MAX_LON_DEGE7)
+
+
+def holds_position(message_id: int, fields: Any) -> Any:
+    """Return whether a message, or which of several, holds a valid position.
+
+    Parameters
+    ----------
+    message_id : int
+        One of `POSITION_SOURCES`.
+    fields : mapping or structured ndarray
+        Its fields, as scalars or as columns.
+    """
+    if message_id == LOCAL_POSITION_NED_ID:
+        return np.isfinite(fields["x"] + fields["y"])
+    source = POSITION_SOURCES[message_id]
+    located = is_located(fields[source.lat], fields[source.lon])
+    return located & (fields[source.fix] >= FIX_2D) if source.fix else located
+
+
+def position_of(
+    message_id: int, fields: Mapping[str, Any], origin: Position | None = None
+) -> Position | None:
+    """Return the position in a message; None if it holds none that is valid.
+
+    Parameters
+    ----------
+    message_id : int
+        One of `POSITION_SOURCES`.
+    fields : mapping
+        Its fields by name.
+    origin : Position, optional
+        Of LOCAL_POSITION_NED, by GPS_GLOBAL_ORIGIN.
+    """
+    if not holds_position(message_id, fields):
+        return None
+    source = POSITION_SOURCES[message_id]
+    unit = source.velocity_unit_mps
+    velocity = (fields["vx"] * unit, fields["vy"] * unit, fields["vz"] * unit) if unit else None
+    speed_mps = _speed_mps(source, fields) if velocity is None else math.hypot(*velocity[:2])
+    alt_home_m = fields["relative_alt"] * M_PER_MM if "relative_alt" in fields else NAN
+    if message_id != LOCAL_POSITION_NED_ID:
+        lat_deg, lon_deg = (fields[name] * DEG_PER_DEGE7 for name in (source.lat, source.lon))
+        alt_m = fields[source.alt] * source.alt_unit_m
+    elif origin is None:
+        return None
+    else:
+        at = (origin.lat_deg, origin.lon_deg, 0.0, fields["x"], fields["y"])
+        lat_deg, lon_deg = offset_deg(*at)
+        alt_m = origin.alt_amsl_m - fields["z"]
+    return Position(lat_deg, lon_deg, alt_m, alt_home_m, speed_mps, velocity or UNKNOWN_VEC3)
+
+
+def _speed_mps(source: PositionSource, fields: Mapping[str, Any]) -> float:
+    name, unit_mps, unknown = source.speed
+    return NAN if not name or fields[name] == unknown else float(fields[name] * unit_mps)
+
+
+def named_position(fields: Mapping[str, Any]) -> Position | None:
+    """Return the position in HOME_POSITION or GPS_GLOBAL_ORIGIN; None if it is not valid."""
+    lat, lon = fields["latitude"], fields["longitude"]
+    if not is_located(lat, lon):
+        return None
+    return Position(lat * DEG_PER_DEGE7, lon * DEG_PER_DEGE7, fields["altitude"] * M_PER_MM)
+
+
+INTERRUPTION_US: Final = 60 * US_PER_S
+"""A longer time without a position breaks a track; those of narrow links come every 10 s."""
+RESTART_US: Final = 5 * US_PER_S
+"""Time since boot that falls by more is a restart; two links may be out of order by less."""
+JUMP_M: Final = 200.0
+JUMP_MPS: Final = 400.0
+"""A step that is longer than `JUMP_M`, and faster than any vehicle here, is no way."""
+
+
+class Continuity:
+    """Find where a track is broken, position by position."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, float, float] | None = None
+        self._boot_us = 0
+
+    def is_broken_at(
+        self, time_us: int, lat_deg: float, lon_deg: float, boot_us: int | None = None
+    ) -> bool:
+        """Return whether a position does not carry on the track before it.
+
+        Parameters
+        ----------
+        time_us : int
+            Time of the position.
+        lat_deg, lon_deg : float
+            The position.
+        boot_us : int, optional
+            The vehicle's own time since its boot.
+        """
+        last, self._last = self._last, (time_us, lat_deg, lon_deg)
+        is_restarted = boot_us is not None and boot_us < self._boot_us - RESTART_US
+        self._boot_us = self._boot_us if boot_us is None else boot_us
+        if last is None or is_restarted:
+            return is_restarted
+        step_us = abs(time_us - last[0])
+        if step_us > INTERRUPTION_US:
+            return True
+        if abs(lat_deg - last[1]) < 1e-3 and abs(lon_deg - last[2]) < 1e-3:
+            return False
+        step_m = math.hypot(*displacement_m(last[1], last[2], lat_deg, lon_deg, 0.0))
+        return step_m > JUMP_M + JUMP_MPS * step_us / US_PER_S
+
+
+STEP_US: Final = US_PER_S // 2
+"""Interval of the positions between which the distance is summed."""
+LEAST_STEP_M: Final = 1.0
+"""Shorter steps are not summed: at rest the noise of positions would be a distance."""
+
+
+class GroundDistance:
+    """The distance over ground: the one definition, for every command and page.
+
+    Steps of `LEAST_STEP_M` or more between positions `STEP_US` apart are summed, except where the
+    track is broken. The positions are those of the vehicle's best source; of a table its states',
+    or its fixes' if no state has a position.
+    """
+
+    def __init__(self) -> None:
+        self._sum_m = 0.0
+        self._sampled_us: int | None = None
+        self._last: tuple[float, float] | None = None
+        self._continuity = Continuity()
+
+    @property
+    def distance_m(self) -> float | None:
+        """Distance over ground in m; None without a position."""
+        return None if self._last is None else self._sum_m
+
+    def is_due(self, time_us: int) -> bool:
+        """Return whether a position of this time counts."""
+        return self._sampled_us is None or not 0 <= time_us - self._sampled_us < STEP_US
+
+    def update(
+        self, time_us: int, lat_deg: float, lon_deg: float, boot_us: int | None = None
+    ) -> None:
+        """Add a position, if it is due; see `Continuity`."""
+        if not self.is_due(time_us):
+            return
+        self._sampled_us = time_us
+        is_broken = self._continuity.is_broken_at(time_us, lat_deg, lon_deg, boot_us)
+        if self._last is not None and not is_broken:
+            step_m = math.hypot(*displacement_m(*self._last, lat_deg, lon_deg, 0.0))
+            if step_m < LEAST_STEP_M:
+                return
+            self._sum_m += step_m
+        self._last = (lat_deg, lon_deg)
+
+
+def ground_distance_m(time_us: IntArray, lat_deg: FloatArray, lon_deg: FloatArray) -> float:
+    """Return the distance over ground along positions, unknown ones of which are NaN; or NaN."""
+    distance, known = GroundDistance(), np.isfinite(lat_deg)
+    columns = (time_us[known].tolist(), lat_deg[known].tolist(), lon_deg[known].tolist())
+    for at_us, lat, lon in zip(*columns, strict=True):
+        distance.update(at_us, lat, lon)
+    return NAN if distance.distance_m is None else distance.distance_m

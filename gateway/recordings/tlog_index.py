@@ -1,0 +1,81 @@
+"""Index of a tlog: where to begin reading for a time, its senders, its damage."""
+
+from array import array
+from bisect import bisect_left
+from typing import Final
+
+import numpy as np
+
+from gateway.recordings.senders import Senders
+from gateway.recordings.tlog import STRIDE, Batch, Damage, Timeline
+from gateway.recordings.tlog_scan import TIME_SIZE
+
+MAX_DAMAGE_RUNS: Final = 1000
+"""Runs that are listed one by one; a file of nothing but damage must not fill the memory."""
+
+
+class TlogIndex:
+    """Index of a file: where to begin reading for a time, and a summary.
+
+    One entry every `STRIDE` records, so the index of a file of any size is about a thousandth of
+    it. The time stamps of other programs' files may jump back; the index searches by the greatest
+    time so far, which never does.
+    """
+
+    def __init__(self, timeline: Timeline | None = None) -> None:
+        self.timeline = timeline or Timeline()
+        """Corrects the times of batches that are read again."""
+        self.count = 0
+        """Records."""
+        self.size = 0
+        """Bytes that were seen, damage included."""
+        self.first_us: int | None = None
+        self.last_us: int | None = None
+        """Greatest time."""
+        self.senders = Senders()
+        self.damage: list[Damage] = []
+        """The first `MAX_DAMAGE_RUNS` runs."""
+        self.damaged_bytes = 0
+        self.mended = 0
+        """Records whose time was damaged."""
+        self.unfinished = 0
+        """Bytes of a last record that is not whole."""
+        self._offsets = array("q")
+        self._times = array("q")
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        for run in batch.damage:
+            self._add_damage(run)
+        self.mended += batch.mended
+        self.unfinished += batch.unfinished
+        if not len(batch):
+            return
+        self.senders.add(batch)
+        if self.first_us is None or self.last_us is None:
+            self.first_us = self.last_us = int(batch.time_us[0])
+        greatest = np.maximum.accumulate(np.maximum(batch.time_us, self.last_us))
+        first = -self.count % STRIDE
+        self._offsets.frombytes((batch.starts[first::STRIDE] + batch.offset).tobytes())
+        self._times.frombytes(greatest[first::STRIDE].tobytes())
+        self.count += len(batch)
+        self.last_us = int(greatest[-1])
+        end = int(batch.starts[-1]) + TIME_SIZE + int(batch.sizes[-1])
+        self.size = max(self.size, batch.offset + end)
+
+    def offset_before(self, time_us: int, records: int = 0) -> int:
+        """Return where to begin reading to find the first record that is not before a time."""
+        if not self._offsets:
+            return 0
+        entry = bisect_left(self._times, time_us) - 1 - -(-records // STRIDE)
+        return self._offsets[max(entry, 0)]
+
+    def _add_damage(self, run: Damage) -> None:
+        self.damaged_bytes += run.size
+        self.size = max(self.size, run.offset + run.size)
+        last = self.damage[-1] if self.damage else None
+        if last is not None and last.offset + last.size == run.offset:
+            # A run across two chunks arrives in two pieces.
+            self.damage[-1] = Damage(last.offset, last.size + run.size)
+        elif len(self.damage) < MAX_DAMAGE_RUNS:
+            self.damage.append(run)

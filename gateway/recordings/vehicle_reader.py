@@ -1,0 +1,154 @@
+"""The one reader of the vehicles in recorded MAVLink, for all files, figures and pages.
+
+Of each vehicle it yields the positions of its best source, the attitude of its best message, its
+texts joined, and any other message that is wanted. Frames of ground stations and of the other
+components of a system are left out, except their texts. See `Senders`.
+"""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+
+from gateway.geometry.quaternion import from_euler, normalise
+from gateway.recordings.positions import ORIGIN_ID, Position, named_position, position_of
+from gateway.recordings.senders import RecordedSender, Senders, is_station
+from gateway.recordings.status_texts import STATUSTEXT_ID, JoinedText, TextJoiner
+from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, TlogRecord, fields_of
+from gateway.records import Quat
+from gateway.wire.mavlink_messages import DEFINITIONS
+from gateway.wire.mavlink_splitter import message_id_of, origin_of
+
+BOOT_UNITS_US: Final = {"time_boot_ms": 1000, "time_usec": 1, "timestamp": 1000}
+"""Fields with the sender's time, and their units; a civil time is not that since its boot."""
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleMessage:
+    """One message of a vehicle, or one text."""
+
+    system_id: int
+    time_us: int
+    """Recorded time; of a text that of its first chunk, which may lie before other messages."""
+    message_id: int
+    fields: Mapping[str, Any]
+    """By name, as they are sent; empty for a text."""
+    position: Position | None = None
+    """Of the vehicle, if this message is that of its best source and holds a valid one."""
+    q_nb: Quat | None = None
+    """Attitude of the vehicle, body FRD to NED, if this is its best message with a valid one."""
+    text: JoinedText | None = None
+
+    @property
+    def boot_us(self) -> int | None:
+        """Time since the boot of the vehicle; None where the message has none."""
+        for name, unit_us in BOOT_UNITS_US.items():
+            if name in self.fields:
+                own_us: int = self.fields[name] * unit_us
+                return own_us if own_us < FIRST_CIVIL_US else None
+        return None
+
+
+class VehicleReader:
+    """Read the vehicles of a recording, frame by frame or batch by batch.
+
+    Parameters
+    ----------
+    senders : Senders
+        The survey of the whole recording. A system that it lacks is taken to be one of the
+        gateway's own.
+    wanted : iterable of int, optional
+        Ids of further messages.
+    system_id : int, optional
+        The only system to read.
+    with_attitude : bool
+        Whether the attitude is wanted.
+    """
+
+    def __init__(
+        self,
+        senders: Senders,
+        wanted: Iterable[int] = (),
+        system_id: int | None = None,
+        *,
+        with_attitude: bool = True,
+    ) -> None:
+        self._senders = senders
+        self._wanted = frozenset(wanted)
+        self._system_id = system_id
+        self._with_attitude = with_attitude
+        self._vehicles: dict[int, RecordedSender] = {}
+        self._frame_origins: dict[int, Position] = {}
+        self._joiner = TextJoiner()
+
+    def vehicle(self, system_id: int) -> RecordedSender:
+        """Return the vehicle of a system."""
+        known = self._vehicles.get(system_id)
+        if known is None:
+            known = self._vehicles[system_id] = self._senders.vehicle(system_id)
+            if not self._with_attitude:
+                known = self._vehicles[system_id] = replace(known, attitude_id=None)
+            if known.frame_origin is not None:
+                self._frame_origins[system_id] = known.frame_origin
+        return known
+
+    def feed_batch(self, batch: Batch) -> Iterator[VehicleMessage]:
+        """Take the next batch of the recording."""
+        for origin in np.unique(batch.origins).tolist():
+            self.vehicle(origin >> 8)
+        ids = {*self._wanted, STATUSTEXT_ID, ORIGIN_ID}
+        for one in self._vehicles.values():
+            ids |= {key for key in (one.attitude_id, one.position_id) if key is not None}
+        for record in batch.records(np.flatnonzero(np.isin(batch.message_ids, [*ids]))):
+            yield from self.feed(record)
+
+    def feed(self, record: TlogRecord) -> Iterator[VehicleMessage]:
+        """Take the next record."""
+        frame, time_us = record.frame, record.time_us
+        system_id, component_id = origin_of(frame)
+        origin, message_id = system_id << 8 | component_id, message_id_of(frame)
+        if self._system_id not in (None, system_id):
+            return
+        if message_id == STATUSTEXT_ID:
+            if not is_station(origin, self._senders.stations):
+                yield from map(_of_text, self._joiner.feed(frame, time_us))
+            return
+        yield from map(_of_text, self._joiner.poll(time_us))
+        vehicle = self.vehicle(system_id)
+        if origin != vehicle.origin or is_station(origin, self._senders.stations):
+            return
+        if message_id == ORIGIN_ID and (found := named_position(fields_of(frame))) is not None:
+            self._frame_origins[system_id] = found
+        is_best = message_id in (vehicle.position_id, vehicle.attitude_id)
+        if (is_best or message_id in self._wanted) and message_id in DEFINITIONS:
+            yield self._message(vehicle, message_id, record)
+
+    def flush(self) -> Iterator[VehicleMessage]:
+        """Return the texts of which no more will come."""
+        return map(_of_text, self._joiner.flush())
+
+    def _message(
+        self, vehicle: RecordedSender, message_id: int, record: TlogRecord
+    ) -> VehicleMessage:
+        fields, system_id = fields_of(record.frame), vehicle.origin >> 8
+        position = q_nb = None
+        if message_id == vehicle.position_id:
+            position = position_of(message_id, fields, self._frame_origins.get(system_id))
+        elif message_id == vehicle.attitude_id:
+            q_nb = attitude_of(fields)
+        return VehicleMessage(system_id, record.time_us, message_id, fields, position, q_nb)
+
+
+def _of_text(text: JoinedText) -> VehicleMessage:
+    return VehicleMessage(text.origin >> 8, text.time_us, STATUSTEXT_ID, {}, text=text)
+
+
+def attitude_of(fields: Mapping[str, Any]) -> Quat | None:
+    """Return the attitude in ATTITUDE or ATTITUDE_QUATERNION; None if it is not known."""
+    if "roll" in fields:
+        angles = (fields["roll"], fields["pitch"], fields["yaw"])
+        return from_euler(*angles) if math.isfinite(sum(angles)) else None
+    q: Quat = (fields["q1"], fields["q2"], fields["q3"], fields["q4"])
+    return normalise(q) if math.isfinite(sum(q)) and any(q) else None
