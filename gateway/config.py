@@ -10,7 +10,7 @@ import logging
 import stat
 import textwrap
 import tomllib
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -30,6 +30,24 @@ from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
+USUAL: Final = (
+    "serial.port",
+    "hub.endpoints",
+    "vehicle.type",
+    "vehicle.autopilot",
+    "vehicle.armed_when",
+    "vehicle.signing_passphrase",
+    "vehicle.supply_low_v",
+    "estimation.reference.gps_latency_s",
+    "estimation.reference.declination_deg",
+    "recording.mode",
+    "recording.folder",
+    "recording.free_floor_mb",
+    "panel.enabled",
+    "panel.password",
+    "panel.units",
+)
+"""The settings that are changed most: those of the template."""
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)
 
@@ -158,13 +176,17 @@ def aircraft_folder(settings: GatewaySettings) -> Path:
     return Path(settings.aircraft_folder).expanduser()
 
 
-def render(settings: GatewaySettings) -> str:
-    """Return a documented TOML file, with meaning, unit and range of every setting as comments."""
+def render(settings: GatewaySettings, keys: Sequence[str] = ("",)) -> str:
+    """Return a documented TOML file, with meaning, unit and range of every setting as comments.
+
+    `keys` are the settings in it, as `section.name`; each stands for all that begin with it.
+    """
     head = _comment(
         "Settings of mavgate. Every key may be left out: its value here is the default. "
-        "`mavgate check-config FILE` lists the errors in a file."
+        "`mavgate check-config FILE` lists the errors in a file, "
+        "`mavgate check-config --all` shows all settings."
     )
-    return "\n".join([*head, *_render_section(settings, "")]) + "\n"
+    return "\n".join([*head, *_render_section(settings, "", keys)]) + "\n"
 
 
 def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
@@ -285,16 +307,17 @@ def _uncapital(text: str) -> str:
     return (text[:1] if text[:2].isupper() else text[:1].lower()) + text[1:].rstrip(".")
 
 
-def _render_section(settings: Settings, prefix: str) -> Iterator[str]:
+def _render_section(settings: Settings, prefix: str, keys: Sequence[str]) -> Iterator[str]:
     for field in fields_of(type(settings)):
-        value = getattr(settings, field.name)
-        if isinstance(value, Settings):
+        value, path = getattr(settings, field.name), f"{prefix}{field.name}"
+        if not isinstance(value, Settings):
+            if any(map(path.startswith, keys)):
+                yield from _render_key(field, value)
+        elif below := [*_render_section(value, f"{path}.", keys)]:
             yield ""
             yield from _comment((type(value).__doc__ or "").strip())
-            yield f"[{prefix}{field.name}]"
-            yield from _render_section(value, f"{prefix}{field.name}.")
-        else:
-            yield from _render_key(field, value)
+            yield f"[{path}]"
+            yield from below
 
 
 def _render_key(field: Field, value: Any) -> Iterator[str]:

@@ -1,5 +1,6 @@
 """The settings file: strict in, documented out."""
 
+import re
 import stat
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import msgspec
 import pytest
 
 from gateway.config import (
+    USUAL,
     ConfigError,
     GatewaySettings,
     aircraft_file,
@@ -41,6 +43,14 @@ def test_documented_file_contains_defaults(tmp_path: Path) -> None:
     """config/gateway.toml shows every setting; `mavgate check-config` writes it."""
     assert (ROOT / "config" / "gateway.toml").read_text() == render(GatewaySettings())
     assert load(ROOT / "config" / "gateway.toml") == GatewaySettings()
+
+
+def test_template_contains_fifteen_known_settings_with_their_defaults(tmp_path: Path) -> None:
+    text = render(GatewaySettings(), USUAL)
+    shown = [path for path, _ in FIELDS if path in USUAL]
+    assert sorted(shown) == sorted(USUAL)
+    assert len(re.findall(r"^\w+ = ", text, re.MULTILINE)) == len(USUAL) == 15
+    assert load_text(tmp_path, text) == GatewaySettings()
 
 
 @pytest.mark.parametrize(("path", "field"), FIELDS, ids=[path for path, _ in FIELDS])

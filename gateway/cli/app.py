@@ -84,8 +84,8 @@ GROUPS: Final = {
     "Set-up": {
         "setup": "Guide through the first start: receiver, sensors, radio, GPS, calibration.",
         "calibrate": "Calibrate an aircraft's sensors and save the result with its residuals.",
-        "check-config": "Check the settings and those of the aircraft, or print all settings with "
-        "their defaults.",
+        "check-config": "Check the settings and those of the aircraft, or print a template with "
+        "the defaults.",
         "ports": "List the serial ports, and the one that `auto` selects.",
         "flash": "Write a ready-made program with its settings to a board, or read them back.",
         "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, "

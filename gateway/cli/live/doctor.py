@@ -19,10 +19,11 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.support.options import folder_of, read_settings
+from gateway.cli.support.options import CONFIG, USER_CONFIG, folder_of, read_settings
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import (
+    USUAL,
     ConfigError,
     GatewaySettings,
     aircraft_folder,
@@ -36,6 +37,7 @@ from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
 from gateway.live.part import free_bytes_near
 from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
+from gateway.output import PRIVATE, write_new
 from gateway.printable import reason_of
 
 app = typer.Typer()
@@ -261,6 +263,17 @@ def check_extras(_: GatewaySettings) -> Iterator[Diagnosis]:
             yield info("extra", how_to_add(use, extra))
 
 
+def _write_template(text: str) -> None:
+    """Write the settings file, which is never replaced."""
+    file = CONFIG.get() or USER_CONFIG.expanduser()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        write_new(file, [text.encode()], rights=PRIVATE)
+    except FileExistsError:
+        refuse(f"{file}: is there, and is kept; `mavgate check-config {file}` checks it")
+    print(f"wrote {file}")
+
+
 CHECKS: Final[tuple[Check, ...]] = (
     check_receiver,
     check_ports,
@@ -296,15 +309,26 @@ def doctor() -> None:
 @app.command()
 def check_config(
     file: Annotated[
-        Path | None, typer.Argument(help="Settings file; without it, the defaults are printed.")
+        Path | None,
+        typer.Argument(help="Settings file to check; without it, a template is printed."),
     ] = None,
+    *,
+    every: Annotated[
+        bool, typer.Option("--all", help="Print all settings with their defaults.")
+    ] = False,
+    write: Annotated[
+        bool,
+        typer.Option("--write", help="Write the template as the settings file if there is none."),
+    ] = False,
 ) -> None:
-    """Check the settings and those of the aircraft, or print all settings with their defaults.
+    """Check the settings and those of the aircraft, or print a template with the defaults.
 
-    All errors are listed at once, each with the allowed values.
+    All errors are listed at once, each with the allowed values. The template contains the settings
+    that are changed most.
     """
     if file is None:
-        print(render(GatewaySettings()), end="")
+        text = render(GatewaySettings(), ("",) if every else USUAL)
+        _write_template(text) if write else print(text, end="")
         return
     settings = load(file)
     aircraft = load_aircraft(settings)

@@ -212,3 +212,18 @@ def test_missing_or_broken_certificate_is_wrong(settings: GatewaySettings, tmp_p
         Grade.FAIL, "hub.tls_certificate", f"{file}: No such file or directory"
     )
     assert "no certificate" in broken.text.replace(str(file), "").lower()
+
+
+def test_template_is_written_once_into_a_new_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    file = tmp_path / ".config" / "mavgate" / "gateway.toml"
+    assert invoke("check-config", "--write").output == f"wrote {file}\n"
+    template = file.read_text()
+    assert (template, file.stat().st_mode & 0o777) == (invoke("check-config").output, 0o600)
+    file.write_text("# mine")
+    again = invoke("check-config", "--write")
+    assert (again.exit_code, f"{file}: is there, and is kept" in again.output) == (2, True)
+    assert file.read_text() == "# mine"
+    assert invoke("check-config", "--all").output.count("\n[") > template.count("\n[")
