@@ -103,7 +103,12 @@ class PlayerDaemon:
         self._timer: asyncio.TimerHandle | None = None
         self.ended = asyncio.Event()
         self.edge = PlayerEdge(
-            self._player, self._send, self._now_us, files=files, on_end=self.ended.set
+            self._player,
+            self._send,
+            self._now_us,
+            repeat=self._repeat,
+            files=files,
+            on_end=self.ended.set,
         )
         self._control = ControlServer(socket_path("play"), self.edge.verbs())
 
@@ -157,6 +162,11 @@ class PlayerDaemon:
             Outgoing(self._numbering.played(frame), message_id_of(frame)) for frame in frames
         )
 
+    def _repeat(self, frames: Iterable[bytes]) -> None:
+        self._hub.send_all(
+            Outgoing(self._numbering.inserted(frame), message_id_of(frame)) for frame in frames
+        )
+
     def _on_frame(self, incoming: Incoming) -> None:
         for vehicle in self._vehicles:
             self._perform(vehicle.handle(incoming, self._now_us()))
@@ -193,9 +203,9 @@ class PlayerDaemon:
 
 
 class _Numbering:
-    """Sequence numbers: an answer between recorded frames must not look like a loss.
+    """Sequence numbers: a frame between recorded ones must not look like a loss.
 
-    Until the first answer of a sender its frames are played byte for byte.
+    Until the first inserted frame of a sender its frames are played byte for byte.
     """
 
     def __init__(self) -> None:
@@ -210,7 +220,7 @@ class _Numbering:
         return (edit_frame(read, sequence=sequence) or read).data if added else frame
 
     def inserted(self, frame: bytes) -> bytes:
-        """Return an answer, numbered in between the recorded frames."""
+        """Return an answer or a repeated frame, numbered in between the recorded frames."""
         read = frame_of(frame)
         sequence = self._last[read.origin] = self._last.get(read.origin, 0xFF) + 1 & 0xFF
         self._added[read.origin] = self._added.get(read.origin, 0) + 1

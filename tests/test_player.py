@@ -204,3 +204,19 @@ async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station:
     steer(daemon, "q")
     assert daemon.ended.is_set()
     daemon.close()
+
+
+@pytest.mark.parametrize("plan", [{"paused": True}, {}], ids=["before the start", "at the end"])
+async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
+    tmp_path: Path, opened: ExitStack, station: Station, plan: dict[str, Any]
+) -> None:
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url), **plan)
+    await daemon.start()
+    recorded = 0 if plan else 2
+    await station.until(recorded + 3)
+    daemon.close()
+    read = [frame_of(frame) for frame in station.frames]
+    assert {frame.message_id for frame in read} == {mavlink.MAVLINK_MSG_ID_HEARTBEAT}
+    assert [frame.sequence for frame in read] == [
+        (read[0].sequence + i) % 256 for i in range(len(read))
+    ]

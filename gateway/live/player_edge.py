@@ -1,4 +1,8 @@
-"""The player's edge: emits the frames of recordings when they are due."""
+"""The player's edge: emits the frames of recordings when they are due.
+
+While nothing plays, the state of the vehicles is repeated once a second: ground stations give up a
+vehicle without heartbeats.
+"""
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
@@ -13,6 +17,8 @@ from gateway.units import US_PER_S
 BATCH: Final = 25
 """Frames at once: to four clients a millisecond, after which others get their turn."""
 LONGEST_WAIT_S: Final = 0.5
+HOLD_US: Final = US_PER_S
+"""Between two repetitions of the state."""
 SEEKING: Final = "seeking"
 
 
@@ -34,7 +40,10 @@ class PlayerStatus:
 
 
 class PlayerEdge:
-    """Play recordings on the event loop: batches of frames to `emit`; `on_end` at their end."""
+    """Play recordings on the event loop: batches of frames to `emit`; `on_end` at their end.
+
+    `repeat` gets the frames that show the state while nothing plays.
+    """
 
     def __init__(
         self,
@@ -42,11 +51,14 @@ class PlayerEdge:
         emit: Callable[[Iterable[bytes]], None],
         now_us: Callable[[], int],
         *,
+        repeat: Callable[[Iterable[bytes]], None] | None = None,
         files: Sequence[str] = (),
         on_end: Callable[[], None] | None = None,
     ) -> None:
         self._player = player
         self._emit = emit
+        self._repeat = repeat
+        self._emitted_us = 0
         self._clock = now_us
         self._files = tuple(files)
         self._on_end = on_end
@@ -67,6 +79,7 @@ class PlayerEdge:
 
     def start(self) -> None:
         """Start; needs a running event loop."""
+        self._emitted_us = self._clock()
         self._turn()
 
     def close(self) -> None:
@@ -88,6 +101,7 @@ class PlayerEdge:
     def step(self, count: int = 1) -> PlayerStatus:
         """Pause, and play the next frames."""
         self._emit(self._player.step(self._clock(), count))
+        self._emitted_us = self._clock()
         return self._turned()
 
     def set_speed(self, speed: float | None) -> PlayerStatus:
@@ -137,6 +151,10 @@ class PlayerEdge:
         was_playing = self._player.state is PlayState.PLAYING
         if frames := self._player.poll(self._clock(), BATCH):
             self._emit(frames)
+            self._emitted_us = self._clock()
+        is_idle = self._wanted_us is not None or self._player.state is not PlayState.PLAYING
+        if is_idle:
+            self._hold()
         loop, due_us = asyncio.get_running_loop(), self._player.next_due_us()
         if self._wanted_us is not None:
             self._timer = loop.call_soon(self._turn)
@@ -146,5 +164,13 @@ class PlayerEdge:
                 self._timer = loop.call_soon(self._turn)
             else:
                 self._timer = loop.call_later(min(wait_s, LONGEST_WAIT_S), self._turn)
-        elif was_playing and self._player.state is PlayState.ENDED and self._on_end is not None:
-            self._on_end()
+        else:
+            self._timer = loop.call_later(LONGEST_WAIT_S, self._turn)
+            if was_playing and self._player.state is PlayState.ENDED and self._on_end is not None:
+                self._on_end()
+
+    def _hold(self) -> None:
+        """Repeat the state if nothing was emitted for a while."""
+        if self._repeat is not None and self._clock() - self._emitted_us >= HOLD_US:
+            self._emitted_us = self._clock()
+            self._repeat(self._player.held())

@@ -2,7 +2,8 @@
 
 A tlog holds the answers that the vehicle gave in flight. They are collected while the file is
 indexed, each with the time from which it was valid, so that a player can give them again: as of
-the moment that is played, or the first one for what the vehicle sent only later.
+the moment that is played, or the first one for what the vehicle sent only later. A mission or a
+parameter that a station set in flight did not exist before.
 
 | what                         | where from                                               |
 | ---------------------------- | -------------------------------------------------------- |
@@ -111,7 +112,10 @@ _KEPT: Final = _ids(
 _MISSION: Final = _ids(
     "MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_COUNT", "MISSION_CLEAR_ALL", "MISSION_ACK"
 )
-_READ: Final = np.array(sorted(_KEPT | _MISSION))
+_PARAM_SET: Final = MESSAGE_IDS["PARAM_SET"]
+_SET_NAME: Final = slice(6, 22)
+"""Of PARAM_SET: behind the value and the target."""
+_READ: Final = np.array(sorted(_KEPT | _MISSION | {_PARAM_SET}))
 
 KINDS: Final = (0, 1, 2)
 """Mission, fence, rally points."""
@@ -127,6 +131,8 @@ Value = TypeVar("Value")
 class _Course(Generic[Value]):
     """A value that changes: since when each of its values is valid."""
 
+    is_set: bool = False
+    """Whether the first value was set when it became valid; else it was so before."""
     times: list[int] = field(default_factory=list)
     values: list[Value] = field(default_factory=list)
 
@@ -135,8 +141,9 @@ class _Course(Generic[Value]):
         self.times.append(max(time_us, self.times[-1]) if self.times else time_us)
         self.values.append(value)
 
-    def at(self, time_us: int) -> Value:
-        return self.values[max(bisect_right(self.times, time_us) - 1, 0)]
+    def at(self, time_us: int) -> Value | None:
+        number = bisect_right(self.times, time_us) - 1
+        return None if number < 0 and self.is_set else self.values[max(number, 0)]
 
 
 @dataclass(slots=True)
@@ -158,6 +165,8 @@ class LogAnswers:
         self.seen: set[tuple[int, int]] = set()
         """System and id of each message."""
         self._transfers: dict[tuple[int, int, bool], _Transfer] = {}
+        self._set: set[tuple[int, bytes]] = set()
+        """Parameters that a station has set, by system and name, until their value comes."""
         self._kept = 0
 
     def note(self, batch: Batch, stations: Set[int]) -> None:
@@ -175,8 +184,15 @@ class LogAnswers:
         self.seen.add((system, message_id))
         if message_id in _MISSION:
             self._note_mission(frame, time_us, is_station(system << 8 | component, stations))
+        elif message_id == _PARAM_SET:
+            name = payload_of(frame, _SET_NAME.stop)[_SET_NAME]
+            if len(self._set) < MAX_KEPT:
+                self._set.add((frame_of(frame).target[0], name))
         elif message_id in _KEPT and component == AUTOPILOT:
-            course = self.frames.setdefault((system, message_id, _key_of(frame)), _Course())
+            key = _key_of(frame)
+            is_set = message_id == PARAM_VALUE_ID and (system, key) in self._set
+            self._set.discard((system, key))
+            course = self.frames.setdefault((system, message_id, key), _Course(is_set))
             if not course.values or _content_of(course.values[-1]) != _content_of(frame):
                 course.add(time_us, frame)
                 self._kept += 1
@@ -196,7 +212,7 @@ class LogAnswers:
                 for each in kinds:
                     transfer = self._transfers.pop((vehicle, each, True), None)
                     if transfer is not None and not message["type"]:
-                        self._store(vehicle, each, transfer, time_us)
+                        self._store(vehicle, each, transfer, time_us, is_set=True)
             case "MISSION_ITEM" | "MISSION_ITEM_INT":
                 transfer = self._transfers.get((vehicle, kind, is_upload))
                 if transfer is not None and message["seq"] < transfer.count:
@@ -210,12 +226,14 @@ class LogAnswers:
         if not is_upload:
             self._store(vehicle, kind, transfer, time_us)
 
-    def _store(self, vehicle: int, kind: int, transfer: _Transfer, time_us: int) -> None:
+    def _store(
+        self, vehicle: int, kind: int, transfer: _Transfer, time_us: int, *, is_set: bool = False
+    ) -> None:
         """Keep a mission that is complete."""
         if kind not in KINDS or len(transfer.items) < transfer.count:
             return
         items = tuple(transfer.items[i] for i in range(transfer.count))
-        course = self.missions.setdefault((vehicle, kind), _Course())
+        course = self.missions.setdefault((vehicle, kind), _Course(is_set))
         contents = [payload_of(frame, 255) for frame in items]
         if not course.values or [payload_of(f, 255) for f in course.values[-1]] != contents:
             course.add(time_us, items)
@@ -241,11 +259,12 @@ class VehicleAnswers:
         return [self._edited(frame) for frame in self._recorded(message_id)]
 
     def _recorded(self, message_id: int) -> list[bytes]:
-        return [
+        present = (
             course.at(self._position_us())
             for (system, kind, _), course in self._log.frames.items()
             if (system, kind) == (self._system_id, message_id)
-        ]
+        )
+        return [frame for frame in present if frame is not None]
 
     def _edited(self, frame: bytes, **fields: int) -> bytes:
         read, system_id = frame_of(frame), self.played_as

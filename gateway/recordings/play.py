@@ -48,6 +48,7 @@ CONTEXT_IDS: Final = [
     )
 ]  # fmt: skip
 """The messages that show the state of a vehicle."""
+_CONTEXT: Final = frozenset(CONTEXT_IDS)
 
 
 class Source(Protocol):
@@ -89,6 +90,8 @@ class Track:
         self._with_commands = with_commands
         self._records = self._records_of(self._read_from(0))
         self._next = next(self._records, None)
+        self.ahead: list[bytes] = []
+        """The first messages after the last seek that show the state of a vehicle."""
 
     @property
     def first_us(self) -> int:
@@ -129,15 +132,24 @@ class Track:
             known = known[(known < begin) & np.isin(batch.message_ids[known], CONTEXT_IDS)]
             for i in known.tolist():
                 frame = batch.frame(i)
-                key = (*origin_of(frame), message_id_of(frame))
+                key = _kind_of(frame)
                 # Taken out first, so that the newest come last.
                 newest.pop(key, None)
                 newest[key] = frame
             if len(reached):
+                self.ahead = self._ahead(batch, begin)
                 self._records = self._records_of(chain([batch], batches), begin)
                 break
         self._next = next(self._records, None)
         return [self._addressed(frame) for frame in newest.values()]
+
+    def _ahead(self, batch: Batch, begin: int) -> list[bytes]:
+        """Return the first message of each kind that shows a state."""
+        wanted = self._wanted(batch, begin)
+        shown = wanted[np.isin(batch.message_ids[wanted], CONTEXT_IDS)]
+        kinds = batch.origins[shown] << 32 | batch.message_ids[shown]
+        firsts = np.sort(np.unique(kinds, return_index=True)[1])
+        return [self._addressed(batch.frame(i)) for i in shown[firsts].tolist()]
 
     def _wanted(self, batch: Batch, begin: int) -> IntArray:
         if self._with_commands:
@@ -243,6 +255,8 @@ class Player:
         self._anchor = (now_us, self.begin_us)
         self.position_us = self.begin_us
         """Recorded time of the newest frame that was played."""
+        self._held: dict[tuple[int, int, int], bytes] = {}
+        """The newest message of each kind that shows the state of a vehicle."""
         self._context = self._seek_tracks(self.begin_us)
 
     @property
@@ -283,6 +297,14 @@ class Player:
         self._anchor = (now_us, self.position_us)
         return frames
 
+    def held(self) -> list[bytes]:
+        """Return the state of the vehicles at the present position.
+
+        What was not sent before it is as in its first message.
+        """
+        ahead = {_kind_of(frame): frame for track in self._tracks for frame in track.ahead}
+        return list((ahead | self._held).values())
+
     def prepare(self, time_us: int) -> bool:
         """Do a part of the work for a seek; return whether it can be made at once now."""
         return all(track.prepare(time_us) for track in self._tracks)
@@ -322,7 +344,9 @@ class Player:
         return frames
 
     def _seek_tracks(self, time_us: int) -> list[bytes]:
-        return [frame for track in self._tracks for frame in track.seek(time_us)]
+        context = [frame for track in self._tracks for frame in track.seek(time_us)]
+        self._held = {_kind_of(frame): frame for frame in context}
+        return context
 
     def _next_track(self) -> Track | None:
         """Find the track whose next frame is the earliest; None at the end of the range."""
@@ -339,7 +363,10 @@ class Player:
     def _take(self, track: Track) -> bytes:
         self.position_us = track.peek_us() or self.position_us
         self.sent += 1
-        return track.take()
+        frame = track.take()
+        if message_id_of(frame) in _CONTEXT:
+            self._held[_kind_of(frame)] = frame
+        return frame
 
     def _end(self, now_us: int) -> None:
         if self.loop and self.sent:
@@ -376,3 +403,7 @@ class Player:
         due_last_us = self._anchor[0] + math.ceil((self.position_us - self._anchor[1]) / self.speed)
         self._anchor = (max(due_last_us, now_us) if went_back else due_last_us, time_us - kept_us)
         self.position_us = time_us - kept_us
+
+
+def _kind_of(frame: bytes) -> tuple[int, int, int]:
+    return (*origin_of(frame), message_id_of(frame))

@@ -9,8 +9,11 @@
 | REQUEST_MESSAGE, GET_HOME_POSITION … | the recorded message; unsupported if it was never sent  |
 | SET_MESSAGE_INTERVAL                 | thins what is played to the client that asks            |
 | any other command, SET_MODE          | denied: the past cannot be changed                      |
+| logs, terrain, extended parameters   | there are none                                          |
 | files, COMPONENT_METADATA            | of own recordings the parameters' metadata              |
 | PING, TIMESYNC                       | answered                                                |
+
+A station that tries to change something is also sent a text.
 """
 
 import math
@@ -20,9 +23,19 @@ from typing import Any, Final, Protocol
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
+from gateway.units import US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
 from gateway.vehicle.plan import KINDS, MISSION, read_item
-from gateway.vehicle.requests import Answer, Reply, Request, RequestReader, Service
+from gateway.vehicle.requests import (
+    NOTICE,
+    UNANSWERED,
+    Answer,
+    Reply,
+    Request,
+    RequestReader,
+    Service,
+    StatusText,
+)
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,
@@ -44,8 +57,14 @@ from gateway.vehicle.services.ftp import FtpService
 from gateway.vehicle.services.missions import MissionService
 from gateway.vehicle.services.parameter_service import ReadOnlyParameters
 from gateway.vehicle.services.parameters import Metadata
+from gateway.vehicle.telemetry.announcements import Announcer
 
 PARAM_VALUE: Final = mavlink.MAVLINK_MSG_ID_PARAM_VALUE
+THE_PAST: Final = StatusText(NOTICE, "This is a recording: nothing can be changed in it")
+TEXTS_AT_ONCE: Final = 3
+TEXT_INTERVAL_US: Final = 20 * US_PER_S
+STREAMED: Final = frozenset({"MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"})
+"""Sent many times a second by a ground station with a joystick."""
 
 RecordedAction = Outgoing | ClientInterval
 
@@ -111,13 +130,18 @@ class _Commands(Service):
         self._answers = answers
         self._metadata = metadata
 
+    def changes_state(self, request: Request) -> bool:
+        number = read_command(request).number
+        return number not in (REQUEST_MESSAGE, SET_INTERVAL, *SHORTHANDS)
+
+    def refuse(self, request: Request, result: int) -> list[Answer]:
+        return [read_command(request).ack(result)]
+
     def handle(self, request: Request, _now_us: int) -> list[Answer]:
         command = read_command(request)
-        if command.number == REQUEST_MESSAGE or command.number in SHORTHANDS:
-            return self._send(command, requested_message(command))
         if command.number == SET_INTERVAL:
             return self._thin(command)
-        return [command.ack(DENIED)]
+        return self._send(command, requested_message(command))
 
     def _send(self, command: Command, message_id: int) -> list[Answer]:
         client_id = command.request.client_id
@@ -161,22 +185,39 @@ class RecordedVehicle:
             _Missions(answers),
             FtpService({} if self.metadata is None else self.metadata.files),
         )
-        queries: Service = QueryService(lambda *_: None, lambda *_: [])
-        self._by_message = dict.fromkeys(("PING", "TIMESYNC"), queries)
-        for service in self._services:
-            self._by_message |= dict.fromkeys(service.types, service)
+        self._answers = answers
+        self._texts = Announcer(TEXTS_AT_ONCE, TEXT_INTERVAL_US)
+        self._mavlink: Any = mavlink.MAVLink(None)
+        queries = QueryService(self._recorded, lambda *_: [])
+        self._by_message: dict[str, Service] = {
+            kind: service for service in (queries, *self._services) for kind in service.types
+        }
 
     def handle(self, incoming: Incoming, now_us: int) -> list[RecordedAction]:
         """Answer one frame of a client; ignore one that is not for this vehicle."""
         request = self._reader.read(incoming, now_us)
         if request is None:
             return []
-        service = self._by_message.get(request.message.get_type())
+        kind = request.message.get_type()
+        service = self._by_message.get(kind)
         if service is None:
-            return []
+            is_asked = getattr(request.message, "target_system", None) == self.system_id
+            is_ignored = not is_asked or kind in UNANSWERED | STREAMED
+            return [] if is_ignored else self._finish(self._explain(request, now_us))
         if service.changes_state(request):
-            return self._finish(service.refuse(request, DENIED))
+            answers = service.refuse(request, DENIED)
+            return self._finish([*answers, *self._explain(request, now_us)])
         return self._finish(service.handle(request, now_us))
+
+    def _explain(self, request: Request, now_us: int) -> list[Answer]:
+        """Return the text for a station that wants to change something."""
+        found = self._texts.say(THE_PAST, now_us)
+        return [request.reply(each.message) for each in found if isinstance(each, Reply)]
+
+    def _recorded(self, message_id: int, _now_us: int) -> Any:
+        """Return a recorded message; None if there is none."""
+        frames = self._answers.frames(message_id)
+        return self._mavlink.decode(bytearray(frames[0])) if frames else None
 
     def poll(self, now_us: int) -> list[RecordedAction]:
         """Send the next of every list and file that is under way."""

@@ -115,6 +115,20 @@ def test_upload_is_the_mission_once_acknowledged(day: Day) -> None:
     assert len(day.answers().mission(FENCE) or ()) == 1
 
 
+def test_mission_and_parameter_set_in_flight_did_not_exist_before(day: Day) -> None:
+    day.send(day.vehicle, value("READ", 1.0))
+    set_us = day.now_us
+    for name in ("READ", "SET"):
+        day.send(day.station, mavlink.MAVLink_param_set_message(3, 1, name.encode(), 2.0, 9))
+        day.send(day.vehicle, value(name, 2.0))
+    day.send(day.station, count_of(1, target=3), item(0, target=3))
+    day.send(day.vehicle, mavlink.MAVLink_mission_ack_message(255, 190, ACCEPTED, MISSION))
+    later, before = day.answers(), day.answers(at_us=set_us)
+    assert [sorted(each.parameters()) for each in (later, before)] == [["READ", "SET"], ["READ"]]
+    assert decode(before.parameters()["READ"]).param_value == 1.0
+    assert (len(later.mission(MISSION) or ()), before.mission(MISSION)) == (1, None)
+
+
 def test_denied_upload_leaves_the_mission_unchanged(day: Day) -> None:
     day.send(day.vehicle, count_of(1), item(0))
     day.send(day.station, count_of(1, target=3), item(0, target=3))

@@ -112,6 +112,24 @@ def test_seek_is_clamped_to_the_range() -> None:
     assert player.position_us == START_US + 20 * STEP_US
 
 
+@pytest.mark.parametrize(("position", "shown"), [(0, {0, 1}), (2, {0, 1}), (50, {48, 49})])
+def test_state_is_known_at_every_position(position: int, shown: set[int]) -> None:
+    """Before the first message of a kind it is that message."""
+    player = make_player()
+    player.pause(0)
+    player.seek(START_US + position * STEP_US, 0)
+    assert set(player.held()) == {FRAMES[i] for i in shown}
+
+
+def test_state_follows_the_played_frames() -> None:
+    player = make_player()
+    player.poll(50 * STEP_US, MANY)
+    before = set(player.held())
+    player.poll(60 * STEP_US, MANY)
+    assert set(player.held()) != before
+    assert set(player.held()) <= set(FRAMES[50:61])
+
+
 def test_range_begins_with_its_state_messages() -> None:
     player = make_player(begin_us=START_US + 10 * STEP_US, end_us=START_US + 20 * STEP_US)
     frames = [frame for _, frame in play_to_end(player)]

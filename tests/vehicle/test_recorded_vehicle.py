@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import Incoming
 from gateway.vehicle.recorded_vehicle import RecordedVehicle
 from tests.conftest import ManualClock
-from tests.kit.ground_station import FtpClient, GroundStation, kinds, results
+from tests.kit.ground_station import FtpClient, GroundStation, command, kinds, results, texts
 from tests.kit.mavlink import packed
 
 SYSTEM = 3
@@ -82,8 +82,57 @@ def test_parameter_is_read_by_index_or_name(asking: GroundStation) -> None:
 
 def test_set_parameter_is_refused_with_its_recorded_value(asking: GroundStation) -> None:
     found = asking.set_parameter("P5", 9.0)
-    assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE"]
+    assert kinds(found) == ["PARAM_ERROR", "PARAM_VALUE", "STATUSTEXT"]
     assert found[1].param_value == 5.0
+
+
+@pytest.mark.parametrize(
+    ("message", "kind"),
+    [
+        (command(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1, target=ME), "COMMAND_ACK"),
+        (command(mavlink.MAV_CMD_DO_SET_HOME, 1, target=ME), "COMMAND_ACK"),
+        (mavlink.MAVLink_set_mode_message(SYSTEM, 1, 0), "COMMAND_ACK"),
+        (mavlink.MAVLink_mission_count_message(*ME, 3, MISSION), "MISSION_ACK"),
+        (mavlink.MAVLink_mission_clear_all_message(*ME, MISSION), "MISSION_ACK"),
+        (mavlink.MAVLink_log_erase_message(*ME), ""),
+        (
+            mavlink.MAVLink_set_home_position_message(
+                SYSTEM, 0, 0, 0, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0
+            ),
+            "",
+        ),
+    ],
+)
+def test_request_of_a_change_is_denied_with_a_text(
+    asking: GroundStation, message: Any, kind: str
+) -> None:
+    found = asking.send(message)
+    assert kinds(found) == [*([kind] if kind else []), "STATUSTEXT"]
+    assert texts(found) == ["This is a recording: nothing can be changed in it"]
+    assert asking.frames[-1].client_id == asking.client_id
+
+
+def test_texts_about_denied_requests_are_limited(asking: GroundStation) -> None:
+    found = [text for _ in range(50) for text in texts(asking.set_parameter("P5", 9.0))]
+    assert len(found) == 3
+
+
+@pytest.mark.parametrize(
+    ("message", "expected"),
+    [
+        (mavlink.MAVLink_log_request_list_message(*ME, 0, 0xFFFF), ["LOG_ENTRY"]),
+        (mavlink.MAVLink_log_request_data_message(*ME, 0, 0, 90), ["LOG_DATA"]),
+        (mavlink.MAVLink_log_request_end_message(*ME), []),
+        (mavlink.MAVLink_param_ext_request_list_message(*ME), ["PARAM_EXT_VALUE"]),
+        (mavlink.MAVLink_manual_control_message(SYSTEM, 0, 0, 0, 0, 0), []),
+        (mavlink.MAVLink_rc_channels_override_message(*ME, *[1500] * 8), []),
+        (mavlink.MAVLink_command_ack_message(400, 0, 0, 0, *ME), []),
+    ],
+)
+def test_request_of_what_does_not_exist_is_answered_without_a_text(
+    asking: GroundStation, message: Any, expected: list[str]
+) -> None:
+    assert kinds(asking.send(message)) == expected
 
 
 def test_parameter_list_of_a_log_without_parameters_is_an_error(clock: ManualClock) -> None:
@@ -115,7 +164,7 @@ def test_parameter_list_of_a_log_without_parameters_is_an_error(clock: ManualClo
 def test_request_is_answered_with_the_contents_of_the_log(
     asking: GroundStation, message: Any, kind: str, fields: dict[str, Any]
 ) -> None:
-    [answer] = asking.send(message)
+    answer = asking.send(message)[0]
     assert answer.get_type() == kind
     assert {name: getattr(answer, name) for name in fields} == fields
 
