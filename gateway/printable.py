@@ -1,6 +1,7 @@
 """Texts for people: sanitised texts of others, errors and states in words."""
 
 import logging
+import math
 import os
 from collections.abc import Iterable
 from typing import Final
@@ -79,6 +80,17 @@ class PrintableFormatter(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the whole record, a traceback included, without control characters."""
         return printable(super().format(record))
+
+
+UNKNOWN: Final = "—"
+"""In place of a number that is unknown."""
+
+
+def figure(value: float | None, form: str, unit: str = "") -> str:
+    """Return a number in a format with its unit; `UNKNOWN` alone for None, NaN and infinity."""
+    if value is None or not math.isfinite(value):
+        return UNKNOWN
+    return f"{value:{form}} {unit}" if unit else f"{value:{form}}"
 
 
 FEW_BYTES: Final = 200

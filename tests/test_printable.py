@@ -3,6 +3,7 @@
 import io
 import json
 import logging
+import math
 import unicodedata
 
 import pytest
@@ -10,7 +11,14 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.cli.support.terminal import console_of
-from gateway.printable import LONGEST, PrintableFormatter, printable, printable_json, receiver_state
+from gateway.printable import (
+    LONGEST,
+    PrintableFormatter,
+    figure,
+    printable,
+    printable_json,
+    receiver_state,
+)
 
 RIGHT_TO_LEFT = "\u202e"
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
@@ -94,3 +102,13 @@ def test_port_without_frames_is_described(
     state = receiver_state("auto", connected, received, frames)
     assert text in state
     assert (state == "receiver: auto connected") == (frames > 0)
+
+
+@pytest.mark.parametrize("value", [None, math.nan, math.inf, -math.inf])
+def test_unknown_number_is_a_dash_without_its_unit(value: float | None) -> None:
+    assert figure(value, ".1f", "m") == "—"
+
+
+def test_known_number_is_followed_by_its_unit() -> None:
+    assert figure(2.25, ".1f", "m") == "2.2 m"
+    assert figure(0.1, ".0%") == "10%"

@@ -100,7 +100,9 @@ def mounting_svg() -> str:
             "</g></g>"
         )
         parts.append(_text(x, y + 62, name))
-        parts.append(_text(x, y + 77, f"{roll_deg:.0f}, {pitch_deg:.0f}, {yaw_deg:.0f}"))
+        angles = f"roll {roll_deg:.0f}°, pitch {pitch_deg:.0f}°, yaw {yaw_deg:.0f}°"
+        parts.append(_text(x, y + 77, angles))
+        parts.append(f'<view id="way{number}" viewBox="{x - WIDTH / 2:.0f} {y - 51} {WIDTH} 100"/>')
     return _document(round(5.6 * WIDTH), 312, "".join(parts))
 
 
@@ -113,7 +115,7 @@ def _document(width: int, height: int, content: str) -> str:
 
 
 def _text(x: float, y: float, text: str) -> str:
-    look = f'font-family="sans-serif" font-size="11" fill="{INK}" text-anchor="middle"'
+    look = f'font-family="sans-serif" font-size="12" fill="{INK}" text-anchor="middle"'
     return f'<text x="{x:.0f}" y="{y:.0f}" {look}>{text}</text>'
 
 

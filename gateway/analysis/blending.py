@@ -6,6 +6,7 @@ the reference if there is one.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -70,12 +71,36 @@ def thin(flight: Flight, interval_s: float) -> BoolArray:
     return keep
 
 
+ENDING: Final = 0.2
+"""The part of a span in which a fix ends it."""
+
+
 def withhold(flight: Flight, every: int) -> BoolArray:
     """Choose all fixes but every n-th usable one."""
     usable = np.array(
         [is_usable(fix, flight.fusion.estimation.reference) for fix in flight.fixes], np.bool_
     )
     return np.asarray(~(usable & (np.cumsum(usable) % every == 0)))
+
+
+def withhold_spans(flight: Flight, span_s: float, every_s: float) -> tuple[BoolArray, BoolArray]:
+    """Choose all fixes but those of the last `span_s` in every `every_s`; and each span's last.
+
+    A span that a fix does not end, as in an outage or at the end of the flight, has no last one.
+    """
+    keep = np.ones(len(flight.fixes), np.bool_)
+    ends = np.zeros(len(flight.fixes), np.bool_)
+    for k, fix in enumerate(flight.fixes):
+        if not is_usable(fix, flight.fusion.estimation.reference):
+            continue
+        phase_s = (fix.time_us - int(flight.time_us[0])) / US_PER_S % every_s
+        keep[k] = phase_s < every_s - span_s
+        ends[k] = phase_s >= every_s - ENDING * span_s
+    # Of several fixes at the end of a span, only the last.
+    rows = np.flatnonzero(ends)
+    late = [row for row, following in pairwise(rows) if following == row + 1]
+    ends[late] = False
+    return keep, ends
 
 
 def error_at_fixes_m(track: FlightTrack, fixes: Fixes) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from gateway.analysis.blending import make_judge, score, withhold
+from gateway.analysis.blending import Judge, judge_of, make_judge, score, withhold, withhold_spans
 from gateway.analysis.flight import (
     Fixes,
     Flight,
@@ -131,7 +131,27 @@ def summarise(case: Case) -> dict[str, float]:
 
 def withheld_error_m(case: Case, estimator: str) -> float:
     """Fuse without every n-th fix, and measure the horizontal RMS error at those."""
-    judge = make_judge(case.flight, withhold(case.flight, HOLD_OUT))
+    return _held_m(case, estimator, make_judge(case.flight, withhold(case.flight, HOLD_OUT)))
+
+
+OUTAGE_S: Final = 10.0
+OUTAGE_EVERY_S: Final = 30.0
+"""Two thirds of the time are left for the estimator to settle again."""
+
+
+def outage_error_m(case: Case, estimator: str) -> float:
+    """Fuse without the fixes of 10 s in every 30 s; return the horizontal RMS error at their ends.
+
+    NaN for a flight that is too short.
+    """
+    flight = case.flight
+    keep, ends = withhold_spans(flight, OUTAGE_S, OUTAGE_EVERY_S)
+    if not ends.any():
+        return float("nan")
+    return _held_m(case, estimator, judge_of(flight.with_fixes(keep), flight.with_fixes(ends)))
+
+
+def _held_m(case: Case, estimator: str, judge: Judge) -> float:
     if estimator == SMOOTHED:
         track, _ = smooth_track(judge.fused, case.fusion)
     else:

@@ -11,7 +11,8 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, permutation_test
 
-from gateway.batch.tasks import HELD, FlightResult
+from gateway.analysis.case import OUTAGE_S
+from gateway.batch.tasks import DRIFT, HELD, FlightResult
 from gateway.units import counted
 
 FloatArray = NDArray[np.float64]
@@ -204,6 +205,52 @@ def errors_by_group(results: Sequence[FlightResult]) -> pd.DataFrame:
     )
 
 
+REASONS: Final = {
+    "eskf": "it distinguishes manoeuvres from gravity by the GPS velocity, which keeps it level",
+    "paper": "it follows the newest fix closely",
+}
+"""Of the estimators: where their lead comes from."""
+
+
+def why_leads(results: Sequence[FlightResult]) -> str:
+    """Describe which estimator leads, by how much, and why; empty if there is no second.
+
+    It leads at the withheld fixes, which lie a second from others; without GPS its attitude and
+    velocity matter, so errors there show where the lead comes from.
+    """
+    ranked = sorted((median, name) for name, median in _medians_m(results, HELD).items())
+    if len(ranked) < 2:
+        return ""
+    (_, best), (_, second) = ranked[:2]
+    both = [r for r in results if {best, second} <= r.figures.get(HELD, {}).keys()]
+    errors = [np.array([r.figures[HELD][name] for r in both]) for name in (best, second)]
+    lead = lead_of(errors[0], errors[1], [group_of(result) for result in both])
+    if lead is None:
+        return ""
+    text = f"{best} leads {second}: {lead.text}."
+    drift_m = _medians_m(both, DRIFT)
+    if not {best, second} <= drift_m.keys():
+        return text
+    best_m, second_m = drift_m[best], drift_m[second]
+    measured = (
+        f"after {OUTAGE_S:.0f} s without GPS it is {best_m:.1f} m off, {second} {second_m:.1f} m"
+    )
+    if best_m < second_m:
+        return f"{text} It drifts less: {measured}; {REASONS.get(best, 'its attitude is better')}."
+    return f"{text} The lead is in following the GPS, not in drifting less: {measured}."
+
+
+def _medians_m(results: Sequence[FlightResult], key: str) -> dict[str, float]:
+    """Return the median error of each estimator."""
+    names = {name for result in results for name in result.figures.get(key, {})}
+    return {
+        name: float(
+            np.median([r.figures[key][name] for r in results if name in r.figures.get(key, {})])
+        )
+        for name in names
+    }
+
+
 def versus(now: Iterable[FlightResult], then: Iterable[FlightResult]) -> Versus:
     """Compare the flights that both have errors of, by the digests of their files."""
     before = {old.digest: old.figures[HELD] for old in then if HELD in old.figures}
@@ -248,7 +295,7 @@ def write_season_page(
         Section(
             "Errors by aircraft and estimator",
             "Each flight was fused without every fifth fix, which then judged: the figures are the "
-            "root mean square errors of the flights, horizontal.",
+            f"root mean square errors of the flights, horizontal. {why_leads(judged)}".strip(),
             [_picture(judged)] if judged else [],
             [ReportTable("errors", errors_by_group(judged), "Errors at withheld fixes.")],
         )

@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Final
 import msgspec
 
 from gateway import __version__
-from gateway.analysis.case import Case, make_case, summarise, withheld_error_m
+from gateway.analysis.case import Case, make_case, outage_error_m, summarise, withheld_error_m
 from gateway.analysis.flight import Flight, flight_of_files
 from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
@@ -41,6 +41,8 @@ from gateway.recordings.summary import describe
 
 HELD: Final = "held_m"
 """Errors at the withheld fixes, by estimator."""
+DRIFT: Final = "drift_m"
+"""Errors after 10 s without GPS, by estimator."""
 
 
 class FlightResult(msgspec.Struct, frozen=True, kw_only=True):
@@ -277,7 +279,11 @@ def _figures(case: Case) -> dict[str, Any]:
     """Sum one flight up; unknown values are left out, since JSON has none."""
     known = {name: value for name, value in summarise(case).items() if value == value}
     held = {name: withheld_error_m(case, name) for name in case.tracks}
-    return {"summary": known, HELD: {name: m for name, m in held.items() if m == m}}
+    drift = {name: outage_error_m(case, name) for name in case.tracks}
+    found = {HELD: held, DRIFT: drift}
+    return {"summary": known} | {
+        key: {name: m for name, m in errors.items() if m == m} for key, errors in found.items()
+    }
 
 
 RESULTS: Final = "results"

@@ -31,6 +31,7 @@ from gateway.recordings.fuse import FusionSettings, with_estimator
 from gateway.recordings.table import TableBlock
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.sensing.calibration import NodeCalibration
+from gateway.units import US_PER_S
 from gateway.vehicle.services.parameters import ParameterTable
 
 LEAST_S: Final = 20.0
@@ -59,9 +60,17 @@ class Estimate:
 
 
 def compare(frames: TimedFrames, parameters: Mapping[str, float]) -> list[Estimate]:
-    """Fuse the frames with each estimator; raises ComparisonError if the frames are too few."""
+    """Fuse the frames with each estimator; raises ComparisonError if the frames are too few.
+
+    If they came too slowly over the whole time, the newest alone are used.
+    """
     settings = settings_of(parameters)
-    flight, zero_us = _flight_of(frames, settings)
+    try:
+        flight, zero_us = _flight_of(frames, settings)
+    except ComparisonError:
+        since_us = frames[-1][0] - round((LEAST_S + 1.0) * US_PER_S) if frames else 0
+        newest = [(time_us, frame) for time_us, frame in frames if time_us >= since_us]
+        flight, zero_us = _flight_of(newest, settings)
     found = []
     for name in ESTIMATORS:
         track = fuse_track(flight, with_estimator(settings, name))

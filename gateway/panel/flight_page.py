@@ -205,6 +205,7 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
         "aircraft": [
             {
                 "system_id": system_id,
+                "title": printable(flight.aircraft[system_id].name),
                 "model": flight.aircraft[system_id].model,
                 "home": _spot(flight.aircraft[system_id].home),
                 "columns": dict(_columns_of(history, zero_us)),

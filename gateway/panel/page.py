@@ -12,6 +12,7 @@ from nicegui.element import Element
 from gateway.panel.access import Role
 from gateway.panel.added_views import ADDED_VIEWS, View
 from gateway.panel.playback import Playback
+from gateway.panel.player_bar import PlayerBar
 from gateway.panel.view_context import WEB, PanelParts, ViewContext
 from gateway.panel.views.calibration_view import CalibrationView
 from gateway.panel.views.events_view import EventsView, build_banner
@@ -70,7 +71,7 @@ class _Page:
         with ui.element("div").classes("shell") as self._shell:
             self._build_head()
             with ui.element("div").classes("banners"):
-                self._build_recording_bar()
+                self._build_playback_bar()
                 build_banner(self._context)
             self._build_rail()
             with ui.element("div").classes("stage"):
@@ -78,6 +79,7 @@ class _Page:
                     panel = self._panels[view.key] = ui.element("section").classes("view")
                     panel.props["data-view"] = view.key
                     panel.props["aria-label"] = view.title
+            PlayerBar(self._context)
         ui.timer(STATE_S, self._refresh)
         self._refresh()
         self.show(VIEWS[0].key)
@@ -112,9 +114,9 @@ class _Page:
             self._theme = ui.button(icon=THEMES[None], on_click=self._next_theme)
             self._theme.props('flat round dense aria-label="Light or dark"')
 
-    def _build_recording_bar(self) -> None:
-        """Build what marks a recording above every view."""
-        with ui.element("div").classes("recording-bar").props("role=status") as self._bar:
+    def _build_playback_bar(self) -> None:
+        """Build what marks a playback above every view."""
+        with ui.element("div").classes("playback-bar").props("role=status") as self._bar:
             ui.icon("smart_display")
             self._bar_text = ui.label().classes("figure banner-title")
             self._bar_name = ui.label()
@@ -168,7 +170,7 @@ class _Page:
             wanted = min(played, default=context.system_id)
             first = next(iter(names), None)
             self._choice.set_options(names, value=wanted if wanted in names else first)
-        self._show_recording()
+        self._show_playback()
         if (chips := _state_of(context)) != self._chips:
             self._chips = chips
             self._state.clear()
@@ -176,16 +178,16 @@ class _Page:
                 for text, kind in chips:
                     ui.label(text).classes("chip").classes(kind)
 
-    def _show_recording(self) -> None:
+    def _show_playback(self) -> None:
         """Mark the page while it shows a recording."""
         playback, status = self._context.playback, self._context.playback.status
-        shown = self._context.is_recording
+        shown = self._context.is_playback
         if shown != self._bar.visible:
             self._bar.set_visibility(shown)
-            self._shell.classes(replace="shell recording" if shown else "shell")
+            self._shell.classes(replace="shell playback" if shown else "shell")
         if shown and status is not None:
             position, duration = (_clock(status[key]) for key in ("position_s", "duration_s"))
-            self._bar_text.set_text(f"RECORDING {position} of {duration}")
+            self._bar_text.set_text(f"PLAYBACK {position} of {duration}")
             self._bar_name.set_text(printable(playback.name))
 
 
@@ -210,11 +212,14 @@ def _state_of(context: ViewContext) -> list[tuple[str, str]]:
         return [("waiting for an aircraft", "warn")]
     now = vehicle.instant(context.now_us)
     has_fix = now.fix_type >= 3
-    fix = f"GPS {now.satellites} sats" if has_fix else "no GPS fix"
+    sats = f"GPS {now.satellites:.0f} sats" if math.isfinite(now.satellites) else "GPS fix"
+    fix = sats if has_fix else "no GPS fix"
     gps = (fix, "good" if has_fix else "bad")
     if not vehicle.is_live:
-        return [("recording", "recorded"), (fix, "" if has_fix else "bad")]
-    if not math.isfinite(now.silent_s) or now.silent_s > SILENT_S:
+        return [("playback", "recorded"), (fix, "" if has_fix else "bad")]
+    if not math.isfinite(now.silent_s):
+        return [("no heartbeat yet", "bad")]
+    if now.silent_s > SILENT_S:
         return [(f"silent for {now.silent_s:.0f} s", "bad")]
     chips = [("link", "good"), (_mode_of(context), ""), gps]
     recorder = context.parts.watch.recorder

@@ -95,7 +95,7 @@ class TelemetryFeed:
 
 
 def add_tracks(app: FastAPI, fleet: FleetState) -> None:
-    """Serve `/path/1`: `track` and `fixes` as lists of latitude, longitude, height AMSL.
+    """Serve `/path/1`: `track` and `fixes` as lists of latitude, longitude, height AMSL, and time.
 
     And `/history/1`: the columns of `FlightHistory`. The endpoints are coroutines: they must run
     on the loop, which changes what they read.
@@ -106,7 +106,7 @@ def add_tracks(app: FastAPI, fleet: FleetState) -> None:
         vehicle = fleet.vehicles.get(system_id)
         if vehicle is None:
             return Response(status_code=404)
-        fixes = [(point.lat_deg, point.lon_deg, point.alt_amsl_m) for point in vehicle.fixes]
+        fixes = [(at.lat_deg, at.lon_deg, at.alt_amsl_m, at.time_us) for at in vehicle.fixes]
         plain = {"track": vehicle.history.track(), "fixes": fixes}
         return Response(msgspec.json.encode(plain), media_type="application/json")
 

@@ -121,7 +121,7 @@ class ViewContext:
         return None if self.system_id is None else self.parts.dialogues.of(self.system_id)
 
     @property
-    def is_recording(self) -> bool:
+    def is_playback(self) -> bool:
         """Whether the selected aircraft is played from a recording."""
         return self.vehicle is not None and not self.vehicle.is_live
 

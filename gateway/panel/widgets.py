@@ -103,10 +103,20 @@ def closing(dialog: ui.dialog, act: Callable[[], Awaitable[Any]]) -> Callable[[]
     return run
 
 
-def confirm(question: str, word: str, act: Callable[[], Awaitable[Any]]) -> None:
-    """Ask for confirmation, and act on a yes."""
+def confirm(
+    question: str, word: str, act: Callable[[], Awaitable[Any]], *, grave: bool = True
+) -> None:
+    """Ask for confirmation, and act on a yes; a grave act has a red button."""
     with asking(question) as dialog:
-        ui.button(word, on_click=closing(dialog, act)).props("no-caps color=negative")
+        button = ui.button(word, on_click=closing(dialog, act)).props("no-caps")
+        button.props("color=negative" if grave else "")
+
+
+def allow(button: ui.button, reason: str = "") -> None:
+    """Enable a button; with a reason disable it, and show the reason as its tooltip."""
+    button.set_enabled(not reason)
+    if button.props.get("title", "") != reason:
+        button.props["title"] = reason
 
 
 WRITE: Final = 1.0
@@ -189,9 +199,10 @@ class RecorderControls:
         with ui.element("div").classes("line recorder"):
             self._state = ui.label().classes("chip").props("data-role=recorder")
             self._detail = ui.label().classes("soft figure spring")
-            self._buttons = ui.element("div").classes("line")
+            self._line = ui.element("div").classes("line")
+            self._buttons: dict[str, ui.button] = {}
             if context.may_change:
-                with self._buttons:
+                with self._line:
                     self._build_buttons()
         context.every(REFRESH_S, self.refresh)
         self.refresh()
@@ -199,7 +210,7 @@ class RecorderControls:
     def refresh(self) -> None:
         """Show the recorder's state."""
         recorder = self._context.parts.watch.recorder
-        self._buttons.set_visibility(recorder is not None)
+        self._line.set_visibility(recorder is not None)
         if recorder is None:
             self._state.set_text("no gateway on this machine")
             self._detail.set_text("")
@@ -207,6 +218,8 @@ class RecorderControls:
         self._state.set_text(recorder["state"])
         self._state.classes(LOOKS.get(recorder["state"], ""), replace="chip")
         self._detail.set_text(printable(_detail_of(recorder)))
+        for verb, button in self._buttons.items():
+            allow(button, why_not(verb, recorder))
 
     def _build_buttons(self) -> None:
         for text, icon, look, value, act in (
@@ -215,9 +228,11 @@ class RecorderControls:
             ("Save …", "save", "flat", True, self._ask_save),
             ("Delete …", "delete", "flat", True, self._ask_delete),
         ):
+            verb = text.removesuffix(" …")
             button = ui.button(text, icon=icon, on_click=act).props("no-caps dense")
-            button.props["aria-label"] = f"{text.removesuffix(' …')} recording"
+            button.props["aria-label"] = f"{verb} recording"
             button.props[look] = value
+            self._buttons[verb.lower()] = button
 
     async def _ask(self, verb: str, done: str = "", **params: Any) -> None:
         with notify_failure(self._context):
@@ -239,13 +254,25 @@ class RecorderControls:
 
     async def _ask_delete(self) -> None:
         with notify_failure(self._context):
-            recordings = await self._context.ask("record.list")
-            if not recordings:
-                ui.notify("Nothing was recorded yet.", type="warning")
+            name = (self._context.parts.watch.recorder or {}).get("name", "")
+            if name not in (each["name"] for each in await self._context.ask("record.list")):
+                ui.notify("This recording is deleted already.", type="warning")
                 return
-            name = recordings[-1]["name"]
             delete = partial(self._ask, "delete", f"{name} is deleted", name=name)
             confirm(f"Delete the last recording, {name}, permanently?", "Delete", delete)
+
+
+def why_not(verb: str, recorder: Mapping[str, Any]) -> str:
+    """Return why the recorder cannot `start`, `stop`, `save` or `delete` now; empty if it can."""
+    is_idle = recorder["state"] == IDLE
+    if verb == "start":
+        is_under_way = recorder["state"] in ("recording", "opening")
+        return "A recording is in progress." if is_under_way else ""
+    if verb == "stop":
+        return "Nothing is being recorded." if is_idle else ""
+    if not recorder["name"]:
+        return "Nothing was recorded yet."
+    return "Stop the recording first." if verb == "delete" and not is_idle else ""
 
 
 def _detail_of(recorder: dict[str, Any]) -> str:

@@ -17,6 +17,7 @@ from gateway.analysis.blending import (
     score,
     thin,
     withhold,
+    withhold_spans,
 )
 from gateway.analysis.flight import Fixes, fixes_of, flight_of_blocks
 from gateway.analysis.reporting.estimators import weights
@@ -26,7 +27,7 @@ from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import TRACKER_LOG
 from gateway.sensing.calibration import NodeCalibration
-from tests.analysis.flights import short_case, short_flight
+from tests.analysis.flights import DURATION_S, short_case, short_flight
 
 
 def line(valid_s: list[float]) -> Fixes:
@@ -80,6 +81,26 @@ def test_every_nth_usable_fix_is_withheld() -> None:
     total = len(fixes_of(flight))
     assert len(fixes_of(held)) == total // 4
     assert len(fixes_of(kept)) == total - total // 4
+
+
+def test_fixes_of_some_seconds_are_withheld_and_the_last_of_each_span_compared() -> None:
+    flight = short_flight()
+    keep, ends = withhold_spans(flight, 4.0, 12.0)
+    begin_us = int(flight.time_us[0])
+    phases_s = [(fix.time_us - begin_us) * 1e-6 % 12.0 for fix in flight.fixes]
+    usable = set(fixes_of(flight).arrival_us.tolist())
+    held = [p for p, kept in zip(phases_s, keep, strict=True) if not kept]
+    assert held
+    assert min(held) >= 8.0
+    assert all(
+        kept == (phase < 8.0)
+        for fix, phase, kept in zip(flight.fixes, phases_s, keep, strict=True)
+        if fix.time_us in usable
+    )
+    last = [p for p, is_end in zip(phases_s, ends, strict=True) if is_end]
+    assert 1 <= len(last) <= DURATION_S // 12.0
+    assert min(last) > 11.5
+    assert not (keep & ends).any()
 
 
 def test_truth_agrees_with_fixes_at_their_time_of_validity() -> None:

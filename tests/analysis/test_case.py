@@ -4,11 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from gateway.analysis import case as case_module
 from gateway.analysis.case import (
     ESTIMATORS,
     SMOOTHED,
     changed_settings,
     make_case,
+    outage_error_m,
     summarise,
     withheld_error_m,
 )
@@ -36,6 +38,17 @@ def test_error_at_withheld_fixes_differs_between_estimators() -> None:
     errors_m = {withheld_error_m(short_case(), name) for name in names}
     assert len(errors_m) == len(names)
     assert all(0.05 < error_m < 2.0 for error_m in errors_m)
+
+
+def test_error_without_gps_exceeds_that_at_withheld_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(case_module, "OUTAGE_S", 4.0)
+    monkeypatch.setattr(case_module, "OUTAGE_EVERY_S", 12.0)
+    case = short_case()
+    drift_m = {name: outage_error_m(case, name) for name in ESTIMATORS}
+    assert drift_m["paper"] > 1.5 * withheld_error_m(case, "paper")
+    assert 0.1 < drift_m["eskf"] < drift_m["paper"]
+    monkeypatch.setattr(case_module, "OUTAGE_EVERY_S", 600.0)
+    assert np.isnan(outage_error_m(case, "eskf"))
 
 
 def test_changed_settings_are_listed_with_both_values() -> None:

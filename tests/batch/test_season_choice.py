@@ -1,11 +1,12 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
 
-from gateway.batch.statistics import choose, errors_by_group, folds_of, lead_of, versus
+from gateway.batch.statistics import choose, errors_by_group, folds_of, lead_of, versus, why_leads
 from gateway.batch.tasks import FlightResult
 from gateway.config import load
 from tests.kit.cli import invoke
@@ -91,6 +92,26 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
         ["2", "eskf", 1, 8.0, 8.0],
         ["2", "paper", 1, 1.0, 1.0],
     ]
+
+
+def season_of(eskf_m: float, paper_m: float, drifts_m: dict[str, float]) -> list[FlightResult]:
+    """Ten flights of ten days with these errors at withheld fixes and without GPS."""
+    figures = {"held_m": {"eskf": eskf_m, "paper": paper_m}, "drift_m": drifts_m}
+    return [
+        msgspec.structs.replace(flight(str(day), 1), began=f"2026-06-{day:02}", figures=figures)
+        for day in range(1, 11)
+    ]
+
+
+def test_lead_of_an_estimator_is_explained() -> None:
+    text = why_leads(season_of(1.0, 2.0, {"eskf": 4.0, "paper": 31.0}))
+    assert text.startswith("eskf leads paper: -50.0 % error over 10 flights on 10 aircraft-days")
+    assert "drifts less: after 10 s without GPS it is 4.0 m off, paper 31.0 m; it dist" in text
+    text = why_leads(season_of(2.0, 1.0, {"eskf": 4.0, "paper": 31.0}))
+    assert text.startswith("paper leads eskf: -50.0 %")
+    assert "not in drifting less: after 10 s without GPS it is 31.0 m off, eskf 4.0 m." in text
+    assert "drift" not in why_leads(season_of(1.0, 2.0, {}))
+    assert why_leads([flight("a", 1, eskf=1.0)]) == ""
 
 
 def test_degraded_flights_are_listed_worst_first() -> None:

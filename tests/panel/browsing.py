@@ -107,5 +107,7 @@ def open_page(browser: Browser, link: str, view: str = "flight", script: str = "
 def show(page: Page, view: str) -> None:
     """Show a view by its key."""
     button = page.locator(f".rail button[data-view='{view}']")
+    if not button.is_visible():
+        page.get_by_role("button", name="More", exact=True).click()
     button.click()
     page.locator(f"section[data-view='{view}']").wait_for(state="visible")

@@ -3,7 +3,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.estimation.select import ESTIMATORS
-from gateway.panel.estimator_trial import ComparisonError, compare, settings_of
+from gateway.panel.estimator_trial import LEAST_HZ, LEAST_S, ComparisonError, compare, settings_of
 from gateway.panel.state.fleet import SPAN_US, SampleMemory
 from gateway.units import US_PER_S
 
@@ -35,6 +35,28 @@ def test_too_few_samples_are_refused_with_the_reason() -> None:
         memory.take(1, imu(n * 20_000), n * 20_000)
     with pytest.raises(ComparisonError, match="2 s of samples at 50 Hz"):
         compare(memory.frames(1), {})
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "seconds", "share"), [(50, 10, 0.5), (10, 40, 0.5), (25, 21, 1.0), (50, 60, 1.0)]
+)
+def test_share_of_the_needed_samples_is_reported(rate_hz: int, seconds: int, share: float) -> None:
+    memory = SampleMemory()
+    assert memory.collected(1, LEAST_S, LEAST_HZ) == 0.0
+    for n in range(rate_hz * seconds + 1):
+        memory.take(1, imu(n), n * US_PER_S // rate_hz)
+    assert memory.collected(1, LEAST_S, LEAST_HZ) == pytest.approx(share, abs=0.03)
+
+
+def test_newest_samples_suffice_if_the_earlier_ones_came_too_slowly() -> None:
+    memory = SampleMemory()
+    for n in range(150):
+        memory.take(1, imu(n * US_PER_S), n * US_PER_S)
+    for n in range(1100):
+        time_us = 150 * US_PER_S + n * 20_000
+        memory.take(1, imu(time_us), time_us)
+    found = compare(memory.frames(1), {})
+    assert np.ptp(found[0].time_us) / US_PER_S == pytest.approx(LEAST_S + 1.0, abs=1.0)
 
 
 def test_samples_with_repeated_times_are_fused() -> None:

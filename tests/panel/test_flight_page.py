@@ -98,7 +98,7 @@ def test_page_opens_offline_and_moves(
     context = browser.new_context(
         viewport={"width": width, "height": 600}, color_scheme=scheme, offline=True
     )
-    context.add_init_script(FEW_FRAMES)
+    context.add_init_script(FEW_FRAMES + LIST_DRAWN_TEXTS)
     page = context.new_page()
     troubles: list[str] = []
     page.on("console", lambda message: message.type == "error" and troubles.append(message.text))
@@ -112,8 +112,8 @@ def test_page_opens_offline_and_moves(
     page.keyboard.press("PageUp")
     assert page.locator("[data-role=clock]").inner_text() == "1:00 of 1:59"
     before = page.evaluate("mavgate.state.lat_deg")
-    shown = page.locator(".number-strip [data-item=Latitude] b")
-    expect(shown).to_have_text(f"{before:.6f}")
+    shown = page.locator(".number-strip [data-item='Latitude, longitude'] b")
+    expect(shown).to_have_text(re.compile(f"^{before:.6f}, "))
     page.keyboard.press("ArrowRight")
     assert page.evaluate("mavgate.state.lat_deg") != before
     page.keyboard.press("Space")
@@ -122,9 +122,38 @@ def test_page_opens_offline_and_moves(
     page.get_by_title("Go to 0:05").click()
     assert page.locator("[data-role=clock]").inner_text().startswith("0:05")
     check_instruments(page)
+    check_axes(page)
     assert page.evaluate("typeof ran") == "undefined"
     assert troubles == []
     context.close()
+
+
+LIST_DRAWN_TEXTS = """
+window.drawn = {};
+const fill = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...rest) {
+  const name = this.canvas.ariaLabel ?? this.canvas.parentElement?.classList[0] ?? "";
+  (window.drawn[name] ??= new Set()).add(String(text));
+  fill.call(this, text, ...rest);
+};
+"""
+"""Collects the texts of each canvas, by its label or its element's class."""
+
+
+def check_axes(page: Page) -> None:
+    """Check the marks of plots, and that the display and the map's scale follow the units."""
+
+    def texts(name: str) -> set[str]:
+        return set(page.evaluate("(name) => [...(window.drawn[name] ?? [])]", name))
+
+    assert {"0", "90", "180", "270", "360"} <= texts("Heading")
+    assert len([text for text in texts("Heading") if ":" in text]) >= 4
+    scale = page.locator(".leaflet-control-scale-line")
+    expect(scale).to_have_text(re.compile(r"^\d+ k?m$"))
+    page.get_by_label("Units").select_option("aviation")
+    expect(scale).to_have_text(re.compile(r"^\d+ (ft|NM)$"))
+    page.wait_for_function("window.drawn['flight-display']?.has('1200')")
+    assert {"ft/min", "200", "600", "1200"} <= texts("flight-display")
 
 
 def check_instruments(page: Page) -> None:

@@ -165,7 +165,16 @@ def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
     expect(view.locator(".pin.home")).to_be_visible()
     canvas = view.locator(".map-canvas")
     canvas.click(position={"x": 300, "y": 250})
-    page.get_by_text("Mark this position").click()
+    ask = view.locator(".map-ask")
+    # Next to the point, not over all of the map, and named as in the header.
+    expect(ask).to_contain_text("Plane 1")
+    box, around = ask.bounding_box(), canvas.bounding_box()
+    assert box is not None
+    assert around is not None
+    assert 0 < box["x"] - (around["x"] + 300) < 30
+    assert box["width"] < around["width"] / 2
+    ask.get_by_text("Mark this position").click()
+    expect(ask).to_have_count(0)
     expect(view.locator("[data-role='way']")).to_have_text(
         re.compile(r"mark \d+(\.\d+)? (m|km), \d{1,3}°")
     )
@@ -179,7 +188,7 @@ def test_row_marked_position_and_distance(page: Page, demo: Process) -> None:
         arg=aircraft["mark"],
     )
     canvas.click(position={"x": 400, "y": 300})
-    page.get_by_text("Clear the mark").click()
+    view.locator(".map-ask").get_by_text("Clear the mark").click()
     expect(view.locator("[data-role='way']")).to_have_count(0)
 
 
@@ -194,20 +203,25 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
     view = page.locator("section[data-view='recordings']")
     state = view.locator("[data-role='recorder']")
     expect(state).to_have_text("idle")
-    view.get_by_label("Start recording").click()
+    start, stop = view.get_by_label("Start recording"), view.get_by_label("Stop recording")
+    expect(stop).to_be_disabled()
+    expect(stop).to_have_attribute("title", "Nothing is being recorded.")
+    start.click()
     expect(state).to_have_text("recording")
+    expect(start).to_be_disabled()
+    expect(start).to_have_attribute("title", "A recording is in progress.")
     expect(page.locator(".chips").get_by_text("REC")).to_be_visible()
     page.evaluate("window.begun_us = mavgate.state.time_us")
     # Longer than two heartbeats, so that the recording contains the vehicle type.
     page.wait_for_function("mavgate.state.time_us > window.begun_us + 2.5e6")
-    view.get_by_label("Stop recording").click()
+    stop.click()
     expect(state).to_have_text("idle")
     view.get_by_label("Save recording").click()
     page.get_by_label("Name of the recording").fill("morning flight")
     page.locator(".asks").get_by_role("button", name="Save").click()
     row = view.locator("tr[data-key='morning flight']")
     # One file after another gets the new name.
-    expect(row).to_contain_text("3 csv+tlog")
+    expect(row).to_contain_text("2 tables, 1 tlog")
     with page.expect_download() as waiting:
         row.get_by_label("Download").click()
     archive = tmp_path / "flight.zip"
@@ -232,13 +246,11 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
 
 
 def _move_in_time(page: Page, row: object) -> None:
-    view = page.locator("section[data-view='recordings']")
+    view = page.locator(".player")
     row.get_by_label("Open").click()  # type: ignore[attr-defined]
     slider = view.get_by_role("slider")
     expect(slider).to_be_visible()
-    page.wait_for_function(
-        "document.querySelector('[data-view=recordings] .time-slider').dataset.points > 5"
-    )
+    page.wait_for_function("document.querySelector('.player .time-slider').dataset.points > 5")
     # Both aircraft of the recording fly, under numbers that no live one has.
     expect(slider).to_have_attribute("data-curves", "2")
     flown = "Object.values(mavgate.vehicles).filter((v) => v.origin === 'recorded')"
@@ -246,10 +258,20 @@ def _move_in_time(page: Page, row: object) -> None:
     page.get_by_label("Aircraft", exact=True).click()
     page.get_by_role("option", name="Plane 2, recorded").click()
     page.wait_for_function("mavgate.state.origin === 'recorded'")
-    expect(page.locator(".chips").get_by_text("recording", exact=True)).to_be_visible()
+    expect(page.locator(".chips").get_by_text("playback", exact=True)).to_be_visible()
     expect(page.locator(".chips").get_by_text("link", exact=True)).to_have_count(0)
-    expect(page.locator(".recording-bar")).to_contain_text(
-        re.compile(r"RECORDING \d+:\d\d of \d+:\d\d")
+    expect(page.locator(".playback-bar")).to_contain_text(
+        re.compile(r"PLAYBACK \d+:\d\d of \d+:\d\d")
+    )
+    # Nothing of the live recorder and of the live flight is offered meanwhile.
+    expect(page.locator(".recorder >> visible=true")).to_have_count(0)
+    for key in ("map", "flight"):
+        show(page, key)
+        expect(slider).to_be_visible()
+    expect(page.get_by_role("button", name=re.compile("Back to live"))).to_be_visible()
+    expect(page.get_by_title("Show the present")).to_be_hidden()
+    expect(page.locator("section[data-view='map'] [data-role=path]")).to_have_text(
+        ["fused", "recorded"]
     )
     view.get_by_label("Play or pause").click()
     expect(view.get_by_label("Play or pause")).to_have_text("play_arrow")
@@ -257,7 +279,7 @@ def _move_in_time(page: Page, row: object) -> None:
     assert length_s > 2
     box = slider.bounding_box()
     assert box is not None
-    slider.click(position={"x": box["width"] * 0.5, "y": 50})
+    slider.click(position={"x": box["width"] * 0.5, "y": 20})
     middle = range(int(length_s / 2) - 1, int(length_s / 2) + 2)
     half = re.compile(f"^({'|'.join(map(str, middle))})$")
     expect(slider).to_have_attribute("aria-valuenow", half)
@@ -276,9 +298,10 @@ def _move_in_time(page: Page, row: object) -> None:
     )
     expect(slider).to_be_visible()
     expect(speed).to_have_value("1×")
-    view.get_by_label("Close the recording").click()
+    view.get_by_label("Close the playback").click()
     expect(slider).to_be_hidden()
     page.wait_for_function("Object.values(mavgate.vehicles).every((v) => v.origin === 'live')")
+    show(page, "recordings")
 
 
 def test_path_has_no_gap_after_another_view_was_shown(page: Page) -> None:
@@ -329,16 +352,16 @@ def test_recording_is_not_visible_on_another_page(
     show(page, "recordings")
     view = page.locator("section[data-view='recordings']")
     view.locator("tr[data-key='mine']").get_by_label("Open").click()
-    expect(page.locator(".recording-bar")).to_be_visible(timeout=START_LIMIT_MS)
+    expect(page.locator(".playback-bar")).to_be_visible(timeout=START_LIMIT_MS)
     other = open_page(browser, demo.link())
     # Several states after the first: the player sends as often as the gateway.
     other.wait_for_function(f"mavgate.now_us > {other.evaluate('mavgate.now_us')} + 5e5")
     origins = other.evaluate("Object.values(mavgate.vehicles).map((v) => v.origin)")
     assert origins == ["live", "live"]
-    expect(other.locator(".recording-bar")).to_be_hidden()
+    expect(other.locator(".playback-bar")).to_be_hidden()
     other.close()
     page.get_by_role("button", name="Back to live").click()
-    expect(page.locator(".recording-bar")).to_be_hidden()
+    expect(page.locator(".playback-bar")).to_be_hidden()
     page.wait_for_function("mavgate.state && mavgate.state.origin === 'live'")
 
 

@@ -107,6 +107,7 @@ async def test_history_and_path_are_served_in_flight() -> None:
     assert {len(column) for column in history.values()} == {len(history["time_us"])}
     assert history["q_nb.0"][0] is None
     assert len(path["track"]) == 2 * MAX_HISTORY
+    assert path["track"][3] == [47.0 + 3e-6, 8.0, 100.0, 750_000]
 
 
 def test_every_endpoint_runs_on_the_event_loop() -> None:

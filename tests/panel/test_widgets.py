@@ -2,6 +2,7 @@
 
 import asyncio
 import errno
+import math
 import os
 from collections.abc import Iterator
 from concurrent.futures.process import BrokenProcessPool
@@ -16,8 +17,9 @@ from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
 from gateway.panel.state.parameters import ParameterEntry, ParameterMeta
 from gateway.panel.views import tuning_view
-from gateway.panel.views.tuning_view import ComparisonCard, ParameterRow
-from gateway.panel.widgets import DataTable, RowButton, StripChart
+from gateway.panel.views.recordings_view import _facts_cells
+from gateway.panel.views.tuning_view import ComparisonCard, ParameterRow, range_of
+from gateway.panel.widgets import DataTable, RowButton, StripChart, why_not
 
 NAME = "CAL_GYRO_BIAS_Z"
 
@@ -124,33 +126,41 @@ def test_failed_comparison_reports_the_reason_and_can_be_repeated(
         asyncio.run(card._compare())
     assert (card._story.text, card._button.enabled) == (text, True)
     asyncio.run(card._compare())
-    again = "no samples. Samples are being collected; try again in a moment."
+    again = "Cannot be compared: no samples."
     assert (card._story.text, card._button.enabled) == (again, True)
     assert failures == []
 
 
 @pytest.mark.parametrize("may_change", [True, False])
-def test_comparison_requests_samples_only_with_the_right_to_change(
-    monkeypatch: pytest.MonkeyPatch, *, may_change: bool
-) -> None:
-    card, _ = comparison_of(monkeypatch, [ComparisonError("no samples")])
+def test_opened_view_collects_samples_if_the_user_may_change_things(*, may_change: bool) -> None:
     asked: list[int] = []
-    context: Any = card._context
-    context.may_change = may_change
-    context.parts.dialogues.ask_for_samples = asked.append
-    asyncio.run(card._compare())
+    card = ComparisonCard(context_of(asked, share=0.4, may_change=may_change))
     assert asked == [1] * may_change
+    assert not card._button.enabled
+    assert card._button.props["title"] == "Collecting samples: 40%"
+    card._context.parts.samples.collected = lambda *_: 1.0
+    card._refresh()
+    assert card._button.enabled
+
+
+def context_of(asked: list[int], *, share: float, may_change: bool) -> Any:
+    """A page on which that share of the needed samples is collected."""
+    dialogues = SimpleNamespace(of=lambda _: Dialogue(1), ask_for_samples=asked.append)
+    samples = SimpleNamespace(frames=lambda _: [], collected=lambda *_: share)
+    return SimpleNamespace(
+        system_id=1,
+        may_change=may_change,
+        parts=SimpleNamespace(dialogues=dialogues, samples=samples),
+        on_select=lambda _: None,
+        every=lambda *_: None,
+    )
 
 
 def comparison_of(
     monkeypatch: pytest.MonkeyPatch, failures: list[Exception]
 ) -> tuple[ComparisonCard, list[Exception]]:
     """Build a card whose comparisons fail in these ways, one after the other."""
-    dialogues = SimpleNamespace(of=lambda _: Dialogue(1))
-    samples = SimpleNamespace(frames=lambda _: [])
-    parts = SimpleNamespace(dialogues=dialogues, samples=samples)
-    context: Any = SimpleNamespace(system_id=1, may_change=False, parts=parts)
-    card = ComparisonCard(context)
+    card = ComparisonCard(context_of([], share=1.0, may_change=False))
 
     async def fail(*_: object) -> None:
         assert not card._button.enabled
@@ -158,3 +168,32 @@ def comparison_of(
 
     monkeypatch.setattr(tuning_view, "compare_apart", fail)
     return card, failures
+
+
+@pytest.mark.parametrize(
+    ("state", "name", "allowed"),
+    [
+        ("idle", "", {"start"}),
+        ("idle", "day", {"start", "save", "delete"}),
+        ("recording", "day", {"stop", "save"}),
+        ("opening", "day", {"stop", "save"}),
+        ("blocked", "day", {"start", "stop", "save"}),
+    ],
+)
+def test_recorder_offers_only_what_it_can_do(state: str, name: str, allowed: set[str]) -> None:
+    verbs = ("start", "stop", "save", "delete")
+    recorder = {"state": state, "name": name}
+    assert {verb for verb in verbs if not why_not(verb, recorder)} == allowed
+
+
+def test_angles_of_a_parameter_are_shown_in_degrees() -> None:
+    meta = ParameterMeta(name=NAME, unit="rad/s", low=-10.0, high=10.0, default=0.0)
+    assert range_of(meta) == "-572.96 to 572.96 °/s · default 0"
+    assert range_of(ParameterMeta(name=NAME, unit="m", low=0.0)) == "0 to any m"
+
+
+def test_unknown_figures_of_a_recording_are_dashes() -> None:
+    row = dict.fromkeys(("error", "duration", "distance", "highest", "loss"))
+    assert _facts_cells(row) == ("—", "—", "—", ("—", ""))
+    row |= {"duration": 61.2, "distance": math.nan, "highest": 7.4, "loss": 0.1}
+    assert _facts_cells(row) == ("0:01:01", "—", "7 m", ("10.0%", "warn"))

@@ -4,11 +4,20 @@ from typing import Final
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from gateway.analysis.blending import PAPER_TABLE, grows, interpolate
-from gateway.analysis.case import HOLD_OUT, Case, changed_settings, summarise, withheld_error_m
+from gateway.analysis.case import (
+    HOLD_OUT,
+    OUTAGE_S,
+    Case,
+    changed_settings,
+    outage_error_m,
+    summarise,
+    withheld_error_m,
+)
 from gateway.analysis.flight import BoolArray, FlightTrack, Reference
 from gateway.analysis.metrics import (
     errors_over_time,
@@ -55,6 +64,12 @@ ERROR_COLUMNS: Final = (
     ("height, m", rms, "height_m"),
     ("speed, m/s", rms, "speed_mps"),
 )
+DRIFT: Final = f"{OUTAGE_S:.0f} s without GPS, m"
+BARS: Final = {
+    "horizontal, m": "position live (m)",
+    DRIFT: f"position after {OUTAGE_S:.0f} s without GPS (m)",
+}
+"""Titles of the bars, by the column of the table."""
 TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
@@ -71,14 +86,19 @@ def estimators(case: Case) -> Section | None:
     if len(case.fixes) > HOLD_OUT:
         withheld = {name: withheld_error_m(case, name) for name in case.tracks}
         table["withheld fixes, m"] = table["estimator"].map(withheld)
+        drift = {name: outage_error_m(case, name) for name in case.tracks}
+        table[DRIFT] = table["estimator"].map(drift)
+    table = table.dropna(axis="columns", how="all")
     return Section(
         "Estimators compared",
         DESCRIPTION.format(reference.description) + _smoothed_description(case),
         [
             Picture(
                 "estimator_errors",
-                lambda width: _draw_errors(case, reference, width),
-                "Error of each estimator over the flight. "
+                lambda width: _draw_errors(case, reference, table, width),
+                "Above, the errors that matter, RMS: of the position as it is live, and of the "
+                f"position after {OUTAGE_S:.0f} s in which the estimator is given no GPS. Below, "
+                "the error over the flight. "
                 + (TILT if turns else "")
                 + "Without GPS the position drifts until it is back; its scale is logarithmic. "
                 "The first seconds, in which every estimator converges, do not count.",
@@ -89,7 +109,8 @@ def estimators(case: Case) -> Section | None:
                 "estimators",
                 table,
                 "RMS errors where they count; worst is the greatest. Withheld fixes: horizontal "
-                f"error at every {HOLD_OUT}th fix when the estimator is not given it.",
+                f"error at every {HOLD_OUT}th fix when the estimator is not given it. {DRIFT}: at "
+                "the end of such spans.",
             )
         ],
     )
@@ -128,7 +149,7 @@ def _smoothed_description(case: Case) -> str:
     )
 
 
-def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
+def _draw_errors(case: Case, reference: Reference, table: pd.DataFrame, width_in: float) -> Figure:
     errors = {name: errors_over_time(t, reference.track) for name, t in case.tracks.items()}
     kinds = {
         "tilt_deg": "tilt (deg)",
@@ -136,7 +157,12 @@ def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
         "horizontal_m": "horizontal (m)",
     }
     known = [k for k in kinds if any(np.isfinite(found[k]).any() for found in errors.values())]
-    figure, axes = style.over_time(width_in, 1.75, [kinds[key] for key in known])
+    figure, bars, axes = _error_panels(width_in, [kinds[key] for key in known], table)
+    for panel, column in zip(bars, filter(table.__contains__, BARS), strict=True):
+        _draw_bars(panel, table, column)
+    for panel, key in zip(axes, known, strict=True):
+        panel.set_ylabel(kinds[key])
+    axes[-1].set_xlabel("time (s)")
     for panel, key in zip(axes, known, strict=True):
         for name, found in errors.items():
             colour = COLOURS.get(name, OTHER)
@@ -146,6 +172,34 @@ def _draw_errors(case: Case, reference: Reference, width_in: float) -> Figure:
             panel.set_yscale("log")
     style.legend_above(axes[0], 3)
     return figure
+
+
+def _error_panels(
+    width_in: float, labels: list[str], table: pd.DataFrame
+) -> tuple[Figure, list[Axes], list[Axes]]:
+    """Create the panels of the bars, next to each other if there is room, and those over time."""
+    count = sum(column in table for column in BARS)
+    shape = (1, count) if width_in >= style.WIDE_IN else (count, 1)
+    heights_in = (shape[0] * (0.7 + 0.3 * len(table)), 1.75 * len(labels))
+    figure = Figure(figsize=(width_in, sum(heights_in)))
+    above, below = figure.add_gridspec(2, 1, height_ratios=heights_in)
+    bars = above.subgridspec(*shape).subplots(squeeze=False).ravel()
+    axes = below.subgridspec(len(labels), 1).subplots(sharex=True, squeeze=False).ravel()
+    for panel, label in zip(axes, labels, strict=True):
+        panel.set_ylabel(label)
+    axes[-1].set_xlabel("time (s)")
+    return figure, list(bars), list(axes)
+
+
+def _draw_bars(axes: Axes, table: pd.DataFrame, column: str) -> None:
+    """Draw a bar for each estimator, with its value; the best is on top."""
+    rows = table[["estimator", column]].dropna().sort_values(column, ascending=False)
+    colours = [COLOURS.get(name, OTHER) for name in rows["estimator"]]
+    bars = axes.barh(rows["estimator"], rows[column], color=colours, height=0.6)
+    axes.bar_label(bars, fmt="%.2f", padding=3)
+    axes.set_xlim(0.0, 1.2 * max(float(rows[column].max()), 1e-3))
+    axes.set_title(BARS[column], loc="left")
+    axes.grid(visible=False, axis="y")
 
 
 SAME_POSITION_DEG: Final = 0.5

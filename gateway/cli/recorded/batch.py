@@ -147,7 +147,7 @@ def sweep(
 
 def _finish(results: Sequence[FlightResult], output: Path, against: Path | None) -> None:
     """Show the season as a table, and write its page."""
-    from gateway.batch.statistics import errors_by_group, flight_table, write_season_page
+    from gateway.batch.statistics import errors_by_group, flight_table, why_leads, write_season_page
 
     compared = None if against is None else _compare(results, against)
     grid = table_of(
@@ -157,6 +157,8 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
         grid.add_row(aircraft, name, str(flights), *(f"{error_m:.3f}" for error_m in errors_m))
     console = console_of()
     console.print(grid)
+    if text := why_leads(results):
+        console.print(text)
     if compared is not None:
         _show_versus(compared)
     rows = flight_table(results).to_csv(index=False).encode()

@@ -244,9 +244,9 @@ class CalibrationRun:
         """Return the errors before and after, as far as known."""
         match self.step:
             case CalibrationStep.GYRO:
-                return [Residual("Rate at rest", "deg/s", *self._each(_rate_degps))]
+                return [Residual("Rate at rest", "°/s", *self._each(_rate_degps))]
             case CalibrationStep.LEVEL:
-                return [Residual("Tilt when level", "deg", *self._each(_tilt_deg))]
+                return [Residual("Tilt when level", "°", *self._each(_tilt_deg))]
             case CalibrationStep.ACCEL:
                 return [Residual("Error of gravity over the six sides", "m/s²", *self._sides_rms())]
             case CalibrationStep.MAG:

@@ -48,6 +48,11 @@ def unit_text(unit: str) -> str:
     return UNIT_TEXTS.get(unit, unit)
 
 
+def parameter_unit(unit: str) -> tuple[float, str]:
+    """Return the factor and the unit in which a parameter is shown: angles in degrees."""
+    return SHOWN_UNITS[unit] if unit in ("rad", "rad/s") else (1.0, unit_text(unit))
+
+
 def shown_unit(unit: str) -> tuple[float, str]:
     """Return the factor and the unit in which a field of a MAVLink unit is shown."""
     return SHOWN_UNITS.get(unit, (1.0, unit))

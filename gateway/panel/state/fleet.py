@@ -2,7 +2,7 @@
 
 import math
 from array import array
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -17,6 +17,7 @@ from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import DEGE7, is_on_earth
+from gateway.wire.mavlink_splitter import message_id_of
 
 
 def command_long(system_id: int, number: int, *params: float) -> Any:
@@ -47,6 +48,8 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     system_id: int
     time_us: int
     """When the newest attitude or position came, on the panel's clock."""
+    title: str
+    """Displayed name."""
     model: str
     """Its 3D model, see `VehicleState.model`."""
     origin: str
@@ -73,7 +76,8 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """Horizontal standard deviation of the position, root of the sum of both axes."""
     fix_type: int
     """GPS_FIX_TYPE; 0 without a GPS."""
-    satellites: int
+    satellites: float
+    """Unknown where the receiver does not count them."""
     fix: Spot | None
     """Newest GPS fix of two dimensions or more."""
     home: Spot | None
@@ -211,10 +215,10 @@ class FlightHistory:
         for column in (self.time_us, *self.columns.values()):
             del column[:]
 
-    def track(self) -> list[tuple[float, float, float]]:
-        """Return latitude, longitude and height AMSL of all moments."""
+    def track(self) -> list[tuple[float, float, float, int]]:
+        """Return latitude, longitude, height AMSL and time of all moments."""
         names = ("lat_deg", "lon_deg", "alt_amsl_m")
-        return list(zip(*(self.columns[name] for name in names), strict=True))
+        return list(zip(*(self.columns[name] for name in names), self.time_us, strict=True))
 
 
 class VehicleState:
@@ -256,11 +260,15 @@ class VehicleState:
             taker(message, now_us)
 
     @property
-    def title(self) -> str:
-        """Displayed name."""
+    def name(self) -> str:
+        """Its kind and its number."""
         kind = "Aircraft" if self.model == "none" else self.model.capitalize()
-        name = f"{kind} {self.number}"
-        return name if self.is_live else f"{name}, {self.origin}"
+        return f"{kind} {self.number}"
+
+    @property
+    def title(self) -> str:
+        """Displayed name, which indicates where it is not live."""
+        return self.name if self.is_live else f"{self.name}, {self.origin}"
 
     @property
     def is_live(self) -> bool:
@@ -310,6 +318,7 @@ class VehicleState:
         return Instant(
             system_id=self.system_id,
             time_us=self._moved_us,
+            title=self.title,
             model=self.model,
             origin=self.origin,
             generation=self.generation,
@@ -327,7 +336,7 @@ class VehicleState:
             heading_deg=_heading_deg(position, hud),
             pos_std_m=self._pos_std_m(),
             fix_type=fix.fix_type if fix else 0,
-            satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else 0,
+            satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else NAN,
             fix=_spot_of_fix(fix),
             home=self.home,
             mark=mark,
@@ -554,3 +563,20 @@ class SampleMemory:
     def frames(self, system_id: int) -> TimedFrames:
         """Return the frames of an aircraft, the oldest first."""
         return list(self._frames.get(system_id, ()))
+
+    def collected(self, system_id: int, span_s: float, rate_hz: float) -> float:
+        """Return the collected share of a span up to the newest sample at a rate, at most 1."""
+        frames = self._frames.get(system_id, ())
+        newest_us = frames[-1][0] if frames else 0
+        counts, first_us = Counter[int](), dict[int, int]()
+        for time_us, frame in reversed(frames):
+            if newest_us - time_us > (span_s + 1.0) * US_PER_S:
+                break
+            kind = message_id_of(frame)
+            counts[kind] += 1
+            first_us[kind] = time_us
+        shares = (
+            min(count / (span_s * rate_hz), (newest_us - first_us[kind]) / US_PER_S / span_s)
+            for kind, count in counts.items()
+        )
+        return min(1.0, max(shares, default=0.0))

@@ -17,11 +17,11 @@ from gateway.panel.state.calibration import (
     CalibrationStep,
     RunState,
 )
-from gateway.panel.state.fields import FloatArray, unit_text
+from gateway.panel.state.fields import FloatArray, parameter_unit
 from gateway.panel.state.parameters import ListState
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import DataTable, heading, store_parameters
-from gateway.printable import printable
+from gateway.panel.widgets import DataTable, allow, heading, store_parameters
+from gateway.printable import UNKNOWN, figure, printable
 
 REFRESH_S: Final = 0.2
 MIN_CELLS: Final = 60
@@ -78,7 +78,7 @@ class CalibrationView:
 
     def __init__(self, context: ViewContext) -> None:
         self._context = context
-        self._step = CalibrationStep.GYRO
+        self._step = CalibrationStep.MOUNTING
         self._drawn: object = None
         self._choice: ui.select
         self._outcomes: dict[CalibrationStep, tuple[str, str]] = {}
@@ -180,7 +180,7 @@ class CalibrationView:
         for name, shown in (("cancel", runs), ("store", done), ("undo", done), ("start", not runs)):
             self._buttons[name].set_visibility(shown)
         start = self._buttons["start"]
-        start.set_enabled(self._may_calibrate and ready)
+        allow(start, self._why_not(ready=ready))
         start.set_text("Start" if run is None else "Again")
         start.classes("" if run is None else "quiet")
         if run is not None:
@@ -194,10 +194,20 @@ class CalibrationView:
             "Choose how the board lies in the aircraft, seen from above. Its x arrow is printed "
             "next to the chips; both the IMU and the compass are set."
         ).classes("now")
-        with ui.element("div").classes("mounting").props("tabindex=0"):
-            picture = ui.element("img").classes("mounting-picture")
-        picture.props["src"] = "/web/mounting.svg"
-        picture.props["alt"] = "The board in the aircraft in eight orientations, with their angles"
+        self._pictures = {}
+        with ui.element("div").classes("poses four"):
+            for number, (name, (roll_deg, pitch_deg, yaw_deg)) in enumerate(ORIENTATIONS.items()):
+                with ui.element("button").classes("pose pick") as card:
+                    card.props["title"] = f"Choose {name}"
+                    picture = ui.element("img").classes("pose-picture")
+                    picture.props["src"] = f"/web/mounting.svg#way{number}"
+                    # The name below it says the same.
+                    picture.props["alt"] = ""
+                    ui.label(name)
+                    angles = f"roll {roll_deg:.0f}°, pitch {pitch_deg:.0f}°, yaw {yaw_deg:.0f}°"
+                    ui.label(angles).classes("soft")
+                card.on("click", partial(self._choose, name))
+                self._pictures[name] = card
         self._choice = ui.select([*ORIENTATIONS, MEASURED])
         self._choice.props('dense outlined options-dense aria-label="Orientation of the board"')
         with ui.element("div").classes("buttons"):
@@ -206,12 +216,20 @@ class CalibrationView:
                 "store": _button("Store it", "save", self._store, quiet=True),
             }
 
+    def _choose(self, name: str) -> None:
+        self._choice.set_value(name)
+        self._refresh()
+
     def _refresh_mounting(self, *, ready: bool) -> None:
         # Set once alone: a refresh must not change a choice that is not used yet.
         if ready and self._choice.value is None:
             self._choice.set_value(self._orientation())
+        for name, card in self._pictures.items():
+            pressed = "true" if name == self._choice.value else "false"
+            if card.props.get("aria-pressed") != pressed:
+                card.props["aria-pressed"] = pressed
         for button in self._buttons.values():
-            button.set_enabled(self._may_calibrate and ready)
+            allow(button, self._why_not(ready=ready))
 
     def _orientation(self) -> str:
         """Return which of the orientations the parameters have."""
@@ -244,10 +262,16 @@ class CalibrationView:
             "In use until the gateway ends. Raise the nose: the pitch must rise.", type="info"
         )
 
-    @property
-    def _may_calibrate(self) -> bool:
+    def _why_not(self, *, ready: bool) -> str:
+        """Return why nothing can be calibrated now; empty if it can."""
         vehicle = self._context.vehicle
-        return self._context.may_change and vehicle is not None and vehicle.is_live
+        if not self._context.may_change:
+            return "You are logged in as a viewer."
+        if vehicle is None:
+            return "No aircraft is heard."
+        if not vehicle.is_live:
+            return "This aircraft is played from a recording."
+        return "" if ready else "The parameters are being read."
 
     def _what_now(self, run: CalibrationRun | None, *, ready: bool) -> str:
         vehicle = self._context.vehicle
@@ -296,9 +320,12 @@ class CalibrationView:
         metas = self._context.dialogue.metas if self._context.dialogue else {}
         for name, (old, new) in self._changes().items():
             meta = metas.get(name)
-            words = f"{meta.short} ({unit_text(meta.unit)}), {name}" if meta else name
-            found.append((words, old, new))
-        self._residuals.show({name: (name, _figure(old), _figure(new)) for name, old, new in found})
+            factor, unit = parameter_unit(meta.unit if meta else "")
+            words = f"{meta.short} ({unit}), {name}" if meta else name
+            found.append((words, old * factor, new * factor))
+        self._residuals.show(
+            {name: (name, figure(old, ".4g"), figure(new, ".4g")) for name, old, new in found}
+        )
 
     def _changes(self) -> dict[str, tuple[float, float]]:
         """Return the parameters that the calibration changed."""
@@ -336,10 +363,14 @@ class CalibrationView:
         left = len(seen) - sum(seen)
         enough = "well covered" if sum(seen) >= MIN_CELLS else f"{left} directions uncovered"
         texts = (
-            str(len(points)),
-            f"{sum(seen)} of {len(seen)}, {enough}",
-            f"{x:.1f}, {y:.1f}, {z:.1f} µT",
-            f"{radius:.1f} µT",
+            (UNKNOWN, UNKNOWN, UNKNOWN, UNKNOWN)
+            if not len(points)
+            else (
+                str(len(points)),
+                f"{sum(seen)} of {len(seen)}, {enough}",
+                f"{figure(x, '.1f')}, {figure(y, '.1f')}, {figure(z, '.1f')} µT",
+                figure(radius, ".1f", "µT"),
+            )
         )
         for label, text in zip(self._figures.values(), texts, strict=True):
             label.set_text(text)
@@ -393,7 +424,3 @@ class CalibrationView:
 def _button(text: str, icon: str | None, act: Any, *, quiet: bool = False) -> ui.button:
     button = ui.button(text, icon=icon, on_click=act).props("no-caps unelevated")
     return button.classes("quiet" if quiet else "")
-
-
-def _figure(value: float) -> str:
-    return "—" if not math.isfinite(value) else f"{value:.4g}"

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Awaitable, Callable
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from nicegui import ui
 from nicegui.element import Element
@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.panel.access import MAPS
 from gateway.panel.state.fleet import Spot
 from gateway.panel.view_context import WEB, ViewContext
-from gateway.panel.widgets import RecorderControls, UploadButton, asking, closing, notify_failure
+from gateway.panel.widgets import RecorderControls, UploadButton, confirm, notify_failure
 
 STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
@@ -32,7 +32,8 @@ class FlightMap(Element, component=WEB / "flight_map.js"):
         context.every(STYLES_S, self.refresh)
         self._props["may_mark"] = full and context.may_change
         if full and context.may_change:
-            self.on("position", partial(_ask, context))
+            for kind, act in (("mark", _mark), ("home", _ask_home), ("clear", _clear)):
+                self.on(kind, partial(_at, context, act))
             with self:
                 upload = UploadButton(
                     context, MAPS, ".pmtiles", label="Add map…", title="Upload a PMTiles file"
@@ -55,27 +56,13 @@ def build_map(context: ViewContext) -> None:
         FlightMap(context, full=True)
 
 
-def _ask(context: ViewContext, event: GenericEventArguments) -> None:
-    """Ask what to do at the clicked position."""
-    spot = Spot(event.args["lat_deg"], event.args["lon_deg"], _ground_m(context))
-    name = f"{spot.lat_deg:.6f}, {spot.lon_deg:.6f}"
-    with asking(name, "figure") as dialog:
-        ui.label(f"aircraft {context.system_id}").classes("soft")
-
-        def then(act: Callable[[], Awaitable[Any]]) -> Callable[[], Awaitable[None]]:
-            async def run() -> None:
-                with notify_failure(context):
-                    await act()
-
-            return closing(dialog, run)
-
-        mark = ui.button("Mark this position", on_click=then(partial(_mark, context, spot)))
-        mark.props("no-caps")
-        home = ui.button("Set home here", on_click=then(partial(_set_home, context, spot)))
-        home.props("no-caps outline")
-        if context.vehicle is not None and context.vehicle.instant(context.now_us).mark:
-            clear = ui.button("Clear the mark", on_click=then(partial(_clear, context)))
-            clear.props("no-caps outline")
+async def _at(
+    context: ViewContext, act: Callable[..., Awaitable[None]], event: GenericEventArguments
+) -> None:
+    """Do what was chosen at a position of the map."""
+    spot = Spot(float(event.args["lat_deg"]), float(event.args["lon_deg"]), _ground_m(context))
+    with notify_failure(context):
+        await act(context, spot)
 
 
 def _ground_m(context: ViewContext) -> float:
@@ -94,12 +81,24 @@ async def _mark(context: ViewContext, spot: Spot) -> None:
     ui.notify("Marked", type="positive")
 
 
+async def _ask_home(context: ViewContext, spot: Spot) -> None:
+    if context.vehicle is None:
+        return
+    title = f"Set home of {context.vehicle.title} to {spot.lat_deg:.6f}, {spot.lon_deg:.6f}?"
+
+    async def act() -> None:
+        with notify_failure(context):
+            await _set_home(context, spot)
+
+    confirm(title, "Set home", act, grave=False)
+
+
 async def _set_home(context: ViewContext, spot: Spot) -> None:
     await context.command_at(mavlink.MAV_CMD_DO_SET_HOME, spot)
     ui.notify("Home set", type="positive")
 
 
-async def _clear(context: ViewContext) -> None:
+async def _clear(context: ViewContext, _: Spot) -> None:
     await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
     if context.vehicle is not None:
         context.vehicle.exact_mark = None
@@ -142,6 +141,6 @@ def build_flight(context: ViewContext) -> None:
             FlightMap(context, full=False)
         with ui.element("div").classes("flight-scene card"):
             FlightScene()
-        with ui.element("div").classes("flight-foot card"):
+        with ui.element("div").classes("flight-foot card live-only"):
             FlightTimeline()
             RecorderControls(context)

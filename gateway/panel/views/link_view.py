@@ -8,8 +8,16 @@ from nicegui import ui
 
 from gateway.live.control_socket import ControlError
 from gateway.panel.view_context import ViewContext
-from gateway.panel.widgets import Cells, DataTable, RowButton, confirm, heading, notify_failure
-from gateway.printable import printable
+from gateway.panel.widgets import (
+    Cells,
+    DataTable,
+    RowButton,
+    allow,
+    confirm,
+    heading,
+    notify_failure,
+)
+from gateway.printable import UNKNOWN, figure, printable
 from gateway.records import RadioState
 from gateway.units import US_PER_S, counted
 
@@ -17,7 +25,6 @@ REFRESH_S: Final = 1.0
 SERIAL_S: Final = 2.0
 AUTO: Final = "find the receiver by its frames"
 SILENT_US: Final = 2 * US_PER_S
-UNKNOWN: Final = "—"
 LOSS_WARN: Final = 5.0
 LOSS_BAD: Final = 20.0
 """Percent of payloads: above it the estimators mostly extrapolate."""
@@ -36,7 +43,7 @@ class LinkView:
         self._context = context
         self._was_shown = False
         with ui.element("div").classes("cards"):
-            with ui.element("div").classes("card padded"):
+            with ui.element("div").classes("card padded wide"):
                 heading("Receiver")
                 self._receiver = ui.label(UNKNOWN).classes("figure").props("data-role=receiver")
                 if context.may_change:
@@ -44,7 +51,7 @@ class LinkView:
                 self._nodes = DataTable(
                     NODE_COLUMNS,
                     "No node was heard.",
-                )
+                ).props("data-role=nodes")
             with ui.element("div").classes("card padded wide"):
                 heading("Clients")
                 self._build_clients()
@@ -109,7 +116,7 @@ class LinkView:
             kept = self._port.value if self._was_shown else status["wanted"]
             self._port.set_options(options, value=kept if kept in options else "auto")
         self._was_shown = True
-        self._leave.set_enabled(status["state"] != "closed")
+        allow(self._leave, "No port is connected." if status["state"] == "closed" else "")
         self._serial_reason.set_text(printable(_serial_line(status)))
 
     async def _ask(self, verb: str, **params: Any) -> bool:
@@ -179,8 +186,7 @@ class LinkView:
         rows: dict[str, Cells] = {}
         for system_id, vehicle in sorted(self._context.vehicles.items()):
             ages = [self._age(vehicle.heard_us.get(name)) for name in _SHOWN]
-            name, kinds = f"{vehicle.model} {system_id}", str(len(vehicle.newest))
-            rows[str(system_id)] = (name, *ages, kinds)
+            rows[str(system_id)] = (vehicle.title, *ages, str(len(vehicle.newest)))
         return rows
 
     def _age(self, heard_us: int | None) -> str | tuple[str, str]:
@@ -227,12 +233,12 @@ def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
     kind = "bad" if loss > LOSS_BAD else "warn" if loss > LOSS_WARN else ""
     return (
         _name_of(node),
-        f"{node['rate_hz']:.0f} Hz",
+        figure(node["rate_hz"], ".0f", "Hz"),
         str(node["received"]),
         str(node["lost"]),
         (f"{loss:.2f} %", kind),
         (str(node["restarts"]), "warn" if node["restarts"] else ""),
-        f"{node['clock_skew_ppm']:+.0f} ppm",
+        figure(node["clock_skew_ppm"], "+.0f", "ppm"),
         (f"{age_us / US_PER_S:.1f} s", "bad" if age_us > SILENT_US else "good"),
         ", ".join(board["chips"]) if board is not None else UNKNOWN,
     )
@@ -256,7 +262,7 @@ def _client_row(client: Record, now_us: int, before: dict[int, int], span_s: flo
         rate,
         (str(client["dropped"]), "warn" if client["dropped"] else ""),
         str(client["received"]),
-        UNKNOWN if trip_us is None else f"{trip_us / 1000:.1f} ms",
+        figure(trip_us and trip_us / 1000, ".1f", "ms"),
         "never" if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.0f} s ago",
         "may change" if client["trusted"] else "may look",
     )

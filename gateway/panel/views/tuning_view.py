@@ -9,15 +9,22 @@ from typing import Any, Final
 import numpy as np
 from nicegui import ui
 
+from gateway.analysis.metrics import rms
 from gateway.clock import unix_time_us
 from gateway.geometry.angle import wrap_180
 from gateway.panel.dialogues import Dialogue
-from gateway.panel.estimator_trial import ComparisonError, Estimate, compare_apart
-from gateway.panel.state.fields import FloatArray, IntArray, unit_text
+from gateway.panel.estimator_trial import (
+    LEAST_HZ,
+    LEAST_S,
+    ComparisonError,
+    Estimate,
+    compare_apart,
+)
+from gateway.panel.state.fields import FloatArray, IntArray, parameter_unit
 from gateway.panel.state.parameters import ListState, ParameterMeta, is_same_value
 from gateway.panel.view_context import NotAllowedError, ViewContext
-from gateway.panel.widgets import DataTable, LiveChart, StripChart, heading, store_parameters
-from gateway.printable import printable, reason_of
+from gateway.panel.widgets import DataTable, LiveChart, StripChart, allow, heading, store_parameters
+from gateway.printable import figure, printable, reason_of
 from gateway.units import counted
 
 
@@ -29,17 +36,18 @@ class ParameterRow:
         self._meta = meta
         self._system_id = dialogue.parameters.system_id
         self._shown: object = None
-        value = dialogue.parameters.entries[meta.name].value
+        self._factor, self._unit = parameter_unit(meta.unit)
+        value = self._in_shown_unit(dialogue.parameters.entries[meta.name].value)
         self._settled: float | None = value
         """Value of the field while nothing else is typed."""
         self.has_focus = False
         with ui.element("div").classes("parameter") as self._row:
             self._row.props["data-name"] = meta.name
             with ui.element("div"):
-                ui.label(printable(meta.name)).classes("name")
                 meaning = ui.label(printable(meta.short)).classes("meaning")
                 meaning.tooltip(printable(meta.long or meta.short))
-                ui.label(printable(_range_of(meta))).classes("range")
+                ui.label(printable(meta.name)).classes("name")
+                ui.label(printable(range_of(meta))).classes("range")
                 self._trouble = ui.label().classes("trouble").props("role=alert")
             self._field = self._build_field(value)
         self.refresh(dialogue)
@@ -49,12 +57,13 @@ class ParameterRow:
         name, parameters = self._meta.name, dialogue.parameters
         value, trouble = parameters.entries[name].value, parameters.refused.get(name, "")
         pending = name in parameters.pending
+        changed = math.isfinite(self._meta.default) and not is_same_value(value, self._meta.default)
+        value = self._in_shown_unit(value)
         if (value, trouble, pending) == self._shown:
             return
         self._shown = (value, trouble, pending)
         self._trouble.set_text("waiting for the answer …" if pending else printable(trouble))
         self._trouble.set_visibility(bool(trouble) or pending)
-        changed = math.isfinite(self._meta.default) and not is_same_value(value, self._meta.default)
         self._row.classes(add="changed" if changed else "", remove="" if changed else "changed")
         if pending:
             return
@@ -65,6 +74,10 @@ class ParameterRow:
             self._settled = value
             self._field.set_value(value)
 
+    def _in_shown_unit(self, value: float) -> float:
+        # With the digits that a 32-bit float has: the rest is the conversion's.
+        return value if self._factor == 1.0 else float(f"{value * self._factor:.7g}")
+
     def _build_field(self, value: float) -> Any:
         field: Any
         meta, may = self._meta, self._context.may_change
@@ -74,7 +87,7 @@ class ParameterRow:
             field = ui.select(options, value=value, on_change=lambda e: self._set(e.value))
             field.props("dense outlined options-dense")
         else:
-            field = ui.number(value=value, suffix=printable(unit_text(meta.unit)), format="%.7g")
+            field = ui.number(value=value, suffix=printable(self._unit), format="%.7g")
             field.props("dense outlined step=any hide-bottom-space")
             # Only a finished value is sent, not each typed digit.
             field.on("keydown.enter", lambda: self._set(field.value))
@@ -91,38 +104,39 @@ class ParameterRow:
             return
         name, dialogues = self._meta.name, self._context.parts.dialogues
         parameters = dialogues.of(self._system_id).parameters
-        kept = parameters.entries[name].value
+        kept = self._in_shown_unit(parameters.entries[name].value)
         if name not in parameters.pending and is_same_value(value, kept):
             return
         try:
             self._context.check_may_change()
-            dialogues.change(self._system_id, name, float(value))
+            dialogues.change(self._system_id, name, float(value) / self._factor)
         except (ValueError, NotAllowedError) as error:
             ui.notify(printable(str(error)), type="negative")
             return
         self._shown = None
 
 
-def _range_of(meta: ParameterMeta) -> str:
+def range_of(meta: ParameterMeta) -> str:
+    """Describe the range, unit and default of a parameter."""
     parts = []
+    factor, unit = parameter_unit(meta.unit)
     # Adding zero removes the sign of a negative zero.
-    if math.isfinite(meta.low) or math.isfinite(meta.high):
-        low = f"{meta.low + 0.0:g}" if math.isfinite(meta.low) else "any"
-        high = f"{meta.high + 0.0:g}" if math.isfinite(meta.high) else "any"
-        parts.append(f"{low} to {high} {unit_text(meta.unit)}".strip())
-    elif meta.unit:
-        parts.append(unit_text(meta.unit))
-    if math.isfinite(meta.default):
+    low, high, default = (v * factor + 0.0 for v in (meta.low, meta.high, meta.default))
+    if math.isfinite(low) or math.isfinite(high):
+        ends = [f"{end:.5g}" if math.isfinite(end) else "any" for end in (low, high)]
+        parts.append(f"{' to '.join(ends)} {unit}".strip())
+    elif unit:
+        parts.append(unit)
+    if math.isfinite(default):
         words = (each.description for each in meta.choices if each.value == meta.default)
-        word = next(words, "")
-        parts.append(f"default {word or f'{meta.default + 0.0:g}'}")
+        parts.append(f"default {next(words, '') or f'{default:.5g}'}")
     return " · ".join(parts)
 
 
 QUANTITIES: Final = {
-    "roll_deg": ("Roll", "deg", "ATTITUDE.roll", math.degrees(1.0)),
-    "pitch_deg": ("Pitch", "deg", "ATTITUDE.pitch", math.degrees(1.0)),
-    "yaw_deg": ("Heading", "deg", "ATTITUDE.yaw", math.degrees(1.0)),
+    "roll_deg": ("Roll", "°", "ATTITUDE.roll", math.degrees(1.0)),
+    "pitch_deg": ("Pitch", "°", "ATTITUDE.pitch", math.degrees(1.0)),
+    "yaw_deg": ("Heading", "°", "ATTITUDE.yaw", math.degrees(1.0)),
     "alt_amsl_m": ("Altitude", "m", "VFR_HUD.alt", 1.0),
 }
 """Title, unit, and the aircraft's own field with its factor, by field of `Estimate`."""
@@ -134,6 +148,7 @@ class ComparisonCard:
     def __init__(self, context: ViewContext) -> None:
         self._context = context
         self._estimates: list[Estimate] = []
+        self._is_fusing = False
         with ui.element("div").classes("card").props("data-card=comparison"):
             with ui.element("div").classes("tools"):
                 heading("Estimators on the last minutes")
@@ -147,33 +162,52 @@ class ComparisonCard:
                 "Fuses the sensor data of the last three minutes with every estimator, each "
                 "with the present parameters."
             ).classes("soft")
+            self._collecting = ui.label().classes("figure").props("role=status")
             self._chart = StripChart().classes("strip")
             self._chart.set_visibility(False)
             self._table = DataTable(
                 ("Estimator", "RMS difference from flight", "RMS distance to the GPS fixes")
             ).classes("residuals")
             self._table.set_visibility(False)
+        context.on_select(self._collect)
+        context.every(1.0, self._refresh)
+        self._collect()
+        self._refresh()
+
+    def _collect(self) -> None:
+        """Request the samples when the view is opened, and not when they are needed."""
+        system_id = self._context.system_id
+        if system_id is not None and self._context.may_change:
+            self._context.parts.dialogues.ask_for_samples(system_id)
+
+    def _refresh(self) -> None:
+        system_id, samples = self._context.system_id, self._context.parts.samples
+        share = samples.collected(system_id or 0, LEAST_S, LEAST_HZ)
+        reason = "" if share >= 1.0 else f"Collecting samples: {share:.0%}"
+        allow(self._button, "The samples are being fused." if self._is_fusing else reason)
+        self._collecting.set_text(reason)
+        self._collecting.set_visibility(bool(reason))
 
     async def _compare(self) -> None:
         context, system_id = self._context, self._context.system_id
         if system_id is None:
             return
-        if context.may_change:
-            context.parts.dialogues.ask_for_samples(system_id)
         parameters = context.parts.dialogues.of(system_id).parameters.entries
         values = {name: entry.value for name, entry in parameters.items()}
-        self._button.disable()
+        self._is_fusing = True
+        self._refresh()
         self._story.set_text("Fusing …")
         try:
             self._estimates = await compare_apart(context.parts.samples.frames(system_id), values)
         except ComparisonError as error:
-            self._story.set_text(f"{error}. Samples are being collected; try again in a moment.")
+            self._story.set_text(f"Cannot be compared: {error}.")
             return
         except Exception as error:
             self._story.set_text(f"Cannot be compared: {reason_of(error)}.")
             raise
         finally:
-            self._button.enable()
+            self._is_fusing = False
+            self._refresh()
         seconds = np.ptp(self._estimates[0].time_us) / 1e6
         self._story.set_text(f"The last {seconds:.0f} s, and the aircraft's own estimate.")
         self._chart.set_visibility(True)
@@ -204,28 +238,24 @@ class ComparisonCard:
             {
                 e.name: (
                     e.name,
-                    f"{_rms_text(e, key, curves[-1])} {unit}",
-                    f"{_figure(e.to_fixes_m)} m",
+                    figure(_rms(e, key, curves[-1]), ".2f", unit),
+                    figure(e.to_fixes_m, ".2f", "m"),
                 )
                 for e in self._estimates
             }
         )
 
 
-def _rms_text(estimate: Estimate, key: str, flown: tuple[str, IntArray, FloatArray]) -> str:
+def _rms(estimate: Estimate, key: str, flown: tuple[str, IntArray, FloatArray]) -> float:
+    """Return the RMS difference of an estimate from the flown values; NaN without any."""
     _, flown_us, values = flown
     if not len(flown_us):
-        return "—"
+        return math.nan
     rows = np.clip(np.searchsorted(flown_us, estimate.time_us), 0, len(flown_us) - 1)
     apart = getattr(estimate, key) - values[rows]
     if key.endswith("_deg"):
         apart = wrap_180(apart)
-    known = apart[np.isfinite(apart)]
-    return _figure(float(np.sqrt(np.mean(known**2)))) if len(known) else "—"
-
-
-def _figure(value: float) -> str:
-    return "—" if not math.isfinite(value) else f"{value:.2f}"
+    return rms(apart)
 
 
 REFRESH_S: Final = 0.25
@@ -263,7 +293,8 @@ class TuningView:
             self._group.props('dense outlined options-dense aria-label="Group"')
             self._state = ui.label().classes("soft")
             store = ui.button("Store all", icon="save", on_click=self._store)
-            store.props("no-caps unelevated dense").set_enabled(self._context.may_change)
+            store.props("no-caps unelevated dense")
+            allow(store, "" if self._context.may_change else "You are logged in as a viewer.")
             again = ui.button(icon="refresh", on_click=self._reload)
             again.props('flat round dense aria-label="Read all parameters again"')
         with ui.element("div").classes("tuning"):

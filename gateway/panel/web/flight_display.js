@@ -374,11 +374,10 @@ export default {
         g.moveTo(x, y);
         g.lineTo(x + (share === 0 ? 2 : 1.1) * u, y);
         g.stroke();
-        const mark = Math.abs(share * full) / (full > 100 ? 100 : 1);
-        if (share) g.fillText(mark.toFixed(0), x + 1.6 * u, y);
+        if (share) g.fillText(Math.abs(share * full).toFixed(0), x + 1.6 * u, y);
       }
       g.textAlign = "center";
-      g.fillText(unit, x + width / 2, 2.6 * u, width);
+      g.fillText(unit, x + width / 2, 2.6 * u, width - 1.2 * u);
       if (!known(value)) return;
       const shown = value * factor;
       const y = at(shown);
@@ -387,7 +386,7 @@ export default {
       g.font = font(2.2);
       g.fillStyle = INK;
       const text = full > 100 ? (Math.round(shown / 10) * 10).toFixed(0) : shown.toFixed(1);
-      g.fillText(text, x + width / 2, bottom - Math.max(2.2 * u, 5), width);
+      g.fillText(text, x + width / 2, bottom - Math.max(2.2 * u, 5), width - 1.2 * u);
     },
     ribbon({ g, u, w, h, font }, angles) {
       const height = 9 * u;
@@ -496,8 +495,8 @@ function triangle(g, x, y, half, height) {
   g.fill();
 }
 
-// Of the scale of climb; the smallest letters need 22 pixels.
-const climbWidth = (u) => Math.max(5 * u, 22);
+// Of the scale of climb, whose longest mark is 1200 ft/min; the smallest letters need 34 pixels.
+const climbWidth = (u) => Math.max(7 * u, 34);
 
 // How much of a tape is seen, and its ticks: read at a glance in every unit.
 function niceSpan(factor, isSpeed) {

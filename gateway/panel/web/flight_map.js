@@ -10,13 +10,15 @@ const MAX_DOTS = 2000;
 const MAX_TOWNS = 60;
 const LINE_GAP = 90; // least pixels between two lines of the grid
 const GRID_ZOOM = 9; // from here on the grid is drawn over the coarse map
+const FAR_ZOOM = 13; // below it home is a small ring
 const NEAR_ZOOM = 14; // from here on the coarse map, accurate to kilometres, shows nothing
 const AIRCRAFT = {
   plane: "M16 2c1.4 0 2 2 2 5v5l12 6v3l-12-3v7l4 3v2l-6-1.6L10 30v-2l4-3v-7L2 21v-3l12-6V7c0-3 .6-5 2-5z",
   copter: "M16 3l4 7h-8zM8 8a5 5 0 1 1-.1 0zM24 8a5 5 0 1 1-.1 0zM8 19a5 5 0 1 1-.1 0zM24 19a5 5 0 1 1-.1 0zM13 12h6v9h-6z",
   none: "M16 3l9 25-9-6-9 6z",
 };
-const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
+const ORIGINS = { live: ["track", "fused"], recorded: ["recorded", "recorded"], "fused again": ["fused-again", "fused again"] };
+const look_of = (state) => (ORIGINS[state.origin] ?? ORIGINS.live)[0];
 const icon = (html, size) => L.divIcon({ html, className: "map-icon", iconSize: [size, size], iconAnchor: [size / 2, size / 2] });
 const at = (spot) => [spot.lat_deg, spot.lon_deg];
 
@@ -137,6 +139,19 @@ function load_base_map(url) {
   return base_map;
 }
 
+// The length of a round number of the page's units.
+const Scale = L.Control.Scale.extend({
+  _addScales(options, className, container) {
+    this._bar = L.DomUtil.create("div", className, container);
+  },
+  _updateScales(longest_m) {
+    const quantity = longest_m < mavgate.factor("distance") ? "length" : "distance";
+    const longest = longest_m / mavgate.factor(quantity);
+    const shown = this._getRoundNum(longest);
+    this._updateScale(this._bar, `${shown} ${mavgate.show(quantity, NaN)[1]}`, shown / longest);
+  },
+});
+
 export default {
   template: `
     <div class="map" :data-follow="follow">
@@ -159,11 +174,19 @@ export default {
       <form class="map-entry" v-if="full" @submit.prevent="locate">
         <input v-model="entry" placeholder="latitude, longitude" aria-label="Coordinates to show" :aria-invalid="entry !== '' && !entered">
         <button type="submit" :disabled="!entered" title="Show these coordinates">Show</button>
-        <button type="button" v-if="may_mark" :disabled="!entered" @click="$emit('position', entered)" title="Mark these coordinates or set home there">Mark …</button>
+        <button type="button" v-if="may_mark" :disabled="!entered" @click="locate() || ask(entered)" title="Mark these coordinates or set home there">Mark …</button>
       </form>
+      <div class="map-ask" v-if="asked" ref="ask" role="dialog" :aria-label="'Position ' + asked.text" :style="asked.style" @keydown.esc="asked = null">
+        <span class="figure title">{{ asked.text }}</span>
+        <span class="soft">{{ asked.title }}</span>
+        <button type="button" @click="act('mark')">Mark this position</button>
+        <button type="button" @click="act('home')">Set home here …</button>
+        <button type="button" v-if="asked.has_mark" @click="act('clear')">Clear the mark</button>
+        <button type="button" @click="asked = null">Cancel</button>
+      </div>
       <div class="map-legend" v-if="full">
-        <span class="key track">fused</span><span class="key fix">GPS</span>
-        <span v-for="origin in played" :key="origin" class="key" :class="origin.replace(' ', '-')">{{ origin }}</span>
+        <span v-for="[look, name] in paths" :key="look" class="key" :class="look" data-role="path">{{ paths.length > 1 ? name : "path" }}</span>
+        <span v-if="has_fixes" class="key fix">GPS</span>
         <span class="key circle" v-if="circle">95 % within {{ circle }}</span>
         <span class="key mark" v-if="way" data-role="way">{{ way }}</span>
       </div>
@@ -177,7 +200,7 @@ export default {
       return numbers.length === 2 && Math.abs(lat_deg) <= 90 && Math.abs(lon_deg) <= 180 ? { lat_deg, lon_deg } : null;
     },
   },
-  data: () => ({ follow: true, style: 0, position: "", copied: false, way: "", circle: "", played: [], offline: false, entry: "" }),
+  data: () => ({ follow: true, style: 0, position: "", copied: false, way: "", circle: "", paths: [], has_fixes: false, offline: false, entry: "", asked: null }),
 
   mounted() {
     const map = (this.map = L.map(this.$refs.map, {
@@ -187,7 +210,7 @@ export default {
     map.createPane("grid").style.zIndex = 150;
     map.createPane("base").style.zIndex = 160;
     map.createPane("fixes").style.zIndex = 390;
-    L.control.scale({ imperial: false }).addTo(map);
+    this.scale = new Scale().addTo(map);
     this.grid = new MetricGrid().addTo(map);
     this.dots = L.canvas({ pane: "fixes" });
     this.craft = {};
@@ -195,7 +218,8 @@ export default {
     this.bearing = L.polyline([], { weight: 2, dashArray: "6 6" });
     this.home = L.marker([0, 0], { icon: icon('<div class="pin home">H</div>', 22), interactive: false, keyboard: false });
     this.accuracy = L.circle([0, 0], { radius: 1, weight: 1, fillOpacity: 0.12, interactive: false });
-    map.on("click", (event) => this.full && this.$emit("position", { lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
+    map.on("click", (event) => this.may_mark && this.ask({ lat_deg: event.latlng.lat, lon_deg: event.latlng.wrap().lng }));
+    map.on("move zoom resize", () => this.asked && this.place_question());
     map.on("dragstart", () => (this.follow = false));
     this.$watch("style", () => this.set_style());
     // A map that was added is shown where there was none.
@@ -204,6 +228,8 @@ export default {
     });
     this.$watch("offline", () => this.set_base());
     map.on("zoomend", () => this.set_base());
+    // Further out the sign of home would cover names.
+    map.on("zoomend", () => (this.$el.dataset.far = map.getZoom() < FAR_ZOOM));
     this.set_style();
     this.paint();
     this.stop_theme = mavgate.watch_theme(() => this.paint());
@@ -287,10 +313,10 @@ export default {
     make(id, state) {
       const path = `<svg viewBox="0 0 32 32" class="craft"><path d="${AIRCRAFT[state.model] ?? AIRCRAFT.none}"/></svg>`;
       const one = {
-        marker: L.marker(at(state), { icon: icon(path, 34), title: `Aircraft ${id}`, interactive: false, keyboard: false }).addTo(this.map),
+        marker: L.marker(at(state), { icon: icon(path, 34), title: state.title, interactive: false, keyboard: false }).addTo(this.map),
         version: -1,
-        colour: COLOURS[state.origin] ?? "track",
-        track: L.polyline([], { color: mavgate.colour(COLOURS[state.origin] ?? "track"), weight: 3, interactive: false }).addTo(this.map),
+        colour: look_of(state),
+        track: L.polyline([], { color: mavgate.colour(look_of(state)), weight: 3, interactive: false }).addTo(this.map),
         fixes: L.layerGroup().addTo(this.map),
       };
       return one;
@@ -333,8 +359,15 @@ export default {
         for (const layer of [one.marker, one.track, one.fixes]) layer.remove();
         delete this.craft[id];
       }
-      const played = Object.keys(COLOURS).filter((origin) => Object.values(mavgate.vehicles).some((v) => v.origin === origin));
-      if (String(played) !== String(this.played)) this.played = played;
+      const drawn = Object.keys(this.craft).map((id) => mavgate.vehicles[id]);
+      const paths = Object.values(ORIGINS).filter(([look]) => drawn.some((state) => look_of(state) === look));
+      if (String(paths) !== String(this.paths)) this.paths = paths;
+      this.has_fixes = Object.values(this.craft).some((one) => one.dots > 0);
+      if (this.units !== mavgate.units) {
+        this.units = mavgate.units;
+        this.scale._update();
+        this.grid.draw();
+      }
       this.draw_selected(mavgate.state);
     },
     draw_selected(state) {
@@ -386,6 +419,24 @@ export default {
       this.located ??= L.circleMarker([0, 0], { radius: 9, weight: 2, fill: false, interactive: false });
       this.located.setStyle({ color: this.mark_colour }).setLatLng(at(this.entered)).addTo(this.map);
       this.map.setView(at(this.entered), Math.max(this.map.getZoom(), 15), { animate: false });
+    },
+    // Ask next to a position what to do there.
+    ask(spot) {
+      const state = mavgate.state;
+      if (!state) return;
+      this.asked = { ...spot, text: `${spot.lat_deg.toFixed(6)}, ${spot.lon_deg.toFixed(6)}`, title: state.title, has_mark: Boolean(state.mark), style: {} };
+      this.place_question();
+      this.$nextTick(() => this.$refs.ask?.querySelector("button").focus({ preventScroll: true }));
+    },
+    place_question() {
+      const { x, y } = this.map.latLngToContainerPoint(at(this.asked));
+      const { x: width, y: height } = this.map.getSize();
+      const side = x > width / 2 ? { right: `${width - x + 12}px` } : { left: `${x + 12}px` };
+      this.asked.style = { ...side, ...(y > height / 2 ? { bottom: `${height - y - 12}px` } : { top: `${y - 12}px` }) };
+    },
+    act(what) {
+      this.$emit(what, { lat_deg: this.asked.lat_deg, lon_deg: this.asked.lon_deg });
+      this.asked = null;
     },
     clear() {
       mavgate.clear_tracks();

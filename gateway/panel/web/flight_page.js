@@ -12,12 +12,12 @@ const PARTS = [
   ["Height", "m", [["alt_home_m", "above home"], ["alt_amsl_m", "above sea"]]],
   ["Speed", "m/s", [["groundspeed_mps", "ground speed"], ["airspeed_mps", "airspeed"], ["climb_mps", "climb"]]],
   ["Attitude", "°", [["roll_deg", "roll"], ["pitch_deg", "pitch"]]],
-  ["Heading", "°", [["heading_deg", "heading"]]],
+  ["Heading", "°", [["heading_deg", "heading"]], true],
   ["Position accuracy", "m", [["pos_std_m", "standard deviation"]]],
   ["Satellites", "", [["satellites", "satellites"]]],
   ["Battery", "V", [["battery_v", "voltage"]]],
 ];
-const COMPARED = [["roll_deg", "Roll", "°"], ["pitch_deg", "Pitch", "°"], ["yaw_deg", "Heading", "°"], ["alt_amsl_m", "Height above sea", "m"]];
+const COMPARED = [["roll_deg", "Roll", "°"], ["pitch_deg", "Pitch", "°"], ["yaw_deg", "Heading", "°", true], ["alt_amsl_m", "Height above sea", "m"]];
 const YEAR_2000_US = 946_684_800_000_000; // an earlier time is that of no calendar
 const rad = Math.PI / 180;
 
@@ -46,13 +46,6 @@ function add_angles(columns) {
   return angles;
 }
 
-function clock(seconds) {
-  const whole = Math.max(0, Math.floor(seconds));
-  const two = (n) => String(n).padStart(2, "0");
-  const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
-  return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
-}
-
 export default {
   components: { display, scene, "flight-map": map, numbers, plots },
   template: `
@@ -60,7 +53,7 @@ export default {
       <h1>{{ flight.name }}</h1>
       <span class="soft">{{ facts }}</span>
       <span class="spring"></span>
-      <select v-if="ids.length > 1" v-model="selected" aria-label="Aircraft"><option v-for="id in ids" :key="id" :value="id">Aircraft {{ id }}</option></select>
+      <select v-if="ids.length > 1" v-model="selected" aria-label="Aircraft"><option v-for="id in ids" :key="id" :value="id">{{ titles[id] }}</option></select>
       <select v-model="units" aria-label="Units"><option>metric</option><option>imperial</option><option>aviation</option></select>
       <button type="button" @click="theme" aria-label="Light or dark">{{ dark ? "Light" : "Dark" }}</button>
     </header>
@@ -94,36 +87,37 @@ export default {
   },
   computed: {
     text() {
-      return `${clock(this.at_s)} of ${clock(this.duration_s)}`;
+      return `${mavgate.clock(this.at_s)} of ${mavgate.clock(this.duration_s)}`;
     },
     facts() {
       const begin = this.flight.begin_us > YEAR_2000_US ? `${new Date(this.flight.begin_us / 1000).toISOString().slice(0, 16).replace("T", " ")} UTC, ` : "";
-      return `${begin}${clock(this.duration_s)}, ${(this.length_m() / 1000).toFixed(1)} km`;
+      return `${begin}${mavgate.duration(this.duration_s)}, ${(this.length_m() / 1000).toFixed(1)} km`;
     },
     groups() {
       const columns = mavgate.histories[this.selected];
       if (!columns) return [];
       const time_s = columns.time_us.map((us) => us / 1e6);
       const all = { ...columns, ...this.angles[this.selected] };
-      const shown = PARTS.map(([title, unit, series]) => ({
-        title, unit, series: series.filter(([key]) => all[key]?.some((v) => Number.isFinite(v) && v !== 0)).map(([key, name]) => ({ name, time_s, values: all[key] })),
+      const shown = PARTS.map(([title, unit, series, is_heading]) => ({
+        title, unit, is_heading, series: series.filter(([key]) => all[key]?.some((v) => Number.isFinite(v) && v !== 0)).map(([key, name]) => ({ name, time_s, values: all[key] })),
       })).filter(({ series }) => series.length);
       const compared = Object.entries(this.compared);
-      for (const [key, title, unit] of compared.length ? COMPARED : [])
-        shown.push({ title: `${title}, estimators compared`, unit, series: compared.map(([name, one]) => ({ name, time_s: one.time_us.map((us) => us / 1e6), values: one[key] })) });
+      for (const [key, title, unit, is_heading] of compared.length ? COMPARED : [])
+        shown.push({ title: `${title}, estimators compared`, unit, is_heading, series: compared.map(([name, one]) => ({ name, time_s: one.time_us.map((us) => us / 1e6), values: one[key] })) });
       return shown;
     },
   },
   created() {
     this.angles = {};
+    this.titles = Object.fromEntries(this.flight.aircraft.map(({ system_id, title }) => [system_id, title]));
     this.compared = Object.fromEntries(Object.entries(this.flight.compared).map(([name, packed]) => [name, Object.fromEntries(Object.entries(packed).map(([key, values]) => [key, column(values)]))]));
     for (const aircraft of this.flight.aircraft) {
       const id = String(aircraft.system_id);
       const columns = (mavgate.histories[id] = columns_of(aircraft.columns));
       this.angles[id] = add_angles(columns);
-      mavgate.vehicles[id] = { system_id: aircraft.system_id, model: aircraft.model, origin: "live", generation: 0, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
+      mavgate.vehicles[id] = { system_id: aircraft.system_id, title: aircraft.title, model: aircraft.model, origin: "live", generation: 0, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
       const track = mavgate.track(id);
-      track.points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n] ?? 0]).filter(([lat]) => lat !== null);
+      track.points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n] ?? 0, columns.time_us[n]]).filter(([lat]) => lat !== null);
       track.version = 1;
       this.duration_s = Math.max(this.duration_s, columns.time_us.at(-1) / 1e6);
     }
@@ -154,7 +148,7 @@ export default {
     this.go(0);
   },
   methods: {
-    clock,
+    clock: (seconds) => mavgate.clock(seconds),
     length_m() {
       const points = mavgate.track(this.selected).points;
       return points.reduce((sum, point, n) => (n ? sum + mavgate.distance_m(points[n - 1], point) : 0), 0);

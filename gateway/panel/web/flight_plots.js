@@ -7,6 +7,8 @@ const DASHES = [[], [7, 4], [2, 3], [8, 3, 2, 3], [12, 4], [2, 6]];
 const LEFT = 56;
 const RIGHT = 10;
 const BOTTOM = 20;
+const WHOLE_TURN = [-8, 368]; // of headings, with a margin
+const LEAST_MARKS = 5; // of the time axis
 const NARROW = 620; // below it the names of the lines have a row of their own
 
 export default {
@@ -60,14 +62,14 @@ export default {
       const narrow = width < NARROW;
       const top = narrow ? 42 : 26;
       const x = (t) => LEFT + ((t - from) / (to - from)) * (width - LEFT - RIGHT);
-      const [low, high] = range_of(group.series, from, to);
+      const [low, high] = group.is_heading ? WHOLE_TURN : range_of(group.series, from, to);
       const y = (v) => height - BOTTOM - ((v - low) / (high - low)) * (height - top - BOTTOM);
       const [ink, soft, line] = ["ink", "soft", "line"].map(mavgate.colour);
-      pen.font = "11px system-ui, sans-serif";
+      pen.font = "12px system-ui, sans-serif";
       pen.lineWidth = 1;
       pen.textBaseline = "middle";
       pen.textAlign = "right";
-      for (const tick of ticks(low, high, 4)) {
+      for (const tick of group.is_heading ? [0, 90, 180, 270, 360] : ticks(low, high, 4)) {
         pen.strokeStyle = line;
         pen.beginPath();
         pen.moveTo(LEFT, y(tick));
@@ -77,14 +79,14 @@ export default {
         pen.fillText(Number(tick.toPrecision(6)), LEFT - 6, y(tick));
       }
       pen.textAlign = "center";
-      for (const tick of ticks(from, to, Math.max(2, width / 110), [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600])) {
+      for (const tick of ticks(from, to, Math.max(LEAST_MARKS, width / 110), [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600])) {
         pen.strokeStyle = line;
         pen.beginPath();
         pen.moveTo(x(tick), top);
         pen.lineTo(x(tick), height - BOTTOM);
         pen.stroke();
         pen.fillStyle = soft;
-        pen.fillText(clock(tick), x(tick), height - 8);
+        pen.fillText(mavgate.clock(tick), x(tick), height - 8);
       }
       const colours = document.body.classList.contains("body--dark") ? DARK : LIGHT;
       pen.textAlign = "left";
@@ -94,7 +96,7 @@ export default {
       pen.fillText(title, LEFT, 12);
       let label_x = narrow ? LEFT : LEFT + pen.measureText(title).width + 16;
       const label_y = narrow ? 29 : 12;
-      pen.font = "11px system-ui, sans-serif";
+      pen.font = "12px system-ui, sans-serif";
       pen.save();
       group.series.forEach(({ name }, n) => {
         pen.strokeStyle = pen.fillStyle = colours[n % colours.length];
@@ -215,11 +217,4 @@ function ticks(low, high, count, steps) {
   const found = [];
   for (let n = Math.ceil(low / step); n * step <= high; n++) found.push(n * step);
   return found;
-}
-
-function clock(seconds) {
-  const whole = Math.max(0, Math.round(seconds));
-  const two = (n) => String(n).padStart(2, "0");
-  const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
-  return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
 }

@@ -14,6 +14,8 @@ const SLOWEST_MS = 400;
 const LATE_MS = 45; // between two turns of the browser's own
 const VIEWS = { chase: "Chase", ground: "From the ground", cockpit: "Cockpit", above: "From above", side: "From the side" };
 const SPAN_M = 2; // of the models
+const STRONG_US = 90e6; // the path of this long before the shown moment stands out
+const FAINT = 0.2; // of the opacity of the rest, which would hide the aircraft
 const LEAST_HEIGHT_M = 0.3;
 const HEIGHT_ERROR_M = 5;
 const COLOURS = { recorded: "recorded", "fused again": "fused-again" };
@@ -127,11 +129,15 @@ const MODELS = { plane, copter, heli: copter };
 const LINE_SHADER = `
   uniform vec2 resolution;
   uniform float width;
+  uniform vec2 strong;
   attribute vec3 begin;
   attribute vec3 end;
   varying float side;
+  varying float strength;
   void main() {
     side = position.y;
+    float number = float(gl_InstanceID);
+    strength = number >= strong.x && number < strong.y ? 1.0 : FAINT;
     vec4 from = projectionMatrix * modelViewMatrix * vec4(begin, 1.0);
     vec4 to = projectionMatrix * modelViewMatrix * vec4(end, 1.0);
     // What lies behind the eye is cut off at the near plane, where w is small but positive.
@@ -153,8 +159,9 @@ const LINE_COLOUR = `
   uniform vec3 colour;
   uniform float opacity;
   varying float side;
+  varying float strength;
   void main() {
-    gl_FragColor = vec4(colour, opacity * (1.0 - smoothstep(0.45, 1.0, abs(side))));
+    gl_FragColor = vec4(colour, opacity * strength * (1.0 - smoothstep(0.45, 1.0, abs(side))));
     #include <colorspace_fragment>
   }`;
 
@@ -171,8 +178,9 @@ class WideLine {
     geometry.setAttribute("end", new THREE.InterleavedBufferAttribute(this.later, 3, 0));
     this.material = new THREE.ShaderMaterial({
       vertexShader: LINE_SHADER,
+      defines: { FAINT },
       fragmentShader: LINE_COLOUR,
-      uniforms: { resolution: { value: new THREE.Vector2(1, 1) }, width: { value: width }, colour: { value: new THREE.Color(colour) }, opacity: { value: opacity } },
+      uniforms: { resolution: { value: new THREE.Vector2(1, 1) }, width: { value: width }, colour: { value: new THREE.Color(colour) }, opacity: { value: opacity }, strong: { value: new THREE.Vector2(0, TAIL) } },
       transparent: true, depthWrite: false, side: THREE.DoubleSide,
     });
     this.mesh = new THREE.Mesh(geometry, this.material);
@@ -191,6 +199,7 @@ class Path {
     this.count = 0;
     this.version = -1;
     this.read = 0;
+    this.time_us = new Float64Array(TAIL);
     this.line = new WideLine(colour, 3, 1);
     this.shadow = new WideLine("#000000", 2.4, 0.25);
     this.stalk = new WideLine(colour, 2, 0.6);
@@ -203,18 +212,33 @@ class Path {
   resize(width, height) {
     for (const line of this.lines) line.material.uniforms.resolution.value.set(width, height);
   }
-  // Bring the drawn path up to date with that of the telemetry.
-  update(track, place) {
+  // Bring the drawn path up to date with that of the telemetry, and with the shown moment.
+  update(track, place, now_us) {
+    this.extend(track, place);
+    const [from, to] = [now_us - STRONG_US, now_us].map((time_us) => this.row_at(time_us));
+    for (const line of [this.line, this.shadow]) line.material.uniforms.strong.value.set(from, to);
+  }
+  // The first row that is not before a moment.
+  row_at(time_us) {
+    let [low, high] = [0, this.count];
+    while (low < high) {
+      const middle = (low + high) >> 1;
+      if (this.time_us[middle] < time_us) low = middle + 1;
+      else high = middle;
+    }
+    return low;
+  }
+  extend(track, place) {
     if (this.version !== track.version) {
       this.version = track.version;
       this.count = 0;
       this.read = Math.max(0, track.points.length - TAIL / 2);
     }
     if (this.read === track.points.length) return;
-    for (; this.read < track.points.length; this.read++) this.add(place(...track.points[this.read]));
+    for (; this.read < track.points.length; this.read++) this.add(place(...track.points[this.read]), track.points[this.read][3]);
     for (const line of [this.line, this.shadow]) line.show(this.count);
   }
-  add(point) {
+  add(point, time_us) {
     const at = this.line.positions;
     if (this.count) {
       const [x, y, z] = at.subarray((this.count - 1) * 3, this.count * 3);
@@ -223,9 +247,11 @@ class Path {
     if (this.count === TAIL) {
       // The older half goes, so that moving it is seldom.
       for (const line of [this.line, this.shadow]) line.positions.copyWithin(0, (TAIL / 2) * 3);
+      this.time_us.copyWithin(0, TAIL / 2);
       this.count = TAIL / 2;
     }
     at.set([point.x, point.y, point.z], this.count * 3);
+    this.time_us[this.count] = time_us;
     this.shadow.positions.set([point.x, point.y, 0.02], this.count * 3);
     this.count += 1;
   }
@@ -317,11 +343,11 @@ export default {
         grid.material.transparent = true;
         this.scene.add(grid);
       }
-      const home = new THREE.Group();
-      this.pad = new THREE.Mesh(new THREE.RingGeometry(2.2, 3, 40), new THREE.MeshBasicMaterial({ side: THREE.DoubleSide }));
-      this.pole = new THREE.Mesh(new THREE.CylinderGeometry(0.03, 0.03, 2, 8), new THREE.MeshBasicMaterial());
+      const home = (this.home = new THREE.Group());
+      this.pad = new THREE.Mesh(new THREE.RingGeometry(0.55, 0.75, 40), new THREE.MeshBasicMaterial({ side: THREE.DoubleSide }));
+      this.pole = new THREE.Mesh(new THREE.CylinderGeometry(0.03, 0.03, 1.5, 8), new THREE.MeshBasicMaterial());
       this.pole.rotation.x = Math.PI / 2;
-      this.pole.position.z = 1;
+      this.pole.position.z = 0.75;
       home.add(this.pad, this.pole);
       this.beacon = new THREE.Mesh(new THREE.CylinderGeometry(0.5, 0.5, 60, 10), new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.55 }));
       this.beacon.rotation.x = Math.PI / 2;
@@ -373,7 +399,7 @@ export default {
           craft.point = point;
           craft.moved_ms = now_ms;
         }
-        craft.path.update(mavgate.track(id), (...spot) => this.place(...spot));
+        craft.path.update(mavgate.track(id), (...spot) => this.place(...spot), mavgate.past_us ?? mavgate.now_us);
         craft.state = state;
         craft.turned_ms = now_ms;
       }
@@ -443,7 +469,11 @@ export default {
         const corner = stacked ? [0, i === 0 ? height / 2 : 0] : [i * size[0], 0];
         camera.aspect = size[0] / size[1];
         if (craft?.state) this.aim(view, camera, craft, i);
-        for (const other of Object.values(this.aircraft)) this.scale(other, camera, view, other === craft);
+        for (const other of Object.values(this.aircraft)) {
+          this.scale(other.group, camera, other === craft ? 0.13 : 0.07);
+          other.group.visible = !(view === "cockpit" && other === craft);
+        }
+        this.scale(this.home, camera, 0.04);
         camera.updateProjectionMatrix();
         const ratio = this.renderer.getPixelRatio();
         for (const other of Object.values(this.aircraft)) other.path.resize(...size.map((pixels) => pixels * ratio));
@@ -455,12 +485,12 @@ export default {
       this.$el.dataset.model = craft?.model ?? "none";
       this.$el.dataset.frames = Number(this.$el.dataset.frames ?? 0) + 1;
     },
-    // A model two metres wide would vanish a kilometre away; it is drawn larger there.
-    scale(craft, camera, view, selected) {
-      const distance = camera.position.distanceTo(craft.group.position);
+    // A model two metres wide would vanish a kilometre away; it is drawn larger there: at least this
+    // share of the picture's height. The sign of home is always smaller than an aircraft.
+    scale(group, camera, share) {
+      const distance = camera.position.distanceTo(group.position);
       const apparent = (2 * Math.tan((camera.fov * rad) / 2) * distance) / SPAN_M;
-      craft.group.scale.setScalar(Math.max(1, apparent * (selected ? 0.13 : 0.07)));
-      craft.group.visible = !(view === "cockpit" && selected);
+      group.scale.setScalar(Math.max(1, apparent * share));
     },
     aim(view, camera, craft, i) {
       const { position, quaternion } = craft.group;

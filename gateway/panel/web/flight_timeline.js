@@ -6,11 +6,11 @@ const STEP_S = { ArrowLeft: -5, ArrowRight: 5, PageDown: -60, PageUp: 60 };
 export default {
   template: `
     <div class="flight-timeline">
+      <span class="figure flight-time">{{ text }}</span>
       <div class="time-slider" role="slider" tabindex="0" aria-label="Moment of the flight" :aria-valuemin="0"
         :aria-valuemax="Math.round(span_s)" :aria-valuenow="Math.round(at_s)" :aria-valuetext="text"
         @pointerdown="grab" @pointermove="drag" @pointerup="held = false" @keydown="key">
         <canvas ref="canvas"></canvas>
-        <span class="time-slider-text figure">{{ text }}</span>
       </div>
       <button type="button" :aria-pressed="live" @click="to_live" title="Show the present">{{ live ? "● Live" : "Go to live" }}</button>
     </div>`,
@@ -58,7 +58,7 @@ export default {
       this.span_s = (Math.max(mavgate.now_us, times.at(-1)) - times[0]) / 1e6;
       this.at_s = this.live ? this.span_s : (mavgate.past_us - times[0]) / 1e6;
       const back = Math.round(this.span_s - this.at_s);
-      this.text = this.live ? `flight of ${clock(this.span_s)}` : `${clock(this.at_s)}, ${clock(back)} ago`;
+      this.text = this.live ? mavgate.duration(this.span_s) : `${mavgate.duration(back)} ago`;
       this.draw();
     },
     draw() {
@@ -119,10 +119,3 @@ export default {
     },
   },
 };
-
-function clock(seconds) {
-  const whole = Math.max(0, Math.round(seconds));
-  const two = (n) => String(n).padStart(2, "0");
-  const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
-  return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
-}

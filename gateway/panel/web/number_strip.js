@@ -7,9 +7,9 @@ const rad = Math.PI / 180;
 export default {
   template: `
     <dl class="number-strip" aria-label="Flight in numbers">
-      <div v-for="item in items" :key="item.name" :class="{ old: item.age_s > limit }" :data-item="item.name">
-        <dt>{{ item.name }}</dt>
-        <dd><b>{{ item.text }}</b> <span class="unit">{{ item.unit }}</span> <span v-if="item.age_s > limit" class="age">{{ Math.round(item.age_s) }} s old</span></dd>
+      <div v-for="item in items" :key="item.name" :class="{ old: item.age_s > limit, wide: item.is_wide }" :data-item="item.name">
+        <dt>{{ item.name }} <span v-if="item.age_s > limit" class="age">{{ Math.round(item.age_s) }} s old</span></dt>
+        <dd><b>{{ item.text }}</b> <span class="unit">{{ item.unit }}</span></dd>
       </div>
     </dl>`,
   data: () => ({ items: [], limit: OLD_S }),
@@ -36,6 +36,8 @@ function items_of(state) {
   const heading = Number.isFinite(angles[2]) ? angles[2] : state.heading_deg;
   const here = [state.lat_deg, state.lon_deg];
   const item = (name, text, unit, age_name) => ({ name, text, unit, age_s: age(age_name) });
+  // Latitude and longitude are one item, which no line break parts.
+  const position = (name, lat, lon) => ({ ...item(name, Number.isFinite(lat) ? `${lat.toFixed(6)}, ${lon.toFixed(6)}` : "—", "°", "position_s"), is_wide: true });
   const quantity = (name, kind, value, age_name, digits = 1) => item(name, ...mavgate.show(kind, value, digits), age_name);
   const way = (name, spot, distance_m, bearing_deg) => {
     if (!spot || !Number.isFinite(here[0])) return [];
@@ -54,10 +56,9 @@ function items_of(state) {
     quantity("Above sea", "altitude", state.alt_amsl_m, "position_s"),
     ...way("To home", state.home, null, null),
     ...way("To mark", state.mark, state.mark_distance_m, state.mark_bearing_deg),
-    ...(state.mark ? [item("Mark at", `${state.mark.lat_deg.toFixed(6)}, ${state.mark.lon_deg.toFixed(6)}`, "°", "position_s")] : []),
-    item("Latitude", angle(state.lat_deg, 6), "°", "position_s"),
-    item("Longitude", angle(state.lon_deg, 6), "°", "position_s"),
-    item("Satellites", state.fix_type ? String(Math.round(state.satellites)) : "—", "", "gps_s"),
+    position("Latitude, longitude", ...here),
+    ...(state.mark ? [position("Mark at", state.mark.lat_deg, state.mark.lon_deg)] : []),
+    item("Satellites", state.fix_type ? angle(state.satellites, 0) : "—", "", "gps_s"),
     ...(Number.isFinite(state.battery_v) ? [item("Battery", state.battery_v.toFixed(2), Number.isFinite(state.battery_percent) ? `V ${Math.round(state.battery_percent)} %` : "V", "battery_s")] : []),
   ];
 }

@@ -46,6 +46,17 @@
       return [(value / factor).toFixed(digits), unit];
     },
     factor: (quantity) => FACTORS[bus.units][quantity][0],
+    // A moment of a flight: 3:12, 1:03:12.
+    clock(seconds) {
+      const [h, m, s] = parts_of(seconds);
+      const two = (n) => String(n).padStart(2, "0");
+      return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
+    },
+    // A span of time, which must not read as a time of day: 14 min 42 s.
+    duration(seconds) {
+      const [h, m, s] = parts_of(seconds);
+      return h ? `${h} h ${m} min` : m ? `${m} min ${s} s` : `${s} s`;
+    },
     // A colour of the style sheet, as canvas and WebGL want it.
     colour: (name) => getComputedStyle(document.body).getPropertyValue(`--${name}`).trim(),
     // Calls back when the page turns dark or light, not when another class of its body is set again.
@@ -66,8 +77,8 @@
       if (id === bus.selected) return bus.state;
       return bus.histories[id] ? state_at(bus.histories[id], bus.past_us, bus.vehicles[id]) : bus.vehicles[id];
     },
-    // The path of an aircraft: `points` and `fixes` as [lat, lon, alt]. They only grow at their end
-    // while `version` stays.
+    // The path of an aircraft: `points` and `fixes`, which begin with [lat, lon, alt, time_us]. They
+    // only grow at their end while `version` stays.
     track: (id) => (tracks[id] ??= new_track()),
     clear_tracks() {
       for (const track of Object.values(tracks)) reset(track);
@@ -101,6 +112,11 @@
     },
   };
   window.mavgate = bus;
+
+  function parts_of(seconds) {
+    const whole = Math.max(0, Math.floor(seconds));
+    return [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
+  }
 
   function publish() {
     for (const callback of subscribers) {
@@ -173,7 +189,7 @@
     // Also after another view was shown: the server has what came meanwhile.
     if (track.time_us === null || bus.now_us - track.time_us > GAP_US) fill(id, track);
     track.time_us = bus.now_us;
-    add(track, [state.lat_deg, state.lon_deg, state.alt_amsl_m ?? 0]);
+    add(track, [state.lat_deg, state.lon_deg, state.alt_amsl_m ?? 0, bus.now_us]);
     if (state.fix && track.fix !== (track.fix = `${state.fix.lat_deg} ${state.fix.lon_deg}`)) {
       track.fixes.push([state.fix.lat_deg, state.fix.lon_deg]);
     }

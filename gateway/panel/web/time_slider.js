@@ -1,20 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
-// A slider through a recording, with the altitudes of its aircraft drawn in it: that of the chosen
-// one filled, those of the others as lines.
+// A slider through a recording that is played, with the altitudes of its aircraft drawn in it: that of
+// the chosen one filled, those of the others as lines.
 export default {
   template: `
-    <div class="time-slider" role="slider" tabindex="0" aria-label="Moment of the recording"
-      :aria-valuemin="0" :aria-valuemax="Math.round(duration)" :aria-valuenow="Math.round(shown)"
-      :aria-valuetext="text(shown)" @pointerdown="grab" @pointermove="drag" @pointerup="drop" @keydown="key">
-      <canvas ref="canvas"></canvas>
-      <span class="time-slider-text figure">{{ text(shown) }} / {{ text(duration) }}</span>
+    <div class="flight-timeline spring">
+      <span class="figure flight-time">{{ text }}</span>
+      <div class="time-slider" ref="slider" role="slider" tabindex="0" aria-label="Moment of the playback"
+        :aria-valuemin="0" :aria-valuemax="Math.round(duration)" :aria-valuenow="Math.round(shown)"
+        :aria-valuetext="text" @pointerdown="grab" @pointermove="drag" @pointerup="drop" @keydown="key">
+        <canvas ref="canvas"></canvas>
+      </div>
     </div>`,
   props: { curves: Array, duration: Number, position: Number, playing: Boolean, speed: Number },
   data: () => ({ held: null, shown: 0 }),
+  computed: {
+    text() {
+      return `${mavgate.clock(this.shown)} of ${mavgate.clock(this.duration)}`;
+    },
+  },
   mounted() {
     this.updated_ms = performance.now();
     this.size = new ResizeObserver(() => this.draw());
-    this.size.observe(this.$el);
+    this.size.observe(this.$refs.slider);
     for (const name of ["curves", "duration"]) this.$watch(name, () => this.draw());
     this.$watch("position", () => (this.updated_ms = performance.now()));
     const turn = () => {
@@ -34,16 +41,10 @@ export default {
     this.size?.disconnect();
   },
   methods: {
-    text(seconds) {
-      const whole = Math.max(0, Math.floor(seconds));
-      const [h, m, s] = [Math.floor(whole / 3600), Math.floor(whole / 60) % 60, whole % 60];
-      const two = (n) => String(n).padStart(2, "0");
-      return h ? `${h}:${two(m)}:${two(s)}` : `${m}:${two(s)}`;
-    },
     draw() {
-      const { clientWidth: width, clientHeight: height } = this.$el;
+      const { slider, canvas } = this.$refs;
+      const { clientWidth: width, clientHeight: height } = slider;
       if (!width) return;
-      const canvas = this.$refs.canvas;
       const ratio = window.devicePixelRatio || 1;
       if (canvas.width !== width * ratio) {
         canvas.width = width * ratio;
@@ -57,7 +58,7 @@ export default {
       const heights = this.curves.flatMap((curve) => curve.alt_amsl_m);
       const low = Math.min(...heights);
       const high = Math.max(...heights, low + 1);
-      const y = (h) => height - 8 - ((h - low) / (high - low)) * (height - 30);
+      const y = (h) => height - 8 - ((h - low) / (high - low)) * (height - 12);
       const line = ({ time_s, alt_amsl_m }) => {
         const path = new Path2D();
         time_s.forEach((t, i) => path.lineTo(x(t), y(alt_amsl_m[i])));
@@ -81,25 +82,21 @@ export default {
       if (heights.length) {
         pen.strokeStyle = mavgate.colour("soft");
         for (const other of others) pen.stroke(line(other));
-        pen.fillStyle = mavgate.colour("soft");
-        pen.font = "11px system-ui";
-        pen.textAlign = "right";
-        pen.fillText(mavgate.show("altitude", high, 0).join(" "), width - 6, 14);
       }
       pen.fillStyle = mavgate.colour("accent");
       pen.fillRect(x(this.shown) - 1, 0, 2, height);
       pen.beginPath();
       pen.arc(Math.min(Math.max(x(this.shown), 6), width - 6), height - 7, 6, 0, 7);
       pen.fill();
-      this.$el.dataset.points = chosen?.time_s.length ?? 0;
-      this.$el.dataset.curves = this.curves.length;
+      slider.dataset.points = chosen?.time_s.length ?? 0;
+      slider.dataset.curves = this.curves.length;
     },
     at(event) {
-      const box = this.$el.getBoundingClientRect();
+      const box = this.$refs.slider.getBoundingClientRect();
       return Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) * this.duration;
     },
     grab(event) {
-      this.$el.setPointerCapture(event.pointerId);
+      event.currentTarget.setPointerCapture(event.pointerId);
       this.held = this.at(event);
     },
     drag(event) {

@@ -59,7 +59,15 @@ def test_path_has_a_few_points_a_second_and_fixes_apart(vehicle: VehicleState) -
 def test_fix_without_position_is_left_out(vehicle: VehicleState) -> None:
     vehicle.take(fix(0.0, 0.0, kind=mavlink.GPS_FIX_TYPE_NO_FIX, satellites=255), 0)
     now = vehicle.instant(0)
-    assert (now.fix, now.satellites, len(vehicle.fixes)) == (None, 0, 0)
+    assert (now.fix, len(vehicle.fixes)) == (None, 0)
+
+
+def test_satellites_that_are_not_counted_are_unknown(vehicle: VehicleState) -> None:
+    assert math.isnan(vehicle.instant(0).satellites)
+    vehicle.take(fix(*HERE, satellites=255), 0)
+    assert math.isnan(vehicle.instant(0).satellites)
+    vehicle.take(fix(*HERE, satellites=0), 1)
+    assert vehicle.instant(1).satellites == 0
 
 
 def test_mark_is_computed_from_distance_and_bearing(vehicle: VehicleState) -> None:

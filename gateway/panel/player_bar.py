@@ -1,0 +1,102 @@
+"""The player of a recording, below every view while one is open."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from nicegui import ui
+from nicegui.element import Element
+from nicegui.events import GenericEventArguments
+
+from gateway.panel.playback import SPEEDS, Playback, Profile
+from gateway.panel.view_context import WEB, ViewContext
+from gateway.panel.widgets import notify_failure, ongoing
+
+POSITION_S: Final = 0.25
+
+
+async def open_playback(context: ViewContext, name: str, *, fused_again: bool = False) -> None:
+    """Play a recording on this page, instead of the present one."""
+    folder = context.parts.recordings_folder
+    with ongoing(f"Opening {name} …"), notify_failure(context):
+        context.check_may_change()
+        await context.playback.open(folder, name, fused_again=fused_again)
+
+
+class TimeSlider(Element, component=WEB / "time_slider.js"):
+    """A slider through a recording; emits `seek` with seconds since its start."""
+
+
+class PlayerBar:
+    """Play, pause, speed and the time, built at the current place of the page."""
+
+    def __init__(self, context: ViewContext) -> None:
+        self._context = context
+        self._playback = context.playback
+        with ui.element("div").classes("player").props("data-role=player") as self._bar:
+            toggle = partial(self._play, self._playback.toggle)
+            self._toggle = ui.button(icon="pause", on_click=toggle)
+            self._toggle.props('round dense aria-label="Play or pause" title="Space"')
+            for icon, to, title in (("replay_10", "-10", "Back"), ("forward_10", "+10", "Ahead")):
+                seek = partial(self._play, self._playback.order, "seek", to=to)
+                button = ui.button(icon=icon, on_click=seek)
+                button.props("flat round dense").props["aria-label"] = f"{title} ten seconds"
+            self._slider = TimeSlider()
+            self._slider.on("seek", self._on_seek)
+            self._speed = ui.select(
+                {speed: f"{speed:g}×" for speed in SPEEDS}, value=1, on_change=self._on_speed
+            )
+            self._speed.props('dense borderless options-dense aria-label="Speed"')
+            self._fused_again = ui.switch("fused again next to it", on_change=self._on_fused_again)
+            close = ui.button(icon="close", on_click=partial(self._play, self._playback.close))
+            close.props('flat round dense aria-label="Close the playback"')
+        self._bar.set_visibility(False)
+        ui.timer(POSITION_S, self._show)
+
+    def _show(self) -> None:
+        playback, status = self._playback, self._playback.status
+        self._bar.set_visibility(status is not None)
+        if status is None:
+            return
+        self._fused_again.set_value(playback.has_fused_again)
+        playing = status["state"] == "playing"
+        self._toggle.props["icon"] = "pause" if playing else "play_arrow"
+        speed = status["speed"] or SPEEDS[-1]
+        self._speed.set_value(speed)
+        new = {
+            "curves": _curves_of(playback, self._context.system_id),
+            "duration": status["duration_s"],
+            "position": round(status["position_s"], 2),
+            "playing": playing,
+            "speed": speed,
+        }
+        for key, value in new.items():
+            if self._slider.props.get(key) != value:
+                self._slider.props[key] = value
+
+    async def _play(self, act: Callable[..., Any], *args: Any, **params: Any) -> None:
+        """Change the playback, and show its state."""
+        with notify_failure(self._context):
+            self._context.check_may_change()
+            if (answer := act(*args, **params)) is not None:
+                await answer
+            self._show()
+
+    async def _on_fused_again(self, event: Any) -> None:
+        name = self._playback.name
+        if name and event.value != self._playback.has_fused_again:
+            await open_playback(self._context, name, fused_again=event.value)
+
+    async def _on_seek(self, event: GenericEventArguments) -> None:
+        await self._play(self._playback.order, "seek", to=f"{float(event.args):.2f}")
+
+    async def _on_speed(self, event: Any) -> None:
+        status = self._playback.status
+        if status is not None and float(event.value) != (status["speed"] or SPEEDS[-1]):
+            await self._play(self._playback.order, "play.speed", speed=float(event.value))
+
+
+def _curves_of(playback: Playback, system_id: int | None) -> list[Profile]:
+    """Return the heights of all played aircraft, those of the selected one first."""
+    order = sorted(playback.aircraft, key=lambda key: (key != system_id, key))
+    return [playback.aircraft[key].profile for key in order]
