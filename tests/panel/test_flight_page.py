@@ -67,6 +67,20 @@ def test_recording_without_a_position_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.io
+def test_page_of_the_last_recording_has_its_name(tmp_path: Path) -> None:
+    flight_of(tmp_path, 30)
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'[recording]\nfolder = "{tmp_path}"\n')
+    output = tmp_path / "flight.html"
+    done = invoke("page", "last", "-o", str(output), "--no-compare", "-c", str(config))
+    assert done.exit_code == 0, done.output
+    page = output.read_text()
+    assert "<title>day</title>" in page
+    assert unpacked(page, "data")["name"] == "day"
+    assert unpacked(page, "data")["aircraft"][0]["title"] == "Plane 3"
+
+
+@pytest.mark.io
 def test_command_writes_one_file_and_overwrites_none(tmp_path: Path) -> None:
     flight_of(tmp_path, 30)
     output = tmp_path / "flight.html"

@@ -8,7 +8,7 @@ import typer
 from rich.progress import Progress
 
 from gateway.cli.support.options import folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import files_of
+from gateway.cli.support.recording_options import files_of, name_of
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.extras import require
 
@@ -51,6 +51,7 @@ def get(
         positions = [pair]
     else:
         files = files_of([Path(around)], folder_of(settings), "tlogs")
+        around = name_of(Path(around), files)
         flight = read_flight(files, read_options(settings), around)
         for history in flight.histories.values():
             positions += zip(history.columns["lat_deg"], history.columns["lon_deg"], strict=True)

@@ -19,6 +19,7 @@ from gateway.cli.support.recording_options import (
     files_of,
     fusion_of,
     load_flight,
+    name_of,
     print_remarks,
     progress_of,
 )
@@ -123,7 +124,7 @@ def page(
     files = files_of([flight], folder_of(gateway), "tlogs")
     options = read_options(gateway, columns, choice=fuse_with)
     with progress_of(files) as advance:
-        made = read_flight(files, replace(options, progress=advance), flight.name)
+        made = read_flight(files, replace(options, progress=advance), name_of(flight, files))
     if compare:
         tables = files_of([flight], folder_of(gateway), "tables")
         with progress_of(tables) as advance:

@@ -15,7 +15,7 @@ from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import folder_of
 from gateway.cli.support.terminal import console_of, progress_bar
 from gateway.recordings.files import TABLE, TLOG, FlightError, Position, SettingsChoice, format_of
-from gateway.recordings.index import RecordingError, find_recording
+from gateway.recordings.index import RecordingError, find_recording, recording_name
 from gateway.recordings.moment import Moment, parse_moment
 
 if TYPE_CHECKING:
@@ -124,6 +124,11 @@ def files_of(names: Iterable[Path], folder: Path, wanted: Wanted) -> list[Path]:
     return [file for name in names for file in _files_of(name, folder, wanted)]
 
 
+def name_of(wanted: Path, files: Sequence[Path]) -> str:
+    """Return the name of what was chosen: of a file, or of a recording that may be `last`."""
+    return wanted.name if _is_path(wanted) else recording_name(files[0])
+
+
 def _is_path(name: Path) -> bool:
     return name.exists() or name.name != str(name)
 
@@ -199,7 +204,7 @@ def load_flight(
         )
         try:
             flight, table, _ = flight_of_files(
-                parts, options, name=path.name, description=description, checked=True
+                parts, options, name=name_of(path, parts), description=description, checked=True
             )
         except ValueError as error:
             raise FlightError(str(error)) from error

@@ -15,7 +15,8 @@ import pytest
 from gateway.analysis.flight import Flight
 from gateway.cli.live.demo import recorded_line
 from gateway.cli.recorded import play
-from gateway.cli.support.recording_options import files_of
+from gateway.cli.support.options import read_options
+from gateway.cli.support.recording_options import files_of, load_flight
 from gateway.config import GatewaySettings, load
 from gateway.player import PlayerDaemon
 from gateway.recordings.columns import row_to_line
@@ -146,6 +147,14 @@ def test_existing_path_takes_precedence_over_a_name(tmp_path: Path) -> None:
     assert files_of([there, missing], tmp_path, "tables") == [there, missing]
     with pytest.raises(FlightError, match=r"gone\.tlog: no such file"):
         files_of([Path("gone.tlog")], tmp_path, "tables")
+
+
+def test_flight_is_named_by_its_recording_or_its_file(config: Path) -> None:
+    folder, settings = config.parent / "recordings", load(config)
+    (folder / "day_01_v1.csv").write_bytes((folder / "alps_01_v1.csv").read_bytes())
+    assert load_flight(Path("last"), settings, read_options(settings)).name == "day"
+    file = folder / "alps_01_v1.csv"
+    assert load_flight(file, settings, read_options(settings)).name == "alps_01_v1.csv"
 
 
 def test_only_names_need_a_choice_where_several_gateways_run(
