@@ -2,18 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 from gateway.aircraft import Aircraft
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, HubCounters, ListenerStats
-from gateway.printable import receiver_state
+from gateway.printable import figure, receiver_state
 from gateway.records import GpsFix, LinkReport, LoggedRequest, NavState, NodeStatus
 from gateway.units import counted
 from gateway.vehicle.plan import Location, distance_and_bearing
-
-UNKNOWN: Final = "—"
-"""Figure that is not known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +118,11 @@ def summary_line(snapshot: Snapshot) -> str:
     ]
     for vehicle_id, state in snapshot.states:
         roll, pitch, yaw = (math.degrees(angle) for angle in to_euler(state.q_nb))
-        position = f"{figure_of(state.lat_deg, '.6f')} {figure_of(state.lon_deg, '.6f')}"
+        position = f"{figure(state.lat_deg, '.6f')} {figure(state.lon_deg, '.6f')}"
         parts.append(
-            f"aircraft {vehicle_id} at {position} {figure_of(state.alt_amsl_m, '.1f')} m, "
-            f"roll {roll:+.0f} pitch {pitch:+.0f} yaw {yaw % 360.0:.0f}"
+            f"aircraft {vehicle_id} at {position} {figure(state.alt_amsl_m, '.1f')} m, "
+            f"roll {figure(roll, '+.0f')} pitch {figure(pitch, '+.0f')} "
+            f"yaw {figure(yaw % 360.0, '.0f')}"
         )
     parts.append(counted(len(snapshot.clients), "client"))
     return "; ".join(parts)
-
-
-def figure_of(value: float, spec: str) -> str:
-    """Format a number, or a dash for one that is not known."""
-    return format(value, spec) if math.isfinite(value) else UNKNOWN

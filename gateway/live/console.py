@@ -21,16 +21,9 @@ from rich.text import Text
 
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
-from gateway.printable import PrintableFormatter, receiver_state
+from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
-from gateway.status import (
-    UNKNOWN,
-    AircraftStatus,
-    RecorderStatus,
-    RelativeLocation,
-    Snapshot,
-    figure_of,
-)
+from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
 
 OUTAGE_US: Final = 2 * US_PER_S
@@ -205,7 +198,7 @@ def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
         grid.add_row(
             f"{node.node.vehicle_id}.{node.node.node_id}",
             f"{node.rate_hz:.0f}",
-            f"{100 * node.lost / total:.2f}" if total else UNKNOWN,
+            figure(100 * node.lost / total if total else None, ".2f"),
             _age(report.time_us, node.last_time_us),
             *_board_cells(boards.get(node.node), overruns, node),
         )
@@ -216,7 +209,7 @@ def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tup
     if board is None:
         return (*(UNKNOWN,) * 4, overruns, str(node.restarts), UNKNOWN)
     return (
-        f"{board.supply_mv / MV_PER_V:.2f}" if board.supply_mv else UNKNOWN,
+        figure(board.supply_mv / MV_PER_V if board.supply_mv else None, ".2f"),
         str(board.bus_errors),
         str(board.radio_failed),
         str(board.radio_retries),
@@ -239,14 +232,14 @@ def _aircraft(vehicle_id: int, state: NavState, known: AircraftStatus | None) ->
     grid = _Grid("aircraft", *heads, *fixes, "home m", "home at°", "mark m", "mark at°")
     grid.add_row(
         str(vehicle_id),
-        figure_of(roll, "+.1f"),
-        figure_of(pitch, "+.1f"),
-        figure_of(yaw % 360.0, ".1f"),
-        figure_of(state.lat_deg, ".6f"),
-        figure_of(state.lon_deg, ".6f"),
-        figure_of(state.alt_amsl_m, ".1f"),
-        figure_of(math.hypot(north, east), ".1f"),
-        figure_of(-down, "+.1f"),
+        figure(roll, "+.1f"),
+        figure(pitch, "+.1f"),
+        figure(yaw % 360.0, ".1f"),
+        figure(state.lat_deg, ".6f"),
+        figure(state.lon_deg, ".6f"),
+        figure(state.alt_amsl_m, ".1f"),
+        figure(math.hypot(north, east), ".1f"),
+        figure(-down, "+.1f"),
         *_fix_cells(known.fix if known else None),
         *_distance_cells(known.home if known else None),
         *_distance_cells(known.mark if known else None),
@@ -261,15 +254,15 @@ def _fix_cells(fix: GpsFix | None) -> tuple[str | Text, ...]:
     return (
         Text(name, style="" if fix.fix_ok else "red"),
         str(fix.satellites),
-        figure_of(fix.h_acc_m, ".1f"),
-        figure_of(fix.v_acc_m, ".1f"),
+        figure(fix.h_acc_m, ".1f"),
+        figure(fix.v_acc_m, ".1f"),
     )
 
 
 def _distance_cells(location: RelativeLocation | None) -> tuple[str, str]:
     if location is None or location.distance_m is None or location.bearing_deg is None:
         return UNKNOWN, UNKNOWN
-    return figure_of(location.distance_m, ".0f"), figure_of(location.bearing_deg, ".0f")
+    return figure(location.distance_m, ".0f"), figure(location.bearing_deg, ".0f")
 
 
 def _flags(state: NavState) -> Text:

@@ -204,7 +204,7 @@ def test_numbers_are_rounded_and_nan_is_a_dash() -> None:
     table = ReportTable(
         "t", pd.DataFrame({"a": [1.23456, float("nan")], "b": ["x", "y"]}), "", digits=1
     )
-    assert table.rows() == [["1.2", "x"], ["–", "y"]]
+    assert table.rows() == [["1.2", "x"], ["—", "y"]]
     assert [table.is_text(0), table.is_text(1)] == [False, True]
 
 

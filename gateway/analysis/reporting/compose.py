@@ -26,6 +26,7 @@ from gateway.analysis.reporting.raw_sensors import (
     noise,
     timing,
 )
+from gateway.printable import figure
 
 COLOUR_MAP: Final = "viridis"
 LINE_POINTS: Final = 1500
@@ -80,7 +81,7 @@ def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
     outages = figures.gps_outages_s
     longest = f"longest {max(end - begin for begin, end in outages):.1f} s" if outages else ""
     climb = _feet(60 * figures.climb_mps)
-    knots = f"{figures.fastest_mps * KNOTS_PER_MPS:.1f} kt"
+    knots = figure(figures.fastest_mps * KNOTS_PER_MPS, ".1f", "kt")
     rows = [
         ("recorded", case.flight.duration_s, "s", ""),
         ("in the air", figures.airborne_s, "s", ""),
@@ -97,7 +98,7 @@ def _figures_table(case: Case, figures: PilotFigures) -> pd.DataFrame:
 
 
 def _feet(metres: float) -> str:
-    return f"{metres * FEET_PER_M:.0f} ft"
+    return figure(metres * FEET_PER_M, ".0f", "ft")
 
 
 def _draw_map(case: Case, width_in: float) -> Figure:
@@ -220,10 +221,10 @@ def _facts(case: Case) -> list[Fact]:
     return [
         *begin,
         Fact(f"{minutes}:{seconds:02d}", "minutes in the air"),
-        Fact(f"{figures.distance_m / 1000:.2f} km", "flown over ground"),
-        Fact(f"{figures.highest_m:.0f} m", "highest above the first fix"),
-        Fact(f"{figures.fastest_mps:.1f} m/s", "fastest over ground"),
-        Fact(f"{figures.farthest_m:.0f} m", "farthest from the first fix"),
+        Fact(figure(figures.distance_m / 1000, ".2f", "km"), "flown over ground"),
+        Fact(figure(figures.highest_m, ".0f", "m"), "highest above the first fix"),
+        Fact(figure(figures.fastest_mps, ".1f", "m/s"), "fastest over ground"),
+        Fact(figure(figures.farthest_m, ".0f", "m"), "farthest from the first fix"),
         Fact(_sum_text(figures.gps_outages_s), "GPS outages"),
         Fact(_sum_text(figures.link_losses_s), "link losses"),
         *facts,

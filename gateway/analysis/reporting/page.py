@@ -22,6 +22,7 @@ from gateway.analysis.reporting.style import (
     to_svg,
 )
 from gateway.output import write_new, written_together
+from gateway.printable import figure
 
 PAGE_NAME: Final = "index.html"
 
@@ -58,7 +59,7 @@ class ReportTable:
 
     def _text(self, value: object) -> str:
         if isinstance(value, float):
-            return "–" if value != value else f"{value:z.{self.digits}f}"
+            return figure(value, f"z.{self.digits}f")
         return str(value)
 
 

@@ -21,6 +21,7 @@ from gateway.clock import GatewayClock
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.control_verbs import raw_of
 from gateway.live.serial_port import SerialPort, SerialSettings, find_receiver
+from gateway.printable import figure
 from gateway.recordings.reading import open_rows
 from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing import calibrating
@@ -391,4 +392,4 @@ def _text(value: object) -> str:
     if isinstance(value, tuple):
         inner = ", ".join(_text(item) for item in value)
         return f"({inner})"
-    return f"{value:.5g}" if isinstance(value, float) else str(value)
+    return figure(value, ".5g") if isinstance(value, float) else str(value)

@@ -13,14 +13,13 @@ from gateway.cli.support.control import ask
 from gateway.cli.support.options import CONFIG, USER_CONFIG
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
-    UNKNOWN,
     JsonOption,
     console_of,
     print_json,
     refuse,
     table_of,
 )
-from gateway.printable import receiver_state
+from gateway.printable import UNKNOWN, figure, receiver_state
 from gateway.records import RadioState, node_role
 from gateway.units import MV_PER_V, US_PER_S, counted
 
@@ -157,7 +156,7 @@ def _summary(snapshot: Record) -> str:
         )
     lines += [
         f"aircraft {vehicle_id}: {_position(state['lat_deg'], state['lon_deg'])}, "
-        f"{_number(state['alt_amsl_m'], '.1f')} m"
+        f"{figure(state['alt_amsl_m'], '.1f')} m"
         for vehicle_id, state in snapshot["states"]
     ]
     lines += [
@@ -198,7 +197,7 @@ def _nodes(nodes: Sequence[Record], snapshot: Record) -> Table:
         overruns = UNKNOWN if receiver is None else receiver["pipes"][node["pipe"]]["overruns"]
         table.add_row(
             _node_name(node),
-            _number(node["rate_hz"], ".0f"),
+            figure(node["rate_hz"], ".0f"),
             *(str(node[key]) for key in ("received", "lost", "restarts")),
             *_board(boards.get(_node_name(node)), str(overruns)),
         )
@@ -220,7 +219,7 @@ def _board(board: Record | None, overruns: str) -> tuple[str, ...]:
     if board is None:
         return (*(UNKNOWN,) * 4, overruns, UNKNOWN)
     counts = (str(board[key]) for key in ("bus_errors", "radio_failed", "radio_retries"))
-    supply = f"{board['supply_mv'] / MV_PER_V:.2f}" if board["supply_mv"] else UNKNOWN
+    supply = figure(board["supply_mv"] / MV_PER_V if board["supply_mv"] else None, ".2f")
     return (supply, *counts, overruns, ".".join(map(str, board["firmware_version"])))
 
 
@@ -251,15 +250,11 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
             " ".join([client["name"], *(f"{s}.{c}" for s, c in client["systems"])]),
             client["state"],
             *(str(client[key]) for key in ("sent", "dropped", "queued", "received")),
-            UNKNOWN if heard_us is None else f"{(now_us - heard_us) / US_PER_S:.1f}",
-            UNKNOWN if trip_us is None else f"{trip_us / US_PER_MS:.1f}",
+            figure(None if heard_us is None else (now_us - heard_us) / US_PER_S, ".1f"),
+            figure(None if trip_us is None else trip_us / US_PER_MS, ".1f"),
         )
     return table
 
 
 def _position(lat_deg: float | None, lon_deg: float | None) -> str:
-    return f"{_number(lat_deg, '.6f')} {_number(lon_deg, '.6f')}"
-
-
-def _number(value: float | None, form: str) -> str:
-    return UNKNOWN if value is None else format(value, form)
+    return f"{figure(lat_deg, '.6f')} {figure(lon_deg, '.6f')}"

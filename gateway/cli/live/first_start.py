@@ -20,6 +20,7 @@ from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
+from gateway.printable import figure
 from gateway.records import GpsFix, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
@@ -224,7 +225,7 @@ def _check_gps(serial: SerialSettings, vehicle: int) -> None:
             "that was never used takes up to 15 min the first time"
         )
     else:
-        text = f"fix with {fix.satellites} satellites, accuracy {fix.h_acc_m:.1f} m"
+        text = f"fix with {fix.satellites} satellites, accuracy {figure(fix.h_acc_m, '.1f', 'm')}"
         _good(text) if fix.satellites >= WEAK_SATELLITES else _hint(f"{text}: wait for more")
 
 

@@ -25,20 +25,14 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TransferSpeedColu
 from gateway.cli.live.run import EndpointOption, with_endpoints
 from gateway.cli.support.control import ask, socket_of
 from gateway.cli.support.options import read_settings
-from gateway.cli.support.terminal import (
-    UNKNOWN,
-    JsonOption,
-    console_of,
-    print_json,
-    refuse,
-    table_of,
-)
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.extras import require
 from gateway.hub.endpoint import SITE_NAME
 from gateway.live.control_socket import ControlError, request
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import detached_output, on_end_signals
 from gateway.output import sync_folder
+from gateway.printable import UNKNOWN
 from gateway.recordings.index import NEWEST, is_file_name
 from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted

@@ -8,8 +8,9 @@ import typer
 
 from gateway.cli.support.control import ask, is_running, recordings_folder
 from gateway.cli.support.options import folder_of, read_options, read_settings
-from gateway.cli.support.terminal import UNKNOWN, JsonOption, console_of, print_json, table_of
+from gateway.cli.support.terminal import JsonOption, console_of, print_json, table_of
 from gateway.live.session import SessionState
+from gateway.printable import UNKNOWN, figure
 from gateway.recordings.index import (
     Recording,
     RecordingError,
@@ -188,15 +189,15 @@ def _list(recordings: list[Recording]) -> None:
     figures = _figures(recordings)
     for recording in recordings:
         flown = figures.get(recording.name, {})
-        each = [figure for _, figure in sorted(flown.items())]
+        each = [flown[system_id] for system_id in sorted(flown)]
         when, length_s = civil_time(recording.modified_s * US_PER_S), _length_s(flown)
         grid.add_row(
             recording.name,
             UNKNOWN if length_s is None else _clock(length_s),
             " ".join(map(str, sorted(flown))) or UNKNOWN,
-            _each(each, lambda f: f"{f.distance / 1000:.2f}" if f.distance is not None else ""),
-            _each(each, lambda f: f"{f.highest:.0f}" if f.highest is not None else ""),
-            _each(each, lambda f: f"{f.loss:.1%}" if f.loss is not None else ""),
+            _each(each, lambda f: figure(f.distance and f.distance / 1000, ".2f")),
+            _each(each, lambda f: figure(f.highest, ".0f")),
+            _each(each, lambda f: figure(f.loss, ".1%")),
             f"{recording.size / 1e6:.2f}",
             UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
             _path(recording),
@@ -211,8 +212,7 @@ def _length_s(flown: "dict[int, FlightFigures]") -> float | None:
 
 def _each(figures: "list[FlightFigures]", text: "Callable[[FlightFigures], str]") -> str:
     """Write one figure for each vehicle."""
-    texts = (text(figure) or UNKNOWN for figure in figures)
-    return " ".join(texts) or UNKNOWN
+    return " ".join(map(text, figures)) or UNKNOWN
 
 
 def _clock(seconds: float) -> str:

@@ -22,6 +22,7 @@ from gateway.cli.support.recording_options import ColumnsOption, ForceOption, Fu
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.extras import how_to_add, missing, require
 from gateway.output import write_new
+from gateway.printable import figure
 from gateway.units import counted
 
 if TYPE_CHECKING:
@@ -106,7 +107,7 @@ def info(
         km = sum(vehicle["distance_m"] for vehicle in figures["vehicles"]) / 1000.0
         grid.add_row(
             result.location.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
-            f"{figures['duration_s']:.0f}", f"{km:.2f}", str(len(figures["gaps"])),
+            figure(figures["duration_s"], ".0f"), figure(km, ".2f"), str(len(figures["gaps"])),
             str(figures["damaged_bytes"]),
         )  # fmt: skip
     console_of().print(grid)
@@ -154,7 +155,9 @@ def _finish(results: Sequence[FlightResult], output: Path, against: Path | None)
         "aircraft", "estimator", "flights", "median, m", "9 in 10, m", "worst, m", left=2
     )
     for aircraft, name, flights, *errors_m in errors_by_group(results).itertuples(index=False):
-        grid.add_row(aircraft, name, str(flights), *(f"{error_m:.3f}" for error_m in errors_m))
+        grid.add_row(
+            aircraft, name, str(flights), *(figure(error_m, ".3f") for error_m in errors_m)
+        )
     console = console_of()
     console.print(grid)
     if text := why_leads(results):

@@ -14,7 +14,6 @@ from gateway.cli.support.batch_work import JobsOption
 from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption
 from gateway.cli.support.terminal import (
-    UNKNOWN,
     JsonOption,
     console_of,
     print_json,
@@ -22,6 +21,7 @@ from gateway.cli.support.terminal import (
     refuse,
     table_of,
 )
+from gateway.printable import UNKNOWN, figure
 from gateway.recordings.index import RecordingError, find_recording
 from gateway.units import counted
 
@@ -140,6 +140,10 @@ def _folder(folder: Path | None) -> Path:
     return (folder or folder_of(read_settings())).expanduser()
 
 
+WHOLE: Final = ("vehicle", "duration", "highest", "gps_outages", "faults")
+"""Columns that are shown without decimals."""
+
+
 def _show_table(rows: list[Row]) -> None:
     grid = table_of(
         "file", "kind", "began (UTC)", "aircraft", "duration, s", "distance, km", "highest, m",
@@ -150,12 +154,11 @@ def _show_table(rows: list[Row]) -> None:
             grid.add_row(row["path"], "unreadable", row["error"], *[UNKNOWN] * 8)
             continue
         km = None if row["distance"] is None else row["distance"] / 1000.0
-        loss = None if row["loss"] is None else f"{row['loss']:.1%}"
+        whole = {key: figure(row[key], ".0f") for key in WHOLE}
         grid.add_row(
-            row["path"], row["kind"], row["began"] or UNKNOWN, _text(row["vehicle"]),
-            _text(row["duration"], 0), _text(km, 2), _text(row["highest"], 0),
-            _text(row["fastest"], 1), _text(row["gps_outages"]), _text(row["faults"]),
-            loss or UNKNOWN,
+            row["path"], row["kind"], row["began"] or UNKNOWN, whole["vehicle"], whole["duration"],
+            figure(km, ".2f"), whole["highest"], figure(row["fastest"], ".1f"),
+            whole["gps_outages"], whole["faults"], figure(row["loss"], ".1%"),
         )  # fmt: skip
     console = console_of()
     console.print(grid)
@@ -181,7 +184,3 @@ def _durations_s(rows: list[Row]) -> dict[tuple[Path, int | None], float]:
             of_kind = found.setdefault(flight, {})
             of_kind[row["kind"]] = of_kind.get(row["kind"], 0.0) + (row["duration"] or 0.0)
     return {flight: max(of_kind.values()) for flight, of_kind in found.items()}
-
-
-def _text(value: float | None, digits: int = 0) -> str:
-    return UNKNOWN if value is None else f"{value:.{digits}f}"

@@ -51,6 +51,7 @@ from gateway.cli.support.recording_options import (
 from gateway.cli.support.terminal import console_of, progress_bar, refuse, table_of
 from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
+from gateway.printable import figure
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import ReadOptions
 from gateway.units import counted
@@ -209,7 +210,7 @@ def _write(
 
 
 def _cell(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    return figure(value, ".4g") if isinstance(value, float) else str(value)
 
 
 def _parse_axes(options: SweepOptions) -> list[Axis]:

@@ -21,8 +21,6 @@ UNLIMITED_WIDTH: Final = 1000
 """Width of output that is not a terminal, where paths and tables must not be cut."""
 NEGATIVE_NUMBERS: Final = {"ignore_unknown_options": True}
 """Context settings of a command whose arguments may begin with a minus."""
-UNKNOWN: Final = "—"
-"""Cell of a table where a value is not known."""
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs.")]
 
 
