@@ -96,7 +96,9 @@ class PlayerDaemon:
         self._numbering = _Numbering()
         metadata = Aircraft(1, settings.default_aircraft).vehicle.metadata
         self._vehicles = [
-            RecordedVehicle(played_as, self._answers_of(flight, system_id, played_as), metadata)
+            RecordedVehicle(
+                played_as, self._answers_of(flight, system_id, played_as), metadata.of(played_as)
+            )
             for flight in flights
             for system_id, played_as in flight.system_ids.items()
         ]

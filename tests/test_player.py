@@ -11,7 +11,7 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.cli.recorded.play import steer
+from gateway.cli.recorded.play import print_plan, steer
 from gateway.config import GatewaySettings
 from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
@@ -220,3 +220,23 @@ async def test_idle_player_repeats_the_state_without_gaps_in_the_numbers(
     assert [frame.sequence for frame in read] == [
         (read[0].sequence + i) % 256 for i in range(len(read))
     ]
+
+
+@pytest.mark.parametrize(
+    ("endpoints", "text"),
+    [
+        (("udp:127.0.0.1:14550", "tcp-listen:127.0.0.1:5760"),
+         "playing a.tlog as vehicle 3 to udp:127.0.0.1:14550, tcp-listen:127.0.0.1:5760"),
+        ((), "playing a.tlog as vehicle 3 to nobody: no endpoint is set"),
+    ],
+)  # fmt: skip
+def test_vehicles_and_endpoints_are_printed(
+    tmp_path: Path,
+    opened: ExitStack,
+    capsys: pytest.CaptureFixture[str],
+    endpoints: tuple[str, ...],
+    text: str,
+) -> None:
+    flights = open_flights([tmp_path / "a.tlog"], OPTIONS, opened)
+    print_plan(["a.tlog"], lay_out(flights, with_commands=False), endpoints)
+    assert " ".join(capsys.readouterr().out.split()) == text

@@ -6,7 +6,7 @@ vehicle without heartbeats.
 
 import asyncio
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from gateway.live.control_socket import Verbs
@@ -37,6 +37,8 @@ class PlayerStatus:
     loop: bool
     sent: int
     files: tuple[str, ...]
+    remark: str = ""
+    """How a request was not carried out as it was made."""
 
 
 class PlayerEdge:
@@ -71,6 +73,7 @@ class PlayerEdge:
             "seek": self.seek,
             "play.pause": self.pause,
             "play.resume": self.resume,
+            "play.stop": self.stop,
             "play.step": self.step,
             "play.speed": self.set_speed,
             "play.loop": self.set_loop,
@@ -98,6 +101,13 @@ class PlayerEdge:
         self._player.resume(self._clock())
         return self._turned()
 
+    def stop(self) -> PlayerStatus:
+        """End the playback."""
+        self._player.pause(self._clock())
+        if self._on_end is not None:
+            self._on_end()
+        return self.status()
+
     def step(self, count: int = 1) -> PlayerStatus:
         """Pause, and play the next frames."""
         self._emit(self._player.step(self._clock(), count))
@@ -116,11 +126,20 @@ class PlayerEdge:
         return self.status()
 
     def seek(self, to: str) -> PlayerStatus:
-        """Move to a moment, as soon as it is ready; see `parse_moment`, also for its error."""
+        """Move to a moment, as soon as it is ready; see `parse_moment`, also for its error.
+
+        A moment beyond the range is its begin or end, and the status says so.
+        """
         player, moment = self._player, parse_moment(to)
         here_us = player.position_us if self._wanted_us is None else self._wanted_us
-        self._wanted_us = time_us_of(moment, here_us if moment.relative else player.begin_us)
-        return self._turned()
+        wanted_us = time_us_of(moment, here_us if moment.relative else player.begin_us)
+        remark = ""
+        if not player.begin_us <= wanted_us <= player.end_us:
+            wanted_us = min(max(wanted_us, player.begin_us), player.end_us)
+            limit = "begin" if wanted_us == player.begin_us else "end"
+            remark = f"{to} is beyond the recording: moved to its {limit}"
+        self._wanted_us = wanted_us
+        return replace(self._turned(), remark=remark)
 
     def status(self) -> PlayerStatus:
         """Return the present state."""

@@ -124,7 +124,7 @@ class Vehicle:
     def _make_services(self, sections: Mapping[str, Settings]) -> None:
         self._intervals = IntervalService(self.system_id, self.telemetry)
         self._parameters = ParameterService(self.system_id, ParameterTable(sections), self.plan)
-        self.metadata = Metadata(self._parameters.table)
+        self.metadata = Metadata(self._parameters.table, self.system_id)
         """Descriptions of the parameters."""
         self._ftp = FtpService({**self.metadata.files, PACKED_PATH: self._parameters.packed})
         self._calibrator = Calibrator(lambda: self.in_flight, lambda: self.telemetry.state)

@@ -128,4 +128,12 @@ async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> N
     assert not (await ask(server, "seek", to="soon"))["ok"]
     refused = await ask(server, "play.speed", speed=1000)
     assert "speed" in refused["error"]
+    await state("play.pause")
+    for to, position_s, limit in (("1:00:00", 499 * 0.02, "end"), ("-1:00:00", 0.0, "begin")):
+        limited = await state("seek", to=to)
+        assert limited["position_s"] == pytest.approx(position_s, abs=0.03)
+        assert limited["remark"] == f"{to} is beyond the recording: moved to its {limit}"
+    assert (await state("seek", to="0:05"))["remark"] == ""
+    assert (await state("play.stop"))["state"] == "paused"
+    assert played.ended.is_set()
     played.close()

@@ -1,7 +1,7 @@
 """`mavgate play`, and commands for a running player."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import Annotated, Any, Final
@@ -33,7 +33,7 @@ from gateway.live.player_edge import PlayerStatus
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond, prepare
 from gateway.recordings.files import FlightError
-from gateway.recordings.opening import lay_out, open_flights
+from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
 from gateway.recordings.play import (
     AS_FAST_AS_POSSIBLE,
     GREATEST_SPEED,
@@ -111,7 +111,19 @@ def play(
             prepare(flights, plan)
         print_remarks(remark for flight in recorded for remark in flight.remarks)
         names = [file.name for file in files]
+        print_plan(names, flights, gateway.hub.endpoints)
         asyncio.run(_serve(lambda: PlayerDaemon(gateway, flights, plan, names), attached=attached))
+
+
+def print_plan(
+    names: Sequence[str], flights: Sequence[PlayedFlight], endpoints: Sequence[str]
+) -> None:
+    """Print which vehicles are sent, and to whom."""
+    systems = [system_id for flight in flights for system_id in flight.system_ids.values()]
+    listed = ", ".join(map(str, systems))
+    whom = ", ".join(endpoints) or "nobody: no endpoint is set"
+    vehicles = f"vehicle{'s' * (len(systems) != 1)} {listed}"
+    console_of().print(f"playing {', '.join(names)} as {vehicles} to {whom}", markup=False)
 
 
 def _ask_for_commands(settings: GatewaySettings) -> None:
@@ -148,6 +160,7 @@ def _add_verb(name: str, text: str) -> None:
 
 _add_verb("pause", "Pause.")
 _add_verb("resume", "Resume.")
+_add_verb("stop", "End the playback.")
 
 
 @group.command()
@@ -268,3 +281,5 @@ def _position(status: PlayerStatus) -> str:
 def _show(status: dict[str, Any]) -> None:
     current = PlayerStatus(**{**status, "files": tuple(status["files"])})
     console_of().print(f"{current.state}: {_position(current)}")
+    if current.remark:
+        console_of().print(current.remark, style="yellow", markup=False)

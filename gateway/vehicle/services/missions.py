@@ -77,6 +77,8 @@ CHANGING: Final = frozenset(
 Sender = tuple[int, int, int]
 """Client, system and component: several programs may share one client of the hub."""
 
+Items = tuple[Item, ...]
+
 Changed = Callable[[int], list[Answer]]
 """Called with the mission type that was stored, cleared or advanced."""
 
@@ -115,8 +117,15 @@ class MissionService(Service):
         "MISSION_REQUEST_PARTIAL_LIST", *sorted(CHANGING),
     )  # fmt: skip
 
-    def __init__(self, changed: Changed, explain: Callable[[str, int], list[Answer]]) -> None:
-        self.items: dict[int, tuple[Item, ...]] = dict.fromkeys(KINDS, ())
+    def __init__(
+        self,
+        changed: Changed,
+        explain: Callable[[str, int], list[Answer]],
+        empty: Callable[[], Items] = tuple,
+    ) -> None:
+        """Start without items; `empty` returns the mission that is sent while there is none."""
+        self._empty = empty
+        self.items: dict[int, Items] = dict.fromkeys(KINDS, ())
         self.current = 0
         self._changed = changed
         self._explain = explain
@@ -224,12 +233,16 @@ class MissionService(Service):
     def _is_current(self, kind: int, sequence: int) -> bool:
         return kind == MISSION and sequence == self.current
 
+    def _sent(self, kind: int) -> Items:
+        """Return the items that a client gets."""
+        return self._empty() if kind == MISSION and not self.items[kind] else self.items[kind]
+
     def _list(self, request: Request, _now_us: int) -> list[Answer]:
         kind = request.message.mission_type
         if kind not in KINDS:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
         count = mavlink.MAVLink_mission_count_message(
-            request.system_id, request.component_id, len(self.items[kind]), kind
+            request.system_id, request.component_id, len(self._sent(kind)), kind
         )
         return [request.reply(count)]
 
@@ -237,10 +250,11 @@ class MissionService(Service):
         kind, sequence = request.message.mission_type, request.message.seq
         if kind not in KINDS:
             return [mission_ack(request, mavlink.MAV_MISSION_UNSUPPORTED)]
-        if sequence >= len(self.items[kind]):
+        items = self._sent(kind)
+        if sequence >= len(items):
             return [mission_ack(request, mavlink.MAV_MISSION_INVALID_SEQUENCE)]
         target = (request.system_id, request.component_id)
-        item, is_current = self.items[kind][sequence], self._is_current(kind, sequence)
+        item, is_current = items[sequence], self._is_current(kind, sequence)
         as_floats = not self._forms[_sender(request)]
         return [request.reply(write_item(item, sequence, kind, target, is_current, as_floats))]
 

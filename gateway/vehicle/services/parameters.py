@@ -338,6 +338,8 @@ def _replaced(tree: Settings, path: tuple[str, ...], value: Any) -> Settings:
 
 GENERAL_PATH: Final = "/general.json"
 PARAMETER_PATH: Final = "/parameter.json.xz"
+"""Also for programs that know the names. Each vehicle announces names of its own, since programs
+download under the name: two vehicles would overwrite each other's file."""
 TYPE_PARAMETER: Final = 1
 """COMP_METADATA_TYPE_PARAMETER."""
 MAX_SHORT: Final = 100
@@ -350,29 +352,47 @@ PLACES: Final = 4
 class Metadata:
     """The metadata files of one vehicle."""
 
-    def __init__(self, table: ParameterTable) -> None:
-        self.files = _files(table.kinds)
+    def __init__(self, table: ParameterTable, system_id: int) -> None:
+        self._table = table
+        self._general = _named(GENERAL_PATH, system_id)
+        parameters, described = _named(PARAMETER_PATH, system_id), _described(table.kinds)
+        general = _general(parameters, crc32(described))
+        self.files: Mapping[str, bytes] = {
+            **dict.fromkeys((self._general, GENERAL_PATH), general),
+            **dict.fromkeys((parameters, PARAMETER_PATH), described),
+        }
         """By their FTP paths."""
-        self._names = table.parameters.keys()
+
+    def of(self, system_id: int) -> "Metadata":
+        """Return the same for another vehicle."""
+        return Metadata(self._table, system_id)
 
     def describes(self, names: Collection[str]) -> bool:
         """Return whether parameters, of which there are some, are those of this version."""
-        return bool(names) and set(names) <= self._names
+        return bool(names) and set(names) <= self._table.parameters.keys()
 
     def announcement(self, now_us: int) -> Any:
         """Encode COMPONENT_METADATA."""
-        uri = f"mftp://{GENERAL_PATH}".encode()
-        return ComponentMetadata(boot_ms(now_us), crc32(self.files[GENERAL_PATH]), uri)
+        uri = f"mftp://{self._general}".encode()
+        return ComponentMetadata(boot_ms(now_us), crc32(self.files[self._general]), uri)
+
+
+def _named(path: str, system_id: int) -> str:
+    """Return the path of a vehicle's file."""
+    stem, ending = path.split(".", 1)
+    return f"{stem}-{system_id}.{ending}"
 
 
 @cache
-def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> Mapping[str, bytes]:
-    """Write the two files, once for all vehicles."""
+def _described(kinds: tuple[tuple[str, type[Settings]], ...]) -> bytes:
+    """Write the file that describes the parameters, once for all vehicles."""
     described = [_describe(parameter) for parameter in parameters_of(kinds).values()]
     # CRC32 is the check that every decoder of xz supports; embedded ones lack the default, CRC64.
-    parameters = lzma.compress(
-        _json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32
-    )
+    return lzma.compress(_json({"version": 1, "parameters": described}), check=lzma.CHECK_CRC32)
+
+
+def _general(parameter_path: str, parameter_crc: int) -> bytes:
+    """Write the file that names the others."""
     general = {
         "version": 1,
         "vendorName": "mavgate",
@@ -381,12 +401,12 @@ def _files(kinds: tuple[tuple[str, type[Settings]], ...]) -> Mapping[str, bytes]
         "metadataTypes": [
             {
                 "type": TYPE_PARAMETER,
-                "uri": f"mftp://{PARAMETER_PATH}",
-                "fileCrc": crc32(parameters),
+                "uri": f"mftp://{parameter_path}",
+                "fileCrc": parameter_crc,
             }
         ],
     }
-    return MappingProxyType({GENERAL_PATH: _json(general), PARAMETER_PATH: parameters})
+    return _json(general)
 
 
 def _describe(parameter: Parameter) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from gateway.records import NAN, GpsFix, NavState
 from gateway.settings import Settings
 from gateway.vehicle import encoding
 from gateway.vehicle.plan import (
+    DEGE7,
     FENCE,
     GLOBAL_FRAMES,
     KINDS,
@@ -120,7 +121,7 @@ class PlanService:
         self._telemetry = telemetry
         self._say = say
         self.mark = Mark(stored.mark, stored.mark_of)
-        self.missions = MissionService(self._on_items, self._explain)
+        self.missions = MissionService(self._on_items, self._explain, self._empty_mission)
         self.missions.items = {kind: getattr(stored, name) for kind, name in KINDS.items()}
         self.missions.current = stored.current
         self._kept_home = stored.home
@@ -136,6 +137,19 @@ class PlanService:
         telemetry.add(
             mavlink.MAVLINK_MSG_ID_MISSION_CURRENT, lambda _: self.missions.mission_current()
         )
+
+    def _empty_mission(self) -> tuple[Item, ...]:
+        """Return the mission that is sent while there is none: of ArduPilot, home as item 0.
+
+        DroneKit requests item 0 of every mission, and waits for it.
+        """
+        home = self._telemetry.home
+        if self._telemetry.autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA or home is None:
+            return ()
+        at = home.location
+        x, y = round(at.lat_deg * DEGE7), round(at.lon_deg * DEGE7)
+        kind = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_CMD_NAV_WAYPOINT, 1)
+        return (Item(*kind, (0.0, 0.0, 0.0, 0.0), x, y, at.alt_amsl_m),)
 
     def register(self, commands: CommandService) -> None:
         """Register the commands that are carried out here."""

@@ -13,7 +13,9 @@ from gateway.aircraft import AircraftSettings
 from gateway.vehicle.services import ftp as ftp_service
 from gateway.vehicle.services.ftp import ACK, NAK, FtpError, Opcode, Packet, crc32
 from gateway.vehicle.services.parameters import PARAMETER_PATH, Metadata, ParameterTable
+from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
+from tests.conftest import ManualClock
 from tests.kit.ground_station import FtpClient, GroundStation, load_parameters
 
 GENERAL = b"/general.json"
@@ -33,14 +35,15 @@ def refusal(answer: Packet) -> FtpError:
 def test_metadata_is_announced_and_describes_every_parameter(ftp: FtpClient, loss: float) -> None:
     _, announced = ftp.station.request(397)
     file_crc, uri = struct.unpack("<I100s", announced.payload[4:108])
-    assert uri.rstrip(b"\0") == b"mftp:///general.json"
+    assert uri.rstrip(b"\0") == b"mftp:///general-1.json"
     rng = np.random.default_rng(4)
     ftp.station.loses = lambda *_: rng.random() < loss
-    general = ftp.read(GENERAL)
+    general = ftp.read(b"/general-1.json")
+    assert ftp.read(GENERAL) == general
     assert crc32(general) == file_crc
     [kind] = json.loads(general)["metadataTypes"]
-    assert (kind["type"], kind["uri"]) == (1, "mftp:///parameter.json.xz")
-    described = ftp.read(b"/parameter.json.xz")
+    assert (kind["type"], kind["uri"]) == (1, "mftp:///parameter-1.json.xz")
+    described = ftp.read(b"/parameter-1.json.xz")
     assert crc32(described) == kind["fileCrc"]
     ftp.station.loses = lambda *_: False
     parameters = {p["name"]: p for p in json.loads(lzma.decompress(described))["parameters"]}
@@ -53,6 +56,18 @@ def test_metadata_is_announced_and_describes_every_parameter(ftp: FtpClient, los
     integers = ("VEH_TYPE", "TUNING_ENABLED", "TUNING_ORDER")
     assert {parameters[name]["type"] for name in integers} == {"Int32"}
     assert [parameters[name]["decimalPlaces"] for name in ("HOME_LAT", "HOME_LON")] == [7, 7]
+
+
+def test_vehicles_announce_files_of_different_names(clock: ManualClock) -> None:
+    """QGroundControl downloads the files of all vehicles to one folder."""
+    uris = []
+    for system_id in (1, 2):
+        station = GroundStation(Vehicle(VehicleSettings(), system_id), clock)
+        ftp = FtpClient(station)
+        [_, announced] = station.request(397)
+        uris.append(announced.payload[8:108].rstrip(b"\0"))
+        uris += [kind["uri"] for kind in json.loads(ftp.read(uris[-1]))["metadataTypes"]]
+    assert len(set(uris)) == 4
 
 
 def test_metadata_has_only_keys_of_the_schema(ftp: FtpClient) -> None:
@@ -72,7 +87,7 @@ def test_parameter_metadata_of_the_gateway_is_small() -> None:
     """A radio of 57600 baud carries about 140 bytes of a file in 60 ms."""
     settings = AircraftSettings()
     table = ParameterTable({name: getattr(settings, name) for name in settings.__struct_fields__})
-    content = Metadata(table).files[PARAMETER_PATH]
+    content = Metadata(table, 1).files[PARAMETER_PATH]
     assert len(content) < 8_000 < 30_000 < len(lzma.decompress(content))
 
 
@@ -93,8 +108,11 @@ def test_file_is_opened_by_every_form_of_its_path(ftp: FtpClient, path: bytes) -
 def test_root_folder_is_listed_by_every_form_of_its_path(ftp: FtpClient, path: bytes) -> None:
     listed = ftp.ask(Opcode.LIST_DIRECTORY, path)
     names = [entry.split(b"\t")[0] for entry in listed.data.split(b"\0") if entry]
-    assert names == [b"Fgeneral.json", b"Fparameter.json.xz"]
-    assert refusal(ftp.ask(Opcode.LIST_DIRECTORY, path, offset=2)) == FtpError.EOF
+    assert names == [
+        *(b"Fgeneral-1.json", b"Fgeneral.json"),
+        *(b"Fparameter-1.json.xz", b"Fparameter.json.xz"),
+    ]
+    assert refusal(ftp.ask(Opcode.LIST_DIRECTORY, path, offset=4)) == FtpError.EOF
 
 
 def test_packed_parameters_are_decoded_by_mavproxy(ftp: FtpClient) -> None:

@@ -8,6 +8,9 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.plan import MAX_ITEMS, Location, distance_and_bearing
+from gateway.vehicle.vehicle import Vehicle
+from gateway.vehicle.vehicle_settings import Autopilot, VehicleSettings
+from tests.conftest import ManualClock
 from tests.kit.ground_station import (
     ALL,
     FENCE,
@@ -23,7 +26,7 @@ from tests.kit.ground_station import (
     request_item,
     upload,
 )
-from tests.kit.records import STATE
+from tests.kit.records import FIX, STATE
 
 GLOBAL_INT, RELATIVE_INT, LOCAL_NED, MISSION_FRAME = 5, 6, 1, 2
 WAYPOINT = 16
@@ -354,3 +357,21 @@ def test_roi_stays_marked_when_the_mission_is_cleared(station: GroundStation) ->
     assert to_mark(station) is not None
     station.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
     assert to_mark(station) is None
+
+
+@pytest.mark.parametrize(("autopilot", "size"), [("generic", 0), ("ardupilotmega", 1)])
+def test_empty_mission_of_ardupilot_is_home(
+    clock: ManualClock, autopilot: Autopilot, size: int
+) -> None:
+    """DroneKit requests item 0 of every mission."""
+    station = GroundStation(Vehicle(VehicleSettings(autopilot=autopilot), 1), clock)
+    assert download(station) == [], "home is not known yet"
+    station.vehicle.on_gps(FIX, clock.now_us)
+    found = download(station)
+    assert len(found) == size
+    for home in found:
+        assert (home.seq, home.command, home.frame) == (0, WAYPOINT, 0)
+        assert (home.x, home.y) == (FIX.lat_dege7, FIX.lon_dege7)
+    assert station.vehicle.plan.missions.items[MISSION] == ()
+    assert upload(station, [item(0)]) == ACCEPTED
+    assert [content(each) for each in download(station)] == [content(item(0))]
