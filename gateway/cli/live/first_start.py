@@ -106,8 +106,8 @@ def _guide(
     number = _choose(report, vehicle)
     _check_nodes(report, seen.statuses, number)
     _check_gps(serial, number)
-    _calibrate(settings, serial, number, bench)
-    _head("Done")
+    done = _calibrate(settings, serial, number, bench)
+    _head("Done" if done == len(STEPS) else f"Calibrated: {done} of {len(STEPS)} steps")
     console.print("Start the gateway with `mavgate run`, and a ground station on UDP port 14550.")
     console.print("A step that failed can be repeated: `mavgate calibrate gyro`, `level` or `mag`.")
     console.print("For the accelerometer, `mavgate calibrate accel` asks for all six sides.")
@@ -231,7 +231,8 @@ def _check_gps(serial: SerialSettings, vehicle: int) -> None:
 
 def _calibrate(
     settings: GatewaySettings, serial: SerialSettings, vehicle: int, bench: Workbench | None
-) -> None:
+) -> int:
+    """Run the calibration and save it; return the number of steps that succeeded."""
     _head("4 of 5: calibration of gyroscope, level and compass")
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
     from_receiver = capture_from(serial, vehicle)
@@ -241,19 +242,24 @@ def _calibrate(
             bench.turn()
         return from_receiver(seconds, turned=turned)
 
-    saved: list[Path] = []
+    results: list[NodeCalibration] = []
+    files: set[Path] = set()
 
     def save(calibration: NodeCalibration) -> None:
+        results.append(calibration)
         if bench is None:
             changed = replace(aircraft, calibration=calibration)
-            saved.append(save_aircraft(settings, vehicle, changed))
+            files.add(save_aircraft(settings, vehicle, changed))
 
     calibrate_each([*STEPS], poses_from(capture), aircraft.calibration, save)
-    _head("5 of 5: saved")
-    if saved:
-        _good(str(saved[-1]))
+    _head("5 of 5: saving")
+    if bench is not None:
+        _hint("not saved: the receiver is simulated")
+    elif files:
+        _good(f"saved in {', '.join(map(str, files))}")
     else:
-        _hint("nothing was saved" + (", since the receiver is simulated" if bench else ""))
+        _hint("nothing to save: no step succeeded")
+    return len(results)
 
 
 def _observe(

@@ -16,6 +16,7 @@ from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import SerialPort
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.simulator.trajectory import Workbench
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -60,6 +61,9 @@ def test_every_step_passes_on_the_simulated_receiver_and_saves_nothing(tmp_path:
         "mag: done",
     ):
         assert text in done.output
+    ending = done.output[done.output.index("5 of 5") :]
+    assert "not saved: the receiver is simulated" in ending
+    assert "Done" in ending
     assert load_aircraft(load(config)) == {}
 
 
@@ -78,6 +82,25 @@ def test_calibration_of_a_receiver_at_a_port_is_saved(
     assert "nothing is received from vehicle 4, but from 3" in wrong.output
     assert done.exit_code == 0, done.output
     assert load_aircraft(load(config))[3].calibration.gyro_residual_radps > 0.0
+
+
+@pytest.mark.parametrize(
+    ("is_simulated", "last"), [(False, "nothing to save"), (True, "not saved")]
+)
+def test_end_without_a_successful_step_names_what_was_saved(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    is_simulated: bool,
+    last: str,
+) -> None:
+    config = tmp_path / "gateway.toml"
+    config.write_text(f'aircraft_folder = "{tmp_path}"\n')
+    for name in ("capture_from", "calibrate_each"):
+        monkeypatch.setattr(first_start, name, lambda *_: None)
+    settings, bench = load(config), Workbench(SimulatorSettings()) if is_simulated else None
+    assert first_start._calibrate(settings, settings.serial, 1, bench) == 0
+    assert last in capsys.readouterr().out
 
 
 @pytest.fixture
