@@ -121,6 +121,7 @@ class Router:
         round_trip_us = self._round_trip.read(frame, now_us)
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
+            client.prove()
             return
         is_rejected = path is not None and self._is_rejected(client, path, frame, now_us)
         if is_of_gateway(frame):
@@ -169,6 +170,8 @@ class Router:
         clients = (
             self._table.clients_to(frame.target, client.client_id, now_us) if client.trusted else []
         )
+        if ours or clients:
+            client.prove()
         if ours:
             self._ask(client, frame, forwarded=bool(clients))
         if clients:

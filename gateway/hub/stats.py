@@ -17,7 +17,7 @@ class ClientCounters:
     sent: int = 0
     dropped: int = 0
     unheard: int = 0
-    """Sent to a port on which nobody listens."""
+    """Sent to a port on which nobody listens, or withheld from an unproven client."""
     bytes_sent: int = 0
     received: int = 0
     bytes_received: int = 0
@@ -34,7 +34,8 @@ class ClientStats:
     remote: str
     """Address of the peer; empty while unknown."""
     state: str
-    """`open`, or why nothing is sent: `refused`, `unreachable`, `connecting`, `resolving`."""
+    """`open`, or why less is sent: `unproven`, `refused`, `unreachable`, `connecting`,
+    `resolving`."""
     trusted: bool
     systems: tuple[tuple[int, int], ...]
     """System and component ids received from it."""

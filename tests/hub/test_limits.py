@@ -14,7 +14,7 @@ from gateway.hub.limits import (
     RequestQueue,
 )
 from gateway.hub.transports.base import STALE_AFTER_US, client_to_remove
-from gateway.hub.transports.datagram import gone_clients
+from gateway.hub.transports.datagram import UNPROVEN_IDLE_US, gone_clients
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 
@@ -123,6 +123,7 @@ class Present:
     host: str
     last_us: int = 0
     identity: tuple[int, int] = GCS
+    is_proven: bool = True
 
 
 @pytest.mark.parametrize(
@@ -141,6 +142,12 @@ def test_clients_go_after_a_timeout_or_when_they_return_on_another_port(
 ) -> None:
     present = [Present(*each) for each in clients]
     assert gone_clients(present, 30 * S, now_us) == [present[number] for number in gone]
+
+
+def test_client_that_has_not_proven_that_it_receives_goes_earlier() -> None:
+    present = [Present("a"), Present("b", is_proven=False)]
+    assert gone_clients(present, 30 * S, UNPROVEN_IDLE_US - 1) == []
+    assert gone_clients(present, 30 * S, UNPROVEN_IDLE_US) == [present[1]]
 
 
 def removed(hosts: list[str], newcomer: str) -> int | None:

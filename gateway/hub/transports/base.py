@@ -293,6 +293,9 @@ class Client:
         self.trusted = _is_trusted(endpoint, self.host)
         self.context.reconfigure(self)
 
+    def prove(self) -> None:
+        """Note that a frame from it depends on one that it was sent, so that it does receive."""
+
     def tick(self, now_us: int) -> None:
         """Reconnect and expire; called a few times a second."""
 

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint
-from gateway.hub.routing_table import Origin
+from gateway.hub.routing_table import HEARTBEAT_ID, Origin
 from gateway.hub.send_queue import Packer
 from gateway.hub.transports.base import (
     RETRY_US,
@@ -19,8 +19,17 @@ from gateway.hub.transports.base import (
     new_socket,
     not_open,
 )
-from gateway.wire.mavlink_splitter import KEY_V2, DatagramSplitter, MavFrame, read_datagram
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import (
+    KEY_V2,
+    DatagramSplitter,
+    MavFrame,
+    message_id_of,
+    read_datagram,
+)
 
+UNPROVEN: Final = "unproven"
+"""State of a client of a listening port that has not shown that it receives."""
 NOBODY_LISTENS: Final = "nobody listens there"
 MAX_DATAGRAM: Final = 4096
 """Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
@@ -36,6 +45,13 @@ IP_PKTINFO: Final = 8
 """Not exported by `socket` before Python 3.14; gives the local address of a datagram."""
 BACKLOG_DATAGRAMS: Final = 256
 """Most datagrams that wait for a full socket buffer: older ones are of no use."""
+UNPROVEN_FACTOR: Final = 10
+"""Bytes sent for each byte received, to a peer that has not proven that it receives: a heartbeat of
+a station pays for a vehicle's heartbeat and home, which is all that it waits for."""
+HEARTBEAT_RESERVE: Final = 60
+"""Bytes of these that only heartbeats may use, or telemetry would leave no room for them."""
+UNPROVEN_IDLE_US: Final = 5 * US_PER_S
+"""A peer that has not proven that it receives is removed after this time without a frame."""
 
 Address = tuple[str | int, ...]
 
@@ -244,17 +260,62 @@ class DatagramClient(Client):
 
 
 class DatagramPeer(DatagramClient):
-    """A client of a listening port."""
+    """A client of a listening port.
+
+    The address that a datagram claims to come from may be forged, to make the gateway flood
+    somebody else. So a new client is *unproven*, and is sent at most `UNPROVEN_FACTOR` times the
+    bytes that were received from it, until a frame depends on one that it was sent: an answer to
+    PING or TIMESYNC, or a frame addressed to a system behind the gateway.
+    """
 
     identity: Origin
     """System and component of its first frame."""
     address: Address
     """Host and port of the peer."""
+    is_proven: bool = False
+    _spent: int = 0
+    """Bytes that were sent while it was unproven."""
+
+    def adopt(self, sock: socket.socket, write: Write) -> None:
+        """Use an open socket from now on."""
+        self._send_to_proven = write
+        super().adopt(sock, write if self.is_proven else self._send_limited)
+
+    def prove(self) -> None:
+        """Send everything from now on, if anything was sent on which a frame can depend."""
+        if self.is_proven or not self._spent:
+            return
+        self.is_proven = True
+        if self.write == self._direct:
+            self.write = self._send_to_proven
+        self._direct = self._send_to_proven
+        if self.state == UNPROVEN:
+            self.become("open")
+        self.reconfigure(self.endpoint)
+
+    def _send_limited(self, data: bytes) -> object:
+        """Send a datagram if the allowance of an unproven client suffices; else drop it."""
+        reserve = 0 if message_id_of(data) == HEARTBEAT_ID else HEARTBEAT_RESERVE
+        allowance = UNPROVEN_FACTOR * self.counters.bytes_received - self._spent
+        if allowance < len(data) + reserve:
+            self._hold(data)
+            return 0
+        self._spent += len(data)
+        return self._send_to_proven(data)
+
+    def _packer_of(self, endpoint: Endpoint) -> Packer | None:
+        # Packed frames would be larger than the allowance.
+        return super()._packer_of(endpoint) if self.is_proven else None
 
     def _revive(self) -> None:
         """Note that the client is reachable after all."""
         self._end_hold()
         super()._revive()
+        self._become_open()
+
+    def _become_open(self) -> None:
+        """Note that frames are sent, if only a few."""
+        self.become("open" if self.is_proven else UNPROVEN)
 
     def tick(self, now_us: int) -> None:
         """Clear a problem that was not repeated; retry a client that refused."""
@@ -262,7 +323,7 @@ class DatagramPeer(DatagramClient):
             return
         self._end_hold()
         if self.refused_us is None or now_us - self.refused_us >= RETRY_US:
-            self.become("open")
+            self._become_open()
 
     def _note_refusal(self) -> None:
         """Stop sending until the next tick: a dead client costs more than a live one."""
@@ -299,6 +360,7 @@ def gone_clients(
         client
         for client in present
         if (idle_us := now_us - client.last_us) >= idle_timeout_us
+        or (idle_us >= UNPROVEN_IDLE_US and not client.is_proven)
         or (idle_us >= STALE_AFTER_US and newest[client.host, client.identity] is not client)
     ]
 
