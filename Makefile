@@ -13,7 +13,8 @@
 .PHONY: demo kernels test coverage lint deb wheel image fuzz lock firmware clean
 
 BROWSER_PACKAGES := chromium
-FIRMWARE_PACKAGES := make g++ gcc-avr binutils-avr avr-libc libsimavr-dev cppcheck avrdude arduino-core-avr
+COMPILER_PACKAGES := make gcc-avr binutils-avr avr-libc
+FIRMWARE_PACKAGES := $(COMPILER_PACKAGES) g++ libsimavr-dev cppcheck avrdude arduino-core-avr
 
 demo: kernels
 	.venv/bin/mavgate demo
@@ -80,7 +81,7 @@ HEADLESS := $(foreach package,opencv-python vtk wxpython quantized-mesh-tile sha
 	--no-emit-package $(package))
 
 firmware:
-	tools/apt_install.sh $(FIRMWARE_PACKAGES)
+	tools/apt_install.sh $(COMPILER_PACKAGES)
 	$(MAKE) -C firmware images
 
 clean:

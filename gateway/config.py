@@ -7,6 +7,7 @@ refused with all its errors at once, each with file, key, value and what is allo
 import difflib
 import errno
 import logging
+import re
 import stat
 import textwrap
 import tomllib
@@ -286,11 +287,36 @@ def _unknown_key(path: str, key: str, fields: Mapping[str, Field]) -> str:
 
 
 def _wrong_value(path: str, value: Any, field: Field, error: msgspec.ValidationError) -> str:
-    bounds = field.range if "=" in str(error) else ""
-    reason = f"must be {bounds} {field.unit}".rstrip() if bounds else _uncapital(str(error))
+    reason = f"must be {_wanted(field, str(error))}"
     text = f"{path} = {tomlkit.item(value).as_string()}: {reason}"
     hint = "; ".join(filter(None, (_choice_hint(value, field), _uncapital(field.meaning))))
     return f"{text} ({hint})" if hint else text
+
+
+KINDS: Final = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a text in quotes",
+    "bool": "true or false",
+    "array": "a list in brackets",
+    "object": "a table",
+}
+"""What msgspec expected, in the words of TOML."""
+
+
+def _wanted(field: Field, error: str) -> str:
+    """Describe the values that a setting may have, given msgspec's error of one that it may not."""
+    if field.choices:
+        return "one of the choices"
+    if field.range and ("`float`" in error or "`int`" in error):
+        return f"{field.range} {field.unit}".rstrip()
+    if "matching regex" in error:
+        return "as described"
+    kind = re.match(r"Expected `(\w+)", error)
+    length = re.search(r"of length (\d+)", error)
+    wanted = KINDS.get(kind[1], kind[1]) if kind else "as described"
+    inside = "a list, each entry " if " - at `$[" in error else ""
+    return f"{inside}{wanted}{f' of {length[1]} entries' if length else ''}"
 
 
 def _choice_hint(value: Any, field: Field) -> str:

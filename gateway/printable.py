@@ -113,11 +113,19 @@ def reason_of(error: Exception) -> str:
 
 def unknown_choice(what: str, word: str, choices: Iterable[str]) -> str:
     """Return the text for a word that is none of the allowed ones."""
-    return f"unknown {what} {word!r}; choose {', '.join(choices)}"
+    # Imported here, as only an error needs it.
+    import difflib
+
+    listed = [*choices]
+    near = difflib.get_close_matches(word, listed, n=1)
+    meant = f"did you mean {near[0]!r}? " if near else ""
+    return f"unknown {what} {word!r}; {meant}choose {', '.join(listed)}"
 
 
 def receiver_state(port: str, connected: bool, bytes_received: int, frames: int) -> str:
     """Describe the receiver's port: a wrong device or speed is open, too, and sends no frames."""
+    if not connected and port == "none":
+        return "receiver: none"
     if not connected:
         return f"receiver: not connected (serial.port = {port})"
     return f"receiver: {port} {_reception(bytes_received, frames)}"

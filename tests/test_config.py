@@ -19,6 +19,7 @@ from gateway.config import (
     save_endpoint,
 )
 from gateway.estimation.select import EstimationSettings
+from gateway.hub.settings import HubSettings
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -98,17 +99,17 @@ def test_changed_settings_survive_the_round_trip(tmp_path: Path) -> None:
             "[serial]\nbaud = 300",
             "serial.baud = 300: must be 9600 to 2000000 baud (speed of",
         ),
-        ('[serial]\nbaud = "fast"', 'serial.baud = "fast": expected `int`, got `str`'),
+        ('[serial]\nbaud = "fast"', 'serial.baud = "fast": must be 9600 to 2000000 baud'),
         ("[serial]\nbauds = 9600", "serial.bauds: no such setting; did you mean 'baud'?"),
         ("[serial]\nzzz = 1", "serial.zzz: no such setting; known here: port, baud"),
         ("[serail]", "serail: no such setting; did you mean 'serial'?"),
-        ("serial = 3", "serial = 3: expected"),
-        ('[serial]\nport = "ttyUSB0"', 'serial.port = "ttyUSB0": expected `str` matching'),
+        ("serial = 3", "serial = 3: must be"),
+        ('[serial]\nport = "ttyUSB0"', 'serial.port = "ttyUSB0": must be as described'),
         (
             "[vehicle.rates]\nattitude_hz = -1",
             "attitude_hz = -1: must be 0 to 1000 Hz (ATTITUDE",
         ),
-        ('[vehicle]\ntype = "ufo"', 'vehicle.type = "ufo": invalid enum value'),
+        ('[vehicle]\ntype = "ufo"', 'vehicle.type = "ufo": must be one of the choices'),
         ('[hub]\nendpoints = ["udp:"]', "hub: endpoint 'udp:'"),
         ("[serial\n", "is not valid TOML"),
         (f"[serial]\nbaud = {'9' * 5000}", "is not valid TOML: Exceeds the limit"),
@@ -270,3 +271,36 @@ def test_endpoint_is_added_to_file_with_comments_kept(tmp_path: Path) -> None:
         with pytest.raises(ConfigError):
             save_endpoint(file, wrong)
     assert file.read_text() == before
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ('[vehicle]\nsupply_low_v = "x"', 'vehicle.supply_low_v = "x": must be 0 to 12 V'),
+        ("[panel]\nenabled = 1", "panel.enabled = 1: must be true or false"),
+        ('[hub]\nendpoints = "udp:1"', "must be a list in brackets"),
+        ("[panel]\nhosts = [1]", "must be a list, each entry a text in quotes"),
+        ("[simulator]\ngps_outages_s = [[1]]", "each entry a list in brackets of 2 entries"),
+        ('[recording]\nmode = "never"', "allowed: manual, in_flight, always"),
+        ('[serial]\nport = "x"', "must be as described (where the receiver is"),
+        ('[hub]\nendpoints = ["192.168.1.20"]', "write udp:192.168.1.20:14550"),
+        ('[hub]\nendpoints = ["udp:1.2.3.4:5?trust=no"]', "did you mean 'trusted'?"),
+    ],
+)
+def test_wrong_value_is_described_without_texts_of_libraries(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_text(tmp_path, text)
+    assert words in str(caught.value)
+    assert not re.search("expected|`|regex|enum", str(caught.value).partition(" (")[0].lower())
+
+
+@pytest.mark.parametrize(
+    ("added", "found"),
+    [((), False), (("udp:192.168.1.20:14550",), False), (("serial:/dev/ttyACM0:57600",), True),
+     (("udp-listen:0.0.0.0:14552",), True), (("tcp:192.168.1.9:5760",), True)],
+)  # fmt: skip
+def test_sources_besides_the_receiver_are_found(added: tuple[str, ...], found: bool) -> None:
+    hub = HubSettings(endpoints=(*HubSettings().endpoints, *added))
+    assert hub.has_other_sources == found

@@ -20,7 +20,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
 from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG
-from gateway.cli.support.terminal import refuse, refusing
+from gateway.cli.support.terminal import in_words, refuse, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
 
@@ -212,7 +212,11 @@ class LazyGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run a command; errors that a user can mend end it with their text."""
         with refusing():
-            return super().invoke(ctx)
+            try:
+                return super().invoke(ctx)
+            except typer.BadParameter as error:
+                error.message = in_words(error)
+                raise
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the options of `mavgate` itself, wherever they are."""

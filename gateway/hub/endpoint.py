@@ -311,6 +311,8 @@ def _kind_and_rest(address: str) -> tuple[str, str]:
     if word in ADDED_KINDS:
         return word, rest
     word, rest = respell(address)
+    if not rest and (is_numeric(word) or "." in word):
+        raise ValueError(f"write udp:{word}:14550 to send to this host")
     if word not in set(EndpointKind):
         raise ValueError(unknown_choice("kind", word, [*EndpointKind, *sorted(ADDED_KINDS)]))
     return EndpointKind(word), rest

@@ -1,9 +1,14 @@
 """Settings of the hub."""
 
-from typing import Annotated
+from typing import Annotated, Final
 
 from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.settings import Settings, setting
+
+SOURCES: Final = frozenset({EndpointKind.SERIAL, EndpointKind.TCP, EndpointKind.UDP_LISTEN})
+"""Kinds by which autopilots are connected."""
+ENDPOINTS: Final = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
+"""The default."""
 
 
 class HubSettings(Settings, frozen=True):
@@ -19,7 +24,7 @@ class HubSettings(Settings, frozen=True):
             "serial:DEVICE:BAUD; "
             "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
         ),
-    ] = ("udp:127.0.0.1:14550", "udp-listen:127.0.0.1:14551")
+    ] = ENDPOINTS
     max_clients: Annotated[
         int,
         setting("Most clients that a listening endpoint serves at once.", ge=1, le=2000),
@@ -102,6 +107,12 @@ class HubSettings(Settings, frozen=True):
             le=99,
         ),
     ] = 0
+
+    @property
+    def has_other_sources(self) -> bool:
+        """Whether MAVLink may come from more than the default endpoints."""
+        added = {*self.endpoints} - {*ENDPOINTS}
+        return any(parse_endpoint(url).kind in SOURCES for url in added)
 
     def __post_init__(self) -> None:
         """Refuse wrong endpoints when the settings are read, not when they are used."""

@@ -29,7 +29,7 @@ from gateway.live.metrics_server import MetricsServer
 from gateway.live.part import RecordingBudget
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
-from gateway.live.serial_port import SerialPort
+from gateway.live.serial_port import NO_RECEIVER, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -98,7 +98,8 @@ class Daemon:
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
-        self._pipeline.disconnect(serial.port)
+        needed = serial.port != "auto" or not settings.hub.has_other_sources
+        self._pipeline.disconnect(serial.port if needed else NO_RECEIVER)
         self._hub = Hub(
             settings.hub,
             self._on_frame,
@@ -112,7 +113,7 @@ class Daemon:
         self._recorder = self._make_recorder()
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
-        self._serial = SerialPort(serial, *callbacks, self.now_us)
+        self._serial = SerialPort(serial, *callbacks, self.now_us, needed=needed)
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")

@@ -67,16 +67,21 @@ class SerialSettings(Settings, frozen=True):
         str,
         setting(
             'Where the receiver is: a device ("/dev/ttyUSB0"), a USB id with or without its serial '
-            'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), or "auto" for a known USB '
-            "adapter. If several fit, each is opened and asked for the receiver's frames, which "
-            "resets the boards behind them. `mavgate ports` lists them.",
-            pattern=r"^(auto|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
+            'number ("usb:1a86:7523", "usb:0403:6001:A50285BI"), "auto" for a known USB adapter, '
+            'or "none" for a router without one. "auto" with other sources among the endpoints '
+            "does not report that none is there. If several fit, each is opened and asked for the "
+            "receiver's frames, which resets the boards behind them. `mavgate ports` lists them.",
+            pattern=r"^(auto|none|/.+|usb:[0-9a-fA-F]{4}:[0-9a-fA-F]{4}(:.+)?)$",
         ),
     ] = "auto"
     baud: Annotated[
         int,
         setting("Speed of the line; the receiver's firmware must match.", "baud", ge=9600, le=2e6),
     ] = 500_000
+
+
+NO_RECEIVER: Final = "none"
+"""Setting `port` of a gateway that only routes."""
 
 
 class PortNotFoundError(UserError):
@@ -131,6 +136,8 @@ def fitting_ports(wanted: str, ports: list[Port]) -> list[str]:
 
     Raises PortNotFoundError if there is none.
     """
+    if wanted == NO_RECEIVER:
+        raise PortNotFoundError("serial.port = none: no receiver is used")
     if wanted == "auto":
         fitting = [port for port in ports if port.known]
     elif wanted.startswith("usb:"):
@@ -252,6 +259,8 @@ async def find_receiver(settings: SerialSettings) -> str:
 class SerialPort:
     """Keep one serial port open and pass on its bytes.
 
+    One that is not needed is not missed: that it is not there is no warning.
+
     `on_bytes` is called with every chunk and the gateway time of its reading; `on_open` and
     `on_lost` with the device, after each opening, before the first bytes, and after each loss.
     """
@@ -263,8 +272,11 @@ class SerialPort:
         on_open: Callable[[str], None],
         on_lost: Callable[[str], None],
         now_us: Callable[[], int],
+        *,
+        needed: bool = True,
     ) -> None:
         self._settings = settings
+        self._needed = needed
         self._on_bytes = on_bytes
         self._on_open = on_open
         self._on_lost = on_lost
@@ -333,6 +345,8 @@ class SerialPort:
 
     def _open(self) -> None:
         self._retry = None
+        if self._settings.port == NO_RECEIVER:
+            return
         ports = list_serial_ports()
         try:
             fitting = self._candidates(ports)
@@ -380,6 +394,7 @@ class SerialPort:
             # An adapter may hold bytes back to send more at once, FTDI's for 16 ms.
             port.set_low_latency_mode(True)
         log.info("receiver on %s at %d baud", device, self._settings.baud)
+        self._needed = True
         self._delay_s = FIRST_RETRY_S
         self._last_complaint = ""
         self._on_open(device)
@@ -429,5 +444,6 @@ class SerialPort:
     def _complain(self, text: str) -> None:
         """Log a problem once, however often it is repeated."""
         if text != self._last_complaint:
-            log.warning("%s; trying again until it works", text)
+            if self._needed:
+                log.warning("%s; trying again until it works", text)
             self._last_complaint = text

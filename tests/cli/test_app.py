@@ -162,3 +162,20 @@ def test_small_commands_import_nothing_large(words: list[str], tmp_path: Path) -
         env={"HOME": str(tmp_path), "XDG_RUNTIME_DIR": str(tmp_path), "PATH": "/usr/bin:/bin"},
     )
     assert done.stderr.splitlines()[-1] == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        ("sweep --hold-out x", "'x': write a whole number"),
+        ("sweep --gps-interval x", "'x': write a number"),
+        ("play x --as 300", "'300': must be at most 249"),
+        ("play x --skip-gaps -1", "'-1': must be at least 0"),
+        ("fuse x -o y.csv --fuse-with old", "'old' is not one of 'recorded', 'current'"),
+        ("mark north 8", "'north': write a number"),
+    ],
+)
+def test_invalid_value_is_named_with_what_is_allowed(words: str, text: str) -> None:
+    found = CliRunner().invoke(app, words.split(), env={"COLUMNS": "200"})
+    assert (found.exit_code, text in found.output) == (2, True)
+    assert not re.search("Input should|Value error|parse string", found.output)

@@ -17,8 +17,7 @@ RUN_MAY_NOT = {
     "numba",
     "prometheus_client",
     "rich",
-    "scipy.signal",
-    "scipy.spatial",
+    "scipy",
     "wsproto",
     "zenoh",
 }
@@ -43,6 +42,16 @@ def test_gateway_imports_no_optional_part() -> None:
         "gateway.simulator.simulator_settings",
         "gateway.simulator.timed_frame",
     }
+
+
+@pytest.mark.parametrize(
+    "module",
+    ["live.first_start", "live.calibrate", "live.demo", "recorded.catalogue", "recorded.convert",
+     "recorded.play", "recorded.report"],
+)  # fmt: skip
+def test_analysis_libraries_are_imported_only_where_they_are_used(module: str) -> None:
+    found = imported_by("gateway.cli.app", f"gateway.cli.{module}")
+    assert found & (NEVER | {"scipy"}) == set()
 
 
 def test_recording_summary_imports_neither_settings_nor_stages() -> None:

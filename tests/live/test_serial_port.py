@@ -145,9 +145,11 @@ class Listener:
     def on_lost(self, device: str) -> None:
         self.lost.append(device)
 
-    def port(self, wanted: str = "auto", now_us: Callable[[], int] = lambda: 42) -> SerialPort:
+    def port(
+        self, wanted: str = "auto", now_us: Callable[[], int] = lambda: 42, **how: bool
+    ) -> SerialPort:
         settings = SerialSettings(port=wanted)
-        return SerialPort(settings, self.on_bytes, self.on_open, self.on_lost, now_us)
+        return SerialPort(settings, self.on_bytes, self.on_open, self.on_lost, now_us, **how)
 
     async def until(self, *, opened: int = 0, data: bytes = b"") -> None:
         async with asyncio.timeout(60):
@@ -194,6 +196,38 @@ async def test_port_is_opened_again_after_it_was_unplugged(
     assert any("is gone" in text for text in warnings)
     missing = f"receiver {bench.link}: No such file or directory; trying again until it works"
     assert missing in warnings
+
+
+@pytest.mark.io
+@pytest.mark.usefixtures("fast_retry")
+async def test_port_that_is_not_needed_is_missed_only_after_it_was_there(
+    bench: Bench, listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    def warnings() -> list[str]:
+        return [each.getMessage() for each in caplog.records if each.levelname == "WARNING"]
+
+    link = listener.port(str(bench.link), needed=False)
+    link.start()
+    assert warnings() == []
+    bench.plug()
+    await listener.until(opened=1)
+    bench.pull()
+    async with asyncio.timeout(60):
+        while link.connected:
+            await asyncio.sleep(0)
+    link.close()
+    assert any("is gone" in text for text in warnings())
+
+
+@pytest.mark.io
+async def test_gateway_without_receiver_opens_no_port(
+    listener: Listener, caplog: pytest.LogCaptureFixture
+) -> None:
+    link = listener.port("none")
+    link.start()
+    assert (link.status([]).state, link.connected, caplog.records) == ("closed", False, [])
+    with pytest.raises(PortNotFoundError, match=r"serial.port = none"):
+        find_port("none", [])
 
 
 @pytest.mark.io
@@ -382,7 +416,7 @@ async def test_serial_port_is_changed_closed_and_opened_again(
     serial.Serial(first, timeout=0, exclusive=True).close()
     for path in ("/dev/watchdog", "/etc/passwd", "", "usb:1a86:7523"):
         refused = await ask(server, "serial.connect", port=path)
-        assert "is not a serial port of this machine" in refused["error"]
+        assert "is not a serial port here" in refused["error"]
     closed = (await ask(server, "serial.disconnect"))["result"]
     assert (closed["state"], closed["device"], port.connected) == ("closed", "", False)
     adapters.pull(first)

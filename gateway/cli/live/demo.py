@@ -34,6 +34,8 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 
+NOT_RECORDED: Final = "not recording without --record or `mavgate record start`"
+
 log = logging.getLogger(__name__)
 app = typer.Typer()
 
@@ -91,11 +93,11 @@ def demo(
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
 
         def apart(settings: GatewaySettings) -> GatewaySettings:
-            # Nor is an endless demo flight recorded, unless requested.
             recording = replace(settings.recording, mode="always" if record else "manual")
             return replace(settings, aircraft_folder=folder, recording=recording)
 
         def daemon() -> Daemon:
+            log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
             daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line))
             return daemons[0]
 

@@ -1,5 +1,7 @@
 """`mavgate setup`: a guided first start, on the real receiver or on the simulated one."""
 
+from __future__ import annotations
+
 import asyncio
 import logging
 import threading
@@ -7,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 from msgspec.structs import replace
@@ -24,13 +26,12 @@ from gateway.printable import figure
 from gateway.records import GpsFix, LinkReport, NodeStatus, RawRecord
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
-from gateway.simulator.flight import SimulatedAircraft
-from gateway.simulator.node import nodes_of
-from gateway.simulator.receiver import SimulatedReceiver
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.simulator.trajectory import Workbench
 from gateway.units import MV_PER_V
 from gateway.wire.payloads import SENSOR_BARO, SENSOR_GPS, SENSOR_IMU, SENSOR_MAG
+
+if TYPE_CHECKING:
+    from gateway.simulator.trajectory import Workbench
 
 LOOK_S: Final = 5.0
 """After opening: a bootloader takes up to 2 s, and every board reports once a second."""
@@ -287,6 +288,12 @@ def _observe(
 @contextmanager
 def simulated_receiver(settings: SimulatorSettings) -> Iterator[tuple[str, Workbench]]:
     """Run a simulated receiver and an aircraft on a workbench behind a pseudo-terminal."""
+    # Imported here: SciPy draws the simulated flight, and a real first start needs none.
+    from gateway.simulator.flight import SimulatedAircraft
+    from gateway.simulator.node import nodes_of
+    from gateway.simulator.receiver import SimulatedReceiver
+    from gateway.simulator.trajectory import Workbench
+
     bench = Workbench(settings)
     # The flight's dropouts do not occur on a workbench.
     settings = replace(settings, gps_outages_s=())

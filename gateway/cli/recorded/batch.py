@@ -10,7 +10,6 @@ from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, re
 from gateway.cli.support.batch_work import (
     HoldOutOption,
     IntervalOption,
-    JobsOption,
     SchedulerOption,
     SeasonFiles,
     SeasonWork,
@@ -18,7 +17,12 @@ from gateway.cli.support.batch_work import (
     season_options,
 )
 from gateway.cli.support.options import read_settings
-from gateway.cli.support.recording_options import ColumnsOption, ForceOption, FuseWithOption
+from gateway.cli.support.recording_options import (
+    ColumnsOption,
+    ForceOption,
+    FuseWithOption,
+    JobsOption,
+)
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.extras import how_to_add, missing, require
 from gateway.output import write_new

@@ -10,9 +10,8 @@ from typer.core import TyperGroup
 from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
-from gateway.cli.support.batch_work import JobsOption
 from gateway.cli.support.options import folder_of, read_options, read_settings
-from gateway.cli.support.recording_options import ColumnsOption
+from gateway.cli.support.recording_options import ColumnsOption, JobsOption
 from gateway.cli.support.terminal import (
     JsonOption,
     console_of,

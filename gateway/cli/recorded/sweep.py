@@ -31,18 +31,13 @@ from gateway.analysis.sweep import (
 from gateway.batch.statistics import Choice, FloatArray, choose, group_of
 from gateway.batch.storage import is_url
 from gateway.batch.tasks import FlightResult, SweepTask
-from gateway.cli.support.batch_work import (
-    HoldOutOption,
-    IntervalOption,
-    JobsOption,
-    SeasonWork,
-    season_options,
-)
+from gateway.cli.support.batch_work import HoldOutOption, IntervalOption, SeasonWork, season_options
 from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
     ForceOption,
     FuseWithOption,
+    JobsOption,
     ReferenceOption,
     SystemOption,
     fusion_of,

@@ -26,9 +26,6 @@ SchedulerOption = Annotated[
         "--scheduler", help="Work on a Dask cluster: tcp://HOST:8786.", show_default=False
     ),
 ]
-JobsOption = Annotated[
-    int | None, typer.Option("--jobs", help="Processes here; one a core by default.", min=1)
-]
 SeasonFiles = Annotated[
     list[str],
     typer.Argument(

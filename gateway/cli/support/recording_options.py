@@ -38,6 +38,9 @@ FromOption = Annotated[
     str | None, typer.Option("--from", help="Begin: 80, 1:20 or 2026-06-11T14:25:30Z.")
 ]
 ToOption = Annotated[str | None, typer.Option("--to", help="End, written like --from.")]
+JobsOption = Annotated[
+    int | None, typer.Option("--jobs", help="Processes here; one a core by default.", min=1)
+]
 ColumnsOption = Annotated[
     Path | None, typer.Option("--columns", help="Column map of another program's CSV (TOML).")
 ]

@@ -103,6 +103,25 @@ def refuse(text: str) -> NoReturn:
     raise typer.Exit(2)
 
 
+KINDS: Final = {"int": "write a whole number", "float": "write a number"}
+BOUNDS: Final = {"less_than_equal": ("le", "at most"), "greater_than_equal": ("ge", "at least")}
+"""Errors of the library that parses options, by their type."""
+
+
+def in_words(error: typer.BadParameter) -> str:
+    """Describe an argument or option that could not be parsed: its value, and what is allowed."""
+    errors: list[dict[str, Any]] = getattr(error.__cause__ or error.__context__, "errors", list)()
+    if not errors:
+        return error.message
+    found = errors[0]
+    kind, value = str(found["type"]), found["input"]
+    if kind in BOUNDS:
+        key, words = BOUNDS[kind]
+        return f"{value!r}: must be {words} {found['ctx'][key]:g}"
+    allowed = KINDS.get(kind.partition("_")[0], error.message.removeprefix("Value error, "))
+    return allowed if str(value) in allowed else f"{value!r}: {allowed}"
+
+
 @contextmanager
 def refusing() -> Iterator[None]:
     """End the command with a clear error where the user or a file is at fault."""
