@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import file_digest
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Final, get_type_hints
 from urllib.parse import quote
 
@@ -210,28 +210,34 @@ class FlightFigures(msgspec.Struct, frozen=True):
     loss: float | None = None
 
 
-def figures_of(folder: Path) -> dict[str, dict[int, FlightFigures]]:
-    """Sum up each recording from its catalogue, by name and vehicle.
+Figures = dict[PurePath, dict[int | None, FlightFigures]]
+"""By recording, with its folder, and by vehicle."""
+
+
+def figures_of(rows: Iterable[Row]) -> Figures:
+    """Sum up the recordings of a catalogue: the one definition, for every list of recordings.
 
     Tables and tlogs of a recording hold the same flight: of each figure the table's is taken. The
-    parts of a recording are added up.
+    parts of a recording are added up; broken ones are left out.
     """
-    parts: dict[tuple[str, int], list[Row]] = {}
-    for row in find_flights(folder, "error IS NULL AND vehicle IS NOT NULL"):
-        parts.setdefault((row["name"], row["vehicle"]), []).append(row)
-    found: dict[str, dict[int, FlightFigures]] = {}
-    for (name, vehicle), rows in parts.items():
-        kind = max((row["kind"] for row in rows), key=lambda kind: (kind == "table", str(kind)))
-        of_kind = [row for row in rows if row["kind"] == kind]
+    parts: dict[tuple[PurePath, int | None], list[Row]] = {}
+    for row in rows:
+        if row["error"] is None:
+            key = (PurePath(row["path"]).with_name(row["name"]), row["vehicle"])
+            parts.setdefault(key, []).append(row)
+    found: Figures = {}
+    for (path, vehicle), of_flight in parts.items():
+        kind = max((row["kind"] for row in of_flight), key=lambda one: (one == "table", str(one)))
+        of_kind = [row for row in of_flight if row["kind"] == kind]
 
         def known(column: str, rows: list[Row] = of_kind) -> list[Any]:
             return [row[column] for row in rows if row[column] is not None]
 
         distances, losses = known("distance"), known("loss")
         lengths_s: defaultdict[str, float] = defaultdict(float)
-        for row in rows:
+        for row in of_flight:
             lengths_s[row["kind"]] += row["duration"] or 0.0
-        found.setdefault(name, {})[vehicle] = FlightFigures(
+        found.setdefault(path, {})[vehicle] = FlightFigures(
             max(lengths_s.values()),
             sum(distances) if distances else None,
             max(known("highest"), default=None),

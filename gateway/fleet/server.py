@@ -29,6 +29,7 @@ from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, in_key
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
 from gateway.units import US_PER_S
+from gateway.vehicle.telemetry.announcements import TEXT_BYTES, utf8
 from gateway.wire.mavlink_signing import WindowVerifier, key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame, SplitFault, frame_of, split_datagram
 
@@ -331,7 +332,7 @@ class FleetServer:
 
     def _report_gone(self, site: SiteClient) -> None:
         """Send the ground stations one text from each of the site's vehicles."""
-        text = f"Site {site.endpoint.site} disconnected"[:50].encode()
+        text = utf8(f"Site {site.endpoint.site} disconnected", TEXT_BYTES)
         for system_id in site.translation.traffic:
             own_id = self._ids.known_id(site.endpoint.site, system_id)
             if own_id is None:

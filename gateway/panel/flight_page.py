@@ -11,8 +11,9 @@ import html
 import json
 import math
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,12 +28,13 @@ from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
 from gateway.analysis.metrics import euler_rad
 from gateway.panel.state.fleet import FlightHistory, VehicleState
 from gateway.printable import printable, reason_of
+from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError
-from gateway.recordings.opening import open_flights
-from gateway.recordings.play import Track
+from gateway.recordings.positions import Continuity, GroundDistance
 from gateway.recordings.reading import ReadOptions
+from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import message_id_of, origin_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 
 WEB: Final = Path(__file__).parent / "web"
 COMPONENTS: Final = (
@@ -47,10 +49,10 @@ MAX_ROWS: Final = 80_000
 """States of one aircraft: more than five hours; of a longer flight every n-th is kept."""
 MAX_TEXTS: Final = 2000
 READ: Final = frozenset(
-    getattr(mavlink, f"MAVLINK_MSG_ID_{name}")
+    MESSAGE_IDS[name]
     for name in (
         "HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "GLOBAL_POSITION_INT", "GPS_RAW_INT",
-        "VFR_HUD", "HOME_POSITION", "STATUSTEXT", "BATTERY_STATUS", "SYS_STATUS",
+        "VFR_HUD", "HOME_POSITION", "BATTERY_STATUS", "SYS_STATUS", "GPS_GLOBAL_ORIGIN",
         "ESTIMATOR_STATUS", "NAV_CONTROLLER_OUTPUT",
     )
 )  # fmt: skip
@@ -90,6 +92,9 @@ class PageFlight:
     """Civil time of the first state, in µs since 1970; 0 if unknown."""
     aircraft: dict[int, VehicleState] = field(default_factory=dict)
     histories: dict[int, FlightHistory] = field(default_factory=dict)
+    breaks: dict[int, list[int]] = field(default_factory=dict)
+    """Times at which the track of an aircraft begins again after an interruption, µs."""
+    distances: dict[int, GroundDistance] = field(default_factory=dict)
     texts: list[tuple[int, int, int, str]] = field(default_factory=list)
     """Time in µs, system id, severity, text."""
     compared: dict[str, dict[str, FloatArray]] = field(default_factory=dict)
@@ -103,11 +108,12 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     Raises FlightError if it contains no position; OSError if it cannot be read.
     """
     flight = PageFlight(name)
-    with ExitStack() as opened:
-        for recording in open_flights(files, options, opened):
-            flight.remarks += recording.remarks
-            for source in recording.sources:
-                _read_source(Track(source), flight)
+    recorded = FlightToWrite(files, options)
+    reader = mavlink.MAVLink(None)
+    tracks: defaultdict[int, Continuity] = defaultdict(Continuity)
+    for message in recorded.vehicle_messages(READ):
+        _take(flight, message, reader, tracks[message.system_id])
+    flight.remarks += recorded.remarks
     flight.histories = {key: one for key, one in flight.histories.items() if len(one) > 1}
     if not flight.histories:
         raise FlightError(f"{name}: it contains no position, so there is no flight to show")
@@ -115,32 +121,26 @@ def read_flight(files: Sequence[Path], options: ReadOptions, name: str) -> PageF
     return flight
 
 
-def _read_source(track: Track, flight: PageFlight) -> None:
-    """Take the states of all aircraft out of one source of frames."""
-    reader: Any = mavlink.MAVLink(None)
-    heard: dict[int, int] = {}
-    while (time_us := track.peek_us()) is not None:
-        frame = track.take()
-        system_id, component_id = origin_of(frame)
-        if component_id != mavlink.MAV_COMP_ID_AUTOPILOT1 or message_id_of(frame) not in READ:
-            continue
-        try:
-            message = reader.decode(bytearray(frame))
-        except mavlink.MAVError:
-            continue
-        vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
-        texts = len(vehicle.texts.all) and vehicle.texts.all[-1].number
-        vehicle.take(message, time_us)
-        if vehicle.texts.all and vehicle.texts.all[-1].number != texts:
-            newest = vehicle.texts.all[-1]
-            if len(flight.texts) < MAX_TEXTS:
-                flight.texts.append((time_us, system_id, newest.severity, newest.text))
-        if message.get_type() == "GLOBAL_POSITION_INT" and (
-            time_us - heard.get(system_id, -STEP_US) >= STEP_US
-        ):
-            heard[system_id] = time_us
-            history = flight.histories.setdefault(system_id, FlightHistory(MAX_ROWS))
-            history.add(time_us, vehicle.instant(time_us))
+def _take(flight: PageFlight, message: VehicleMessage, reader: Any, track: Continuity) -> None:
+    """Take in the next message of an aircraft."""
+    system_id, time_us = message.system_id, message.time_us
+    if (text := message.text) is not None:
+        if len(flight.texts) < MAX_TEXTS:
+            flight.texts.append((time_us, system_id, text.severity, text.text))
+        return
+    vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
+    with suppress(mavlink.MAVError):
+        vehicle.take(reader.decode(bytearray(message.frame)), time_us)
+    if (at := message.position) is None or vehicle.position is None:
+        return
+    place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)
+    flight.distances.setdefault(system_id, GroundDistance()).update(*place)
+    history = flight.histories.setdefault(system_id, FlightHistory(MAX_ROWS))
+    if time_us - history.newest_us < STEP_US and len(history):
+        return
+    if track.is_broken_at(*place):
+        flight.breaks.setdefault(system_id, []).append(time_us)
+    history.add(time_us, vehicle.instant(time_us))
 
 
 def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadOptions) -> None:
@@ -209,6 +209,8 @@ def _data_of(flight: PageFlight) -> dict[str, Any]:
                 "model": flight.aircraft[system_id].model,
                 "home": _spot(flight.aircraft[system_id].home),
                 "columns": dict(_columns_of(history, zero_us)),
+                "breaks": [time_us - zero_us for time_us in flight.breaks.get(system_id, ())],
+                "distance_m": flight.distances[system_id].distance_m,
             }
             for system_id, history in sorted(flight.histories.items())
         ],

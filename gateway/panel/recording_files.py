@@ -23,7 +23,7 @@ from collections.abc import AsyncIterator, Callable, Generator, Sequence
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, BinaryIO, Final
 from urllib.parse import quote
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
@@ -32,7 +32,15 @@ from fastapi import FastAPI
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 
-from gateway.batch.catalogue import CATALOGUE_NAME, CatalogueError, Row, find_flights, geojson_of
+from gateway.batch.catalogue import (
+    CATALOGUE_NAME,
+    CatalogueError,
+    Figures,
+    FlightFigures,
+    figures_of,
+    find_flights,
+    geojson_of,
+)
 from gateway.geometry.angle import wrap_180
 from gateway.live.terminal import own_command
 from gateway.panel.access import RECORDINGS, ROLE, Role
@@ -174,7 +182,7 @@ def _recording_name(name: str, path: Path) -> str:
     suffix = KINDS.get(_kind(path))
     if suffix is None:
         allowed = " and ".join(str(kind) for kind in KINDS)
-        raise ValueError(f"this unknown file format: {allowed} are taken")
+        raise ValueError(f"unknown file format: {allowed} are accepted")
     return f"{name}{suffix}"
 
 
@@ -200,11 +208,12 @@ MAX_CORNERS: Final = 60
 
 
 class RecordingFacts:
-    """The rows of a folder's catalogue by recording, if it has one."""
+    """Figures and tracks of a folder's recordings, if it has a catalogue."""
 
     def __init__(self) -> None:
         self._asked: tuple[Path, tuple[int, int] | None, str] | None = None
-        self._rows: dict[str, Row] = {}
+        self._figures: Figures = {}
+        self._broken: set[str] = set()
         self._found: frozenset[str] | None = None
         self._tracks: dict[str, str] = {}
         self.trouble = ""
@@ -221,7 +230,9 @@ class RecordingFacts:
         self._asked, self.trouble = (folder, stamp, search), "" if stamp else NO_CATALOGUE
         is_condition = not OPERATORS.isdisjoint(search)
         try:
-            self._rows = {} if stamp is None else _by_name(find_flights(folder))
+            rows = [] if stamp is None else find_flights(folder)
+            self._figures = figures_of(rows)
+            self._broken = {row["name"] for row in rows if row["error"] is not None}
             self._tracks = {} if stamp is None else _thumbnails(geojson_of(folder))
             self._found = (
                 frozenset(row["name"] for row in find_flights(folder, search))
@@ -231,9 +242,11 @@ class RecordingFacts:
         except CatalogueError as error:
             self.trouble, self._found = str(error), frozenset()
 
-    def of(self, name: str) -> Row | None:
-        """Return the row of a recording."""
-        return self._rows.get(name)
+    def of(self, name: str) -> FlightFigures | str | None:
+        """Return the figures of the vehicle that a recording holds longest, or "broken"."""
+        flown = self._figures.get(PurePath(name), {})
+        longest = max(flown.values(), key=lambda figures: figures.duration, default=None)
+        return "broken" if longest is None and name in self._broken else longest
 
     def track(self, name: str) -> str:
         """Return the corners of a recording's track, `x,y` each; empty if unknown."""
@@ -253,20 +266,6 @@ def _stamp(folder: Path) -> tuple[int, int] | None:
     except OSError:
         return None
     return found.st_mtime_ns, found.st_size
-
-
-def _by_name(rows: Sequence[Row]) -> dict[str, Row]:
-    """Choose one row per recording: of its longest file, preferably a table."""
-    found: dict[str, Row] = {}
-    for row in rows:
-        before = found.get(row["name"])
-        if before is None or _weight(row) > _weight(before):
-            found[row["name"]] = row
-    return found
-
-
-def _weight(row: Row) -> tuple[bool, float]:
-    return row["kind"] == "table", row["duration"] or 0.0
 
 
 def _thumbnails(features: dict[str, Any]) -> dict[str, str]:

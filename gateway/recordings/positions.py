@@ -60,6 +60,7 @@ _SOURCES: Final = {
 }  # fmt: skip
 POSITION_SOURCES: Final = {MESSAGE_IDS[name]: source for name, source in _SOURCES.items()}
 """By message id, the best first: estimates of the vehicle, receivers, narrow links."""
+RANKS: Final = {message_id: rank for rank, message_id in enumerate(POSITION_SOURCES)}
 GPS_IDS: Final = (MESSAGE_IDS["GPS_RAW_INT"], MESSAGE_IDS["GPS2_RAW"])
 """Of the first and of the second GPS receiver."""
 GLOBAL_POSITION_INT_ID: Final = MESSAGE_IDS["GLOBAL_POSITION_INT"]

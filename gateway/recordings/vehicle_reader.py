@@ -40,6 +40,8 @@ class VehicleMessage:
     q_nb: Quat | None = None
     """Attitude of the vehicle, body FRD to NED, if this is its best message with a valid one."""
     text: JoinedText | None = None
+    frame: bytes = b""
+    """The whole frame; of a text none."""
 
     @property
     def boot_us(self) -> int | None:
@@ -138,7 +140,9 @@ class VehicleReader:
             position = position_of(message_id, fields, self._frame_origins.get(system_id))
         elif message_id == vehicle.attitude_id:
             q_nb = attitude_of(fields)
-        return VehicleMessage(system_id, record.time_us, message_id, fields, position, q_nb)
+        return VehicleMessage(
+            system_id, record.time_us, message_id, fields, position, q_nb, frame=record.frame
+        )
 
 
 def _of_text(text: JoinedText) -> VehicleMessage:

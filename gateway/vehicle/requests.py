@@ -336,7 +336,7 @@ def describe(message: Any) -> str:
         payload = bytes(message.payload)
         path = payload[_FTP_DATA : _FTP_DATA + payload[4]].partition(b"\0")[0]
         opcode = _name("MAV_FTP_OPCODE", payload[_FTP_OPCODE])
-        subject = f"{opcode} {path.decode('ascii', 'replace')}"
+        subject = f"{opcode} {path.decode(errors='replace')}"
     return _UNSAFE.sub("?", f"{kind} {subject}".strip())
 
 

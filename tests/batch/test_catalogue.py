@@ -3,7 +3,8 @@ import json
 import os
 import re
 import sqlite3
-from pathlib import Path
+from pathlib import Path, PurePath
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from gateway.batch.catalogue import (
     Catalogue,
     CataloguedFile,
     CatalogueError,
+    FlightFigures,
+    figures_of,
     find_flights,
     geojson_of,
     index_folder,
@@ -366,6 +369,29 @@ def test_slow_fix_rate_is_not_an_outage() -> None:
         tally.add_gps(second * US_PER_S, fixed=True)
     facts = tally.facts(35 * US_PER_S)
     assert (facts.gps_outages, facts.gps_lost) == (1, 15.0)
+
+
+def row(path: str, name: str, duration: float, **more: Any) -> dict[str, Any]:
+    kind = "table" if path.endswith("csv") else "tlog"
+    return {
+        "path": path, "name": name, "kind": kind, "vehicle": 1, "duration": duration,
+        "distance": None, "highest": None, "loss": None, "error": None,
+    } | more  # fmt: skip
+
+
+def test_figures_add_up_parts_and_keep_folders_apart() -> None:
+    rows = [
+        row("a_01.tlog", "a", 60.5, distance=900.0, highest=10.0),
+        row("a_01_v1.csv", "a", 60.0, distance=910.0, highest=11.0, loss=0.1),
+        row("a_02_v1.csv", "a", 30.0, distance=90.0, highest=5.0, loss=0.3),
+        row("b/a_01.tlog", "a", 5.0, distance=7.0),
+        row("b/a_02.tlog", "a", 5.0, vehicle=2),
+        row("c_01.tlog", "c", 9.0, error="damaged"),
+    ]
+    assert figures_of(rows) == {
+        PurePath("a"): {1: FlightFigures(90.0, 1000.0, 11.0, 0.2)},
+        PurePath("b/a"): {1: FlightFigures(5.0, 7.0), 2: FlightFigures(5.0)},
+    }
 
 
 def test_commands_index_list_and_show(tmp_path: Path, folder: Path) -> None:

@@ -48,6 +48,44 @@ def test_page_contains_the_states_and_texts_of_a_flight(tmp_path: Path) -> None:
     assert set(unpacked(page, "modules")) >= {"vue", "./flight_page.js"}
 
 
+def page_of(folder: Path, messages: list[tuple[float, Any]]) -> Any:
+    path, link = folder / "day_01.tlog", mavlink.MAVLink(None, 3, 1)
+    records = [(BEGIN_US + round(s * 1e6), bytes(m.pack(link))) for s, m in messages]
+    path.write_bytes(b"".join(encode_record(*record) for record in records))
+    return unpacked(render_page(read_flight([path], read_options(GatewaySettings()), "x")), "data")
+
+
+def located(lat: int, boot_ms: int = 0) -> Any:
+    return mavlink.MAVLink_global_position_int_message(
+        boot_ms, lat, lat // 5, 430_000, 0, 0, 0, 0, 0
+    )
+
+
+@pytest.mark.io
+def test_page_leaves_out_positions_before_the_fix_and_joins_texts(tmp_path: Path) -> None:
+    text = mavlink.MAVLink_statustext_message
+    sent = [(k * 0.5, located(470_000_000 if k > 3 else 0)) for k in range(10)]
+    sent += [(5.0, text(4, b"a" * 50, 7, 0)), (5.1, text(4, "ende ü".encode(), 7, 1))]
+    data = page_of(tmp_path, sent)
+    (aircraft,) = data["aircraft"]
+    assert len(aircraft["columns"]["lat_deg"]["d"]) == 6
+    assert (aircraft["breaks"], aircraft["distance_m"]) == ([], 0.0)
+    assert [words for *_, words in data["texts"]] == ["a" * 50 + "ende ü"]
+
+
+@pytest.mark.io
+def test_page_of_gps_fixes_alone_has_a_track_and_its_interruption(tmp_path: Path) -> None:
+    fixes = [
+        (at, mavlink.MAVLink_gps_raw_int_message(
+            0, 3, 470_000_000 + round(at * 100), 85_000_000, 430_000, 1, 1, 0, 0, 9))
+        for at in (0.0, 1.0, 2.0, 3600.0, 3601.0)
+    ]  # fmt: skip
+    (aircraft,) = page_of(tmp_path, fixes)["aircraft"]
+    assert len(aircraft["columns"]["lat_deg"]["d"]) == 5
+    assert aircraft["breaks"] == [3_600_000_000]
+    assert aircraft["distance_m"] == pytest.approx(3 * 1.11, rel=0.02)
+
+
 @pytest.mark.io
 @pytest.mark.slow
 def test_page_of_a_quarter_of_an_hour_is_small(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from fastapi import FastAPI
 from pymavlink.dialects.v20 import common as mavlink
 from starlette.types import Receive, Scope, Send
 
-from gateway.batch.catalogue import Catalogue, CataloguedFile
+from gateway.batch.catalogue import Catalogue, CataloguedFile, FlightFigures
 from gateway.batch.facts import FlightFacts
 from gateway.panel import recording_files
 from gateway.panel.access import ROLE, Role
@@ -109,7 +109,7 @@ async def test_invalid_upload_leaves_no_file(
 ) -> None:
     answer = await client.put("/recordings/upload", content=content)
     assert (answer.status_code, list(folder.iterdir())) == (HTTPStatus.BAD_REQUEST, [])
-    assert "no recording" in answer.text
+    assert "unknown file format" in answer.text
 
 
 async def test_upload_under_an_existing_name_is_refused(
@@ -181,10 +181,8 @@ def test_recording_is_found_by_name_and_by_condition(tmp_path: Path) -> None:
     facts = RecordingFacts()
     facts.look(tmp_path, "morn")
     assert [facts.shows(name, "morn") for name in ("Morning", "evening")] == [True, False]
-    row = facts.of("Morning")
-    assert row is not None
     # The table contains more facts than the tlog next to it.
-    assert (row["kind"], row["duration"], row["loss"]) == ("table", 400.0, 0.1)
+    assert facts.of("Morning") == FlightFigures(400.0, loss=0.1)
     facts.look(tmp_path, "duration < 300")
     assert [facts.shows(name, "duration < 300") for name in ("Morning", "evening")] == [False, True]
 
@@ -285,9 +283,9 @@ async def test_indexed_recording_has_facts_and_a_track(exported: Path) -> None:
     assert jobs._indexing is not None
     await jobs._indexing
     facts.look(exported)
-    row = facts.of(NAME)
-    assert row is not None
-    assert row["duration"] == pytest.approx(39.9, abs=0.5)
+    figures = facts.of(NAME)
+    assert isinstance(figures, FlightFigures)
+    assert figures.duration == pytest.approx(39.9, abs=0.5)
     corners = [tuple(map(float, corner.split(","))) for corner in facts.track(NAME).split()]
     assert len(corners) > 5
     assert all(0 <= x <= 46 and 0 <= y <= 24 for x, y in corners)

@@ -163,7 +163,7 @@ def _size(status: dict[str, Any]) -> int:
 
 def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]]":
     """Bring the catalogue of the recordings up to date, and take their figures from it."""
-    from gateway.batch.catalogue import CatalogueError, figures_of, index_folder
+    from gateway.batch.catalogue import CatalogueError, figures_of, find_flights, index_folder
     from gateway.batch.executors import ThisProcess
 
     folder = recordings[0].files[0].parent
@@ -175,7 +175,11 @@ def _figures(recordings: list[Recording]) -> "dict[str, dict[int, FlightFigures]
 
         try:
             index_folder(folder, read_options(read_settings()), ThisProcess(), show)
-            return figures_of(folder)
+            found = figures_of(find_flights(folder))
+            return {
+                str(path): {vehicle: one for vehicle, one in flown.items() if vehicle is not None}
+                for path, flown in found.items()
+            }
         except (CatalogueError, OSError) as error:
             console.print(f"no figures of the flights: {error}")
             return {}

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final
 import typer
 from typer.core import TyperGroup
 
-from gateway.batch.catalogue import Row, find_flights, geojson_of, index_folder
+from gateway.batch.catalogue import Row, figures_of, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
 from gateway.batch.facts import UNITS
 from gateway.cli.support.options import folder_of, read_options, read_settings
@@ -161,25 +161,11 @@ def _show_table(rows: list[Row]) -> None:
         )  # fmt: skip
     console = console_of()
     console.print(grid)
-    lasted_s = _durations_s(rows)
-    hours = sum(lasted_s.values()) / 3600.0
+    lasted_s = [one.duration for flown in figures_of(rows).values() for one in flown.values()]
+    hours = sum(lasted_s) / 3600.0
     files = len({row["path"] for row in rows})
     broken = sum(row["error"] is not None for row in rows)
     console.print(
         f"{counted(len(lasted_s), 'flight')}, {hours:.2f} h, in {counted(files, 'file')}; "
         f"{broken} unreadable"
     )
-
-
-def _durations_s(rows: list[Row]) -> dict[tuple[Path, int | None], float]:
-    """Return how long each flight lasted, by recording, with its folder, and aircraft.
-
-    The tables of a recording hold the same flight as its tlogs; its parts follow one another.
-    """
-    found: dict[tuple[Path, int | None], dict[str, float]] = {}
-    for row in rows:
-        if row["error"] is None:
-            flight = Path(row["path"]).with_name(row["name"]), row["vehicle"]
-            of_kind = found.setdefault(flight, {})
-            of_kind[row["kind"]] = of_kind.get(row["kind"], 0.0) + (row["duration"] or 0.0)
-    return {flight: max(of_kind.values()) for flight, of_kind in found.items()}

@@ -3,8 +3,8 @@
 import math
 from array import array
 from collections import Counter, deque
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any, Final
 
 import msgspec
@@ -13,10 +13,13 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
+from gateway.recordings.positions import RANKS, Position, is_located, named_position, position_of
 from gateway.recordings.senders import FIRST_GROUND_STATION
+from gateway.recordings.status_texts import JoinedText, TextJoiner
+from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import DEGE7, is_on_earth
+from gateway.vehicle.plan import DEGE7
 from gateway.wire.mavlink_splitter import message_id_of
 
 
@@ -95,8 +98,6 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     battery_s: float
 
 
-CHUNK: Final = 50
-"""Letters of one message; a shorter one, or one with a zero, ends its text."""
 MAX_TEXTS: Final = 500
 MAX_LETTERS: Final = 2_000
 """Longer texts are cut there."""
@@ -121,33 +122,38 @@ class StatusTexts:
     def __init__(self) -> None:
         self.all: deque[TimedText] = deque(maxlen=MAX_TEXTS)
         self._count = 0
-        self._open: tuple[int, int] | None = None
-        """Id and next chunk of the newest entry, while it is incomplete."""
+        self._joiner = TextJoiner()
 
     def take(self, message: Any, now_us: int) -> None:
         """Take one STATUSTEXT; the chunks of a long one go into one entry, blanks into none."""
-        text, number, chunk = message.text, message.id, message.chunk_seq
-        if self._open == (number, chunk) and self.all:
-            joined = (self.all[-1].text + text)[:MAX_LETTERS]
-            self.all[-1] = replace(self.all[-1], text=joined)
-        elif text.strip():
-            self._count += 1
-            self.all.append(TimedText(self._count, now_us, message.severity, text))
-        else:
-            self._open = None
-            return
-        continues = number and len(text) == CHUNK
-        self._open = (number, chunk + 1) if continues else None
+        self._add(self._joiner.feed(bytes(message.get_msgbuf()), now_us))
+
+    def poll(self, now_us: int) -> None:
+        """Add the texts whose last chunks are lost."""
+        self._add(self._joiner.poll(now_us))
+
+    def flush(self) -> None:
+        """Add the texts that are not complete."""
+        self._add(self._joiner.flush())
+
+    def _add(self, texts: Iterable[JoinedText]) -> None:
+        for joined in texts:
+            if text := joined.text.strip()[:MAX_LETTERS]:
+                self._count += 1
+                self.all.append(TimedText(self._count, joined.time_us, joined.severity, text))
 
 
 MM: Final = 1e3
 CM: Final = 1e2
 UNKNOWN_MV: Final = 65535
+UNKNOWN_U32: Final = 0xFFFFFFFF
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 
 MAX_TRACK: Final = 20_000
 """Moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
 TRACK_INTERVAL_US: Final = 200_000
+POSITION_FRESH_US: Final = 3 * US_PER_S
+"""Positions of a poorer source are left out so long after one of a better source."""
 ATTITUDE_FRESH_US: Final = US_PER_S
 """The quaternion is preferred to the angles unless it is older than this."""
 
@@ -242,10 +248,15 @@ class VehicleState:
         """STATUSTEXT, the newest last."""
         self.exact_mark: Spot | None = None
         """The mark from the gateway's control socket, exact where MAVLink is rounded."""
+        self.position: Position | None = None
+        """The newest of its best source."""
+        self._position_us = -POSITION_FRESH_US
+        self._position_rank = len(RANKS)
+        self._frame_origin: Position | None = None
         self._moved_us = 0
         self._takers: dict[str, Callable[[Any, int], None]] = {
             "STATUSTEXT": self.texts.take,
-            "GLOBAL_POSITION_INT": self._take_position,
+            "GPS_GLOBAL_ORIGIN": self._take_origin,
             "GPS_RAW_INT": self._take_fix,
             "ATTITUDE": self._note_motion,
             "ATTITUDE_QUATERNION": self._note_motion,
@@ -256,8 +267,11 @@ class VehicleState:
         name = message.get_type()
         self.newest[name] = message
         self.heard_us[name] = now_us
+        self.texts.poll(now_us)
         if taker := self._takers.get(name):
             taker(message, now_us)
+        if message.get_msgId() in RANKS:
+            self._take_position(message, now_us)
 
     @property
     def name(self) -> str:
@@ -304,7 +318,7 @@ class VehicleState:
     def home(self) -> Spot | None:
         """Home, if known."""
         message = self.newest.get("HOME_POSITION")
-        if message is None:
+        if message is None or not is_located(message.latitude, message.longitude):
             return None
         return Spot(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
 
@@ -312,7 +326,7 @@ class VehicleState:
         """Return the present state."""
         get = self.newest.get
         q_nb, rates = self._attitude()
-        position, hud = get("GLOBAL_POSITION_INT"), get("VFR_HUD")
+        at, position, hud = self.position, get("GLOBAL_POSITION_INT"), get("VFR_HUD")
         fix, beat = get("GPS_RAW_INT"), get("HEARTBEAT")
         mark, distance_m, bearing_deg = self._mark()
         return Instant(
@@ -325,12 +339,12 @@ class VehicleState:
             silent_s=self.silent_s(now_us),
             q_nb=q_nb,
             rate_b_radps=rates,
-            lat_deg=position.lat / DEGE7 if position else NAN,
-            lon_deg=position.lon / DEGE7 if position else NAN,
-            alt_amsl_m=position.alt / MM if position else (hud.alt if hud else NAN),
-            alt_home_m=position.relative_alt / MM if position else NAN,
-            vel_n_mps=_vel_n_mps(position),
-            groundspeed_mps=hud.groundspeed if hud else NAN,
+            lat_deg=at.lat_deg if at else NAN,
+            lon_deg=at.lon_deg if at else NAN,
+            alt_amsl_m=at.alt_amsl_m if at else (hud.alt if hud else NAN),
+            alt_home_m=at.alt_home_m if at else NAN,
+            vel_n_mps=at.vel_n_mps if at else UNKNOWN_VEC3,
+            groundspeed_mps=hud.groundspeed if hud else (at.groundspeed_mps if at else NAN),
             airspeed_mps=_airspeed_mps(hud),
             climb_mps=hud.climb if hud else NAN,
             heading_deg=_heading_deg(position, hud),
@@ -344,7 +358,7 @@ class VehicleState:
             mark_bearing_deg=bearing_deg,
             **_battery(get("BATTERY_STATUS"), get("SYS_STATUS")),
             attitude_s=self._age_s(now_us, "ATTITUDE_QUATERNION", "ATTITUDE"),
-            position_s=self._age_s(now_us, "GLOBAL_POSITION_INT"),
+            position_s=(now_us - self._position_us) / US_PER_S if at else NAN,
             hud_s=self._age_s(now_us, "VFR_HUD"),
             gps_s=self._age_s(now_us, "GPS_RAW_INT"),
             battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
@@ -368,29 +382,37 @@ class VehicleState:
         estimator, fix = self.newest.get("ESTIMATOR_STATUS"), self.newest.get("GPS_RAW_INT")
         if estimator and math.isfinite(estimator.pos_horiz_accuracy):
             return float(estimator.pos_horiz_accuracy)
-        return fix.h_acc / MM if fix and fix.h_acc else NAN
+        return fix.h_acc / MM if fix and 0 < fix.h_acc < UNKNOWN_U32 else NAN
 
     def _mark(self) -> tuple[Spot | None, float, float]:
         """Return the mark, and the distance and bearing reported by the aircraft."""
-        get = self.newest.get
-        way, position = get("NAV_CONTROLLER_OUTPUT"), get("GLOBAL_POSITION_INT")
-        if way is None or position is None or not way.wp_dist:
+        way, at = self.newest.get("NAV_CONTROLLER_OUTPUT"), self.position
+        if way is None or at is None or not way.wp_dist:
             return self.exact_mark, NAN, NAN
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
         if self.exact_mark is not None:
             return self.exact_mark, distance_m, bearing_deg
-        if not is_on_earth(position.lat / DEGE7, position.lon / DEGE7):
-            return None, distance_m, bearing_deg
-        lat_deg, lon_deg = vincenty.vreckon(
-            position.lat / DEGE7, position.lon / DEGE7, distance_m, bearing_deg
-        )
+        lat_deg, lon_deg = vincenty.vreckon(at.lat_deg, at.lon_deg, distance_m, bearing_deg)
         lon_deg = wrap_180(float(lon_deg))
         return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
 
     def _note_motion(self, _message: Any, now_us: int) -> None:
         self._moved_us = now_us
 
-    def _take_position(self, _message: Any, now_us: int) -> None:
+    def _take_origin(self, message: Any, _now_us: int) -> None:
+        self._frame_origin = named_position(fields_of(bytes(message.get_msgbuf())))
+
+    def _take_position(self, message: Any, now_us: int) -> None:
+        """Take a valid position, unless a better source sent one shortly before."""
+        message_id = message.get_msgId()
+        rank, age_us = RANKS[message_id], now_us - self._position_us
+        if rank > self._position_rank and age_us < POSITION_FRESH_US:
+            return
+        fields = fields_of(bytes(message.get_msgbuf()))
+        found = position_of(message_id, fields, self._frame_origin)
+        if found is None:
+            return
+        self.position, self._position_us, self._position_rank = found, now_us, rank
         self._moved_us = now_us
         if now_us - self.history.newest_us >= TRACK_INTERVAL_US:
             self.history.add(now_us, self.instant(now_us))
@@ -423,12 +445,6 @@ def _airspeed_mps(hud: Any) -> float:
     return NAN if hud is None or hud.airspeed == hud.groundspeed else float(hud.airspeed)
 
 
-def _vel_n_mps(position: Any) -> tuple[float, float, float]:
-    if position is None:
-        return UNKNOWN_VEC3
-    return position.vx / CM, position.vy / CM, position.vz / CM
-
-
 def _heading_deg(position: Any, hud: Any) -> float:
     if position is not None and position.hdg != 65535:
         return float(position.hdg / CM)
@@ -437,6 +453,8 @@ def _heading_deg(position: Any, hud: Any) -> float:
 
 def _spot_of_fix(message: Any) -> Spot | None:
     if message is None or message.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
+        return None
+    if not is_located(message.lat, message.lon):
         return None
     return Spot(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
 

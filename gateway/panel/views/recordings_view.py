@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from nicegui import ui
 
-from gateway.batch.catalogue import Row
+from gateway.batch.catalogue import FlightFigures
 from gateway.panel.access import RECORDINGS
 from gateway.panel.player_bar import open_playback
 from gateway.panel.recording_files import FORMATS, RecordingFacts
@@ -26,7 +26,7 @@ from gateway.panel.widgets import (
     notify_failure,
     ongoing,
 )
-from gateway.printable import UNKNOWN, figure, printable
+from gateway.printable import figure, printable
 from gateway.recordings.index import Recording, delete_recording, list_recordings
 from gateway.units import counted
 
@@ -132,7 +132,7 @@ class RecordingsView:
         await open_playback(self._context, name)
 
 
-def _row(recording: Recording, facts: Row | None, track: str) -> Cells:
+def _row(recording: Recording, facts: FlightFigures | str | None, track: str) -> Cells:
     when = datetime.fromtimestamp(recording.modified_s, UTC)
     endings = [file.suffix for file in recording.files]
     kinds = [(endings.count(".csv"), "table"), (endings.count(".tlog"), "tlog")]
@@ -145,17 +145,15 @@ def _row(recording: Recording, facts: Row | None, track: str) -> Cells:
     )
 
 
-def _facts_cells(facts: Row | None) -> Cells:
+def _facts_cells(facts: FlightFigures | str | None) -> Cells:
     """Return the catalogue's cells; blank where unknown."""
     if facts is None:
         return ("",) * len(FACTS)
-    if facts["error"] is not None:
-        return (("broken", "bad"), "", "", "")
-    duration, distance, highest, loss = (
-        facts[key] for key in ("duration", "distance", "highest", "loss")
-    )
+    if isinstance(facts, str):
+        return ((facts, "bad"), "", "", "")
+    distance, highest, loss = facts.distance, facts.highest, facts.loss
     return (
-        UNKNOWN if duration is None else str(timedelta(seconds=round(duration))),
+        str(timedelta(seconds=round(facts.duration))),
         figure(distance and distance / 1000.0, ".2f", "km"),
         figure(highest, ".0f", "m"),
         (figure(loss, ".1%"), "warn" if (loss or 0.0) > MUCH_LOST else ""),

@@ -327,7 +327,13 @@ export default {
       const flat = ([lat, lon]) => [lat, lon];
       if (one.version !== track.version) {
         one.version = track.version;
-        one.track.setLatLngs(track.points.map(flat));
+        // A recorded path is interrupted where the recording is.
+        const parts = [[]];
+        track.points.forEach((point, n) => {
+          if (track.breaks?.has(n)) parts.push([]);
+          parts.at(-1).push(flat(point));
+        });
+        one.track.setLatLngs(parts);
         one.fixes.clearLayers();
         one.points = track.points.length;
         one.dots = Math.max(0, track.fixes.length - MAX_DOTS);

@@ -118,6 +118,7 @@ export default {
       mavgate.vehicles[id] = { system_id: aircraft.system_id, title: aircraft.title, model: aircraft.model, origin: "live", generation: 0, home: aircraft.home, mark: null, lat_deg: columns.lat_deg[0], lon_deg: columns.lon_deg[0], alt_amsl_m: columns.alt_amsl_m[0] };
       const track = mavgate.track(id);
       track.points = columns.lat_deg.map((lat, n) => [lat, columns.lon_deg[n], columns.alt_amsl_m[n] ?? 0, columns.time_us[n]]).filter(([lat]) => lat !== null);
+      track.breaks = new Set(aircraft.breaks.map((us) => track.points.findIndex(([, , , time_us]) => time_us >= us - 500)));
       track.version = 1;
       this.duration_s = Math.max(this.duration_s, columns.time_us.at(-1) / 1e6);
     }
@@ -150,8 +151,7 @@ export default {
   methods: {
     clock: (seconds) => mavgate.clock(seconds),
     length_m() {
-      const points = mavgate.track(this.selected).points;
-      return points.reduce((sum, point, n) => (n ? sum + mavgate.distance_m(points[n - 1], point) : 0), 0);
+      return this.flight.aircraft.find(({ system_id }) => String(system_id) === this.selected).distance_m;
     },
     go(seconds) {
       this.at_s = Math.min(this.duration_s, Math.max(0, seconds));

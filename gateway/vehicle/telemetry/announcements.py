@@ -125,9 +125,14 @@ class Announcer:
             self._refilled_us += fresh * self._refill_us
 
 
+def utf8(text: str, size: int) -> bytes:
+    """Encode a text in at most so many bytes, without a part of a character at its end."""
+    return text.encode(errors="replace")[:size].decode(errors="ignore").encode()
+
+
 def chunks(text: StatusText, number: int = 1) -> list[Answer]:
     """Encode a text as one STATUSTEXT, or as several chunks."""
-    data = text.text.encode("ascii", "replace")[:MAX_TEXT_BYTES]
+    data = utf8(text.text, MAX_TEXT_BYTES)
     if len(data) <= TEXT_BYTES:
         # Id 0 means a text of one chunk.
         return [Reply(mavlink.MAVLink_statustext_message(text.severity, data))]

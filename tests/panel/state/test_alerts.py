@@ -8,6 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.panel.state.alerts import Alert, AlertLevel, alerts_of, with_status
 from gateway.panel.state.fleet import VehicleState
 from gateway.units import US_PER_S
+from tests.panel.messages import decoded
 
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3)
 MAG, GYRO = 4, 1
@@ -83,7 +84,7 @@ def test_messages_begin_and_end_alerts(name: str) -> None:
     vehicle = VehicleState(1)
     vehicle.take(HEARTBEAT, 0)
     for time_s, message in messages:
-        vehicle.take(message, round(time_s * US_PER_S))
+        vehicle.take(decoded(message), round(time_s * US_PER_S))
     found = alerts_of(vehicle, round(at_s * US_PER_S))
     assert [(alert.title, alert.detail) for alert in found] == expected
     assert all(

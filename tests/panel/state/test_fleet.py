@@ -86,12 +86,14 @@ def test_mark_is_computed_from_distance_and_bearing(vehicle: VehicleState) -> No
 
 def test_impossible_values_are_unknown(vehicle: VehicleState) -> None:
     vehicle.take(decoded(mavlink.MAVLink_attitude_message(0, math.inf, 0, 0, 1, 0, 0)), 0)
+    vehicle.take(position(*HERE), 0)
     vehicle.take(position(214.0, 8.0), 0)
     way = mavlink.MAVLink_nav_controller_output_message(0, 0, 90, 90, 1113, 0, 0, 0)
     vehicle.take(decoded(way), 0)
     now = vehicle.instant(0)
     assert all(math.isnan(value) for value in now.q_nb)
-    assert (now.rate_b_radps, now.mark, now.mark_distance_m) == ((1, 0, 0), None, 1113.0)
+    assert (now.rate_b_radps, now.mark_distance_m) == ((1, 0, 0), 1113.0)
+    assert now.lat_deg == pytest.approx(47.0)
 
 
 @pytest.mark.parametrize(
@@ -112,9 +114,35 @@ def test_chunks_of_a_long_text_are_joined(vehicle: VehicleState) -> None:
 
 
 def test_text_that_fills_its_last_chunk_ends_with_an_empty_one(vehicle: VehicleState) -> None:
-    for chunk, text in enumerate(("a" * 50, "", "b")):
+    for chunk, text in enumerate(("a" * 50, "")):
         vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, text.encode(), 9, chunk)), 0)
-    assert [entry.text for entry in vehicle.texts.all] == ["a" * 50, "b"]
+    assert [entry.text for entry in vehicle.texts.all] == ["a" * 50]
+
+
+def test_text_whose_last_chunk_is_lost_is_shown_after_a_while(vehicle: VehicleState) -> None:
+    vehicle.take(decoded(mavlink.MAVLink_statustext_message(4, b"a" * 49 + b" ", 9, 0)), 0)
+    assert list(vehicle.texts.all) == []
+    vehicle.take(heartbeat(), 4 * US_PER_S)
+    assert [entry.text for entry in vehicle.texts.all] == ["a" * 49 + "…"]
+
+
+def test_position_before_the_first_fix_is_unknown(vehicle: VehicleState) -> None:
+    vehicle.take(position(0.0, 0.0), 7)
+    vehicle.take(fix(0.0, 0.0), 7)
+    now = vehicle.instant(7)
+    assert math.isnan(now.lat_deg)
+    assert (now.fix, len(vehicle.history), len(vehicle.fixes)) == (None, 0, 0)
+
+
+def test_position_of_a_poorer_source_is_used_without_a_better_one(vehicle: VehicleState) -> None:
+    vehicle.take(fix(47.5, 8.0), 0)
+    assert vehicle.instant(0).lat_deg == pytest.approx(47.5)
+    assert len(vehicle.history) == 1
+    vehicle.take(position(*HERE), 10)
+    vehicle.take(fix(47.5, 8.0), 20)
+    assert vehicle.instant(20).lat_deg == pytest.approx(47.0)
+    vehicle.take(fix(47.5, 8.0), 5 * US_PER_S)
+    assert vehicle.instant(5 * US_PER_S).lat_deg == pytest.approx(47.5)
 
 
 def test_aircraft_are_separate_and_other_components_ignored() -> None:

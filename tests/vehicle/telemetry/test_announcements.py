@@ -6,6 +6,7 @@ import pytest
 from msgspec.structs import replace
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.recordings.status_texts import TextJoiner
 from gateway.records import NodeId, PipeCounters, ReceiverStatus
 from gateway.vehicle.requests import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
@@ -13,6 +14,7 @@ from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, Findi
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.kit.ground_station import decode, kinds, of_kind, texts
+from tests.kit.mavlink import packed
 from tests.kit.records import link, report, status
 
 SECOND_US = 1_000_000
@@ -229,3 +231,12 @@ def test_long_texts_are_chunked(size: int) -> None:
     else:
         assert len({m.id for m in found} - {0}) == 1
         assert len(found[-1].text) < 50
+
+
+@pytest.mark.parametrize("text", ["Höhe über 120 m: größer", "a" * 70, "aü" * 40, "罗" * 100])
+def test_texts_are_sent_as_utf_8_and_cut_between_characters(text: str) -> None:
+    found = [packed(answer.message) for answer in Announcer().say(StatusText(INFO, text), 0)]
+    joiner = TextJoiner()
+    (joined,) = [each for frame in found for each in joiner.feed(frame, 0)]
+    assert text.startswith(joined.text)
+    assert len(joined.text.encode()) > min(len(text.encode()), 200) - 3
