@@ -137,6 +137,7 @@ class Sources:
             case (
                 ast.Subscript(value=inner)
                 | ast.Call(func=ast.Attribute(value=inner, attr="encode"))
+                | ast.Call(func=ast.Name(id="utf8"), args=[inner, _])
             ):
                 return self._patterns(inner, function, package, depth)
             case ast.Name(id=name):
