@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,6 +27,7 @@ from gateway import __version__
 from gateway.analysis.case import make_case
 from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
 from gateway.analysis.metrics import euler_rad
+from gateway.analysis.processes import begin_copy
 from gateway.panel.state.fleet import FlightHistory, VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.convert import FlightToWrite
@@ -143,17 +145,31 @@ def _take(flight: PageFlight, message: VehicleMessage, reader: Any, track: Conti
     history.add(time_us, vehicle.instant(time_us))
 
 
-def compare_estimators(flight: PageFlight, files: Sequence[Path], options: ReadOptions) -> None:
-    """Fuse the sensor data of a recording with every estimator; a remark says if there is none."""
+def begin_comparison(files: Sequence[Path], options: ReadOptions) -> Connection:
+    """Fuse the sensor data of a recording with every estimator, in a process of its own."""
+    return begin_copy(_compare, (files, options))
+
+
+def add_comparison(flight: PageFlight, compared: Connection) -> None:
+    """Wait for a comparison, and add it; a remark says if there is none."""
     try:
-        sensors, table, _ = flight_of_files(files, options, name=flight.name)
-        case = make_case(sensors)
-    except (FlightError, OSError, ValueError) as error:
-        flight.remarks.append(f"The estimators are not compared: {reason_of(error)}")
+        unix_us_at_zero, tracks = compared.recv()
+    except EOFError:
+        unix_us_at_zero, tracks = "its process has ended", {}
+    if isinstance(unix_us_at_zero, str):
+        flight.remarks.append(f"The estimators are not compared: {unix_us_at_zero}")
         return
-    zero_us = flight.begin_us - (table.header.unix_us_at_zero or 0)
-    for name, track in case.tracks.items():
-        flight.compared[name] = _compared(track, zero_us)
+    zero_us = flight.begin_us - unix_us_at_zero
+    flight.compared = {name: _compared(track, zero_us) for name, track in tracks.items()}
+
+
+def _compare(argument: tuple[Sequence[Path], ReadOptions], sender: Connection) -> None:
+    """Send the civil time of the clock's zero and the tracks, or the reason why there are none."""
+    try:
+        sensors, table, _ = flight_of_files(*argument, name="")
+        sender.send((table.header.unix_us_at_zero or 0, make_case(sensors).tracks))
+    except (FlightError, OSError, ValueError) as error:
+        sender.send((reason_of(error), {}))
 
 
 def _compared(track: FlightTrack, zero_us: int) -> dict[str, FloatArray]:

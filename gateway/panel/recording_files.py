@@ -5,7 +5,7 @@ an upload gets a name that follows the rules of recordings. An upload is written
 file, checked, and only then gets its name. A download is packed while it is sent, so it needs no
 space on the disk.
 
-Exports and the catalogue are made by other processes, one at a time each, at the lowest priority,
+Exports and the catalogue are made by other processes, one at a time each, at a lower priority,
 so that neither the gateway nor the page waits for them.
 """
 
@@ -301,7 +301,8 @@ def _corners(positions: list[list[float]]) -> str:
 
 
 EXPORTS: Final = "/exports/"
-LOWEST: Final = ("nice", "-n", "19")
+LOW: Final = ("nice", "-n", "5")
+"""Below the gateway and the page, but not so low that a browser that draws leaves nothing."""
 EXPORT_S: Final = 900.0
 """Longest time for an export; a first start may compile for a minute of it."""
 KEPT_S: Final = 600.0
@@ -433,7 +434,7 @@ async def _make(folder: Path, work: Path, name: str, kind: str) -> Path:
 async def _run(command: list[str]) -> None:
     """Run a command; raises ExportError with its last line, or after the longest time."""
     child = await asyncio.create_subprocess_exec(
-        *LOWEST,
+        *LOW,
         *command,
         stdin=asyncio.subprocess.DEVNULL,
         stdout=asyncio.subprocess.DEVNULL,

@@ -13,12 +13,21 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.cli.support.options import read_options
 from gateway.config import GatewaySettings
-from gateway.panel.flight_page import PageFlight, read_flight, render_page
+from gateway.estimation.select import ESTIMATORS
+from gateway.panel.flight_page import (
+    PageFlight,
+    add_comparison,
+    begin_comparison,
+    read_flight,
+    render_page,
+)
 from gateway.recordings.files import FlightError
 from gateway.recordings.tlog import encode_record
 from tests.kit.cli import invoke
 from tests.panel.browsing import FEW_FRAMES, needs_chromium
 from tests.panel.messages import BEGIN_US, HOSTILE_TEXT, flight_frames
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 
 
 def flight_of(folder: Path, seconds: int) -> PageFlight:
@@ -116,6 +125,21 @@ def test_page_of_the_last_recording_has_its_name(tmp_path: Path) -> None:
     assert "<title>day</title>" in page
     assert unpacked(page, "data")["name"] == "day"
     assert unpacked(page, "data")["aircraft"][0]["title"] == "Plane 3"
+
+
+@pytest.mark.io
+def test_estimators_are_compared_in_another_process(tmp_path: Path) -> None:
+    tlog = flight_of(tmp_path, 30)
+    options = read_options(GatewaySettings())
+    add_comparison(tlog, begin_comparison([tmp_path / "day_01.tlog"], options))
+    assert "The estimators are not compared: " in tlog.remarks[-1]
+    flight = read_flight([GOLDEN], options, "take-off")
+    add_comparison(flight, begin_comparison([GOLDEN], options))
+    assert flight.remarks == []
+    assert set(flight.compared) == set(ESTIMATORS)
+    for curves in flight.compared.values():
+        # On the page's clock, which begins with the first position.
+        assert -10e6 < curves["time_us"][0] < curves["time_us"][-1] < 90e6
 
 
 @pytest.mark.io

@@ -118,17 +118,20 @@ def page(
     """
     require("a page", "panel")
     # These take a second to import.
-    from gateway.panel.flight_page import compare_estimators, read_flight, render_page
+    from gateway.panel.flight_page import add_comparison, begin_comparison, read_flight, render_page
 
     gateway = read_settings()
     files = files_of([flight], folder_of(gateway), "tlogs")
     options = read_options(gateway, columns, choice=fuse_with)
+    comparison = None
+    if compare:
+        # At the same time on another core.
+        tables = files_of([flight], folder_of(gateway), "tables")
+        comparison = begin_comparison(tables, options)
     with progress_of(files) as advance:
         made = read_flight(files, replace(options, progress=advance), name_of(flight, files))
-    if compare:
-        tables = files_of([flight], folder_of(gateway), "tables")
-        with progress_of(tables) as advance:
-            compare_estimators(made, tables, replace(options, progress=advance))
+        if comparison is not None:
+            add_comparison(made, comparison)
     print_remarks(made.remarks)
     write_new(output, [render_page(made).encode()], overwrite=force, inputs=files)
     print(f"{output}: {output.stat().st_size / 1e6:.1f} MB")

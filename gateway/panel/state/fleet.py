@@ -147,6 +147,7 @@ MM: Final = 1e3
 CM: Final = 1e2
 UNKNOWN_MV: Final = 65535
 UNKNOWN_U32: Final = 0xFFFFFFFF
+UNKNOWN_SATELLITES: Final = 255
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 
 MAX_TRACK: Final = 20_000
@@ -350,7 +351,7 @@ class VehicleState:
             heading_deg=_heading_deg(position, hud),
             pos_std_m=self._pos_std_m(),
             fix_type=fix.fix_type if fix else 0,
-            satellites=fix.satellites_visible if fix and fix.satellites_visible != 255 else NAN,
+            satellites=_satellites(fix),
             fix=_spot_of_fix(fix),
             home=self.home,
             mark=mark,
@@ -434,6 +435,14 @@ def _battery(battery: Any, system: Any) -> dict[str, float]:
     sources = [source.battery_remaining for source in (battery, system) if source]
     percent = next((value for value in sources if value >= 0), NAN)
     return {"battery_v": sum(volts) if volts else NAN, "battery_percent": float(percent)}
+
+
+def _satellites(fix: Any) -> float:
+    """Return the number of satellites; a log without it has a fix of none."""
+    if fix is None or fix.satellites_visible == UNKNOWN_SATELLITES:
+        return NAN
+    has_fix = fix.fix_type >= mavlink.GPS_FIX_TYPE_2D_FIX
+    return float(fix.satellites_visible) if fix.satellites_visible or not has_fix else NAN
 
 
 def _rates(message: Any) -> tuple[float, float, float]:

@@ -66,8 +66,13 @@ def test_satellites_that_are_not_counted_are_unknown(vehicle: VehicleState) -> N
     assert math.isnan(vehicle.instant(0).satellites)
     vehicle.take(fix(*HERE, satellites=255), 0)
     assert math.isnan(vehicle.instant(0).satellites)
-    vehicle.take(fix(*HERE, satellites=0), 1)
-    assert vehicle.instant(1).satellites == 0
+    vehicle.take(fix(*HERE, satellites=7), 1)
+    assert vehicle.instant(1).satellites == 7
+    # As in a log that has none.
+    vehicle.take(fix(*HERE, satellites=0), 2)
+    assert math.isnan(vehicle.instant(2).satellites)
+    vehicle.take(fix(*HERE, kind=mavlink.GPS_FIX_TYPE_NO_FIX, satellites=0), 3)
+    assert vehicle.instant(3).satellites == 0
 
 
 def test_mark_is_computed_from_distance_and_bearing(vehicle: VehicleState) -> None:
