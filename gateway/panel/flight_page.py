@@ -24,14 +24,15 @@ import numpy as np
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway import __version__
-from gateway.analysis.case import make_case
-from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files
+from gateway.analysis.flight import FlightTrack, FloatArray, flight_of_files, fuse_track
 from gateway.analysis.metrics import euler_rad
 from gateway.analysis.processes import begin_copy
+from gateway.estimation.select import ESTIMATORS
 from gateway.panel.state.fleet import FlightHistory, VehicleState
 from gateway.printable import printable, reason_of
 from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError
+from gateway.recordings.fuse import with_estimator
 from gateway.recordings.positions import Continuity, GroundDistance
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.vehicle_reader import VehicleMessage
@@ -167,7 +168,10 @@ def _compare(argument: tuple[Sequence[Path], ReadOptions], sender: Connection) -
     """Send the civil time of the clock's zero and the tracks, or the reason why there are none."""
     try:
         sensors, table, _ = flight_of_files(*argument, name="")
-        sender.send((table.header.unix_us_at_zero or 0, make_case(sensors).tracks))
+        tracks = {
+            name: fuse_track(sensors, with_estimator(sensors.fusion, name)) for name in ESTIMATORS
+        }
+        sender.send((table.header.unix_us_at_zero or 0, tracks))
     except (FlightError, OSError, ValueError) as error:
         sender.send((reason_of(error), {}))
 

@@ -236,7 +236,7 @@ def test_row_start_stop_save_delete_export_import_and_move_in_time(
     expect(brought).to_be_visible()
     (tmp_path / "holiday.tlog").write_text("this is no flight at all, but a text\n")
     view.get_by_label("Upload a recording").set_input_files(tmp_path / "holiday.tlog")
-    expect(page.get_by_text("this is no recording")).to_be_visible()
+    expect(page.get_by_text("unknown file format")).to_be_visible()
     _move_in_time(page, row)
     for name in ("morning flight", "evening"):
         view.locator(f"tr[data-key='{name}']").get_by_label("Delete").click()
