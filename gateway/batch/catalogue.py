@@ -33,8 +33,9 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
-from gateway.recordings.formats.maps import TrackPoint, track_feature
+from gateway.recordings.formats.maps import track_feature
 from gateway.recordings.index import as_text, recording_name
+from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import ReadOptions, open_rows
 from gateway.recordings.table import TableBlock, TableReader
 from gateway.records import NAN

@@ -27,9 +27,9 @@ from gateway.recordings.columns import (
     has_position,
 )
 from gateway.recordings.figures import gps_outages_us, lost_share
-from gateway.recordings.formats.maps import TrackPoint, point_of_fix
+from gateway.recordings.formats.maps import point_of_fix
 from gateway.recordings.moment import civil_time
-from gateway.recordings.positions import FIX_2D, GPS_IDS, Continuity, GroundDistance
+from gateway.recordings.positions import FIX_2D, GPS_IDS, Continuity, GroundDistance, TrackPoint
 from gateway.recordings.senders import RecordedSender, Senders
 from gateway.recordings.summary import TimesSpan
 from gateway.recordings.table import TableBlock, TableFault, TableHeader

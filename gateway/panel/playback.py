@@ -22,8 +22,8 @@ from gateway.panel.state.fleet import FleetState, Origin
 from gateway.panel.uplink import ControlClient, Uplink
 from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TLOG, format_of, open_tlog, read_chunks
-from gateway.recordings.formats.maps import TrackPoint
 from gateway.recordings.index import RecordingError, find_recording, parts_together
+from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import recorded_frames
 from gateway.recordings.senders import FIRST_GROUND_STATION, Senders
 from gateway.recordings.table import TableHeader, TableReader

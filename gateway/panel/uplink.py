@@ -21,10 +21,10 @@ from gateway.clock import GatewayClock
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
-from gateway.panel.state.fleet import FleetState, Spot, command_long
+from gateway.panel.state.fleet import FleetState, command_long
 from gateway.records import NAN, Incoming, Outgoing
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import DEGE7
+from gateway.vehicle.plan import DEGE7, Location
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 log = logging.getLogger(__name__)
@@ -104,11 +104,11 @@ class GatewayWatch:
             await asyncio.sleep(STATUS_S)
 
 
-def _spot_of(mark: dict[str, Any] | None) -> Spot | None:
+def _spot_of(mark: dict[str, Any] | None) -> Location | None:
     if mark is None:
         return None
     alt_amsl_m = NAN if mark["alt_amsl_m"] is None else mark["alt_amsl_m"]
-    return Spot(mark["lat_deg"], mark["lon_deg"], alt_amsl_m)
+    return Location(mark["lat_deg"], mark["lon_deg"], alt_amsl_m)
 
 
 SYSTEM_ID: Final = 253
@@ -204,7 +204,7 @@ class Uplink:
         message = command_long(system_id, number, *params)
         await self._until_acknowledged(system_id, number, message)
 
-    async def command_at(self, system_id: int, number: int, spot: Spot) -> None:
+    async def command_at(self, system_id: int, number: int, spot: Location) -> None:
         """Send a command with a position; raises as `command`."""
         message = mavlink.MAVLink_command_int_message(
             system_id,

@@ -42,8 +42,9 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_files import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
-from gateway.panel.state.fleet import FleetState, SampleMemory, Spot, VehicleState
+from gateway.panel.state.fleet import FleetState, SampleMemory, VehicleState
 from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink
+from gateway.vehicle.plan import Location
 
 WEB: Final = Path(__file__).parent / "web"
 """The components' JavaScript and the style sheet."""
@@ -148,7 +149,7 @@ class ViewContext:
         self.check_may_change()
         await self.parts.uplink.command(self.system_id or 0, number, *params)
 
-    async def command_at(self, number: int, spot: Spot) -> None:
+    async def command_at(self, number: int, spot: Location) -> None:
         """Send a MAV_CMD with a position to the selected aircraft; raises as `command`."""
         self.check_may_change()
         await self.parts.uplink.command_at(self.system_id or 0, number, spot)

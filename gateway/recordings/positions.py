@@ -81,6 +81,19 @@ class Position:
     vel_n_mps: Vec3 = UNKNOWN_VEC3
 
 
+@dataclass(frozen=True, slots=True)
+class TrackPoint:
+    """One point of a track."""
+
+    time_us: int
+    """µs since 1970, or since the start where civil time is not known."""
+    lat_deg: float
+    lon_deg: float
+    alt_amsl_m: float = NAN
+    attitude_deg: tuple[float, float, float] | None = None
+    """Roll, pitch and yaw, where they are known."""
+
+
 def is_located(lat_dege7: Any, lon_dege7: Any) -> Any:
     """Return whether coordinates, or which of several, are those of a known position."""
     is_somewhere = (lat_dege7 != 0) | (lon_dege7 != 0)

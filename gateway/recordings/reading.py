@@ -313,8 +313,8 @@ def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> I
 
 
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
-    reader = AutopilotReader(options.system_id)
     source = open_tlog(path)
+    reader = AutopilotReader(options.system_id, source.senders)
     batches = source.batches(options.progress, strict=True)
     blocks = chain(map(reader.feed, batches), [None])
     stream = (reader.flush() if cells is None else cells for cells in blocks)

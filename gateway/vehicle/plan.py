@@ -57,7 +57,8 @@ class Location:
 
     lat_deg: float
     lon_deg: float
-    alt_amsl_m: float
+    alt_amsl_m: float = math.nan
+    """NaN if unknown."""
 
     def fault(self) -> str:
         """Return what is wrong with the coordinates; an empty text for a location on the earth."""

@@ -29,7 +29,7 @@ from gateway.batch.catalogue import (
 from gateway.batch.executors import LocalProcesses, ThisProcess
 from gateway.batch.facts import FlightFacts, FlightTally, simplified
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.formats.maps import TrackPoint
+from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import ReadOptions
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S

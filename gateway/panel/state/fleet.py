@@ -13,13 +13,20 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.quaternion import from_euler
-from gateway.recordings.positions import RANKS, Position, is_located, named_position, position_of
-from gateway.recordings.senders import FIRST_GROUND_STATION
+from gateway.recordings.positions import (
+    RANKS,
+    Position,
+    TrackPoint,
+    is_located,
+    named_position,
+    position_of,
+)
+from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.recordings.status_texts import JoinedText, TextJoiner
 from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import US_PER_S
-from gateway.vehicle.plan import DEGE7
+from gateway.vehicle.plan import DEGE7, Location
 from gateway.wire.mavlink_splitter import message_id_of
 
 
@@ -32,14 +39,6 @@ def command_long(system_id: int, number: int, *params: float) -> Any:
 
 LIVE: Final = "live"
 """Origin of an aircraft that is not played."""
-
-
-class Spot(msgspec.Struct, frozen=True):
-    """A position; its height is NaN if unknown."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_amsl_m: float = NAN
 
 
 class Instant(msgspec.Struct, frozen=True, kw_only=True):
@@ -81,10 +80,10 @@ class Instant(msgspec.Struct, frozen=True, kw_only=True):
     """GPS_FIX_TYPE; 0 without a GPS."""
     satellites: float
     """Unknown where the receiver does not count them."""
-    fix: Spot | None
+    fix: Location | None
     """Newest GPS fix of two dimensions or more."""
-    home: Spot | None
-    mark: Spot | None
+    home: Location | None
+    mark: Location | None
     mark_distance_m: float
     mark_bearing_deg: float
     battery_v: float
@@ -178,17 +177,6 @@ HISTORY_COLUMNS: Final = {
 """Columns of a history and their type: fields of `Instant`, `.n` for one of several numbers."""
 
 
-@dataclass(frozen=True, slots=True)
-class PathPoint:
-    """One point of a path."""
-
-    time_us: int
-    """On the panel's clock."""
-    lat_deg: float
-    lon_deg: float
-    alt_amsl_m: float
-
-
 class FlightHistory:
     """States of one aircraft as columns over time."""
 
@@ -243,11 +231,11 @@ class VehicleState:
         """When that came, on the panel's clock in µs."""
         self.history = FlightHistory()
         """Its states so far, a few a second."""
-        self.fixes: deque[PathPoint] = deque(maxlen=MAX_TRACK)
+        self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
         """GPS fixes."""
         self.texts = StatusTexts()
         """STATUSTEXT, the newest last."""
-        self.exact_mark: Spot | None = None
+        self.exact_mark: Location | None = None
         """The mark from the gateway's control socket, exact where MAVLink is rounded."""
         self.position: Position | None = None
         """The newest of its best source."""
@@ -316,12 +304,12 @@ class VehicleState:
         return "copter" if kind in COPTERS else OTHERS.get(kind, "none")
 
     @property
-    def home(self) -> Spot | None:
+    def home(self) -> Location | None:
         """Home, if known."""
         message = self.newest.get("HOME_POSITION")
         if message is None or not is_located(message.latitude, message.longitude):
             return None
-        return Spot(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
+        return Location(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
 
     def instant(self, now_us: int) -> Instant:
         """Return the present state."""
@@ -385,7 +373,7 @@ class VehicleState:
             return float(estimator.pos_horiz_accuracy)
         return fix.h_acc / MM if fix and 0 < fix.h_acc < UNKNOWN_U32 else NAN
 
-    def _mark(self) -> tuple[Spot | None, float, float]:
+    def _mark(self) -> tuple[Location | None, float, float]:
         """Return the mark, and the distance and bearing reported by the aircraft."""
         way, at = self.newest.get("NAV_CONTROLLER_OUTPUT"), self.position
         if way is None or at is None or not way.wp_dist:
@@ -395,7 +383,7 @@ class VehicleState:
             return self.exact_mark, distance_m, bearing_deg
         lat_deg, lon_deg = vincenty.vreckon(at.lat_deg, at.lon_deg, distance_m, bearing_deg)
         lon_deg = wrap_180(float(lon_deg))
-        return Spot(float(lat_deg), lon_deg), distance_m, bearing_deg
+        return Location(float(lat_deg), lon_deg), distance_m, bearing_deg
 
     def _note_motion(self, _message: Any, now_us: int) -> None:
         self._moved_us = now_us
@@ -424,7 +412,7 @@ class VehicleState:
             return
         last = self.fixes[-1] if self.fixes else None
         if last is None or (last.lat_deg, last.lon_deg) != (spot.lat_deg, spot.lon_deg):
-            self.fixes.append(PathPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
+            self.fixes.append(TrackPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
 
 
 def _battery(battery: Any, system: Any) -> dict[str, float]:
@@ -460,12 +448,12 @@ def _heading_deg(position: Any, hud: Any) -> float:
     return float(hud.heading % 360) if hud is not None else NAN
 
 
-def _spot_of_fix(message: Any) -> Spot | None:
+def _spot_of_fix(message: Any) -> Location | None:
     if message is None or message.fix_type < mavlink.GPS_FIX_TYPE_2D_FIX:
         return None
     if not is_located(message.lat, message.lon):
         return None
-    return Spot(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
+    return Location(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
 
 
 MAX_VEHICLES: Final = 32
@@ -496,6 +484,8 @@ class FleetState:
         """Of played aircraft, by their played system ids."""
         self.version = 0
         """Counts the messages, so that a reader knows whether there is new data."""
+        self._components: dict[int, int] = {}
+        """The vehicle's component of each system; see `Senders`."""
         self._listeners: list[Listener] = []
         self._on_discard: list[Callable[[int], None]] = []
 
@@ -532,9 +522,15 @@ class FleetState:
     def take(self, message: Any, now_us: int) -> None:
         """Take in a decoded message; those of ground stations and other components are ignored."""
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
+        if not 0 < system_id < FIRST_GROUND_STATION:
+            return
         # Other components, such as a camera, have the system id of their vehicle.
-        is_vehicle = component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
-        if not is_vehicle or not 0 < system_id < FIRST_GROUND_STATION:
+        is_beat = message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        if component_id == AUTOPILOT:
+            self._components[system_id] = AUTOPILOT
+        elif is_beat and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+            self._components.setdefault(system_id, component_id)
+        if component_id != self._components.get(system_id):
             return
         vehicle = self.vehicles.get(system_id)
         if vehicle is None:

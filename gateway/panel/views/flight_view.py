@@ -11,9 +11,9 @@ from nicegui.events import GenericEventArguments
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.panel.access import MAPS
-from gateway.panel.state.fleet import Spot
 from gateway.panel.view_context import WEB, ViewContext
 from gateway.panel.widgets import RecorderControls, UploadButton, confirm, notify_failure
+from gateway.vehicle.plan import Location
 
 STYLES_S: Final = 2.0
 LEAFLET: Final = ui.leaflet
@@ -60,7 +60,7 @@ async def _at(
     context: ViewContext, act: Callable[..., Awaitable[None]], event: GenericEventArguments
 ) -> None:
     """Do what was chosen at a position of the map."""
-    spot = Spot(float(event.args["lat_deg"]), float(event.args["lon_deg"]), _ground_m(context))
+    spot = Location(float(event.args["lat_deg"]), float(event.args["lon_deg"]), _ground_m(context))
     with notify_failure(context):
         await act(context, spot)
 
@@ -74,14 +74,14 @@ def _ground_m(context: ViewContext) -> float:
     return now.alt_amsl_m if now.home is None else now.home.alt_amsl_m
 
 
-async def _mark(context: ViewContext, spot: Spot) -> None:
+async def _mark(context: ViewContext, spot: Location) -> None:
     await context.command_at(mavlink.MAV_CMD_DO_SET_ROI_LOCATION, spot)
     if context.vehicle is not None:
         context.vehicle.exact_mark = spot
     ui.notify("Marked", type="positive")
 
 
-async def _ask_home(context: ViewContext, spot: Spot) -> None:
+async def _ask_home(context: ViewContext, spot: Location) -> None:
     if context.vehicle is None:
         return
     title = f"Set home of {context.vehicle.title} to {spot.lat_deg:.6f}, {spot.lon_deg:.6f}?"
@@ -93,12 +93,12 @@ async def _ask_home(context: ViewContext, spot: Spot) -> None:
     confirm(title, "Set home", act, grave=False)
 
 
-async def _set_home(context: ViewContext, spot: Spot) -> None:
+async def _set_home(context: ViewContext, spot: Location) -> None:
     await context.command_at(mavlink.MAV_CMD_DO_SET_HOME, spot)
     ui.notify("Home set", type="positive")
 
 
-async def _clear(context: ViewContext, _: Spot) -> None:
+async def _clear(context: ViewContext, _: Location) -> None:
     await context.command(mavlink.MAV_CMD_DO_SET_ROI_NONE)
     if context.vehicle is not None:
         context.vehicle.exact_mark = None

@@ -16,30 +16,17 @@ from gateway.aircraft import AircraftSettings
 from gateway.geometry.quaternion import to_euler
 from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
-from gateway.recordings.positions import Continuity, named_position
+from gateway.recordings.positions import Continuity, TrackPoint, named_position
 from gateway.recordings.reading import RecordedTable
 from gateway.recordings.table import REMARK, TableMark
 from gateway.recordings.vehicle_reader import VehicleMessage
-from gateway.records import NAN, FusionState, GpsFix, NavFlags, Quat
+from gateway.records import FusionState, GpsFix, NavFlags, Quat
 from gateway.units import DEG_PER_DEGE7, US_PER_S
 from gateway.vehicle.plan import is_good_enough
 
 COLOURS: Final = ("ff0000ff", "ffff7000", "ff00b000", "ff00c8ff", "ffff00c8", "ffc8c800")
 """Of the vehicles' lines: alpha, blue, green, red."""
 _NOT_IN_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-
-
-@dataclass(frozen=True, slots=True)
-class TrackPoint:
-    """One point of a track."""
-
-    time_us: int
-    """µs since 1970, or since the start where civil time is not known."""
-    lat_deg: float
-    lon_deg: float
-    alt_amsl_m: float = NAN
-    attitude_deg: tuple[float, float, float] | None = None
-    """Roll, pitch and yaw, where they are known."""
 
 
 class MarkerKind(StrEnum):

@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
+from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, columns_of
 from gateway.recordings.tlog_scan import IntArray
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
@@ -204,8 +205,9 @@ _HEAD: Final = slice(0, 4)
 class AutopilotReader:
     """Turn one vehicle's messages into rows of a table."""
 
-    def __init__(self, system_id: int | None = None) -> None:
+    def __init__(self, system_id: int | None = None, senders: Senders | None = None) -> None:
         self.system_id = system_id
+        self._senders = senders or Senders()
         self.unix_us_at_zero: int | None = None
         """Civil time of the rows' time zero, by the times of the recording."""
         self._rank = 0
@@ -253,7 +255,7 @@ class AutopilotReader:
                 return wanted[:0]
             self.system_id = int(batch.origins[wanted[first[0]]]) >> 8
             wanted, ranks = wanted[first[0] :], ranks[first[0] :]
-        own = batch.origins[wanted] == self.system_id << 8 | 1
+        own = batch.origins[wanted] == self._senders.vehicle(self.system_id).origin
         wanted, ranks = wanted[own], ranks[own]
         best = np.maximum.accumulate(np.concatenate([[self._rank], ranks]))
         self._rank = int(best[-1])

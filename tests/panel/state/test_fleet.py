@@ -4,8 +4,9 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
-from gateway.panel.state.fleet import MAX_VEHICLES, FleetState, Spot, VehicleState
+from gateway.panel.state.fleet import MAX_VEHICLES, FleetState, VehicleState
 from gateway.units import US_PER_S
+from gateway.vehicle.plan import Location
 from tests.panel.messages import decoded, fix, heartbeat, position
 
 HERE = (47.0, 8.0)
@@ -85,8 +86,8 @@ def test_mark_is_computed_from_distance_and_bearing(vehicle: VehicleState) -> No
     assert (now.mark_distance_m, now.mark_bearing_deg) == (1113.0, 90.0)
     assert now.mark is not None
     assert (now.mark.lat_deg, now.mark.lon_deg) == pytest.approx((0.0, -179.991), abs=1e-4)
-    vehicle.exact_mark = Spot(1.0, 2.0, 3.0)
-    assert vehicle.instant(0).mark == Spot(1.0, 2.0, 3.0)
+    vehicle.exact_mark = Location(1.0, 2.0, 3.0)
+    assert vehicle.instant(0).mark == Location(1.0, 2.0, 3.0)
 
 
 def test_impossible_values_are_unknown(vehicle: VehicleState) -> None:
@@ -162,6 +163,19 @@ def test_aircraft_are_separate_and_other_components_ignored() -> None:
     assert sorted(fleet.vehicles) == [3, 4]
     assert heard == [3, 4]
     assert fleet.vehicles[4].instant(0).lat_deg == pytest.approx(1.0)
+
+
+def test_vehicle_is_the_component_with_an_autopilots_heartbeat() -> None:
+    fleet = FleetState()
+    camera = mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)
+    fleet.take(decoded(camera, 3, 100), 0)
+    fleet.take(position(1.0, 2.0, system_id=3, component_id=100), 0)
+    assert fleet.vehicles == {}
+    fleet.take(heartbeat(system_id=3, component_id=5), 0)
+    fleet.take(position(*HERE, system_id=3, component_id=5), 0)
+    assert fleet.vehicles[3].instant(0).lat_deg == pytest.approx(HERE[0])
+    fleet.take(position(1.0, 2.0, system_id=3), 0)
+    assert fleet.vehicles[3].instant(0).lat_deg == pytest.approx(1.0)
 
 
 def test_number_of_forged_systems_is_bounded() -> None:

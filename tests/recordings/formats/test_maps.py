@@ -17,7 +17,6 @@ from gateway.recordings.formats.maps import (
     DRAWN_IDS,
     MapMarker,
     MarkerKind,
-    TrackPoint,
     VehicleTrack,
     to_geojson,
     to_gpx,
@@ -25,6 +24,7 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
+from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import RecordedTable
 from gateway.recordings.table import TableMark, block_of
 from gateway.recordings.tlog import TlogRecord

@@ -13,7 +13,7 @@ from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.tlog import TlogScanner, encode_record
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuCalibrated, ImuFlags, NavFlags, NavState
 from tests.kit.mavlink import packed
-from tests.recordings.frames import START_US
+from tests.recordings.frames import START_US, senders_of
 
 G = 9.80665
 Message = Any
@@ -261,3 +261,16 @@ def test_rows_do_not_depend_on_the_size_of_the_batches(seed: int) -> None:
             whole.system_id,
             whole.unix_us_at_zero,
         )
+
+
+def test_samples_are_those_of_the_autopilots_component() -> None:
+    sent: list[tuple[tuple[int, int], Any]] = [
+        ((1, 3), mavlink.MAVLink_heartbeat_message(1, 3, 0, 0, 4, 3)),
+        ((1, 3), mavlink.MAVLink_scaled_imu_message(100, 0, 0, -1000, 0, 0, 0, 0, 0, 0)),
+        ((1, 1), mavlink.MAVLink_scaled_imu_message(200, 0, 0, -500, 0, 0, 0, 0, 0, 0)),
+    ]
+    frames = [(START_US + k * 100_000, packed(m, *who)) for k, (who, m) in enumerate(sent)]
+    data = b"".join(encode_record(time_us, frame) for time_us, frame in frames)
+    (row,) = rows_of(AutopilotReader(1, senders_of(data)), frames, 1 << 20)
+    assert row.imu is not None
+    assert row.imu.accel_b_mps2[2] == pytest.approx(-9.80665)
