@@ -11,6 +11,7 @@ shrunk, shown and kept in `.hypothesis`, so that the next run begins with it.
 import argparse
 import gzip
 import itertools
+import json
 import math
 import struct
 import sys
@@ -20,11 +21,13 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
+from xml.etree import ElementTree
 
 import msgspec
 import tomlkit
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import all as all_messages
 from pymavlink.dialects.v20 import common as mavlink
 from typer.testing import CliRunner
 
@@ -34,10 +37,21 @@ from gateway.live.control_socket import ControlServer, Verbs
 from gateway.live.control_verbs import mark_verbs
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import COLUMNS, TableRow
+from gateway.recordings.formats.maps import (
+    DRAWN_IDS,
+    to_geojson,
+    to_gpx,
+    to_kml,
+    tracks_of_messages,
+)
 from gateway.recordings.formats.ulog import TOPICS
 from gateway.recordings.moment import parse_moment
+from gateway.recordings.positions import ORIGIN_ID, POSITION_SOURCES
+from gateway.recordings.senders import ATTITUDE_ID, ATTITUDE_QUATERNION_ID, Senders
+from gateway.recordings.status_texts import STATUSTEXT_ID
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
-from gateway.recordings.tlog import TlogScanner, encode_record
+from gateway.recordings.tlog import HEARTBEAT_ID, TlogScanner, encode_record
+from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
 from gateway.vehicle.plan import Location
@@ -293,6 +307,47 @@ def tlog(data: bytes, cuts: list[int], strict: bool) -> None:
     assert all(record.frame in data for record in found)
 
 
+VEHICLE_IDS: Final = sorted(
+    {*POSITION_SOURCES, *DRAWN_IDS, HEARTBEAT_ID, STATUSTEXT_ID, ORIGIN_ID}
+    | {ATTITUDE_ID, ATTITUDE_QUATERNION_ID}
+)
+
+
+@st.composite
+def vehicle_records(draw: st.DrawFn) -> bytes:
+    """Make a record with a message that the reader of vehicles uses."""
+    kind = all_messages.mavlink_map[draw(st.sampled_from(VEHICLE_IDS))]
+    size = kind.unpacker.size
+    body = draw(st.binary(min_size=size, max_size=size) | st.just(bytes(size)))
+    mav = mavlink.MAVLink(None, draw(st.sampled_from((1, 2, 255))), draw(st.sampled_from((1, 100))))
+    message = mavlink.MAVLink_message(kind.id, kind.msgname)
+    frame = bytes(message._pack(mav, kind.crc_extra, body))  # noqa: SLF001
+    near_us = st.integers(10**15, 10**15 + 10**8)
+    return encode_record(draw(st.integers(0, 2**56 - 1) | near_us), frame)
+
+
+@given(st.lists(vehicle_records(), max_size=30))
+def vehicles(records: list[bytes]) -> None:
+    """Any messages of vehicles: the same in batches, on the earth, and maps that others read."""
+    batch, senders = TlogScanner().feed(b"".join(records), final=True), Senders()
+    senders.add(batch)
+    reader = VehicleReader(senders, DRAWN_IDS)
+    singly = [message for record in batch.records() for message in reader.feed(record)]
+    singly += reader.flush()
+    reader = VehicleReader(senders, DRAWN_IDS)
+    assert sorted(map(repr, singly)) == sorted(
+        map(repr, [*reader.feed_batch(batch), *reader.flush()])
+    )
+    places = [message.position for message in singly if message.position is not None]
+    assert all(abs(at.lat_deg) <= 90.0 and abs(at.lon_deg) <= 180.0 for at in places)
+    tracks = tracks_of_messages(singly)
+    for write in (to_kml, to_gpx):
+        text = "".join(write("x", tracks))
+        assert ">nan" not in text
+        ElementTree.fromstring(text)
+    json.loads("".join(to_geojson("x", tracks)))
+
+
 TOPIC_FIELDS: Final = (
     *("uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2", "float[4] q"),
     *("float[3] magnetometer_ga", "int32_t lat", "double latitude_deg", "uint8_t fix_type"),
@@ -392,7 +447,7 @@ TARGETS: Final[dict[str, Any]] = {
     target.__name__: target
     for target in (
         *(splitter, whole_frames, receiver, vehicle, control),
-        *(settings_file, table, tlog, command),
+        *(settings_file, table, tlog, vehicles, command),
     )
 }
 """By name."""

@@ -112,7 +112,7 @@ def holds_position(message_id: int, fields: Any) -> Any:
         Its fields, as scalars or as columns.
     """
     if message_id == LOCAL_POSITION_NED_ID:
-        return np.isfinite(fields["x"] + fields["y"])
+        return np.isfinite(fields["x"]) & np.isfinite(fields["y"])
     source = POSITION_SOURCES[message_id]
     located = is_located(fields[source.lat], fields[source.lon])
     return located & (fields[source.fix] >= FIX_2D) if source.fix else located
@@ -147,6 +147,8 @@ def position_of(
     else:
         at = (origin.lat_deg, origin.lon_deg, 0.0, fields["x"], fields["y"])
         lat_deg, lon_deg = offset_deg(*at)
+        if not abs(lat_deg) <= 90.0:
+            return None
         alt_m = origin.alt_amsl_m - fields["z"]
     return Position(lat_deg, lon_deg, alt_m, alt_home_m, speed_mps, velocity or UNKNOWN_VEC3)
 
