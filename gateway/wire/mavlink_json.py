@@ -206,7 +206,10 @@ def class_of(name: Any) -> Any:
 def _out(message: Any, name: str, kind: str) -> Any:
     value = getattr(message, name)
     if kind == "char":
-        text = value.decode("latin-1") if isinstance(value, bytes) else value
+        # pymavlink reads a text as ASCII, and keeps its bytes.
+        value = getattr(message, f"_{name}_raw", value)
+        is_text = isinstance(value, str)
+        text = value if is_text else bytes(value).split(b"\0", 1)[0].decode(errors="replace")
         length = _length(message, name)
         return list(text.ljust(length, NUL)) if length else text
     if isinstance(value, list | tuple):

@@ -174,3 +174,11 @@ def test_notations_of_a_text_are_read(text: Any) -> None:
 def test_invalid_message_is_reported(fields: Any, words: str) -> None:
     with pytest.raises(BadMessageError, match=words):
         from_json(fields)
+
+
+def test_text_beyond_ascii_is_written_and_read() -> None:
+    text = "Höhe 120 m, 罗盘"
+    message = mavlink.MAVLink_statustext_message(4, text.encode())
+    decoded = mavlink.MAVLink(None).decode(bytearray(message.pack(mavlink.MAVLink(None, 1, 1))))
+    assert "".join(to_json(decoded)["text"]).rstrip("\0") == text
+    assert from_json(to_json(decoded) | {"text": text})._text_raw == text.encode()
