@@ -184,8 +184,10 @@ UNCALIBRATED: Final = sum(int(flag) for flag, _, _ in CALIBRATION_TEXTS)
 INERTIAL: Final = UNCALIBRATED & ~int(ImuFlags.MAG_UNCALIBRATED)
 
 LATENCY_PARAMETER: Final = "REF_GPS_LATENCY"
-LATENCY_SETTLED_US: Final = 5_000_000
-"""A latency that has not changed for so long has converged."""
+LATENCY_SETTLED_US: Final = 60 * US_PER_S
+LATENCY_SPREAD_S: Final = 0.02
+"""A latency that has not changed by more for so long has converged; the first manoeuvres of a
+flight may show one that is 0.08 s off."""
 RESTART_REPORTS: Final = 10
 """Reports of the link, one a second, in which restarts of a node are counted."""
 MANY_RESTARTS: Final = 3
@@ -246,7 +248,8 @@ class Announcements(Announcer):
 
         The latency in use approaches the estimate slowly, and stays constant while fixes are lost.
         """
-        if used_s != self._latency_s:
+        known_s = self._latency_s
+        if known_s is None or abs(used_s - known_s) > LATENCY_SPREAD_S:
             self._latency_s, self._latency_since_us = used_s, now_us
         if used_s == set_s or now_us - self._latency_since_us < LATENCY_SETTLED_US:
             return []
