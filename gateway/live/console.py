@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Final
 
-from pymavlink.dialects.v20 import all as mavlink
 from rich.cells import cell_len
 from rich.columns import Columns
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
@@ -25,6 +24,7 @@ from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_stat
 from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
 from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
 
 OUTAGE_US: Final = 2 * US_PER_S
 LOG_LINES: Final = 5
@@ -281,8 +281,7 @@ def _rates(snapshot: Snapshot, previous: Snapshot) -> Columns:
 
 
 def _message_name(message_id: int) -> str:
-    kind = mavlink.mavlink_map.get(message_id)
-    return str(message_id) if kind is None else str(kind.msgname)
+    return MESSAGE_NAMES.get(message_id, str(message_id))
 
 
 def _clients(snapshot: Snapshot) -> _Grid:

@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.geometry.quaternion import from_euler_array
 from gateway.recordings.columns import BARO, COLUMNS, GPS, LARGEST_WHOLE, NAV, SI, FloatArray
 from gateway.recordings.formats.csv import level_velocity
+from gateway.recordings.positions import is_located
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, columns_of
 from gateway.recordings.tlog_scan import IntArray
@@ -315,7 +316,8 @@ class AutopilotReader:
         at = np.cumsum(is_position) - 1 + known
         if len(positions):
             is_old = np.abs(recorded_us - positions_us[at]) > VELOCITY_AGE_US
-            at = np.where(is_old, -1, at)
+            is_known = is_located(positions["lat"][at], positions["lon"][at])
+            at = np.where(is_old | ~is_known, -1, at)
         self._positions, self._positions_us = positions[-1:], positions_us[-1:]
         return positions, at
 

@@ -274,3 +274,16 @@ def test_samples_are_those_of_the_autopilots_component() -> None:
     (row,) = rows_of(AutopilotReader(1, senders_of(data)), frames, 1 << 20)
     assert row.imu is not None
     assert row.imu.accel_b_mps2[2] == pytest.approx(-9.80665)
+
+
+def test_position_before_the_fix_is_no_state_of_the_autopilot() -> None:
+    sent = [
+        mavlink.MAVLink_scaled_imu_message(100, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_global_position_int_message(150, 0, 0, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_attitude_message(160, 0.1, 0.2, 0.3, 0, 0, 0),
+        mavlink.MAVLink_scaled_imu_message(200, 0, 0, -1000, 0, 0, 0, 0, 0, 0),
+    ]
+    frames = [(START_US + k * 10_000, packed(message)) for k, message in enumerate(sent)]
+    *_, row = rows_of(AutopilotReader(), frames, 1 << 20)
+    assert row.state is not None
+    assert NavFlags.POSITION_VALID not in row.state.flags
