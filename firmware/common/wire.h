@@ -7,6 +7,7 @@
 
 constexpr uint8_t WIRE_VERSION = 1;
 constexpr uint8_t WIRE_MAX_PAYLOAD = 32;  // one nRF24L01+ packet
+constexpr uint8_t WIRE_MAX_FOREIGN = 60;  // of a packet of another program, header included
 constexpr uint8_t WIRE_PIPES = 6;
 constexpr uint8_t WIRE_NO_PIPE = 0xFF;
 
@@ -21,6 +22,8 @@ enum WirePayloadKind : uint8_t {
 enum WireFrameKind : uint8_t {
     WIRE_RADIO = 1,
     WIRE_RECEIVER_STATUS = 2,
+    WIRE_RADIO_SIGNAL = 3,  // as 1, with the packet's signal
+    WIRE_FOREIGN = 4,       // a packet of another program
 };
 
 enum WireImuFlag : uint16_t {
@@ -164,6 +167,20 @@ struct WIRE_PACKED WireRadioFrame {
     WireFrameHeader header;
     uint8_t payload[WIRE_MAX_PAYLOAD];
 };
+
+// How a packet was received, by a radio that measures it.
+struct WIRE_PACKED WireSignal {
+    uint8_t minus_rssi_dbm;  // 0: not measured
+    int8_t snr_qdb;          // quarters of a dB
+};
+
+// A radio payload, or a packet of another program, with its signal.
+struct WIRE_PACKED WireSignalFrame {
+    WireFrameHeader header;
+    WireSignal signal;
+    uint8_t payload[WIRE_MAX_FOREIGN];
+};
+static_assert(sizeof(WireSignalFrame) <= 72, "PROTOCOL.md: the content is at most 72 bytes");
 
 struct WIRE_PACKED WirePipe {
     uint32_t received;

@@ -1,9 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "drivers/nrf24.h"
-
+// nRF24L01+: Enhanced ShockBurst with dynamic payload length, 2-byte CRC and automatic
+// acknowledgement. Product specification 1.0.
+//
+// Clones are used if they keep their configuration. None of what they do otherwise is used: the
+// Si24R1 has the packet's NO_ACK bit reversed, which matters only with EN_DYN_ACK.
 #include <string.h>
 
+#include "drivers/radio.h"
 #include "hal/board.h"
+#include "hal/lines.h"
 #include "hal/spi.h"
 #include "hal/stored_settings.h"
 
@@ -46,7 +51,12 @@ constexpr uint8_t ADDRESS_WIDTH_5 = 3;
 constexpr uint8_t ADDRESS_SIZE = 5;
 constexpr uint8_t FIFO_RX_EMPTY = 1 << 0;
 constexpr uint8_t FIFO_RX_FULL = 1 << 1;
-constexpr uint8_t CAUSES = NRF24_RECEIVED | NRF24_SENT | NRF24_GAVE_UP;
+
+// Status register, section 9.1: interrupt causes.
+constexpr uint8_t CAUSE_RECEIVED = 1 << 6;
+constexpr uint8_t CAUSE_SENT = 1 << 5;
+constexpr uint8_t CAUSE_GAVE_UP = 1 << 4;
+constexpr uint8_t CAUSES = CAUSE_RECEIVED | CAUSE_SENT | CAUSE_GAVE_UP;
 
 constexpr uint8_t RATE_250_KBPS = 1 << 5;
 constexpr uint8_t RATE_2000_KBPS = 1 << 3;
@@ -57,6 +67,29 @@ constexpr uint8_t POWER_UP_MS = 5;  // table 16: up to 4.5 ms for a crystal of 9
 constexpr uint8_t CHECKED[] = {CONFIG, EN_AA, EN_RXADDR, SETUP_AW, RF_CH, RF_SETUP, DYNPD, FEATURE};
 // RF_SETUP without the PLL's lock and without bit 0, which clones use otherwise.
 constexpr uint8_t RF_SETUP_USED = 0xAE;
+
+// One retry by the chip alone, then a new round: 24 attempts in all.
+constexpr uint8_t RETRIES = 1;
+constexpr uint8_t ROUNDS = 12;
+// Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
+// 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
+// the acknowledgement (section 7.4.2 of the chip's specification).
+struct Pauses {
+    uint8_t step;
+    uint8_t count;
+    uint16_t round_step_us;
+};
+constexpr Pauses PAUSES_250 = {7, 3, 2000};
+constexpr Pauses PAUSES_1000 = {3, 5, 1000};
+constexpr Pauses PAUSES_2000 = {2, 5, 1000};
+constexpr uint8_t PAUSE_FIRST = 2;
+constexpr bool fits(const Pauses &pauses) {
+    return PAUSE_FIRST + pauses.step * (pauses.count - 1) <= 16;
+}
+static_assert(fits(PAUSES_250) && fits(PAUSES_1000) && fits(PAUSES_2000),
+              "the chip pauses up to 4 ms");
+constexpr uint32_t LOST_US = 50000;
+constexpr uint32_t LONGEST_PACKET_US = 2000;  // 1.4 ms, and its acknowledgement
 
 uint8_t config;
 uint8_t pipes;     // mask of those in use
@@ -159,23 +192,37 @@ WireRadioState power_up(uint8_t mode) {
     config = CONFIG_CRC_16 | CONFIG_POWER_UP | mode;
     write_register(CONFIG, config);
     board_wait_ms(POWER_UP_MS);
-    return nrf24_check();
+    return radio_check();
 }
 
-void write_retries(uint8_t pause, uint8_t retries) {
-    write_register(SETUP_RETR, static_cast<uint8_t>((pause - 1) << 4 | retries));
+const Pauses &pauses() {
+    const uint16_t kbps = stored_settings().radio_kbps;
+    return kbps == 250 ? PAUSES_250 : kbps == 1000 ? PAUSES_1000 : PAUSES_2000;
+}
+
+// Up to `RETRIES` further attempts, each a drawn number of 250 us after the last.
+void write_retries(uint16_t random) {
+    const Pauses &drawn = pauses();
+    const uint8_t pause = static_cast<uint8_t>(PAUSE_FIRST + drawn.step * ((random >> 4) % drawn.count));
+    write_register(SETUP_RETR, static_cast<uint8_t>((pause - 1) << 4 | RETRIES));
+}
+
+// Reading clears them: the status comes back while the clearing byte goes out.
+uint8_t take_causes() {
+    const uint8_t causes = CAUSES;
+    return command(W_REGISTER | STATUS, &causes, nullptr, 1) & CAUSES;
 }
 
 }  // namespace
 
-WireRadioState nrf24_start_sender(uint8_t pipe) {
+WireRadioState radio_start_sender(uint8_t pipe) {
     set_up(1, pipe);
     write_address(TX_ADDR, pipe);
     write_address(RX_ADDR_P0, pipe);  // the acknowledgement comes to the address it was sent to
     return power_up(0);
 }
 
-WireRadioState nrf24_start_receiver() {
+WireRadioState radio_start_receiver() {
     set_up(ALL_PIPES, 0);
     for (uint8_t pipe = 0; pipe < WIRE_PIPES; ++pipe) {
         write_address(static_cast<uint8_t>(RX_ADDR_P0 + pipe), pipe);
@@ -185,7 +232,7 @@ WireRadioState nrf24_start_receiver() {
     return state;
 }
 
-WireRadioState nrf24_check() {
+WireRadioState radio_check() {
     uint8_t zeros = 0;
     uint8_t ones = 0xFF;
     bool kept = true;
@@ -209,38 +256,52 @@ WireRadioState nrf24_check() {
     return activated ? WIRE_RADIO_ACTIVATED : WIRE_RADIO_OK;
 }
 
-void nrf24_send(const uint8_t *payload, uint8_t size, uint8_t pause, uint8_t retries) {
-    write_retries(pause, retries);
+RadioTiming radio_timing() { return RadioTiming{ROUNDS, pauses().round_step_us, LOST_US}; }
+
+void radio_send(const uint8_t *payload, uint8_t size, uint16_t random) {
+    write_retries(random);
     command(W_TX_PAYLOAD, payload, nullptr, size);
     spi_enable_radio(true);
 }
 
-void nrf24_send_again(uint8_t pause, uint8_t retries) {
+void radio_send_again(uint16_t random) {
     // CE must fall and rise for a new round: section 6.1.4.
     spi_enable_radio(false);
-    write_retries(pause, retries);
+    write_retries(random);
     spi_enable_radio(true);
 }
 
-void nrf24_stop_sending() {
+RadioProgress radio_progress() {
+    if (!lines_radio_low()) {
+        return RADIO_PENDING;
+    }
+    return (take_causes() & CAUSE_SENT) != 0 ? RADIO_SENT : RADIO_GAVE_UP;
+}
+
+void radio_stop_sending() {
     spi_enable_radio(false);
     command(FLUSH_TX, nullptr, nullptr, 0);
 }
 
-uint8_t nrf24_take_causes() {
-    const uint8_t causes = CAUSES;
-    // The status comes back while the clearing byte goes out.
-    return command(W_REGISTER | STATUS, &causes, nullptr, 1) & CAUSES;
+uint8_t radio_retries() { return read_register(OBSERVE_TX) & 0x0F; }
+
+bool radio_has_received() {
+    if (!lines_radio_low()) {
+        return false;
+    }
+    // Causes are cleared before the FIFO is read, so that a packet that comes meanwhile pulls the
+    // line low again.
+    take_causes();
+    return true;
 }
 
-uint8_t nrf24_retries() { return read_register(OBSERVE_TX) & 0x0F; }
-
-bool nrf24_receive(Nrf24Packet *packet) {
+bool radio_receive(RadioPacket *packet) {
     const uint8_t fifo = read_register(FIFO_STATUS);
     if ((fifo & FIFO_RX_EMPTY) != 0) {
         return false;
     }
     packet->fifo_full = (fifo & FIFO_RX_FULL) != 0;
+    packet->signal = WireSignal{};
     const uint8_t status = command(R_RX_PL_WID, nullptr, &packet->size, 1);
     packet->pipe = (status >> 1) & 0x07;
     if (packet->size == 0 || packet->size > WIRE_MAX_PAYLOAD || packet->pipe >= WIRE_PIPES) {
@@ -251,9 +312,13 @@ bool nrf24_receive(Nrf24Packet *packet) {
     return true;
 }
 
-void nrf24_restart_listening() {
+// Leaving and entering reception makes the carrier detector measure again.
+void radio_measure_carrier() {
     spi_enable_radio(false);
     spi_enable_radio(true);
 }
 
-bool nrf24_carrier() { return (read_register(RPD) & 1) != 0; }
+// Whether a carrier above -64 dBm was on the channel.
+bool radio_carrier() { return (read_register(RPD) & 1) != 0; }
+
+uint32_t radio_longest_packet_us() { return LONGEST_PACKET_US; }

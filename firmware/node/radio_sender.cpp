@@ -4,61 +4,32 @@
 #include <string.h>
 
 #include "common/random16.h"
-#include "drivers/nrf24.h"
+#include "drivers/radio.h"
 #include "hal/clock.h"
-#include "hal/lines.h"
 #include "hal/stored_settings.h"
 
 namespace {
 
 enum State : uint8_t { ABSENT, IDLE, SENDING, PAUSING };
 
-// One retry by the chip alone, then a new round: 24 attempts in all.
-constexpr uint8_t RETRIES = 1;
-constexpr uint8_t ROUNDS = 12;
-// Pauses in units of 250 us. The steps are longer than a full packet with its acknowledgement (0.33,
-// 0.53 and 1.74 ms), so that two different draws keep clear of each other; the shortest waits for
-// the acknowledgement (section 7.4.2 of the chip's specification).
-struct Pauses {
-    uint8_t step;
-    uint8_t count;
-    uint16_t round_step_us;
-};
-constexpr Pauses PAUSES_250 = {7, 3, 2000};
-constexpr Pauses PAUSES_1000 = {3, 5, 1000};
-constexpr Pauses PAUSES_2000 = {2, 5, 1000};
-constexpr uint8_t PAUSE_FIRST = 2;
-constexpr bool fits(const Pauses &pauses) {
-    return PAUSE_FIRST + pauses.step * (pauses.count - 1) <= 16;
-}
-static_assert(fits(PAUSES_250) && fits(PAUSES_1000) && fits(PAUSES_2000),
-              "the chip pauses up to 4 ms");
-
-constexpr uint32_t LOST_US = 50000;
 constexpr uint32_t SET_UP_EVERY_US = 500000;
 
-const Pauses &pauses() {
-    const uint16_t kbps = stored_settings().radio_kbps;
-    return kbps == 250 ? PAUSES_250 : kbps == 1000 ? PAUSES_1000 : PAUSES_2000;
-}
-
-uint8_t draw_pause(RadioSender *sender) {
+uint16_t draw(RadioSender *sender) {
     sender->random = random16_next(sender->random);
-    const Pauses &drawn = pauses();
-    return static_cast<uint8_t>(PAUSE_FIRST + drawn.step * ((sender->random >> 4) % drawn.count));
+    return sender->random;
 }
 
 void count_lost(RadioSender *sender) {
     ++sender->failed;
     sender->acknowledged = false;
     payload_queue_pop(&sender->queue);
-    nrf24_stop_sending();
+    radio_stop_sending();
     sender->state = IDLE;
 }
 
 void set_up(RadioSender *sender) {
-    sender->radio = nrf24_start_sender(stored_settings().radio_pipe);
-    sender->state = nrf24_usable(sender->radio) ? IDLE : ABSENT;
+    sender->radio = radio_start_sender(stored_settings().radio_pipe);
+    sender->state = radio_usable(sender->radio) ? IDLE : ABSENT;
     sender->since_us = clock_us();
 }
 
@@ -71,33 +42,34 @@ void begin(RadioSender *sender, const Payload *payload, uint32_t now_us) {
     sender->rounds = 1;
     sender->state = SENDING;
     sender->since_us = now_us;
-    nrf24_send(payload->bytes, payload->size, draw_pause(sender), RETRIES);
+    radio_send(payload->bytes, payload->size, draw(sender));
 }
 
 void follow(RadioSender *sender, uint32_t now_us) {
-    if (!lines_radio_low()) {
-        if (clock_passed(now_us, sender->since_us + LOST_US)) {
+    const RadioTiming timing = radio_timing();
+    const RadioProgress progress = radio_progress();
+    if (progress == RADIO_PENDING) {
+        if (clock_passed(now_us, sender->since_us + timing.lost_us)) {
             count_lost(sender);
             sender->state = ABSENT;
         }
         return;
     }
-    const uint8_t causes = nrf24_take_causes();
-    sender->retries = static_cast<uint16_t>(sender->retries + nrf24_retries());
-    if ((causes & NRF24_SENT) != 0) {
+    sender->retries = static_cast<uint16_t>(sender->retries + radio_retries());
+    if (progress == RADIO_SENT) {
         payload_queue_pop(&sender->queue);
-        nrf24_stop_sending();
+        radio_stop_sending();
         sender->acknowledged = true;
         sender->state = IDLE;
-    } else if ((causes & NRF24_GAVE_UP) != 0 && sender->rounds < ROUNDS) {
+    } else if (sender->rounds < timing.rounds) {
         // The more rounds have failed, the more nodes there may be that want the air.
         const uint8_t steps = static_cast<uint8_t>((sender->random >> 8) % (sender->rounds / 2 + 1U));
         ++sender->rounds;
-        sender->since_us = now_us + steps * pauses().round_step_us;
+        sender->since_us = now_us + static_cast<uint32_t>(steps) * timing.round_step_us;
         sender->state = PAUSING;
     } else {
         count_lost(sender);
-        if (!nrf24_usable(nrf24_check())) {
+        if (!radio_usable(radio_check())) {
             sender->state = ABSENT;
         }
     }
@@ -107,7 +79,7 @@ void resume(RadioSender *sender, uint32_t now_us) {
     if (clock_passed(now_us, sender->since_us)) {
         sender->state = SENDING;
         sender->since_us = now_us;
-        nrf24_send_again(draw_pause(sender), RETRIES);
+        radio_send_again(draw(sender));
     }
 }
 

@@ -4,7 +4,7 @@
 
 #include "common/frame.h"
 #include "common/link_counter.h"
-#include "drivers/nrf24.h"
+#include "drivers/radio.h"
 #include "hal/board.h"
 #include "hal/clock.h"
 #include "hal/events.h"
@@ -26,8 +26,6 @@ constexpr uint32_t QUIET_US = 2000000;
 constexpr uint32_t NOISE_EVERY_US = 50000;
 // The carrier detector needs 130 us to enter reception and 40 us to measure: section 6.4.
 constexpr uint32_t NOISE_AFTER_US = 200;
-// A carrier that ends in a packet within this time was our own; the longest lasts 1.4 ms.
-constexpr uint32_t NOISE_OWN_US = 2000;
 
 const SettingsImage IMAGE SETTINGS_IN_FLASH =
     settings_image(default_settings(PROGRAM_RECEIVER, 0, 0));
@@ -60,36 +58,42 @@ void send_frame(const void *content, uint8_t size) {
 }
 
 void set_up_radio() {
-    receiver.radio = nrf24_start_receiver();
+    receiver.radio = radio_start_receiver();
     receiver.set_up_due_us = clock_us() + SET_UP_EVERY_US;
     receiver.noise_state = NOISE_IDLE;
     receiver.noise_due_us = clock_us() + NOISE_EVERY_US;
 }
 
-void pass_on(const Nrf24Packet &packet, uint32_t arrived_us) {
+void pass_on(const RadioPacket &packet, uint32_t arrived_us) {
     receiver.heard_us = arrived_us;
-    link_count(&receiver.link, packet.pipe, packet.payload, packet.size);
-    if (packet.fifo_full) {
-        link_overrun(&receiver.link, packet.pipe);
+    const bool is_foreign = packet.pipe == WIRE_NO_PIPE;
+    if (!is_foreign) {
+        link_count(&receiver.link, packet.pipe, packet.payload, packet.size);
+        if (packet.fifo_full) {
+            link_overrun(&receiver.link, packet.pipe);
+        }
     }
-    WireRadioFrame frame;
-    frame.header = WireFrameHeader{wire_version_kind(WIRE_RADIO), receiver.sequence++, packet.pipe,
-                                   arrived_us};
-    memcpy(frame.payload, packet.payload, packet.size);
-    send_frame(&frame, static_cast<uint8_t>(sizeof frame.header + packet.size));
+    WireSignalFrame frame;
+    const bool has_signal = packet.signal.minus_rssi_dbm != 0;
+    const uint8_t kind = is_foreign ? WIRE_FOREIGN : has_signal ? WIRE_RADIO_SIGNAL : WIRE_RADIO;
+    frame.header = WireFrameHeader{wire_version_kind(kind), receiver.sequence++, packet.pipe, arrived_us};
+    uint8_t *end = reinterpret_cast<uint8_t *>(&frame) + sizeof frame.header;
+    if (kind != WIRE_RADIO) {
+        memcpy(end, &packet.signal, sizeof packet.signal);
+        end += sizeof packet.signal;
+    }
+    memcpy(end, packet.payload, packet.size);
+    send_frame(&frame, static_cast<uint8_t>(end - reinterpret_cast<uint8_t *>(&frame) + packet.size));
 }
 
 void poll_radio() {
-    if (!lines_radio_low()) {
+    if (!radio_has_received()) {
         return;
     }
-    // Causes are cleared before the FIFO is read, so that a packet that comes meanwhile pulls the
-    // line low again.
-    nrf24_take_causes();
     receiver.noise_state = NOISE_IDLE;  // the carrier is a packet's own
     uint32_t arrived_us = lines_radio_us();
-    Nrf24Packet packet;
-    while (nrf24_receive(&packet)) {
+    RadioPacket packet;
+    while (radio_receive(&packet)) {
         pass_on(packet, arrived_us);
         arrived_us = clock_us();  // whatever follows came while this one was read
     }
@@ -107,12 +111,12 @@ void poll_noise(uint32_t now_us) {
         return;
     }
     if (receiver.noise_state == NOISE_IDLE) {
-        nrf24_restart_listening();
+        radio_measure_carrier();
         receiver.noise_state = NOISE_LISTENING;
         receiver.noise_due_us = now_us + NOISE_AFTER_US;
-    } else if (receiver.noise_state == NOISE_LISTENING && nrf24_carrier()) {
+    } else if (receiver.noise_state == NOISE_LISTENING && radio_carrier()) {
         receiver.noise_state = NOISE_HEARD;
-        receiver.noise_due_us = now_us + NOISE_OWN_US;
+        receiver.noise_due_us = now_us + radio_longest_packet_us();
     } else {
         end_noise_look(now_us, receiver.noise_state == NOISE_HEARD);
     }
@@ -139,14 +143,14 @@ void poll_status(uint32_t now_us) {
     status.reset_and_radio = wire_reset_and_radio(board_reset_cause(), receiver.radio);
     memcpy(status.pipes, receiver.link.pipes, sizeof status.pipes);
     send_frame(&status, sizeof status);
-    if (nrf24_usable(receiver.radio)) {
-        receiver.radio = nrf24_check();
+    if (radio_usable(receiver.radio)) {
+        receiver.radio = radio_check();
         receiver.set_up_due_us = now_us;  // the last one may lie more than half a wrap back
     }
 }
 
 LedCode led_code(uint32_t now_us) {
-    if (!nrf24_usable(receiver.radio)) {
+    if (!radio_usable(receiver.radio)) {
         return LED_NO_RADIO;
     }
     if (clock_passed(now_us, receiver.heard_us + QUIET_US)) {
@@ -170,7 +174,7 @@ int main() {
         events_wait();
         board_feed_watchdog();
         const uint32_t now_us = clock_us();
-        if (nrf24_usable(receiver.radio)) {
+        if (radio_usable(receiver.radio)) {
             poll_radio();
             poll_noise(now_us);
         } else if (clock_passed(now_us, receiver.set_up_due_us)) {
