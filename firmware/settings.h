@@ -59,6 +59,48 @@
 #define GPS_RADIO_PIPE (((VEHICLE_ID - 1) * 2 + 1) % 6)
 #endif
 
+// --- LoRa radio ------------------------------------------------------------------------------
+
+// Built with RADIO=sx1276; 0 is the nRF24L01+.
+#ifndef RADIO_SX1276
+#define RADIO_SX1276 0
+#endif
+
+// * Within 433.05 to 434.79, 863 to 870 or 902 to 928 MHz, by the rules of the country.
+#ifndef LORA_FREQUENCY_KHZ
+#define LORA_FREQUENCY_KHZ 868300UL
+#endif
+
+// * 125, 250 or 500 kHz. Half the bandwidth gains 3 dB and doubles the time on the air.
+#ifndef LORA_BANDWIDTH_KHZ
+#define LORA_BANDWIDTH_KHZ 250
+#endif
+
+// * Factor 7 to 10. Each step gains 2.5 dB and nearly doubles the time on the air.
+#ifndef LORA_SPREADING
+#define LORA_SPREADING 7
+#endif
+
+// * Coding rate 4/5 to 4/8: 5 to 8.
+#ifndef LORA_CODING
+#define LORA_CODING 5
+#endif
+
+// * 2 to 20 dBm, by PA_BOOST, the only output that RFM95 modules connect.
+#ifndef LORA_POWER_DBM
+#define LORA_POWER_DBM 14
+#endif
+
+// * Another group of boards nearby takes another; 0x34 is LoRaWAN's.
+#ifndef LORA_SYNC_WORD
+#define LORA_SYNC_WORD 0x12
+#endif
+
+// * 1: the receiver passes packets of other programs on, such as RadioHead's.
+#ifndef LORA_FOREIGN
+#define LORA_FOREIGN 0
+#endif
+
 // --- IMU node --------------------------------------------------------------------------------
 
 // Readings of the MPU6050 per second: 1000 divided by a whole number.
@@ -66,9 +108,9 @@
 #define IMU_SAMPLE_HZ (F_CPU >= 16000000UL ? 1000 : 500)
 #endif
 
-// * IMU payloads per second, 60 to 250.
+// * IMU payloads per second: 60 to 250, by LoRa 4 to 20.
 #ifndef IMU_SEND_HZ
-#define IMU_SEND_HZ 100
+#define IMU_SEND_HZ (RADIO_SX1276 ? 10 : 100)
 #endif
 
 // * 1 sends means of the readings and leaves every filter to the gateway; 0 filters on the node.
@@ -109,14 +151,14 @@
 #define BARO_OVERSAMPLING 3
 #endif
 #ifndef BARO_HZ
-#define BARO_HZ 25
+#define BARO_HZ (RADIO_SX1276 ? 2 : 25)
 #endif
 
 // --- GPS node --------------------------------------------------------------------------------
 
 // * 1 to 10; 10 needs GPS alone (no GLONASS) on an M8N.
 #ifndef GPS_RATE_HZ
-#define GPS_RATE_HZ 5
+#define GPS_RATE_HZ (RADIO_SX1276 ? 1 : 5)
 #endif
 
 // The speed that is set in the GPS receiver, one that this crystal can make: 16 MHz gives 57143,
@@ -151,8 +193,18 @@ static_assert(RADIO_POWER >= 0 && RADIO_POWER <= 3, "RADIO_POWER is 0 to 3");
 static_assert(IMU_RADIO_PIPE <= 5 && GPS_RADIO_PIPE <= 5, "the receiver has pipes 0 to 5");
 static_assert(IMU_SAMPLE_HZ >= 200 && IMU_SAMPLE_HZ <= 1000 && 1000 % (IMU_SAMPLE_HZ) == 0,
               "IMU_SAMPLE_HZ is 1000, 500, 250 or 200");
-static_assert(IMU_SEND_HZ >= 60 && IMU_SEND_HZ <= 250 && IMU_SEND_HZ <= IMU_SAMPLE_HZ,
-              "IMU_SEND_HZ is 60 to 250");
+static_assert((RADIO_SX1276 ? IMU_SEND_HZ >= 4 && IMU_SEND_HZ <= 20
+                            : IMU_SEND_HZ >= 60 && IMU_SEND_HZ <= 250) && IMU_SEND_HZ <= IMU_SAMPLE_HZ,
+              "IMU_SEND_HZ is 60 to 250, by LoRa 4 to 20");
+static_assert((LORA_FREQUENCY_KHZ >= 433050 && LORA_FREQUENCY_KHZ <= 434790) ||
+              (LORA_FREQUENCY_KHZ >= 863000 && LORA_FREQUENCY_KHZ <= 870000) ||
+              (LORA_FREQUENCY_KHZ >= 902000 && LORA_FREQUENCY_KHZ <= 928000),
+              "LORA_FREQUENCY_KHZ is 433050 to 434790, 863000 to 870000 or 902000 to 928000");
+static_assert(LORA_BANDWIDTH_KHZ == 125 || LORA_BANDWIDTH_KHZ == 250 || LORA_BANDWIDTH_KHZ == 500,
+              "LORA_BANDWIDTH_KHZ is 125, 250 or 500");
+static_assert(LORA_SPREADING >= 7 && LORA_SPREADING <= 10, "LORA_SPREADING is 7 to 10");
+static_assert(LORA_CODING >= 5 && LORA_CODING <= 8, "LORA_CODING is 5 to 8");
+static_assert(LORA_POWER_DBM >= 2 && LORA_POWER_DBM <= 20, "LORA_POWER_DBM is 2 to 20");
 static_assert(ACCEL_LOWPASS_HZ * 10 <= IMU_SAMPLE_HZ,
               "ACCEL_LOWPASS_HZ is at most a tenth of IMU_SAMPLE_HZ");
 static_assert(ACCEL_RANGE >= 0 && ACCEL_RANGE <= 3, "ACCEL_RANGE is 0 to 3");
@@ -170,6 +222,7 @@ constexpr SettingsBlock default_settings(SettingsProgram program, uint8_t node_i
         static_cast<uint8_t>(F_CPU / 1000000UL), FIRMWARE_VERSION_MAJOR, FIRMWARE_VERSION_MINOR,
         VEHICLE_ID, node_id, pipe, RADIO_CHANNEL, RADIO_KBPS, RADIO_POWER, IMU_SEND_HZ,
         RADIO_ADDRESS, IMU_RAW, ACCEL_RANGE, GYRO_RANGE, GPS_RATE_HZ, GPS_DYNAMIC_MODEL,
-        0, {0, 0}, 0,
+        0, {0, 0}, RADIO_SX1276 ? SETTINGS_SX1276 : SETTINGS_NRF24, LORA_FREQUENCY_KHZ,
+        LORA_BANDWIDTH_KHZ, LORA_SPREADING, LORA_CODING, LORA_POWER_DBM, LORA_SYNC_WORD, LORA_FOREIGN, 0,
     };
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The settings block: 34 bytes of each program's image that hold what differs between users.
+// The settings block: 46 bytes of each program's image that hold what differs between users.
 // `mavgate flash` patches them in the image before it is uploaded, so nobody needs a compiler; as
 // built, they hold the values of settings.h. gateway/flashing/boards.py reads and writes the
 // same bytes.
@@ -11,9 +11,11 @@
 #include "common/firmware_version.h"
 
 // Raised when the layout changes. A new field takes a reserved byte or goes before the CRC.
-constexpr uint8_t SETTINGS_VERSION = 1;
+constexpr uint8_t SETTINGS_VERSION = 2;
 
 enum SettingsProgram : uint8_t { PROGRAM_IMU_NODE = 1, PROGRAM_GPS_NODE = 2, PROGRAM_RECEIVER = 3 };
+
+enum SettingsRadio : uint8_t { SETTINGS_NRF24 = 0, SETTINGS_SX1276 = 1 };
 
 struct __attribute__((packed)) SettingsBlock {
     char magic[7];  // "mavgate": the block is found by it, wherever the linker puts it
@@ -37,9 +39,17 @@ struct __attribute__((packed)) SettingsBlock {
     uint8_t gps_dynamic_model;
     uint8_t soft_restart;  // the bootloader leaves the watchdog on, see board.h
     uint8_t reserved[2];
+    uint8_t radio;  // SettingsRadio: the driver in this image
+    uint32_t lora_frequency_khz;
+    uint16_t lora_bandwidth_khz;
+    uint8_t lora_spreading;
+    uint8_t lora_coding;
+    uint8_t lora_power_dbm;
+    uint8_t lora_sync_word;
+    uint8_t lora_foreign;  // the receiver passes packets of other programs on
     uint16_t crc;  // CRC-16 of all before it
 };
-static_assert(sizeof(SettingsBlock) == 34, "gateway/flashing/boards.py");
+static_assert(sizeof(SettingsBlock) == 46, "gateway/flashing/boards.py");
 
 // The block as the bytes of the image. A constant expression cannot look at a struct's bytes, and
 // the CRC has to be one: so the fields are written one by one.
@@ -79,6 +89,18 @@ constexpr SettingsImage settings_image(const SettingsBlock &block) {
         block.soft_restart,
         block.reserved[0],
         block.reserved[1],
+        block.radio,
+        static_cast<uint8_t>(block.lora_frequency_khz),
+        static_cast<uint8_t>(block.lora_frequency_khz >> 8),
+        static_cast<uint8_t>(block.lora_frequency_khz >> 16),
+        static_cast<uint8_t>(block.lora_frequency_khz >> 24),
+        static_cast<uint8_t>(block.lora_bandwidth_khz),
+        static_cast<uint8_t>(block.lora_bandwidth_khz >> 8),
+        block.lora_spreading,
+        block.lora_coding,
+        block.lora_power_dbm,
+        block.lora_sync_word,
+        block.lora_foreign,
     };
     for (uint8_t field : fields) {
         image.bytes[size++] = field;

@@ -215,6 +215,11 @@ uint8_t take_causes() {
 
 }  // namespace
 
+void radio_start_pins() {
+    spi_start();
+    lines_start_radio(false);
+}
+
 WireRadioState radio_start_sender(uint8_t pipe) {
     set_up(1, pipe);
     write_address(TX_ADDR, pipe);
@@ -256,7 +261,7 @@ WireRadioState radio_check() {
     return activated ? WIRE_RADIO_ACTIVATED : WIRE_RADIO_OK;
 }
 
-RadioTiming radio_timing() { return RadioTiming{ROUNDS, pauses().round_step_us, LOST_US}; }
+RadioTiming radio_timing() { return RadioTiming{ROUNDS, 1, pauses().round_step_us, LOST_US}; }
 
 void radio_send(const uint8_t *payload, uint8_t size, uint16_t random) {
     write_retries(random);
@@ -272,7 +277,7 @@ void radio_send_again(uint16_t random) {
 }
 
 RadioProgress radio_progress() {
-    if (!lines_radio_low()) {
+    if (!lines_radio_active()) {
         return RADIO_PENDING;
     }
     return (take_causes() & CAUSE_SENT) != 0 ? RADIO_SENT : RADIO_GAVE_UP;
@@ -286,7 +291,7 @@ void radio_stop_sending() {
 uint8_t radio_retries() { return read_register(OBSERVE_TX) & 0x0F; }
 
 bool radio_has_received() {
-    if (!lines_radio_low()) {
+    if (!lines_radio_active()) {
         return false;
     }
     // Causes are cleared before the FIFO is read, so that a packet that comes meanwhile pulls the

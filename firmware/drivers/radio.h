@@ -7,6 +7,9 @@
 
 #include "common/wire.h"
 
+// SPI and the interrupt line; before all else.
+void radio_start_pins();
+
 // Both set the chip up and check it.
 WireRadioState radio_start_sender(uint8_t pipe);
 WireRadioState radio_start_receiver();
@@ -23,7 +26,8 @@ enum RadioProgress : uint8_t { RADIO_PENDING, RADIO_SENT, RADIO_GAVE_UP };
 // How a sender waits for the air.
 struct RadioTiming {
     uint8_t rounds;          // attempts before a payload is lost
-    uint16_t round_step_us;  // of the random pause between two rounds
+    uint8_t least_steps;     // of the range that the pause between two rounds is drawn from
+    uint16_t round_step_us;
     uint32_t lost_us;        // longer than any attempt: the chip is lost
 };
 RadioTiming radio_timing();

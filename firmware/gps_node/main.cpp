@@ -2,10 +2,9 @@
 // The GPS node: GPS receiver to radio.
 #include "common/wire.h"
 #include "drivers/gps.h"
+#include "drivers/radio.h"
 #include "hal/board.h"
 #include "hal/clock.h"
-#include "hal/lines.h"
-#include "hal/spi.h"
 #include "hal/stored_settings.h"
 #include "node/node_report.h"
 #include "node/radio_sender.h"
@@ -35,8 +34,7 @@ NodeHealth health() {
 }  // namespace
 
 int main() {
-    spi_start();
-    lines_start_radio();
+    radio_start_pins();
     board_start();
     stored_settings_load(&IMAGE);
     gps_start(&gps);

@@ -14,6 +14,8 @@ namespace {
 volatile uint32_t imu_us;
 volatile uint32_t radio_us;
 
+bool radio_active_high;
+
 }  // namespace
 
 ISR(INT0_vect) {
@@ -33,10 +35,15 @@ void lines_start_imu() {
     EIMSK |= 1 << INT0;
 }
 
-void lines_start_radio() {
+void lines_start_radio(bool active_high) {
+    radio_active_high = active_high;
     DDRD &= static_cast<uint8_t>(~(1 << PD3));
-    PORTD |= 1 << PD3;
-    EICRA |= 1 << ISC11;
+    if (active_high) {
+        EICRA |= 1 << ISC11 | 1 << ISC10;
+    } else {
+        PORTD |= 1 << PD3;
+        EICRA |= 1 << ISC11;
+    }
     EIFR = 1 << INTF1;
     EIMSK |= 1 << INT1;
 }
@@ -53,4 +60,4 @@ uint32_t lines_radio_us() {
     return time_us;
 }
 
-bool lines_radio_low() { return (PIND & 1 << PD3) == 0; }
+bool lines_radio_active() { return ((PIND & 1 << PD3) != 0) == radio_active_high; }

@@ -6,10 +6,9 @@
 #include "common/imu_chip.h"
 #include "common/imu_reducer.h"
 #include "common/wire.h"
+#include "drivers/radio.h"
 #include "hal/board.h"
 #include "hal/clock.h"
-#include "hal/lines.h"
-#include "hal/spi.h"
 #include "hal/stored_settings.h"
 #include "hal/twi.h"
 #include "imu_node/sensors.h"
@@ -91,8 +90,7 @@ NodeHealth health() {
 }  // namespace
 
 int main() {
-    spi_start();
-    lines_start_radio();
+    radio_start_pins();
     board_start();
     stored_settings_load(&IMAGE);
     radio_sender_start(&sender);

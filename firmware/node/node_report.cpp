@@ -5,10 +5,11 @@
 #include "hal/board.h"
 #include "hal/clock.h"
 #include "hal/events.h"
+#include "settings.h"
 
 namespace {
 
-constexpr uint32_t EVERY_US = 1000000;
+constexpr uint8_t EVERY_S = RADIO_SX1276 ? 5 : 1;
 
 }  // namespace
 
@@ -29,7 +30,7 @@ bool node_report_due(const NodeReport *report, uint32_t now_us) {
 
 void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &health,
                       RadioSender *sender) {
-    report->due_us += EVERY_US;
+    report->due_us += EVERY_S * 1000000UL;
     WireNodeStatus status = {};
     status.version_major = FIRMWARE_VERSION_MAJOR;
     status.version_minor = FIRMWARE_VERSION_MINOR;
@@ -42,7 +43,7 @@ void node_report_send(NodeReport *report, uint32_t now_us, const NodeHealth &hea
     status.loop_max_us = report->loop_max_us > UINT16_MAX
                              ? static_cast<uint16_t>(UINT16_MAX)
                              : static_cast<uint16_t>(report->loop_max_us);
-    status.sample_rate_hz = report->samples;
+    status.sample_rate_hz = (report->samples + EVERY_S / 2) / EVERY_S;
     status.supply_mv = board_supply_mv();
     status.chips = health.chips;
     report->loop_max_us = 0;

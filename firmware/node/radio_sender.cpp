@@ -63,7 +63,7 @@ void follow(RadioSender *sender, uint32_t now_us) {
         sender->state = IDLE;
     } else if (sender->rounds < timing.rounds) {
         // The more rounds have failed, the more nodes there may be that want the air.
-        const uint8_t steps = static_cast<uint8_t>((sender->random >> 8) % (sender->rounds / 2 + 1U));
+        const uint8_t steps = static_cast<uint8_t>((sender->random >> 8) % (sender->rounds / 2U + timing.least_steps));
         ++sender->rounds;
         sender->since_us = now_us + static_cast<uint32_t>(steps) * timing.round_step_us;
         sender->state = PAUSING;

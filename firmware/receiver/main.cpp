@@ -10,7 +10,6 @@
 #include "hal/events.h"
 #include "hal/lines.h"
 #include "hal/led.h"
-#include "hal/spi.h"
 #include "hal/stored_settings.h"
 #include "hal/uart.h"
 #include "settings.h"
@@ -163,8 +162,7 @@ LedCode led_code(uint32_t now_us) {
 }  // namespace
 
 int main() {
-    spi_start();
-    lines_start_radio();
+    radio_start_pins();
     uart_start(UART_BAUD, tx_ring, sizeof tx_ring);
     board_start();
     stored_settings_load(&IMAGE);

@@ -15,9 +15,11 @@ from firmware.rig.i2c import I2cBus
 from firmware.rig.imu import IMU_CHIPS, Imu
 from firmware.rig.mcu import FIRMWARE, Mcu
 from firmware.rig.nrf24 import RADIO_CHIPS, Nrf24
+from firmware.rig.sx1276 import Sx1276
 from firmware.rig.world import World
 
 _CE: Final = 1 << 1
+"""CE of an nRF24L01+, the reset line of an SX1276."""
 _CSN: Final = 1 << 2
 _IMU_LINE: Final = 2
 _RADIO_LINE: Final = 3
@@ -36,6 +38,12 @@ class Parts:
     radio: str = "nRF24L01+"
     """The receiver's."""
     node_radio: str = "nRF24L01+"
+
+
+LORA_VERSIONS: Final = {"SX1276": 0x12, "look-alike 0x11": 0x11, "look-alike 0x22": 0x22}
+"""Version registers of LoRa chips, by name."""
+LORA_PARTS: Final = {"radio": "SX1276", "node_radio": "SX1276"}
+"""Of `Parts`, for programs that were built for this radio."""
 
 
 @dataclass
@@ -85,18 +93,25 @@ class Board:
         self.setup = setup
         self.mcu = Mcu(setup.build / f"{program}.hex", setup.frequency_hz, clock_ppm)
         setup.bench.chips.append(self.mcu)
-        self._radio_line = True
-        self.radio = Nrf24(
-            setup.bench,
-            setup.air,
-            lambda: self.mcu.now_ps,
-            self._drive_radio_line,
-            RADIO_CHIPS[setup.parts.radio if program == "receiver" else setup.parts.node_radio],
+        self.radio = self._make_radio(
+            setup.parts.radio if program == "receiver" else setup.parts.node_radio
         )
         self.mcu.on_spi = self.radio.begin
         self.mcu.on_port_b = self._port_b
         Board._restore_lines(self)
         self.mcu.on_reset = self._restore_lines
+
+    def _make_radio(self, chip: str) -> Nrf24 | Sx1276:
+        """Solder a radio to the board; its first act is to drive its line."""
+        edges = (
+            self.setup.bench,
+            self.setup.air,
+            lambda: self.mcu.now_ps,
+            self._drive_radio_line,
+        )
+        if chip in LORA_VERSIONS:
+            return Sx1276(*edges, LORA_VERSIONS[chip])
+        return Nrf24(*edges, RADIO_CHIPS[chip])
 
     def reset(self, cause: int, through_bootloader: bool = False) -> None:
         """Restart the chip; radio and sensors keep their state."""

@@ -32,6 +32,7 @@ def build(
     settings: str = "",
     frequency_hz: int = 16_000_000,
     programs: tuple[str, ...] = PROGRAMS,
+    radio: str = "nrf24",
 ) -> Path:
     """Build programs and the shim.
 
@@ -43,6 +44,8 @@ def build(
         The boards' clock: 8 or 16 MHz.
     programs : tuple of str
         Which ones; all three by default.
+    radio : str
+        The driver, nrf24 or sx1276.
 
     Returns
     -------
@@ -57,10 +60,11 @@ def build(
     if missing := missing_tools():
         raise BuildError(f"{', '.join(missing)} not found: apt-get install {PACKAGES}")
     folder = _BUILD
-    if settings or frequency_hz != 16_000_000:
-        name = hashlib.sha256(f"{settings} {frequency_hz}".encode()).hexdigest()[:12]
+    if settings or frequency_hz != 16_000_000 or radio != "nrf24":
+        name = hashlib.sha256(f"{settings} {frequency_hz} {radio}".encode()).hexdigest()[:12]
         folder = _BUILD / f"variant-{name}"
-    make(*programs, f"BUILD={folder}", f"SETTINGS={settings}", f"F_CPU={frequency_hz}UL")
+    options = (f"SETTINGS={settings}", f"F_CPU={frequency_hz}UL", f"RADIO={radio}")
+    make(*programs, f"BUILD={folder}", *options)
     make("rig")
     return folder
 

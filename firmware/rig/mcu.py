@@ -20,7 +20,7 @@ WATCHDOG: Final = 1 << 3
 BUS_ADDRESS, BUS_WRITE, BUS_READ, BUS_STOP = range(4)
 
 _UART_OUT: Final = 4096
-_SPI_DATA: Final = 32
+_SPI_DATA: Final = 64
 _SRAM_OFFSET: Final = 0x800000
 _FS_PER_S: Final = 1_000_000_000_000_000
 _R2: Final = 2

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from firmware.rig.air import Air, Packet
+from firmware.rig.air import Air, Packet, Transmission
 from firmware.rig.bench import PS_PER_US, Bench
 
 SETTLING_PS: Final = 130 * PS_PER_US
@@ -248,17 +248,19 @@ class Nrf24:
 
     # --- Receiving: section 7.4.2 -------------------------------------------------------------
 
-    def listens(self, channel: int, kbps: int, start_ps: int) -> bool:
-        """Whether it has been receiving there since `start_ps`."""
+    def listens(self, packet: Transmission, start_ps: int) -> bool:
+        """Whether it has been receiving such packets since `start_ps`."""
         since = self._listening_ps
         return (
             since is not None
             and since <= start_ps
-            and (channel, kbps) == (self._channel, self._kbps)
+            and isinstance(packet, Packet)
+            and (packet.channel, packet.kbps) == (self._channel, self._kbps)
         )
 
-    def hear(self, packet: Packet) -> None:
+    def hear(self, packet: Transmission) -> None:
         """Take an undamaged packet."""
+        assert isinstance(packet, Packet)
         if self._receiving_mode():
             self._hear_data(packet)
         elif packet.is_ack and packet.address == self.addresses[RX_ADDR_P0]:

@@ -24,7 +24,7 @@
 #include <simavr/sim_time.h>
 
 enum { SUPPLY_MV = 3300, MCUSR = 0x54, UART_OUT_SIZE = 4096 };
-enum { RADIO_SELECT = 1 << 2, SPI_SIZE = 33, TWI_SIZE = 32 }; /* CSN on PB2; a command and 32 bytes */
+enum { RADIO_SELECT = 1 << 2, SPI_SIZE = 65, TWI_SIZE = 32 }; /* CSN on PB2; a command and 64 bytes */
 enum { TWCR_TWIE = 0, TWCR_TWEN = 2, TWCR_TWSTO = 4, TWCR_TWSTA = 5, TWCR_TWEA = 6, TWCR_TWINT = 7 };
 
 /* A message of the bus to the model, which answers with an acknowledgement or a byte. */
