@@ -4,6 +4,7 @@
 
 #include "common/filters.h"
 #include "common/imu_chip.h"
+#include "common/imu_increments.h"
 #include "common/imu_reducer.h"
 #include "common/wire.h"
 #include "drivers/radio.h"
@@ -27,7 +28,8 @@ constexpr LowPassDesign ACCEL_LOWPASS = low_pass_design(ACCEL_LOWPASS_HZ, IMU_SA
 
 Sensors sensors;
 SensorReadings readings;
-ImuReducer reducer;
+ImuReducer reducer;        // of a fast radio
+ImuIncrements increments;  // of a slow one
 WireImu imu;
 RadioSender sender;
 NodeReport report;
@@ -38,6 +40,17 @@ ImuReducerSettings reducer_settings() {
     const SettingsBlock &settings = stored_settings();
     return ImuReducerSettings{IMU_SAMPLE_HZ, settings.imu_send_hz, settings.imu_raw != 0, ACCEL_LOWPASS,
                               GYRO_HIGHPASS_GAIN_1_HZ / settings.imu_send_hz};
+}
+
+constexpr int16_t INCREMENT_SCALE_250_DPS = increment_scale(250.0, IMU_SAMPLE_HZ);
+
+bool reduce() {
+    if (!RADIO_SX1276) {
+        return imu_reduce(&reducer, reducer_settings(), readings.imu, &imu);
+    }
+    const SettingsBlock &settings = stored_settings();
+    const int16_t scale = static_cast<int16_t>(INCREMENT_SCALE_250_DPS << settings.gyro_range);
+    return imu_increment(&increments, {IMU_SAMPLE_HZ, settings.imu_send_hz, scale}, readings.imu, &imu);
 }
 
 uint16_t flag_if(bool condition, uint16_t flag) { return condition ? flag : 0; }
@@ -75,7 +88,7 @@ void poll_sensors(uint32_t now_us) {
     if ((news & SENSOR_NEWS_MAG) != 0) {
         mag_is_new = true;
     }
-    if ((news & SENSOR_NEWS_IMU) != 0 && imu_reduce(&reducer, reducer_settings(), readings.imu, &imu)) {
+    if ((news & SENSOR_NEWS_IMU) != 0 && reduce()) {
         send_imu();
     }
     if ((news & SENSOR_NEWS_BARO) != 0) {
