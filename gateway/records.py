@@ -315,6 +315,13 @@ class FusionState(msgspec.Struct, frozen=True, gc=False):
     """Latitude and longitude in degrees, height in m AMSL, and since when on the gateway clock."""
 
 
+class RadioSignal(msgspec.Struct, frozen=True, gc=False):
+    """How a packet was received, by a radio that measures it."""
+
+    rssi_dbm: int
+    snr_db: float
+
+
 class NodeLink(msgspec.Struct, frozen=True, gc=False):
     """Counts of the gateway for one node since it started."""
 
@@ -332,6 +339,8 @@ class NodeLink(msgspec.Struct, frozen=True, gc=False):
     """Arrival of the newest payload on the gateway clock."""
     clock_skew_ppm: float
     """How much faster than the gateway's the node's clock runs."""
+    signal: RadioSignal | None = None
+    """Of the newest payload; None from a radio that does not measure it."""
 
 
 class LinkReport(msgspec.Struct, frozen=True, gc=False):
@@ -348,6 +357,8 @@ class LinkReport(msgspec.Struct, frozen=True, gc=False):
     """Kind and number of faults, only of kinds that occurred."""
     nodes: tuple[NodeLink, ...]
     receiver: ReceiverStatus | None
+    foreign: int = 0
+    """Packets of other programs that the receiver passed on."""
 
 
 START_V2: Final = 0xFD

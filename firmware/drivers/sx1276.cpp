@@ -3,9 +3,10 @@
 // explicit header, CRC, and channel activity detection before each packet. Datasheet revision 7.
 //
 // The chip has no acknowledgements. A node listens before it sends: as long as it detects a packet it
-// waits for a random time. Two nodes that listen at the same moment do not notice each other. After a
-// packet of another node that is likely, for all that have waited for its end want to send: so a node
-// that finds the channel free again waits for a random time once more, and sends if it is still free.
+// waits for a random time. Two nodes that listen at the same moment do not notice each other, and that
+// is likely: those that have waited for the end of a packet want to send at once, and nodes of one rate
+// sample together for minutes. So a node that finds the channel free waits for a random time once more,
+// and sends if it is still free.
 //
 // The version register is not asked for: look-alikes have other values, so a
 // chip is accepted if it keeps its configuration.
@@ -100,8 +101,8 @@ constexpr uint8_t MINUS_CARRIER_DBM = 100;  // 14 dB above the noise of 250 kHz
 
 constexpr uint8_t RESET_MS = 6;     // section 7.2.2: 5 ms until the chip is ready
 constexpr uint8_t ROUNDS = 24;
-constexpr uint8_t LEAST_STEPS = 8;
-constexpr uint16_t TURNAROUND_US = 1000;  // from the end of the detection to the first symbol
+constexpr uint8_t LEAST_STEPS = 32;
+constexpr uint16_t TURNAROUND_US = 600;  // from a symbol of detection to the first of a packet
 constexpr uint32_t MARGIN_US = 50000;
 
 // Registers that are read back after the set-up and from time to time.
@@ -110,7 +111,7 @@ constexpr uint8_t CHECKED[] = {OP_MODE,        FRF_MSB,   FRF_MID,      FRF_LSB,
 
 uint8_t own_prefix;
 RadioTiming timing;
-bool busy;  // a packet was detected since the channel was last known to be free
+bool busy;  // the channel is not known to be free
 bool gave_up;
 bool has_packet;
 
@@ -191,7 +192,7 @@ WireRadioState set_up(uint8_t prefix) {
     own_prefix = prefix;
     // A step lasts longer than the detection and the turn to sending, in which another node's packet
     // is not noticed.
-    timing = RadioTiming{ROUNDS, LEAST_STEPS, static_cast<uint16_t>(2 * lora_symbol_us(modem()) + TURNAROUND_US),
+    timing = RadioTiming{ROUNDS, LEAST_STEPS, static_cast<uint16_t>(lora_symbol_us(modem()) + TURNAROUND_US),
                          radio_longest_packet_us() + MARGIN_US};
     has_packet = busy = gave_up = false;
     spi_enable_radio(false);
@@ -270,6 +271,7 @@ void radio_send(const uint8_t *payload, uint8_t size, uint16_t) {
     write_register(FIFO, own_prefix);
     access(WRITE | FIFO, payload, nullptr, size);
     write_register(PAYLOAD_LENGTH, static_cast<uint8_t>(size + 1));
+    busy = true;
     detect();
 }
 

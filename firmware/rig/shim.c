@@ -14,6 +14,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include <simavr/avr_extint.h>
 #include <simavr/avr_ioport.h>
 #include <simavr/avr_spi.h>
 #include <simavr/avr_twi.h>
@@ -304,6 +305,9 @@ static void hook(board_t *board)
     avr_io_addr_t ubrrl = board->uart->ubrrl.reg;
     board->uart_baud_write = avr->io[AVR_DATA_TO_IO(ubrrl)].w.c;
     replace_write(board, ubrrl, uart_baud_write);
+    /* Or a line that is low while its interrupt has no mode yet would raise it for ever. */
+    for (uint8_t line = 0; line < 2; ++line)
+        avr_extint_set_strict_lvl_trig(avr, line, 0);
     uint32_t no_flags = 0;
     avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &no_flags);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT),

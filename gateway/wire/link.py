@@ -21,6 +21,7 @@ from gateway.records import (
     NodeId,
     NodeLink,
     NodeStatus,
+    RadioSignal,
     RawRecord,
     ReceiverStatus,
 )
@@ -116,6 +117,7 @@ class _Node:
     """Those of its clock that were taken into account."""
     sequence: SequenceCounter = field(default_factory=SequenceCounter)
     pipe: int = 0
+    signal: RadioSignal | None = None
     last_time_us: int = 0
     last_stamp_us: int | None = None
     """On its own clock; None before the first payload after a start of it."""
@@ -147,6 +149,7 @@ class Link:
         self._bytes_received = 0
         self._frames = 0
         self._frames_lost = 0
+        self._foreign = 0
         self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
@@ -171,6 +174,8 @@ class Link:
             self._frames += 1
             if isinstance(frame, payloads.ReceiverStatusFrame):
                 self._receiver_status = _receiver_status(frame, received_us)
+            elif isinstance(frame, payloads.ForeignFrame):
+                self._foreign += 1
             elif (node := self._nodes.get(frame.header.node)) is None:
                 records += self._receive_new_node(frame, received_us, arrival_us)
             elif (record := _receive(node, frame, received_us, arrival_us)) is not None:
@@ -199,6 +204,7 @@ class Link:
             faults=tuple(sorted(self._all_faults().items())),
             nodes=tuple(_node_link(node_id, n, now_us) for node_id, n in self._nodes.items()),
             receiver=self._receiver_status,
+            foreign=self._foreign,
         )
 
     def _all_faults(self) -> Counter[str]:
@@ -236,7 +242,7 @@ def _receive(
     if node.sequence.count(header.seq) is not Arrival.NEW:
         node.faults["sequence"] += _is_later(stamp_us, node.last_stamp_us)
         return None
-    node.pipe = frame.pipe
+    node.pipe, node.signal = frame.pipe, frame.signal
     node.arrivals_us.append(arrival_us)
     node.last_time_us = time_us = _never_back(node, stamp_us, time_us)
     node.last_stamp_us = stamp_us
@@ -379,4 +385,5 @@ def _node_link(node_id: NodeId, node: _Node, now_us: int) -> NodeLink:
         rate_hz=recent * US_PER_S / RATE_SPAN_US,
         last_time_us=node.arrivals_us[-1],
         clock_skew_ppm=node.clock.skew_ppm,
+        signal=node.signal,
     )

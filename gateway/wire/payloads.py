@@ -13,7 +13,7 @@ from typing import Final
 
 import msgspec
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters, RadioState
+from gateway.records import GpsFixType, ImuFlags, NodeId, PipeCounters, RadioSignal, RadioState
 from gateway.wire.framing import Fault, FaultKind
 
 GPS_ACKNOWLEDGES: Final = 0x10
@@ -96,7 +96,11 @@ def _gps_name(chips: Chips) -> str:
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD: Final = 32
 """One nRF24L01+ packet."""
+MAX_FOREIGN: Final = 60
+"""Of a packet of another program, its header included."""
 PIPES: Final = 6
+NO_PIPE: Final = 0xFF
+"""Of a frame that carries no radio payload."""
 
 ACCEL_RANGES_G: Final = (2, 4, 8, 16)
 GYRO_RANGES_DPS: Final = (250, 500, 1000, 2000)
@@ -110,6 +114,10 @@ class FrameKind(IntEnum):
 
     RADIO = 1
     RECEIVER_STATUS = 2
+    RADIO_SIGNAL = 3
+    """As `RADIO`, with the signal of the packet."""
+    FOREIGN = 4
+    """A packet of another program."""
 
 
 class PayloadKind(IntEnum):
@@ -126,6 +134,8 @@ _FRAME_HEADER: Final = struct.Struct("<BBBI")
 _HEADER: Final = struct.Struct("<BBHI")
 _RADIO_HEAD: Final = struct.Struct("<BBBIBBHI")
 """A frame's header and that of the payload in it."""
+_SIGNAL: Final = struct.Struct("<Bb")
+_SNR_PER_DB: Final = 4
 _unpack_head: Final = _RADIO_HEAD.unpack_from
 _IMU: Final = struct.Struct("<3h3h3hhHB")
 _BARO: Final = struct.Struct("<Ih")
@@ -242,6 +252,18 @@ class RadioFrame(msgspec.Struct, frozen=True, gc=False):
     receiver_time_us: int
     header: Header
     payload: Payload
+    signal: RadioSignal | None = None
+    """None from a radio that does not measure it."""
+
+
+class ForeignFrame(msgspec.Struct, frozen=True, gc=False):
+    """A packet of another program, such as RadioHead, as the receiver passed it on."""
+
+    frame_seq: int
+    receiver_time_us: int
+    signal: RadioSignal
+    packet: bytes
+    """With the other program's header."""
 
 
 class ReceiverStatusFrame(msgspec.Struct, frozen=True, gc=False):
@@ -268,23 +290,43 @@ def encode_payload(header: Header, payload: Payload) -> bytes:
     return _HEADER.pack(first, address, header.seq, header.node_time_us) + body
 
 
-def encode_radio(frame_seq: int, pipe: int, receiver_time_us: int, payload: bytes) -> bytes:
+def encode_radio(
+    frame_seq: int,
+    pipe: int,
+    receiver_time_us: int,
+    payload: bytes,
+    signal: RadioSignal | None = None,
+) -> bytes:
     """Build the content of the serial frame that carries one radio payload."""
-    first = PROTOCOL_VERSION << 4 | FrameKind.RADIO
-    return _FRAME_HEADER.pack(first, frame_seq, pipe, receiver_time_us) + payload
+    kind = FrameKind.RADIO if signal is None else FrameKind.RADIO_SIGNAL
+    head = _FRAME_HEADER.pack(PROTOCOL_VERSION << 4 | kind, frame_seq, pipe, receiver_time_us)
+    return head + (b"" if signal is None else _encode_signal(signal)) + payload
+
+
+def encode_foreign(frame: ForeignFrame) -> bytes:
+    """Build the content of the serial frame that carries a packet of another program."""
+    first = PROTOCOL_VERSION << 4 | FrameKind.FOREIGN
+    head = _FRAME_HEADER.pack(first, frame.frame_seq, NO_PIPE, frame.receiver_time_us)
+    return head + _encode_signal(frame.signal) + frame.packet
+
+
+def _encode_signal(signal: RadioSignal) -> bytes:
+    return _SIGNAL.pack(-signal.rssi_dbm, round(signal.snr_db * _SNR_PER_DB))
 
 
 def encode_receiver_status(status: ReceiverStatusFrame) -> bytes:
     """Build the content of a receiver status frame."""
     first = PROTOCOL_VERSION << 4 | FrameKind.RECEIVER_STATUS
-    head = _FRAME_HEADER.pack(first, status.frame_seq, 0xFF, status.receiver_time_us)
+    head = _FRAME_HEADER.pack(first, status.frame_seq, NO_PIPE, status.receiver_time_us)
     cause = status.reset_cause | status.radio << _RADIO_SHIFT
     body = _RECEIVER_HEAD.pack(status.channel, status.noise_percent, status.uart_dropped, cause)
     pipes = b"".join(_PIPE.pack(p.received, p.lost, p.overruns) for p in status.pipes)
     return head + body + pipes
 
 
-def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | Fault:
+def decode_content(
+    content: bytes,
+) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
     """Read the content of one checked serial frame, without COBS and CRC.
 
     A fault names what does not fit: version, kind, length or a value.
@@ -301,19 +343,43 @@ def decode_content(content: bytes) -> RadioFrame | ReceiverStatusFrame | Fault:
     return RadioFrame(frame_seq, pipe, receiver_us, Header(_NODES[address], seq, node_us), payload)
 
 
-def _decode_other(content: bytes, size: int) -> ReceiverStatusFrame | Fault:
-    """Read the receiver's own report, or return what is wrong with a frame."""
+def _decode_other(
+    content: bytes, size: int
+) -> RadioFrame | ReceiverStatusFrame | ForeignFrame | Fault:
+    """Read a frame without a plain radio payload, or return what is wrong with it."""
     if size < _FRAME_HEADER.size:
         return Fault(FaultKind.TOO_SHORT, size)
     first, frame_seq, _, receiver_time_us = _FRAME_HEADER.unpack_from(content)
     if first >> 4 != PROTOCOL_VERSION:
         return Fault(FaultKind.VERSION, size)
-    if first & 0xF == FrameKind.RADIO:
-        return Fault(FaultKind.PAYLOAD, size)
-    if first & 0xF == FrameKind.RECEIVER_STATUS:
-        body = content[_FRAME_HEADER.size :]
-        return _decode_receiver_status(frame_seq, receiver_time_us, body, size)
+    body = content[_FRAME_HEADER.size :]
+    match first & 0xF:
+        case FrameKind.RADIO:
+            return Fault(FaultKind.PAYLOAD, size)
+        case FrameKind.RECEIVER_STATUS:
+            return _decode_receiver_status(frame_seq, receiver_time_us, body, size)
+        case FrameKind.RADIO_SIGNAL | FrameKind.FOREIGN if len(body) <= _SIGNAL.size:
+            return Fault(FaultKind.PAYLOAD, size)
+        case FrameKind.RADIO_SIGNAL:
+            return _decode_radio_signal(content)
+        case FrameKind.FOREIGN:
+            signal, packet = _split_signal(body)
+            return ForeignFrame(frame_seq, receiver_time_us, signal, packet)
     return Fault(FaultKind.KIND, size)
+
+
+def _decode_radio_signal(content: bytes) -> RadioFrame | Fault:
+    """Read a radio payload with its signal: that of a plain frame, and two bytes before it."""
+    signal, payload = _split_signal(content[_FRAME_HEADER.size :])
+    frame = decode_content(bytes([_RADIO_FIRST]) + content[1 : _FRAME_HEADER.size] + payload)
+    if isinstance(frame, RadioFrame):
+        return msgspec.structs.replace(frame, signal=signal)
+    return Fault(frame.kind if isinstance(frame, Fault) else FaultKind.PAYLOAD, len(content))
+
+
+def _split_signal(body: bytes) -> tuple[RadioSignal, bytes]:
+    minus_rssi_dbm, snr = _SIGNAL.unpack_from(body)
+    return RadioSignal(-minus_rssi_dbm, snr / _SNR_PER_DB), body[_SIGNAL.size :]
 
 
 def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:

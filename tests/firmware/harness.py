@@ -8,6 +8,7 @@ from firmware.rig.bench import PS_PER_S
 from firmware.rig.boards import Board, GpsNode, ImuNode, Receiver, Setup
 from gateway.wire.framing import Fault, FrameDecoder
 from gateway.wire.payloads import (
+    ForeignFrame,
     Header,
     NodeStatusPayload,
     Payload,
@@ -35,6 +36,7 @@ class Bench:
         self.boards: list[Board] = [self.receiver]
         self.frames: list[tuple[float, RadioFrame]] = []
         """Every radio frame with the time of its last byte in seconds."""
+        self.foreign: list[tuple[float, ForeignFrame]] = []
         self.statuses: list[ReceiverStatusFrame] = []
         self.faults: list[Fault] = []
         self.line: list[tuple[int, int]] = []
@@ -97,6 +99,8 @@ class Bench:
             self.faults.append(content)
         elif isinstance(content, ReceiverStatusFrame):
             self.statuses.append(content)
+        elif isinstance(content, ForeignFrame):
+            self.foreign.append((time_s, content))
         else:
             self.frames.append((time_s, content))
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gateway.records import GpsFixType, ImuFlags, NodeId, RadioState
+from gateway.records import GpsFixType, ImuFlags, NodeId, RadioSignal, RadioState
 from gateway.wire.framing import Fault, FaultKind
 from gateway.wire.payloads import (
     ACCEL_RANGES_G,
@@ -17,6 +17,7 @@ from gateway.wire.payloads import (
     MAX_PAYLOAD,
     BaroPayload,
     Chips,
+    ForeignFrame,
     GpsFixPayload,
     Header,
     ImuPayload,
@@ -25,6 +26,7 @@ from gateway.wire.payloads import (
     chip_names,
     decode_content,
     decode_payload,
+    encode_foreign,
     encode_payload,
     encode_radio,
     encode_receiver_status,
@@ -110,6 +112,43 @@ def test_imu_payload_has_the_layout_of_the_protocol() -> None:
         gyro_range=1,
         mag_gain=2,
     )
+
+
+SIGNAL_HEAD = "13 07 02 00010203"
+"""Version and kind, sequence, pipe, receiver time."""
+
+
+def test_payload_with_signal_has_the_layout_of_the_protocol() -> None:
+    plain = decode_content(bytes.fromhex(RADIO[0]["content_hex"]))
+    packet = bytes.fromhex(RADIO[0]["payload_hex"])
+    content = bytes.fromhex(SIGNAL_HEAD + "79 e4") + packet  # -121 dBm, -7 dB
+    frame = decode_content(content)
+    assert frame == RadioFrame(
+        7, 2, 0x03020100, plain.header, plain.payload, RadioSignal(-121, -7.0)
+    )
+    assert encode_radio(7, 2, 0x03020100, packet, frame.signal) == content
+
+
+def test_foreign_packet_has_the_layout_of_the_protocol() -> None:
+    content = bytes.fromhex("14 07 ff 00010203 50 28") + b"\xff\x07\x21\x00text"
+    frame = decode_content(content)
+    assert frame == ForeignFrame(7, 0x03020100, RadioSignal(-80, 10.0), b"\xff\x07\x21\x00text")
+    assert encode_foreign(frame) == content
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        ("13 07 02 00010203 79 e4", FaultKind.PAYLOAD),
+        ("14 07 ff 00010203 79 e4", FaultKind.PAYLOAD),
+        ("13 07 02 00010203 79 e4 21" + "00" * 30, FaultKind.VERSION),
+        ("13 07 06 00010203 79 e4" + RADIO[0]["payload_hex"], FaultKind.VALUE),
+        ("13 07 02 00010203 79 e4 ff", FaultKind.PAYLOAD),
+    ],
+)
+def test_damaged_frame_with_signal_is_a_fault(content: str, kind: FaultKind) -> None:
+    data = bytes.fromhex(content)
+    assert decode_content(data) == Fault(kind, len(data))
 
 
 @pytest.mark.parametrize("scale", range(16))

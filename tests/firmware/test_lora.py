@@ -1,0 +1,170 @@
+"""The SX1276 driver, nodes that share a channel, and the receiver's frames with signal."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from firmware.rig.boards import LORA_PARTS, LORA_VERSIONS, Parts
+from firmware.rig.sx1276 import LoraPacket
+from gateway.records import RadioState
+from gateway.wire.payloads import BaroPayload, ForeignFrame, GpsFixPayload, ImuPayload
+from tests.firmware.harness import Bench
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+MakeBench = Callable[..., Bench]
+RUNNING_S = 1.0
+RUN_S = 10.0
+CHANNEL = (868_300, 7, 250, 5, 0x12)
+"""Frequency, spreading factor, bandwidth, coding and sync word of the default settings."""
+
+
+@pytest.fixture
+def lora(bench: MakeBench, build: Callable[..., Path]) -> MakeBench:
+    """Make benches whose boards have LoRa radios; the receiver may have other settings."""
+
+    def make(receiver: str = "", parts: dict[str, str] = LORA_PARTS, **setup: Any) -> Bench:
+        nodes = build(radio="sx1276")
+        folder = build(receiver, programs=("receiver",), radio="sx1276") if receiver else nodes
+        rig = bench(build=folder, parts=Parts(**parts), **setup)
+        rig.setup.build = nodes
+        return rig
+
+    return make
+
+
+def test_two_nodes_share_the_channel(lora: MakeBench) -> None:
+    rig = lora()
+    rig.imu_node(clock_ppm=40.0).radio.strength_db = -100.0
+    rig.gps_node(clock_ppm=-30.0).radio.strength_db = -121.0
+    rig.run(RUNNING_S + RUN_S)
+    assert len(rig.payloads(ImuPayload, RUNNING_S)) == pytest.approx(10 * RUN_S, abs=2)
+    assert len(rig.payloads(BaroPayload, RUNNING_S)) == pytest.approx(2 * RUN_S, abs=2)
+    assert len(rig.payloads(GpsFixPayload, RUNNING_S)) == pytest.approx(RUN_S, abs=1)
+    assert rig.lost(0, RUNNING_S) + rig.lost(1, RUNNING_S) <= 4
+    assert not rig.faults
+    assert rig.statuses[-1].radio is RadioState.OK
+    assert max(status.noise_percent for status in rig.statuses) <= 5
+    signals = {f.header.node.node_id: f.signal for _, f in rig.frames}
+    assert signals[0].rssi_dbm == pytest.approx(-100, abs=1)
+    assert signals[0].snr_db == pytest.approx(10.0, abs=0.5)
+    # Below the noise: -174 dBm/Hz, 250 kHz and 6 dB.
+    assert signals[1].rssi_dbm == pytest.approx(-121, abs=1)
+    assert signals[1].snr_db == pytest.approx(-7.0, abs=0.5)
+
+
+def test_four_nodes_that_sample_together_lose_a_tenth_at_most(
+    lora: MakeBench, build: Callable[..., Path]
+) -> None:
+    """Half of the channel's time is used; nodes that start at one moment are the worst case."""
+    wide = "-DLORA_BANDWIDTH_KHZ=500"
+    rig = lora(wide, seed=3)
+    for vehicle in (1, 2):
+        rig.setup.build = build(
+            f"{wide} -DVEHICLE_ID={vehicle}", programs=("imu_node", "gps_node"), radio="sx1276"
+        )
+        rig.imu_node(clock_ppm=40.0 - 15.0 * vehicle)
+        rig.gps_node(clock_ppm=-30.0 + 10.0 * vehicle)
+    rig.run(RUNNING_S + RUN_S)
+    assert rig.setup.air.sent > 25 * RUN_S
+    pipes = rig.statuses[-1].pipes
+    received, lost = sum(p.received for p in pipes), sum(p.lost for p in pipes)
+    assert received > 23 * RUN_S
+    assert lost < 0.1 * received
+
+
+@pytest.mark.parametrize("version", LORA_VERSIONS)
+def test_look_alike_is_accepted_by_what_it_does(lora: MakeBench, version: str) -> None:
+    rig = lora(parts={"radio": version, "node_radio": version})
+    rig.imu_node()
+    rig.run(RUNNING_S + 1.5)
+    assert len(rig.payloads(ImuPayload, RUNNING_S)) > 10
+    assert rig.statuses[-1].radio is RadioState.OK
+
+
+@pytest.mark.parametrize("side", ["receiver", "node"])
+def test_radio_that_lost_its_supply_is_set_up_again(lora: MakeBench, side: str) -> None:
+    rig = lora()
+    node = rig.imu_node()
+    rig.run(RUNNING_S)
+    (rig.receiver if side == "receiver" else node).radio.power_cycle()
+    rig.run(3.0)
+    assert len(rig.payloads(ImuPayload, RUNNING_S + 2.0)) > 8
+    assert rig.receiver.mcu.resets == node.mcu.resets == 0
+
+
+def test_node_without_its_radio_waits_for_it(lora: MakeBench) -> None:
+    rig = lora()
+    node = rig.imu_node()
+    node.radio.absent = True
+    rig.run(1.0)
+    assert not rig.frames
+    node.radio.absent = False
+    rig.run(1.5)
+    assert len(rig.payloads(ImuPayload)) > 5
+    assert node.mcu.resets == 0
+
+
+@pytest.mark.parametrize(
+    "settings", ["-DLORA_SYNC_WORD=0x34", "-DLORA_FREQUENCY_KHZ=869525UL", "-DLORA_SPREADING=8"]
+)
+def test_packets_of_other_settings_are_not_received(
+    lora: MakeBench, build: Callable[..., Path], settings: str
+) -> None:
+    rig = lora()
+    default, rig.setup.build = (
+        rig.setup.build,
+        build(settings, programs=("imu_node",), radio="sx1276"),
+    )
+    rig.imu_node()
+    rig.setup.build = default
+    rig.run(RUNNING_S + 1.0)
+    assert not rig.frames
+    assert not rig.faults
+
+
+@pytest.mark.parametrize("passed_on", [True, False])
+def test_packets_of_other_programs_are_passed_on_by_setting(
+    lora: MakeBench, passed_on: bool
+) -> None:
+    rig = lora(f"-DLORA_FOREIGN={int(passed_on)}")
+    node = rig.imu_node()
+    rig.run(RUNNING_S)
+    # RadioHead's header: to everybody, from 7, the 33rd packet, no flags.
+    packet = b"\xff\x07\x21\x00" + b"lat=48.1,lon=11.5"
+    rig.setup.air.send(LoraPacket(*CHANNEL, packet, -60.0), node.radio, lambda: None)
+    rig.run(0.2)
+    assert [frame.packet for _, frame in rig.foreign] == [packet] * passed_on
+    assert all(frame.signal.rssi_dbm == pytest.approx(-60, abs=1) for _, frame in rig.foreign)
+    assert all(isinstance(frame, ForeignFrame) for _, frame in rig.foreign)
+
+
+@pytest.mark.parametrize("broken", ["no CRC", "too long", "empty"])
+def test_unusable_packet_leaves_the_receiver_receiving(lora: MakeBench, broken: str) -> None:
+    rig = lora("-DLORA_FOREIGN=1")
+    node = rig.imu_node()
+    rig.run(RUNNING_S)
+    payload = {"no CRC": b"\xff" * 20, "too long": b"\xff" * 200, "empty": b""}[broken]
+    packet = LoraPacket(*CHANNEL, payload, -70.0, crc_on=broken != "no CRC")
+    rig.setup.air.send(packet, node.radio, lambda: None)
+    rig.run(1.5)
+    assert not rig.foreign
+    assert not rig.faults
+    assert len(rig.payloads(ImuPayload, RUNNING_S + 0.5)) > 8
+
+
+def test_stronger_packet_survives_an_overlap(lora: MakeBench) -> None:
+    rig = lora("-DLORA_FOREIGN=1")
+    node = rig.imu_node()
+    node.radio.absent = True
+    rig.run(0.5)
+    weak, strong, equal = (LoraPacket(*CHANNEL, bytes([i]) * 20, s) for i, s in
+                           enumerate((-100.0, -90.0, -93.0)))  # fmt: skip
+    for first, second in ((weak, strong), (strong, equal)):
+        rig.setup.air.send(first, node.radio, lambda: None)
+        rig.run(0.005)
+        rig.setup.air.send(second, node.radio, lambda: None)
+        rig.run(0.1)
+    assert [frame.packet for _, frame in rig.foreign] == [strong.payload]
