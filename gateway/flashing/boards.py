@@ -1,6 +1,6 @@
 """Firmware of the boards: the settings in an image, and avrdude, which writes and reads the flash.
 
-The settings block is 34 bytes of the program that begin with the word `mavgate` and end with a
+The settings block is 46 bytes of the program that begin with the word `mavgate` and end with a
 CRC-16 of all before it, little-endian and packed. `firmware/common/settings_block.h` is the other
 side. Every access to a board resets it: its USB adapter does so whenever a program opens the port.
 """
@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, get_args
 
 import msgspec
 import serial
@@ -30,10 +30,12 @@ from gateway.wire.framing import crc16
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, PIPES
 
 MAGIC: Final = b"mavgate"
-VERSION: Final = 1
+VERSION: Final = 2
 POWERS_DBM: Final = (-18, -12, -6, 0)
 
-_LAYOUT: Final = struct.Struct("<7s9BH2BI6B2x")
+_LAYOUT: Final = struct.Struct("<7s9BH2BI6B2xBIH5B")
+_LAYOUT_1: Final = struct.Struct("<7s9BH2BI6B2x")
+"""Of version 1, before there was a second radio; such a block is read, but no longer written."""
 _CRC: Final = struct.Struct("<H")
 SIZE: Final = _LAYOUT.size + _CRC.size
 PIPES_PER_VEHICLE: Final = 2
@@ -51,6 +53,10 @@ class Program(IntEnum):
     RECEIVER = 3
 
 
+Radio = Literal["nrf24", "sx1276"]
+RADIOS: Final[tuple[Radio, ...]] = get_args(Radio)
+
+
 class BoardSettings(Settings, frozen=True):
     """What differs between users, in the order of the block."""
 
@@ -64,7 +70,9 @@ class BoardSettings(Settings, frozen=True):
         Literal[250, 1000, 2000], setting("On the air; the same on all boards.", "kbit/s")
     ] = 1000
     radio_power_dbm: Annotated[Literal[-18, -12, -6, 0], setting("Of the transmitter.", "dBm")] = 0
-    imu_send_hz: Annotated[int, setting("IMU samples sent per second.", "Hz", ge=60, le=250)] = 100
+    imu_send_hz: Annotated[
+        int, setting("IMU samples sent per second; by LoRa at most 20.", "Hz", ge=4, le=250)
+    ] = 100
     radio_address: Annotated[
         int, setting("Upper four bytes of every pipe's address.", ge=0, le=0xFFFFFFFF)
     ] = 0xD35AC396
@@ -80,16 +88,50 @@ class BoardSettings(Settings, frozen=True):
     soft_restart: Annotated[
         bool, setting("For a bootloader that leaves the watchdog on: restart without a reset.")
     ] = False
+    radio: Annotated[Radio, setting("The radio that the image is built for.")] = "nrf24"
+    lora_frequency_khz: Annotated[
+        int,
+        setting("Centre of the channel; the same on all boards.", "kHz", ge=433_050, le=928_000),
+    ] = 868_300
+    lora_bandwidth_khz: Annotated[
+        Literal[125, 250, 500], setting("Of the channel; the same on all boards.", "kHz")
+    ] = 250
+    lora_spreading: Annotated[
+        int, setting("Spreading factor; the same on all boards.", ge=7, le=10)
+    ] = 7
+    lora_coding: Annotated[int, setting("Coding rate 4/5 to 4/8: 5 to 8.", ge=5, le=8)] = 5
+    lora_power_dbm: Annotated[int, setting("Of the transmitter.", "dBm", ge=2, le=20)] = 14
+    lora_sync_word: Annotated[
+        int, setting("Of the network; the same on all boards.", ge=0, le=0xFF)
+    ] = 0x12
+    lora_foreign: Annotated[
+        bool, setting("The receiver passes packets of other programs on, as RadioHead's.")
+    ] = False
 
 
-COMMON: Final = ("radio_channel", "radio_kbps", "radio_address", "radio_power_dbm", "soft_restart")
-NODE: Final = ("vehicle_id", "node_id", "radio_pipe", *COMMON)
-USED_BY: Final[dict[Program, tuple[str, ...]]] = {
-    Program.IMU: (*NODE, "imu_send_hz", "imu_raw", "accel_range_g", "gyro_range_dps"),
-    Program.GPS: (*NODE, "gps_rate_hz", "gps_dynamic_model"),
-    Program.RECEIVER: COMMON,
+NRF24: Final = ("radio_channel", "radio_kbps", "radio_address", "radio_power_dbm")
+SX1276: Final = (
+    "lora_frequency_khz",
+    "lora_bandwidth_khz",
+    "lora_spreading",
+    "lora_coding",
+    "lora_power_dbm",
+    "lora_sync_word",
+)
+_NODE: Final = ("vehicle_id", "node_id", "radio_pipe", "soft_restart")
+_OF_PROGRAM: Final[dict[Program, tuple[str, ...]]] = {
+    Program.IMU: (*_NODE, "imu_send_hz", "accel_range_g", "gyro_range_dps"),
+    Program.GPS: (*_NODE, "gps_rate_hz", "gps_dynamic_model"),
+    Program.RECEIVER: ("soft_restart",),
 }
-"""The settings that each program reads."""
+
+
+def used_by(program: Program, radio: Radio) -> tuple[str, ...]:
+    """Return the names of the settings that a program reads."""
+    names = (*_OF_PROGRAM[program], *(NRF24 if radio == "nrf24" else SX1276))
+    if radio == "nrf24" and program is Program.IMU:
+        return (*names, "imu_raw")
+    return (*names, "lora_foreign") if (program, radio) == (Program.RECEIVER, "sx1276") else names
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,9 +159,12 @@ def find_block(image: bytes) -> SettingsBlock:
     damaged = None
     offset = image.find(MAGIC)
     while offset >= 0:
-        block = image[offset : offset + SIZE]
-        if len(block) == SIZE and _CRC.unpack(block[-2:])[0] == crc16(block[:-2]):
-            return _decode(block, offset)
+        version = image[offset + len(MAGIC) : offset + len(MAGIC) + 1]
+        layout = _LAYOUT_1 if version == b"\x01" else _LAYOUT
+        size = layout.size + _CRC.size
+        block = image[offset : offset + size]
+        if len(block) == size and _CRC.unpack(block[-2:])[0] == crc16(block[:-2]):
+            return _decode(block, offset, layout)
         damaged = offset if damaged is None else damaged
         offset = image.find(MAGIC, offset + 1)
     if damaged is not None:
@@ -133,18 +178,18 @@ def patch(image: bytes, settings: BoardSettings) -> tuple[int, bytes]:
     return block.offset, _encode(block, settings)
 
 
-def _decode(block: bytes, offset: int) -> SettingsBlock:
-    values = _LAYOUT.unpack(block[: _LAYOUT.size])
+def _decode(block: bytes, offset: int, layout: struct.Struct) -> SettingsBlock:
+    values = layout.unpack(block[: layout.size])
     version, program, clock_mhz, major, minor = values[1:6]
-    if version != VERSION:
+    if version not in (1, VERSION):
         raise FlashError(f"the settings block has version {version}, this mavgate knows {VERSION}")
-    names = BoardSettings.__struct_fields__
-    found = dict(zip(names, values[6:], strict=True))
+    found = dict(zip(BoardSettings.__struct_fields__, values[6:], strict=False))
     try:
+        found["radio"] = RADIOS[found.get("radio", 0)]
         found["radio_power_dbm"] = POWERS_DBM[found["radio_power_dbm"]]
         found["accel_range_g"] = round(ACCEL_RANGES_G[found["accel_range_g"]])
         found["gyro_range_dps"] = round(GYRO_RANGES_DPS[found["gyro_range_dps"]])
-        for name in ("imu_raw", "soft_restart"):
+        for name in {"imu_raw", "soft_restart", "lora_foreign"} & found.keys():
             found[name] = bool(found[name])
         settings = msgspec.convert(found, BoardSettings)
         kind = Program(program)
@@ -158,6 +203,7 @@ def _encode(block: SettingsBlock, settings: BoardSettings) -> bytes:
     found["radio_power_dbm"] = POWERS_DBM.index(settings.radio_power_dbm)
     found["accel_range_g"] = ACCEL_RANGES_G.index(settings.accel_range_g)
     found["gyro_range_dps"] = GYRO_RANGES_DPS.index(settings.gyro_range_dps)
+    found["radio"] = RADIOS.index(settings.radio)
     head = (VERSION, block.program, block.clock_mhz, *block.firmware_version)
     content = _LAYOUT.pack(MAGIC, *head, *found.values())
     return content + _CRC.pack(crc16(content))
@@ -196,9 +242,10 @@ BOOTLOADERS: Final = (
 )
 
 
-def image_path(program: Program, clock_mhz: int) -> Path:
+def image_path(program: Program, clock_mhz: int, radio: Radio = "nrf24") -> Path:
     """Return the file of a ready-made image; raises FlashError if it has not been built."""
-    path = IMAGES / f"{program.name.lower()}_{clock_mhz}mhz.hex"
+    name = program.name.lower() if radio == "nrf24" else f"{program.name.lower()}_{radio}"
+    path = IMAGES / f"{name}_{clock_mhz}mhz.hex"
     if not path.exists():
         raise FlashError(
             f"{path} is not there: a checkout has to build the images first, `make firmware`"
