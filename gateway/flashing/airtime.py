@@ -17,7 +17,6 @@ IMU_BYTES, BARO_BYTES, GPS_BYTES, STATUS_BYTES = (PREFIX_BYTES + size for size i
 """Of a payload and its prefix; a fix is sent as two payloads."""
 BARO_HZ: Final = 2.0
 STATUS_HZ: Final = 0.2
-MOST_IMU_HZ: Final = 20
 MOST_SHARE: Final = 0.45
 """Of the channel's time, by one node. Two nodes that use half of it lose 1 % to each other."""
 BANDS: Final = (
@@ -38,7 +37,7 @@ def airtime_s(settings: BoardSettings, size: int) -> float:
     symbol_s = 2**settings.lora_spreading / (1000 * settings.lora_bandwidth_khz)
     bits = 8 * size + 44 - 4 * settings.lora_spreading
     payload = 8 + math.ceil(bits / (4 * settings.lora_spreading)) * settings.lora_coding
-    return (8 + 4.25 + payload) * symbol_s
+    return float((8 + 4.25 + payload) * symbol_s)
 
 
 def share(program: Program, settings: BoardSettings) -> float:
@@ -64,8 +63,6 @@ def check(program: Program, settings: BoardSettings, most: float = MOST_SHARE) -
     if duty_cycle(settings.lora_frequency_khz) is None:
         bands = ", ".join(f"{low / 1000:g} to {high / 1000:g}" for low, high, _ in BANDS)
         raise FlashError(f"{settings.lora_frequency_khz / 1000:g} MHz is in no band: {bands} MHz")
-    if program is Program.IMU and settings.imu_send_hz > MOST_IMU_HZ:
-        raise FlashError(f"by LoRa at most {MOST_IMU_HZ} IMU samples per second")
     used = share(program, settings)
     if used <= most:
         return used
@@ -87,8 +84,8 @@ def _slower(program: Program, settings: BoardSettings) -> Iterator[tuple[str, Bo
         for rate in range(settings.gps_rate_hz - 1, 0, -1):
             yield f"--gps-rate {rate}", replace(settings, gps_rate_hz=rate)
     slowest = replace(settings, imu_send_hz=4, gps_rate_hz=1)
-    rate = "--send-rate 4" if program is Program.IMU else "--gps-rate 1"
+    option = "--send-rate 4" if program is Program.IMU else "--gps-rate 1"
     for spreading in range(settings.lora_spreading, 6, -1):
         for width in (w for w in (125, 250, 500) if w >= settings.lora_bandwidth_khz):
             other = replace(slowest, lora_spreading=spreading, lora_bandwidth_khz=width)
-            yield f"{rate} --spreading {spreading} --bandwidth {width}", other
+            yield f"{option} --spreading {spreading} --bandwidth {width}", other

@@ -126,6 +126,10 @@ _OF_PROGRAM: Final[dict[Program, tuple[str, ...]]] = {
 }
 
 
+IMU_SEND_HZ: Final[dict[Radio, tuple[int, int]]] = {"nrf24": (60, 250), "sx1276": (4, 20)}
+"""Least and most IMU samples per second, by radio."""
+
+
 def used_by(program: Program, radio: Radio) -> tuple[str, ...]:
     """Return the names of the settings that a program reads."""
     names = (*_OF_PROGRAM[program], *(NRF24 if radio == "nrf24" else SX1276))

@@ -7,24 +7,26 @@ import pytest
 
 from gateway.flashing.boards import (
     MAGIC,
+    RADIOS,
     SIZE,
-    USED_BY,
     BoardSettings,
     FlashError,
     Program,
     default_pipe,
     find_block,
     patch,
+    used_by,
 )
 from gateway.wire.framing import crc16
 
-BLOCK = bytes.fromhex(
-    "6d617667617465"  # magic
-    "01 01 10 01 02"  # version, program, MHz, firmware 1.2
-    "05 03 02 50 fa00 01 3c 04030201 01 03 00 0a 06 01 0000"
-)
+HEAD = "01 10 01 02 05 03 02 50 fa00 01 3c 04030201 01 03 00 0a 06 01 0000"
+"""Program, MHz, firmware 1.2, and the fields of version 1."""
+LORA = "01 7aa10600 f401 09 08 11 34 01"
+BLOCK = MAGIC + b"\x02" + bytes.fromhex(HEAD + LORA)
+NRF24_BLOCK = MAGIC + b"\x02" + bytes.fromhex(HEAD + "00" + LORA[2:])
+BLOCK_1 = MAGIC + b"\x01" + bytes.fromhex(HEAD)
 """Written by hand from firmware/common/settings_block.h."""
-SETTINGS = BoardSettings(
+SETTINGS_1 = BoardSettings(
     vehicle_id=5,
     node_id=3,
     radio_pipe=2,
@@ -39,6 +41,17 @@ SETTINGS = BoardSettings(
     gps_rate_hz=10,
     gps_dynamic_model=6,
     soft_restart=True,
+)
+SETTINGS = msgspec.structs.replace(
+    SETTINGS_1,
+    radio="sx1276",
+    lora_frequency_khz=434_554,
+    lora_bandwidth_khz=500,
+    lora_spreading=9,
+    lora_coding=8,
+    lora_power_dbm=17,
+    lora_sync_word=0x34,
+    lora_foreign=True,
 )
 
 
@@ -55,6 +68,10 @@ def test_block_is_found_and_every_field_decoded() -> None:
     assert (found.offset, found.program) == (104, Program.IMU)
     assert (found.clock_mhz, found.firmware_version) == (16, (1, 2))
     assert found.settings == SETTINGS
+
+
+def test_block_of_version_1_is_that_of_an_nrf24() -> None:
+    assert find_block(image_with(with_crc(BLOCK_1))).settings == SETTINGS_1
 
 
 def test_patch_changes_the_block_alone_and_reads_back() -> None:
@@ -87,7 +104,7 @@ def test_any_damaged_byte_is_detected() -> None:
         (b"", "no settings block"),
         (b"\xff" * 32768, "no settings block"),
         (MAGIC, "damaged"),
-        (with_crc(BLOCK[:7] + b"\x02" + BLOCK[8:]), "version 2"),
+        (with_crc(BLOCK[:7] + b"\x03" + BLOCK[8:]), "version 3"),
         (with_crc(BLOCK[:8] + b"\x09" + BLOCK[9:]), "out of range"),
         (with_crc(BLOCK[:12] + b"\x20" + BLOCK[13:]), "out of range"),
         (with_crc(BLOCK[:18] + b"\x04" + BLOCK[19:]), "out of range"),
@@ -112,5 +129,5 @@ def test_pipes_of_three_vehicles_differ() -> None:
 
 
 def test_every_setting_is_used_by_a_program() -> None:
-    used = {name for names in USED_BY.values() for name in names}
-    assert used == {field.name for field in msgspec.structs.fields(BoardSettings)}
+    used = {name for pair in itertools.product(Program, RADIOS) for name in used_by(*pair)}
+    assert used | {"radio"} == {field.name for field in msgspec.structs.fields(BoardSettings)}

@@ -11,8 +11,15 @@ from intelhex import IntelHex
 
 from gateway.cli.support.options import output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.flashing import boards
-from gateway.flashing.boards import USED_BY, BoardSettings, FlashError, Program, SettingsBlock
+from gateway.flashing import airtime, boards
+from gateway.flashing.boards import (
+    BoardSettings,
+    FlashError,
+    Program,
+    Radio,
+    SettingsBlock,
+    used_by,
+)
 from gateway.live.serial_port import (
     PortNotFoundError,
     SerialSettings,
@@ -40,6 +47,13 @@ OPTIONS: Final = {
     "gyro_range_dps": "--gyro-range",
     "gps_rate_hz": "--gps-rate",
     "gps_dynamic_model": "--gps-model",
+    "lora_frequency_khz": "--frequency",
+    "lora_bandwidth_khz": "--bandwidth",
+    "lora_spreading": "--spreading",
+    "lora_coding": "--coding",
+    "lora_sync_word": "--sync-word",
+    "lora_foreign": "--foreign/--own-only",
+    "lora_power_dbm": "--power",
 }
 
 console = console_of()
@@ -54,6 +68,13 @@ class Board(StrEnum):
     RECEIVER = "receiver"
 
 
+class RadioName(StrEnum):
+    """The radios as they are named on the command line."""
+
+    NRF24 = "nrf24"
+    SX1276 = "sx1276"
+
+
 def _allowed(field: Field) -> str:
     literals = ", ".join(map(str, get_args(field.type.__origin__)))
     return f"{literals or field.range} {field.unit}".strip()
@@ -63,7 +84,8 @@ def _option(name: str) -> Any:
     field, flags = FIELDS[name], [OPTIONS[name]]
     if name == "imu_raw":
         flags = ["--raw/--filtered"]
-    allowed = "" if name in ("imu_raw", "radio_address") else f" {_allowed(field)}."
+    unbounded = ("imu_raw", "radio_address", "lora_foreign")
+    allowed = "" if name in unbounded else f" {_allowed(field)}."
     return typer.Option(*flags, help=f"{field.meaning}{allowed}", show_default=False)
 
 
@@ -93,7 +115,10 @@ def flash(
     pipe: Annotated[int | None, _option("radio_pipe")] = None,
     channel: Annotated[int | None, _option("radio_channel")] = None,
     rate: Annotated[int | None, _option("radio_kbps")] = None,
-    power: Annotated[int | None, _option("radio_power_dbm")] = None,
+    power: Annotated[
+        int | None,
+        typer.Option("--power", help="Of the transmitter. -18, -12, -6, 0 dBm; by LoRa 2 to 20."),
+    ] = None,
     address: Annotated[str | None, _option("radio_address")] = None,
     send_rate: Annotated[int | None, _option("imu_send_hz")] = None,
     raw: Annotated[bool | None, _option("imu_raw")] = None,
@@ -101,17 +126,40 @@ def flash(
     gyro_range: Annotated[int | None, _option("gyro_range_dps")] = None,
     gps_rate: Annotated[int | None, _option("gps_rate_hz")] = None,
     gps_model: Annotated[int | None, _option("gps_dynamic_model")] = None,
+    radio: Annotated[
+        RadioName, typer.Option("--radio", help="The radio of all boards: nRF24L01+ or LoRa.")
+    ] = RadioName.NRF24,
+    frequency: Annotated[
+        float | None,
+        typer.Option("--frequency", help="LoRa: centre of the channel, MHz; as on all boards."),
+    ] = None,
+    bandwidth: Annotated[int | None, _option("lora_bandwidth_khz")] = None,
+    spreading: Annotated[int | None, _option("lora_spreading")] = None,
+    coding: Annotated[int | None, _option("lora_coding")] = None,
+    sync_word: Annotated[int | None, _option("lora_sync_word")] = None,
+    foreign: Annotated[bool | None, _option("lora_foreign")] = None,
+    duty: Annotated[
+        float | None,
+        typer.Option(
+            "--duty", help="LoRa: most time on the air, percent; by default 45, and a warning."
+        ),
+    ] = None,
 ) -> None:
     """Write a ready-made program with its settings to a board, or read them back.
 
     Needs avrdude, and no compiler. Listing, reading and writing restart the board.
     """
-    radio = (pipe, channel, rate, power, _address(address))
-    sensors = (send_rate, raw, accel_range, gyro_range, gps_rate, gps_model)
-    given: tuple[object, ...] = (vehicle, node, *radio, *sensors)
+    khz = None if frequency is None else round(1000 * frequency)
+    nrf24_power, lora_power = (power, None) if radio is RadioName.NRF24 else (None, power)
+    given: tuple[object, ...] = (
+        *(vehicle, node, pipe, channel, rate, nrf24_power, _address(address)),
+        *(send_rate, raw, accel_range, gyro_range, gps_rate, gps_model),
+        *(khz, bandwidth, spreading, coding, sync_word, foreign, lora_power),
+    )
     changes = {n: v for n, v in zip(OPTIONS, given, strict=True) if v is not None}
     if clock not in boards.CLOCKS_MHZ:
         refuse(f"--clock {clock}: 16 or 8")
+    of_board: Radio = "nrf24" if radio is RadioName.NRF24 else "sx1276"
     try:
         if show:
             device = find_port(port, list_serial_ports())
@@ -122,12 +170,12 @@ def flash(
             _list()
         else:
             program = Program[board.name]
-            _check(program, changes)
-            image = boards.read_image(boards.image_path(program, clock))
+            _check(program, of_board, changes)
+            image = boards.read_image(boards.image_path(program, clock, of_board))
             if output is None:
-                _write(program, image, changes, port=port, keep=keep)
+                _write(program, image, changes, port=port, keep=keep, duty=duty)
             else:
-                settings = _changed(program, boards.block_of(image).settings, changes)
+                settings = _changed(program, boards.block_of(image).settings, changes, duty)
                 write_new(output, [boards.with_settings(image, settings)], overwrite=force)
     except FileExistsError:
         refuse(f"{output} already exists; use --force to overwrite")
@@ -167,43 +215,73 @@ def _bootloader_text(device: str) -> str:
 
 
 def _write(
-    program: Program, image: IntelHex, changes: dict[str, Any], *, port: str, keep: bool
+    program: Program,
+    image: IntelHex,
+    changes: dict[str, Any],
+    *,
+    port: str,
+    keep: bool,
+    duty: float | None,
 ) -> None:
     """Patch an image and write it to a board."""
+    # Settings that do not fit are refused before a port is opened.
+    settings = _changed(program, boards.block_of(image).settings, changes, duty)
     device = find_port(port, list_serial_ports())
     with boards.reserved(device):
         loader = boards.require_bootloader(device)
-        before = boards.block_of(image).settings
         if keep:
             kept = boards.block_of(boards.read_flash(device, loader))
             if kept.program is not program:
                 refuse(f"--keep: the board holds the program {kept.program.name.lower()}")
-            before = kept.settings
-        before = msgspec.structs.replace(before, soft_restart=loader.leaves_watchdog_on)
-        settings = _changed(program, before, changes)
+            if kept.settings.radio != settings.radio:
+                refuse(f"--keep: the board's program is for the radio {kept.settings.radio}")
+            settings = _changed(program, kept.settings, changes, duty)
+        settings = msgspec.structs.replace(settings, soft_restart=loader.leaves_watchdog_on)
         boards.write_flash(device, loader, boards.with_settings(image, settings))
     _print(device, boards.block_of(image))
 
 
-def _check(program: Program, changes: dict[str, Any]) -> None:
+def _check(program: Program, radio: Radio, changes: dict[str, Any]) -> None:
     """End the command if an option does not concern the program, or has an invalid value."""
     for name, value in changes.items():
         option = OPTIONS[name]
-        if name not in USED_BY[program]:
-            refuse(f"{option}: the program {program.name.lower()} has no such setting")
+        if name not in used_by(program, radio):
+            other = next((r for r in boards.RADIOS if name in used_by(program, r)), None)
+            no_such = f"the program {program.name.lower()} has no such setting"
+            refuse(f"{option}: {f'needs --radio {other}' if other else no_such}")
         try:
             msgspec.convert(value, FIELDS[name].type)
         except msgspec.ValidationError:
             refuse(f"{option} {value}: must be {_allowed(FIELDS[name])}")
+    least, most = boards.IMU_SEND_HZ[radio]
+    if not least <= changes.get("imu_send_hz", most) <= most:
+        refuse(f"--send-rate {changes['imu_send_hz']}: must be {least} to {most} Hz")
 
 
-def _changed(program: Program, before: BoardSettings, changes: dict[str, Any]) -> BoardSettings:
-    """Apply the options; another vehicle gets its own pipe."""
+def _changed(
+    program: Program, before: BoardSettings, changes: dict[str, Any], duty: float | None
+) -> BoardSettings:
+    """Apply the options, with a pipe for another vehicle, and check the time on the air of LoRa."""
     after = msgspec.structs.replace(before, **changes)
     if "vehicle_id" in changes and "radio_pipe" not in changes:
         pipe = boards.default_pipe(program, after.vehicle_id)
         after = msgspec.structs.replace(after, radio_pipe=pipe)
+    if after.radio == "sx1276" and program is not Program.RECEIVER:
+        _check_airtime(program, after, duty)
     return after
+
+
+def _check_airtime(program: Program, settings: BoardSettings, duty: float | None) -> None:
+    """Refuse what does not fit the channel, and warn of what the band does not allow."""
+    most = airtime.MOST_SHARE if duty is None else duty / 100
+    used = airtime.check(program, settings, most)
+    console.print(f"on the air {100 * used:.1f} % of the time")
+    allowed = airtime.duty_cycle(settings.lora_frequency_khz)
+    if duty is None and allowed is not None and used > allowed:
+        console.print(
+            f"warning: {settings.lora_frequency_khz / 1000:g} MHz allows {100 * allowed:g} % in "
+            f"Europe; --duty {100 * allowed:g} refuses what does not fit"
+        )
 
 
 def _print(device: str, block: SettingsBlock) -> None:
@@ -212,7 +290,7 @@ def _print(device: str, block: SettingsBlock) -> None:
     name = block.program.name.lower()
     console.print(f"{device}: {name}, version {major}.{minor}, for {block.clock_mhz} MHz")
     table = table_of("setting", "value", "unit", "option", left=4)
-    for field in USED_BY[block.program]:
+    for field in ("radio", *used_by(block.program, block.settings.radio)):
         value: object = getattr(block.settings, field)
         text = f"{value:08x}" if field == "radio_address" else str(value)
         table.add_row(field, text, FIELDS[field].unit, OPTIONS.get(field, ""))

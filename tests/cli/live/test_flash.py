@@ -12,7 +12,7 @@ from typer.testing import Result
 from gateway.flashing import boards
 from gateway.flashing.boards import find_block
 from gateway.live.serial_port import Port
-from tests.flashing.test_settings_block import BLOCK, image_with, with_crc
+from tests.flashing.test_settings_block import BLOCK, NRF24_BLOCK, image_with, with_crc
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io
@@ -23,10 +23,11 @@ def images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Images of one program, and a machine without serial ports."""
     folder = tmp_path / "images"
     folder.mkdir()
-    image = IntelHex()
-    image.puts(0, image_with(with_crc(BLOCK)))
-    for mhz in (16, 8):
-        image.write_hex_file(str(folder / f"imu_{mhz}mhz.hex"))
+    for name, block in (("imu", NRF24_BLOCK), ("imu_sx1276", BLOCK)):
+        image = IntelHex()
+        image.puts(0, image_with(with_crc(block)))
+        for mhz in (16, 8):
+            image.write_hex_file(str(folder / f"{name}_{mhz}mhz.hex"))
     monkeypatch.setattr(boards, "IMAGES", folder)
     monkeypatch.setattr("gateway.cli.live.flash.list_serial_ports", list[Port])
     return folder
@@ -50,11 +51,23 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
     before = IntelHex(str(images / "imu_16mhz.hex")).tobinstr()
     after = IntelHex(str(out)).tobinstr()
     assert before[:104] == after[:104]
-    assert before[138:] == after[138:]
+    assert before[150:] == after[150:]
     again = flash("imu", "-o", str(out))
     assert again.exit_code == 2
     assert f"{out} already exists; use --force to overwrite" in again.output
     assert flash("imu", "-o", str(out), "--force").exit_code == 0
+
+
+def test_lora_image_holds_its_settings_and_names_its_airtime(images: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.hex"
+    words = ["--frequency", "868.3", "--spreading", "7", "--coding", "5", "--send-rate", "10"]
+    done = flash("imu", "--radio", "sx1276", "-o", str(out), "--power", "20", *words)
+    assert done.exit_code == 0, done.output
+    assert "on the air" in done.output
+    assert "warning: 868.3 MHz allows 1 % in Europe" in done.output
+    settings = find_block(IntelHex(str(out)).tobinstr(start=0)).settings
+    assert (settings.radio, settings.lora_power_dbm, settings.imu_send_hz) == ("sx1276", 20, 10)
+    assert settings.lora_frequency_khz == 868_300
 
 
 @pytest.mark.parametrize(
@@ -66,6 +79,14 @@ def test_output_holds_the_image_with_the_given_settings(images: Path, tmp_path: 
         (["imu", "--gps-rate", "5"], "--gps-rate: the program imu has no such setting"),
         (["imu", "--address", "xyz"], "--address xyz"),
         (["imu", "--clock", "20"], "--clock 20: 16 or 8"),
+        (["imu", "--spreading", "8"], "--spreading: needs --radio sx1276"),
+        (["imu", "--radio", "sx1276", "--channel", "80"], "--channel: needs --radio nrf24"),
+        (["imu", "--radio", "sx1276", "--power", "21"], "--power 21: must be 2 to 20 dBm"),
+        (["imu", "--send-rate", "20"], "--send-rate 20: must be 60 to 250 Hz"),
+        (
+            ["imu", "--radio", "sx1276", "--spreading", "7", "--send-rate", "20"],
+            "on the air 55 % of the time, more than 45 %; --send-rate 16 would fit",
+        ),
         (["gps"], "make firmware"),
         (["--show"], "no port fits 'auto'"),
         ([], "no USB adapter is connected"),
