@@ -21,7 +21,16 @@ from rich.text import Text
 from gateway.geometry.quaternion import to_euler
 from gateway.hub.stats import ClientStats, ListenerStats
 from gateway.printable import UNKNOWN, PrintableFormatter, figure, receiver_state
-from gateway.records import GpsFix, LinkReport, NavFlags, NavState, NodeId, NodeLink, NodeStatus
+from gateway.records import (
+    GpsFix,
+    LinkReport,
+    NavFlags,
+    NavState,
+    NodeId,
+    NodeLink,
+    NodeStatus,
+    RadioSignal,
+)
 from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
@@ -188,9 +197,14 @@ def _recorder_line(recorder: RecorderStatus | None) -> list[Text]:
 
 
 def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
-    """Show radio, supply in V, bus errors, failed and repeated sends, overruns, firmware."""
-    heads = ("Hz", "lost %", "age s", "V", "bus", "TX failed", "retries", "overruns")
-    grid = _Grid("node", *heads, "restarts", "fw")
+    """Show radio, supply in V, bus errors, failed and repeated sends, overruns, firmware.
+
+    A radio that measures its signal has two more columns.
+    """
+    signals = any(node.signal is not None for node in report.nodes)
+    heads = ("Hz", "lost %", "age s", *(("dBm", "SNR") if signals else ()))
+    boards_heads = ("V", "bus", "TX failed", "retries", "overruns", "restarts", "fw")
+    grid = _Grid("node", *heads, *boards_heads)
     for node in report.nodes:
         pipes = report.receiver.pipes if report.receiver is not None else ()
         overruns = str(pipes[node.pipe].overruns) if node.pipe < len(pipes) else UNKNOWN
@@ -200,9 +214,14 @@ def _nodes(report: LinkReport, boards: Mapping[NodeId, NodeStatus]) -> _Grid:
             f"{node.rate_hz:.0f}",
             figure(100 * node.lost / total if total else None, ".2f"),
             _age(report.time_us, node.last_time_us),
+            *(_signal_cells(node.signal) if signals else ()),
             *_board_cells(boards.get(node.node), overruns, node),
         )
     return grid
+
+
+def _signal_cells(signal: RadioSignal | None) -> tuple[str, str]:
+    return (UNKNOWN, UNKNOWN) if signal is None else (f"{signal.rssi_dbm}", f"{signal.snr_db:.0f}")
 
 
 def _board_cells(board: NodeStatus | None, overruns: str, node: NodeLink) -> tuple[str, ...]:

@@ -11,9 +11,9 @@ from tests.kit.process import START_LIMIT_S
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 
-@pytest.fixture
-def gateway(programs: Path, tmp_path: Path) -> Iterator[Gateway]:
-    started = Gateway(tmp_path, "demo", "--firmware")
+@pytest.fixture(params=["nrf24", "sx1276"])
+def gateway(programs: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Gateway]:
+    started = Gateway(tmp_path, "demo", "--firmware", "--radio", request.param)
     yield started
     if started.process.poll() is None:
         started.process.kill()

@@ -22,7 +22,7 @@ from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.cli.live.panel import launched_panel
 from gateway.cli.live.run import EndpointOption, PlainOption, serve, with_endpoints
-from gateway.cli.support.options import folder_of, read_options, read_settings
+from gateway.cli.support.options import RadioName, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
@@ -54,6 +54,9 @@ def demo(
     firmware: Annotated[
         bool, typer.Option("--firmware", help="Run the boards' own programs on simulated chips.")
     ] = False,
+    radio: Annotated[
+        RadioName, typer.Option("--radio", help="The boards' radio, with --firmware.")
+    ] = RadioName.NRF24,
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
@@ -80,7 +83,7 @@ def demo(
         if flight is not None:
             line, aircraft = recorded_line(settings, flight, columns, report)
         elif firmware:
-            line = made_ahead(firmware_line(settings.simulator, unix_time_us()))
+            line = made_ahead(firmware_line(settings.simulator, unix_time_us(), radio.value))
             aircraft = calibrated_aircraft(settings)
         else:
             from gateway.simulator.receiver import simulate
@@ -177,7 +180,9 @@ class BenchError(RuntimeError):
     """The bench is missing, or cannot be built."""
 
 
-def firmware_line(settings: SimulatorSettings, start_unix_us: int) -> Iterator[TimedFrame]:
+def firmware_line(
+    settings: SimulatorSettings, start_unix_us: int, radio: str
+) -> Iterator[TimedFrame]:
     """Fly the simulated aircraft with the firmware on simulated chips, or raise `BenchError`."""
     if not (CHECKOUT / "firmware" / "rig").is_dir():
         raise BenchError("--firmware needs a checkout of the project, not an installed package")
@@ -185,7 +190,7 @@ def firmware_line(settings: SimulatorSettings, start_unix_us: int) -> Iterator[T
         sys.path.append(str(CHECKOUT))
     line = importlib.import_module("firmware.rig.line")
     try:
-        frames: Iterator[TimedFrame] = line.frames(settings, start_unix_us)
+        frames: Iterator[TimedFrame] = line.frames(settings, start_unix_us, radio)
     except (RuntimeError, OSError) as error:
         raise BenchError(f"--firmware: {error}") from error
     return frames

@@ -9,7 +9,7 @@ import msgspec
 import typer
 from intelhex import IntelHex
 
-from gateway.cli.support.options import output_file
+from gateway.cli.support.options import RadioName, output_file
 from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.flashing import airtime, boards
 from gateway.flashing.boards import (
@@ -66,13 +66,6 @@ class Board(StrEnum):
     IMU = "imu"
     GPS = "gps"
     RECEIVER = "receiver"
-
-
-class RadioName(StrEnum):
-    """The radios as they are named on the command line."""
-
-    NRF24 = "nrf24"
-    SX1276 = "sx1276"
 
 
 def _allowed(field: Field) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextvars import ContextVar
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -25,6 +26,13 @@ CONFIG: Final[ContextVar[Path | None]] = ContextVar("config", default=None)
 """Settings file that the user has named."""
 SOCKET: Final[ContextVar[Path | None]] = ContextVar("socket", default=None)
 """Control socket that the user has named."""
+
+
+class RadioName(StrEnum):
+    """The radios of the boards as they are named on the command line."""
+
+    NRF24 = "nrf24"
+    SX1276 = "sx1276"
 
 
 def read_settings(file: Path | None = None) -> GatewaySettings:

@@ -231,9 +231,12 @@ def _node_row(node: Record, now_us: int, board: Record | None) -> Cells:
     loss = 100 * node["lost"] / total if total else 0.0
     age_us = max(0, now_us - node["last_time_us"])
     kind = "bad" if loss > LOSS_BAD else "warn" if loss > LOSS_WARN else ""
+    rate = figure(node["rate_hz"], ".0f", "Hz")
+    if (signal := node["signal"]) is not None:
+        rate += f", {signal['rssi_dbm']} dBm, SNR {signal['snr_db']:.0f} dB"
     return (
         _name_of(node),
-        figure(node["rate_hz"], ".0f", "Hz"),
+        rate,
         str(node["received"]),
         str(node["lost"]),
         (f"{loss:.2f} %", kind),

@@ -1,7 +1,7 @@
 """Health of one aircraft: its sensors for SYS_STATUS, and its boards for BATTERY_STATUS and texts.
 
-RADIO_STATUS is not sent: the nRF24L01+ measures no signal strength, and ground stations show the
-value for "unknown" as -1 dBm. The losses of the radio are in SYS_STATUS.
+RADIO_STATUS is sent only where the radio measures its signal: ground stations show the value for
+"unknown", the nRF24L01+'s, as -1 dBm. The losses of the radio are in SYS_STATUS too.
 
 A node reports once a second the counters since its start. Most faults of cheap boards appear here
 first: a supply that sags when the radio sends, a broken cable to the sensors, a lost antenna. They
@@ -324,6 +324,27 @@ class Health:
             errors_count4=overruns,
         )
 
+    def radio_status(self, _now_us: int) -> Any:
+        """Encode RADIO_STATUS of the weakest link; None if no radio measures its signal.
+
+        Signal and noise are in dBm as signed bytes, which QGroundControl expects of any radio but
+        SiK's. Nothing is known of the other side, and nothing waits to be sent to it.
+        """
+        signals = [link.signal for link in self._links if link.signal is not None]
+        if not signals:
+            return None
+        weakest = min(signals, key=lambda signal: signal.rssi_dbm)
+        noise_dbm = weakest.rssi_dbm - round(weakest.snr_db)
+        return mavlink.MAVLink_radio_status_message(
+            rssi=_signed_byte(weakest.rssi_dbm),
+            remrssi=encoding.UINT8_MAX,
+            txbuf=100,
+            noise=_signed_byte(noise_dbm),
+            remnoise=encoding.UINT8_MAX,
+            rxerrors=encoding.uint16(self._lost),
+            fixed=0,
+        )
+
     def _error_counts(self) -> list[int]:
         """Sum up bus errors, failed sends, repeated sends and overruns, as SYS_STATUS has room."""
         boards = self._boards.values()
@@ -388,3 +409,8 @@ class Health:
     def known_nodes(self) -> frozenset[int]:
         """Return the nodes that have sent a payload."""
         return frozenset(link.node.node_id for link in self._links if link.received)
+
+
+def _signed_byte(dbm: int) -> int:
+    """Return a signal strength as the byte of its two's complement."""
+    return max(-128, min(dbm, -1)) & 0xFF

@@ -125,6 +125,7 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_NAV_CONTROLLER_OUTPUT,
     mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
     mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
+    mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
 )
 
 APART_US: Final = 13_000
@@ -132,6 +133,9 @@ APART_US: Final = 13_000
 due at the same moments for ever. No multiple of 10 ms: they would come with samples at 100 Hz."""
 HEARTBEAT_HZ: Final = 1.0
 """Clients expect heartbeats at this rate, and take a vehicle without them for lost."""
+
+RADIO_STATUS_HZ: Final = 1.0
+"""As often as the links are counted."""
 
 Builder = Callable[[int], Any]
 
@@ -189,6 +193,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: self._scaled_pressure,
             mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: health.sys_status,
+            mavlink.MAVLINK_MSG_ID_RADIO_STATUS: health.radio_status,
             mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._system_time,
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
@@ -458,6 +463,7 @@ def _intervals(settings: VehicleSettings) -> dict[int, int]:
     """Return the interval of every message; a rate's setting is named after its message."""
     found = dict.fromkeys(REQUESTED_MESSAGES, OFF)
     found[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = interval_us(HEARTBEAT_HZ)
+    found[mavlink.MAVLINK_MSG_ID_RADIO_STATUS] = interval_us(RADIO_STATUS_HZ)
     for name, rate in msgspec.structs.asdict(settings.rates).items():
         message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
         found[getattr(mavlink, message)] = interval_us(rate)

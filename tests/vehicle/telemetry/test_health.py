@@ -3,7 +3,7 @@ from collections.abc import Callable
 import pytest
 from msgspec.structs import replace
 
-from gateway.records import ImuFlags, NavFlags, NodeId
+from gateway.records import ImuFlags, NavFlags, NodeId, RadioSignal
 from gateway.vehicle.telemetry import health as bits
 from gateway.vehicle.telemetry.health import AHRS, GEOFENCE, GPS, LOGGING, MAG, PREARM, Health
 from tests.kit.records import GPS_NODE, IMU_NODE, NO_FIX, SAMPLE, STATE, link, report, status
@@ -51,6 +51,22 @@ def test_sys_status_reports_outages_and_faults_of_sensors(
     assert enabled == present & ~LOGGING
     assert well == (ALL | PREARM | GEOFENCE) & ~absent & ~bad
     assert health.has_fix(now_us) == (not bad & GPS)
+
+
+def test_radio_status_has_the_weakest_signal_and_none_without_a_measurement(
+    health: Health,
+) -> None:
+    health.on_link(report(link(IMU_NODE), link(GPS_NODE)))
+    assert health.radio_status(0) is None
+    strong, weak = RadioSignal(-60, 10.0), RadioSignal(-121, -7.25)
+    other = link(NodeId(2, 0), signal=RadioSignal(-127, -15.0))
+    health.on_link(
+        report(link(IMU_NODE, signal=strong), link(GPS_NODE, signal=weak, lost=7), other)
+    )
+    sent = health.radio_status(0)
+    # As QGroundControl reads them: signed bytes.
+    assert [value - 256 for value in (sent.rssi, sent.noise)] == [-121, -114]
+    assert (sent.remrssi, sent.remnoise, sent.txbuf, sent.rxerrors) == (255, 255, 100, 7)
 
 
 def test_sensor_is_absent_before_its_first_sample() -> None:
