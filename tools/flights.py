@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.spatial.transform import Rotation
 
 from gateway.estimation.columns import (
     GPS_ALT,
@@ -57,6 +58,40 @@ class Flight:
         """Leave out fixes."""
         log = replace(self.log, gps_time_us=self.log.gps_time_us[keep], gps=self.log.gps[keep])
         return replace(self, log=log)
+
+
+def as_increments(flight: Flight, rate_hz: float) -> Flight:
+    """Reduce the IMU samples of a flight as a node does for a slow link.
+
+    Each new sample has the constant rate that leads to the rotation of its interval, the constant
+    force that leads to the gained velocity in the axes half way, and the newest field.
+    """
+    log, size = flight.log, len(IMU_NAMES)
+    step_s = np.diff(log.imu_time_us, prepend=2 * log.imu_time_us[0] - log.imu_time_us[1]) * 1e-6
+    every = max(1, round(1.0 / (rate_hz * float(np.median(step_s)))))
+    ends = np.arange(every - 1, len(log.imu), every)
+    imu = log.imu[ends].copy()
+    for row, end in zip(imu, ends, strict=True):
+        part = slice(end - every + 1, end + 1)
+        steps, span_s = step_s[part, None], step_s[part].sum()
+        turned, velocity = Rotation.identity(), np.zeros(3)
+        for angle, gained in zip(
+            log.imu[part, 3:6] * steps, log.imu[part, 0:3] * steps, strict=True
+        ):
+            velocity += (turned * Rotation.from_rotvec(0.5 * angle)).apply(gained)
+            turned = turned * Rotation.from_rotvec(angle)
+        half_way = Rotation.from_rotvec(0.5 * turned.as_rotvec())
+        row[0:3] = half_way.inv().apply(velocity) / span_s
+        row[3:6] = turned.as_rotvec() / span_s
+        fields = log.imu[part, 6:size]
+        row[6:size] = next((field for field in fields[::-1] if np.isfinite(field[0])), np.nan)
+    return replace(
+        flight,
+        log=replace(log, imu_time_us=log.imu_time_us[ends], imu=imu),
+        q_nb=flight.q_nb[ends],
+        pos_ne_m=flight.pos_ne_m[ends],
+        counts=flight.counts[ends],
+    )
 
 
 def read_flight(path: Path) -> Flight:

@@ -72,6 +72,8 @@ BIAS_RAISE_S: Final = 0.3
 """Time in which the rest is added to the variance of the bias."""
 STEP_LIMIT: Final = 1e4
 """A larger squared change from sample to sample is a fault, and NaN compares false."""
+MEANS_S: Final = 0.05
+"""Samples further apart are means, without vibration, and change by the motion between them."""
 HISTORY_INTERVAL_S: Final = 0.005
 """Samples that come faster share a slot; between slots the integrals are interpolated."""
 CLIMB_DENSITY: Final = 4.0
@@ -145,7 +147,7 @@ def add_vibration(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> Non
         accel_sq += (change - s.imu_change[3 + k]) ** 2
         s.imu_change[3 + k] = change
         s.imu_before[k], s.imu_before[3 + k] = gyro[k], accel[k]
-    if gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
+    if dt < MEANS_S and gyro_sq < STEP_LIMIT and accel_sq < STEP_LIMIT:
         share = dt * dt / 18.0
         s.pending_noise[0] += p.gyro_vibration_sq * share * gyro_sq
         s.pending_noise[1] += p.accel_vibration_sq * share * accel_sq
