@@ -24,15 +24,22 @@ Angle angle_of(const ImuIncrements *increments, int16_t scale) {
     return angle;
 }
 
+int16_t component(int16_t angle_a, int16_t counts_b, int16_t angle_b, int16_t counts_a) {
+    const int32_t sum = static_cast<int32_t>(angle_a) * counts_b - static_cast<int32_t>(angle_b) * counts_a;
+    return saturated((sum + HALF) >> INCREMENT_BITS);
+}
+
 // The vector product of an angle and counts, rounded to counts.
 void cross(const Angle &angle, const int16_t counts[3], int16_t product[3]) {
-    for (uint8_t axis = 0; axis < 3; ++axis) {
-        const uint8_t next = static_cast<uint8_t>((axis + 1) % 3);
-        const uint8_t last = static_cast<uint8_t>((axis + 2) % 3);
-        const int32_t sum = static_cast<int32_t>(angle.axes[next]) * counts[last] -
-                            static_cast<int32_t>(angle.axes[last]) * counts[next];
-        product[axis] = saturated((sum + HALF) >> INCREMENT_BITS);
-    }
+    const int16_t *a = angle.axes;
+    product[0] = component(a[1], counts[2], a[2], counts[1]);
+    product[1] = component(a[2], counts[0], a[0], counts[2]);
+    product[2] = component(a[0], counts[1], a[1], counts[0]);
+}
+
+// A division would take 220 cycles.
+int16_t twelfth(int16_t counts) {
+    return static_cast<int16_t>((static_cast<int32_t>(counts) * 5461 + INT32_C(0x8000)) >> 16);
 }
 
 bool at_end(int16_t counts) { return counts == INT16_MAX || counts == INT16_MIN; }
@@ -50,7 +57,7 @@ void integrate(ImuIncrements *increments, int16_t scale, const ImuReading &readi
     cross(start, reading.gyro, once);
     cross(start, once, twice);
     for (uint8_t axis = 0; axis < 3; ++axis) {
-        increments->angle[axis] += reading.gyro[axis] + once[axis] / 2 + twice[axis] / 12;
+        increments->angle[axis] += reading.gyro[axis] + once[axis] / 2 + twelfth(twice[axis]);
         if (at_end(reading.gyro[axis])) {
             increments->flags |= WIRE_GYRO_CLIPPED;
         }

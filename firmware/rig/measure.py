@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from firmware.rig.bench import PS_PER_S, PS_PER_US
-from firmware.rig.boards import Board, Setup
+from firmware.rig.boards import LORA_PARTS, Board, Parts, Setup
 from firmware.rig.build import PROGRAMS, build, make
 from firmware.rig.tracker import IMU_CLOCK_PPM, Tracker
 from gateway.wire.framing import FrameDecoder
@@ -73,6 +73,7 @@ class Programs:
 
     settings: str = ""
     mhz: int = 16
+    radio: str = "nrf24"
 
     @property
     def frequency_hz(self) -> int:
@@ -82,8 +83,9 @@ class Programs:
 
 def measure(programs: Programs, loss: float, seconds: float) -> Run:
     """Fly with one loss on the air."""
-    folder = build(programs.settings, programs.frequency_hz)
-    setup = Setup(seed=1, loss=loss, build=folder, frequency_hz=programs.frequency_hz)
+    folder = build(programs.settings, programs.frequency_hz, radio=programs.radio)
+    parts = Parts(**LORA_PARTS) if programs.radio == "sx1276" else Parts()
+    setup = Setup(seed=1, loss=loss, build=folder, frequency_hz=programs.frequency_hz, parts=parts)
     tracker = Tracker(setup)
     tracker.run_for(STARTED_S)
     run = Run(loss)
@@ -158,7 +160,11 @@ def _latency_ms(frame: RadioFrame, end_ps: int, sampled_ps: list[int]) -> float:
 
 def program_table(programs: Programs, run: Run) -> list[str]:
     """Build the table of sizes and loads."""
-    options = (f"SETTINGS={programs.settings}", f"F_CPU={programs.frequency_hz}UL")
+    options = (
+        f"SETTINGS={programs.settings}",
+        f"F_CPU={programs.frequency_hz}UL",
+        f"RADIO={programs.radio}",
+    )
     with tempfile.TemporaryDirectory() as folder:
         said = make("all", f"BUILD={folder}", *options)
     sizes = {name: (int(flash), int(ram)) for name, flash, ram in _SIZES.findall(said)}
@@ -203,11 +209,14 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="simulated time for each loss")
     parser.add_argument("--settings", default="", help='such as "-DRADIO_KBPS=250"')
     parser.add_argument("--mhz", type=int, choices=(8, 16), default=16)
+    parser.add_argument("--radio", choices=("nrf24", "sx1276"), default="nrf24")
     options = parser.parse_args()
-    programs, seconds = Programs(options.settings, options.mhz), options.seconds
+    programs = Programs(options.settings, options.mhz, options.radio)
+    seconds = options.seconds
     runs = [measure(programs, loss, seconds) for loss in LOSSES]
     speed = seconds * len(runs) / sum(run.processor_s for run in runs)
-    air = f"{runs[0].sent} packets with acknowledgements, {runs[0].collisions} of them collided"
+    acknowledged = " with acknowledgements" if programs.radio == "nrf24" else ""
+    air = f"{runs[0].sent} packets{acknowledged}, {runs[0].collisions} of them collided"
     last = f"At 0 % loss: {air}. Simulated {speed:.1f} times as fast as true time on one core."
     lines = [*program_table(programs, runs[0]), "", *loss_table(runs), "", last, ""]
     sys.stdout.write("\n".join(lines))
