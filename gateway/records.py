@@ -229,14 +229,23 @@ class PipeCounters(msgspec.Struct, frozen=True, gc=False):
     overruns: int
 
 
+LORA_CHANNEL: Final = 0xFF
+
+
+def channel_name(channel: int) -> str:
+    """Name the channel of a receiver's report."""
+    return "LoRa" if channel == LORA_CHANNEL else f"channel {channel}"
+
+
 class ReceiverStatus(msgspec.Struct, frozen=True, gc=False):
     """The receiver's own once-a-second report."""
 
     time_us: int
     receiver_time_us: int
     channel: int
+    """Of an nRF24L01+: 2400 MHz plus this; `LORA_CHANNEL` for a LoRa radio."""
     noise_percent: int
-    """Share of idle listening in which the channel held a carrier above -64 dBm."""
+    """Share of idle listening in which the channel held a carrier above -64 dBm, or -100 dBm."""
     uart_dropped: int
     reset_cause: int
     pipes: tuple[PipeCounters, ...]

@@ -15,14 +15,15 @@ BOARDS: Final = (
     ("IMU node", ("nRF24L01+", "GY-87")),
     ("GPS node", ("nRF24L01+", "GPS receiver")),
     ("Receiver", ("nRF24L01+",)),
+    ("LoRa: any of the three", ("RFM95",)),
 )
 """Each board and the modules at its left and right side."""
 COLOURS: Final = (
-    (r"VCC", "#d55e00"),
+    (r"VCC|3\.3V", "#d55e00"),
     (r"GND", "#222222"),
-    (r"MOSI|MISO|SCK|CE|CSN", "#0072b2"),
+    (r"MOSI|MISO|SCK|CE|CSN|NSS|RESET", "#0072b2"),
     (r"SDA|SCL", "#009e73"),
-    (r"IRQ|INTA", "#e69f00"),
+    (r"IRQ|INTA|DIO0", "#e69f00"),
     (r"TX|RX", "#cc79a7"),
 )
 """Colour of a wire by its pin, from a palette that people with colour blindness can distinguish."""

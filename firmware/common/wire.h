@@ -10,6 +10,7 @@ constexpr uint8_t WIRE_MAX_PAYLOAD = 32;  // one nRF24L01+ packet
 constexpr uint8_t WIRE_MAX_FOREIGN = 60;  // of a packet of another program, header included
 constexpr uint8_t WIRE_PIPES = 6;
 constexpr uint8_t WIRE_NO_PIPE = 0xFF;
+constexpr uint8_t WIRE_LORA_CHANNEL = 0xFF;  // in place of an nRF24 channel
 
 enum WirePayloadKind : uint8_t {
     WIRE_IMU = 1,

@@ -136,7 +136,7 @@ void poll_status(uint32_t now_us) {
     WireReceiverStatus status;
     status.header = WireFrameHeader{wire_version_kind(WIRE_RECEIVER_STATUS), receiver.sequence++,
                                     WIRE_NO_PIPE, now_us};
-    status.channel = stored_settings().radio_channel;
+    status.channel = RADIO_SX1276 ? WIRE_LORA_CHANNEL : stored_settings().radio_channel;
     status.noise_percent = take_noise_percent();
     status.dropped = receiver.dropped;
     status.reset_and_radio = wire_reset_and_radio(board_reset_cause(), receiver.radio);

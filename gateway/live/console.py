@@ -30,6 +30,7 @@ from gateway.records import (
     NodeLink,
     NodeStatus,
     RadioSignal,
+    channel_name,
 )
 from gateway.status import AircraftStatus, RecorderStatus, RelativeLocation, Snapshot
 from gateway.units import MV_PER_V, US_PER_S, counted
@@ -177,7 +178,7 @@ def _link_line(snapshot: Snapshot) -> Text:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     if report.receiver is not None:
         line.append(f"  radio {sum(node.lost for node in report.nodes)} lost")
-        line.append(f", channel {report.receiver.channel}")
+        line.append(f", {channel_name(report.receiver.channel)}")
         line.append(f", noise {report.receiver.noise_percent} %")
         if problem := report.receiver.radio.problem:
             line.append(f", {problem}", style="red")

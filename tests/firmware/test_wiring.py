@@ -21,7 +21,7 @@ def test_picture_is_that_of_the_tables() -> None:
 
 def test_every_module_of_a_board_has_its_table() -> None:
     assert set(tables()) == {module for _, modules in draw_wiring.BOARDS for module in modules}
-    assert [len(wires) for wires in tables().values()] == [8, 5, 4]
+    assert [len(wires) for wires in tables().values()] == [8, 8, 5, 4]
 
 
 def test_names_of_the_chips_pins_and_of_the_boards_pins_agree() -> None:
@@ -36,3 +36,7 @@ def test_programs_use_the_pins_of_the_table() -> None:
     used = dict(re.findall(r"constexpr uint8_t (\w+) = 1 << (PB\d);", source))
     wired = {wire.module_pin: wire.chip_pin for wire in tables()["nRF24L01+"]}
     assert used == {pin: wired[pin] for pin in ("CE", "CSN", "MOSI", "SCK")}
+    by_pin = {wire.chip_pin: wire.module_pin for wire in tables()["RFM95"]}
+    assert [by_pin[used[pin]] for pin in ("CE", "CSN", "MOSI", "SCK")] == [
+        *("RESET", "NSS", "MOSI", "SCK")
+    ]

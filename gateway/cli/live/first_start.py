@@ -23,7 +23,14 @@ from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
-from gateway.records import GpsFix, LinkReport, NodeStatus, RawRecord
+from gateway.records import (
+    LORA_CHANNEL,
+    GpsFix,
+    LinkReport,
+    NodeStatus,
+    RawRecord,
+    channel_name,
+)
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -140,13 +147,15 @@ def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
     if receiver is None:
         _hint(f"{serial.port}: no report of the receiver in {LOOK_S:.0f} s")
         return
-    _good(f"{serial.port}, channel {receiver.channel}, noise {receiver.noise_percent} %")
+    _good(f"{serial.port}, {channel_name(receiver.channel)}, noise {receiver.noise_percent} %")
     if receiver.radio.problem:
         _hint(f"receiver: {receiver.radio.problem}; check its wiring and 3.3 V supply")
     if receiver.noise_percent > NOISY_PERCENT:
         _hint(
-            "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all boards "
-            "with another --channel (76 and above lie beyond Wi-Fi)"
+            "The channel is noisy: choose another frequency of the band, by --frequency on all boards"
+            if receiver.channel == LORA_CHANNEL
+            else "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all "
+            "boards with another --channel (76 and above lie beyond Wi-Fi)"
         )
 
 
@@ -157,7 +166,7 @@ def _choose(report: LinkReport, vehicle: int | None) -> int:
         _stop(
             "no aircraft is received",
             "Is it powered? A node whose LED flashes once every 2 s gets no answer: channel, rate "
-            "and address must be the receiver's, compare them by `mavgate flash --show`",
+            "and address, or the LoRa settings, must be the receiver's, compare them by `mavgate flash --show`",
             "Three flashes: its radio module does not answer: check its wiring and 3.3 V supply",
         )
     listed = ", ".join(map(str, received))

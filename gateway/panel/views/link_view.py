@@ -18,7 +18,7 @@ from gateway.panel.widgets import (
     notify_failure,
 )
 from gateway.printable import UNKNOWN, figure, printable
-from gateway.records import RadioState
+from gateway.records import RadioState, channel_name
 from gateway.units import US_PER_S, counted
 
 REFRESH_S: Final = 1.0
@@ -215,7 +215,7 @@ def _receiver_line(status: Record) -> str:
         f"{counted(report['frames'], 'frame')}, {report['frames_lost']} lost on the line",
     ]
     if (receiver := report["receiver"]) is not None:
-        parts.append(f"channel {receiver['channel']}, noise {receiver['noise_percent']} %")
+        parts.append(f"{channel_name(receiver['channel'])}, noise {receiver['noise_percent']} %")
         if problem := RadioState(receiver["radio"]).problem:
             parts.append(problem.upper())
     parts += [counted(count, f"{kind} fault") for kind, count in report["faults"]]
