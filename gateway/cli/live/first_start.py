@@ -23,14 +23,7 @@ from gateway.config import GatewaySettings, load_aircraft, save_aircraft
 from gateway.live.pty_port import PtyPort
 from gateway.live.serial_port import PortNotFoundError, SerialPort, SerialSettings, find_receiver
 from gateway.printable import figure
-from gateway.records import (
-    LORA_CHANNEL,
-    GpsFix,
-    LinkReport,
-    NodeStatus,
-    RawRecord,
-    channel_name,
-)
+from gateway.records import LORA_CHANNEL, GpsFix, LinkReport, NodeStatus, RawRecord, channel_name
 from gateway.sensing.calibrating import NodeSamples
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -152,7 +145,7 @@ def _check_receiver(report: LinkReport, serial: SerialSettings) -> None:
         _hint(f"receiver: {receiver.radio.problem}; check its wiring and 3.3 V supply")
     if receiver.noise_percent > NOISY_PERCENT:
         _hint(
-            "The channel is noisy: choose another frequency of the band, by --frequency on all boards"
+            "The channel is noisy: flash all boards with another --frequency of the band"
             if receiver.channel == LORA_CHANNEL
             else "The channel is noisy: move the receiver away from Wi-Fi routers, or flash all "
             "boards with another --channel (76 and above lie beyond Wi-Fi)"
@@ -166,7 +159,8 @@ def _choose(report: LinkReport, vehicle: int | None) -> int:
         _stop(
             "no aircraft is received",
             "Is it powered? A node whose LED flashes once every 2 s gets no answer: channel, rate "
-            "and address, or the LoRa settings, must be the receiver's, compare them by `mavgate flash --show`",
+            "and address, or the LoRa settings, must be the receiver's, compare them by "
+            "`mavgate flash --show`",
             "Three flashes: its radio module does not answer: check its wiring and 3.3 V supply",
         )
     listed = ", ".join(map(str, received))
