@@ -18,7 +18,7 @@ IMU_BYTES, BARO_BYTES, GPS_BYTES, STATUS_BYTES = (PREFIX_BYTES + size for size i
 BARO_HZ: Final = 2.0
 STATUS_HZ: Final = 0.2
 MOST_SHARE: Final = 0.45
-"""Of the channel's time, by one node. Two nodes that use half of it lose 1 % to each other."""
+"""Of the channel's time, by one node. Two nodes that use half of it lose 1 to 3 % to each other."""
 BANDS: Final = (
     (433_050, 434_790, 0.1),
     (863_000, 868_000, 0.01),
