@@ -24,7 +24,7 @@ pytestmark = [pytest.mark.io, pytest.mark.slow]
 
 CONFIG = """
 [hub]
-endpoints = ["udp-listen:127.0.0.1:{listen}"]
+endpoints = ["tcp-listen:127.0.0.1:{listen}"]
 
 [simulator]
 gps_first_fix_s = 0.5
@@ -52,11 +52,10 @@ def located(messages: list[Any]) -> bool:
 
 def talk(port: int) -> None:
     """Be a station that uploads a mission, one of MAVLink 1, and a companion."""
-    stations = [Station.connect(socket.SOCK_DGRAM, port, version) for version in (2, 1)]
+    stations = [Station.connect(socket.SOCK_STREAM, port, version) for version in (2, 1)]
     stations[1].mav.srcSystem = 254
     companion = mavlink.MAVLink(None, 1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
-        sock.connect(("127.0.0.1", port))
+    with socket.create_connection(("127.0.0.1", port)) as sock:
         beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
         turned = mavlink.MAVLink_attitude_message(0, 1.0, 1.0, 1.0, 0, 0, 0)
         data = LONG.encode()
@@ -66,9 +65,9 @@ def talk(port: int) -> None:
         ]
         stations[0].until_heard()
         for message in (beat, turned, *texts, turned):
-            sock.send(message.pack(companion))
+            sock.sendall(message.pack(companion))
             companion.seq += 1
-        sock.send(private_frame(companion))
+        sock.sendall(private_frame(companion))
         assert upload(stations[0], [item(n) for n in range(3)]) == mavlink.MAV_MISSION_ACCEPTED
         wait_for(lambda: located(stations[1].wait(0.2)))
         stations[1].wait(RECORDED_S)
@@ -189,6 +188,13 @@ def test_catalogue_is_read_by_sqlite_and_agrees_with_the_summary(folder: Path, t
         distance == pytest.approx(by_info[vehicle])
         for kind, vehicle, distance, _ in rows if kind == "tlog"
     )  # fmt: skip
+
+
+def test_batch_commands_take_the_folder(folder: Path, tmp_path: Path) -> None:
+    for command in ("info", "fuse"):
+        done = invoke("batch", command, folder, "-o", tmp_path / command, "--jobs", 1)
+        assert done.exit_code == 0, done.output
+        assert any(path.is_file() for path in (tmp_path / command).rglob("*"))
 
 
 def test_page_and_report_are_made(folder: Path, tlog: Path, tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def info(
         figures = result.figures
         if result.error is not None:
             continue
-        km = sum(vehicle["distance_m"] for vehicle in figures["vehicles"]) / 1000.0
+        km = sum(vehicle["distance_m"] or 0.0 for vehicle in figures["vehicles"]) / 1000.0
         grid.add_row(
             result.location.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
             figure(figures["duration_s"], ".0f"), figure(km, ".2f"), str(len(figures["gaps"])),
