@@ -50,9 +50,17 @@ def located(messages: list[Any]) -> bool:
     return {m.get_srcSystem() for m in positions if m.lat} >= {1, 2}
 
 
+def station_of(port: int, version: int) -> Station | None:
+    """Connect a station, unless the gateway does not listen yet."""
+    try:
+        return Station.connect(socket.SOCK_STREAM, port, version)
+    except OSError:
+        return None
+
+
 def talk(port: int) -> None:
     """Be a station that uploads a mission, one of MAVLink 1, and a companion."""
-    stations = [Station.connect(socket.SOCK_STREAM, port, version) for version in (2, 1)]
+    stations = [wait_for(lambda v=version: station_of(port, v)) for version in (2, 1)]
     stations[1].mav.srcSystem = 254
     companion = mavlink.MAVLink(None, 1, mavlink.MAV_COMP_ID_ONBOARD_COMPUTER)
     with socket.create_connection(("127.0.0.1", port)) as sock:
