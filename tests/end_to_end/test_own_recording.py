@@ -198,11 +198,10 @@ def test_catalogue_is_read_by_sqlite_and_agrees_with_the_summary(folder: Path, t
     )  # fmt: skip
 
 
-def test_batch_commands_take_the_folder(folder: Path, tmp_path: Path) -> None:
-    for command in ("info", "fuse"):
-        done = invoke("batch", command, folder, "-o", tmp_path / command, "--jobs", 1)
-        assert done.exit_code == 0, done.output
-        assert any(path.is_file() for path in (tmp_path / command).rglob("*"))
+def test_batch_command_describes_the_folder(folder: Path, tmp_path: Path) -> None:
+    done = invoke("batch", "info", folder, "-o", tmp_path / "info", "--jobs", 1, code=0)
+    assert "_01.tlog" in done.output
+    assert any(path.is_file() for path in (tmp_path / "info").rglob("*"))
 
 
 def test_page_and_report_are_made(folder: Path, tlog: Path, tmp_path: Path) -> None:
