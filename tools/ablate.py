@@ -92,8 +92,8 @@ MECHANISMS: Final = (
         ("magnetometer.field_weight", "magnetometer.learn_field"),
     ),
     Mechanism(
-        "hard iron by the model's dip", "fixes", "raise_hard_iron_by_dip", NOTHING,
-        ("magnetometer.raise_hard_iron_by_dip",),
+        "hard iron by the model's field", "fixes", "raise_hard_iron", NOTHING,
+        ("magnetometer.raise_hard_iron",),
     ),
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
     Mechanism("GPS latency from motion", "latency", "slew_latency", NOTHING, ("latency",)),

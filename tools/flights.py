@@ -109,7 +109,7 @@ def read_flight(path: Path) -> Flight:
             counts = table[name].to_numpy() == 1
     settings = ReferenceSettings(
         gps_latency_s=meta.get("gps_latency_s", 0.0),
-        declination="fixed",
+        declination="fixed" if "declination_deg" in meta else "model",
         declination_deg=meta.get("declination_deg", 0.0),
     )
     log = _samples(table, settings)
@@ -136,11 +136,11 @@ def _samples(table: pd.DataFrame, settings: ReferenceSettings) -> SampleLog:
     gps[:, 0] = 1.0
     gps[:, 1:7] = fixes[GPS_NAMES].to_numpy()
     earth = EarthField(settings)
-    gps[:, GPS_DECLINATION] = earth.declination_rad
     if len(gps):
         lat_deg, lon_deg, alt_m = gps[0, GPS_LAT : GPS_ALT + 1].tolist()
         earth.update(lat_deg, lon_deg, alt_m, None)
-        gps[:, GPS_DIP] = math.nan if earth.field is None else earth.field.inclination_rad
+        gps[:, GPS_DECLINATION] = earth.declination_rad
+        gps[:, GPS_DIP:] = math.nan if earth.field is None else earth.field[1:]
     imu = np.zeros((len(table), IMU_COLUMNS))
     imu[:, : len(IMU_NAMES)] = table[IMU_NAMES].to_numpy()
     return SampleLog(

@@ -31,7 +31,10 @@ MAG_UNCALIBRATED: Final = 10
 GYRO_UNCALIBRATED: Final = 11
 ACCEL_UNCALIBRATED: Final = 12
 """1 where that sensor was never calibrated, else 0."""
-IMU_COLUMNS: Final = 13
+ACCEL_FILTERED: Final = 13
+GYRO_FILTERED: Final = 14
+"""1 where the node has filtered that sensor, else 0."""
+IMU_COLUMNS: Final = 15
 
 GPS_USABLE: Final = 0
 """1 for a fix that may be fused, else 0."""
@@ -48,7 +51,9 @@ GPS_DECLINATION: Final = 10
 """Declination in rad; NaN while not known."""
 GPS_DIP: Final = 11
 """Dip of the Earth's field at the position, positive down, rad; NaN while not known."""
-GPS_COLUMNS: Final = 12
+GPS_STRENGTH: Final = 12
+"""Norm of that field, uT; NaN while not known."""
+GPS_COLUMNS: Final = 13
 
 NAV_QUAT: Final = 0
 NAV_RATE: Final = 4
@@ -67,6 +72,8 @@ ROW_FLAGS: Final = (
     int(ImuFlags.MAG_UNCALIBRATED),
     int(ImuFlags.GYRO_UNCALIBRATED),
     int(ImuFlags.ACCEL_UNCALIBRATED),
+    int(ImuFlags.ACCEL_FILTERED),
+    int(ImuFlags.GYRO_FILTERED),
 )
 """A column each."""
 
@@ -124,7 +131,7 @@ def gps_row(fix: GpsFix, settings: ReferenceSettings, earth: EarthField) -> GpsR
         fix.v_acc_m,
         fix.speed_acc_mps,
         earth.declination_rad,
-        NAN if earth.field is None else earth.field.inclination_rad,
+        *((NAN, NAN) if earth.field is None else earth.field[1:]),
     )
 
 

@@ -18,6 +18,7 @@ from gateway.estimation.columns import (
     GPS_VEL,
     GYRO,
     GYRO_UNCALIBRATED,
+    IMU_COLUMNS,
     MAG,
     NAV_ATTITUDE_STD,
     NAV_FLAGS,
@@ -166,7 +167,7 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
     """Rest on the side, with a gyroscope that is off by 1.7 deg/s about the vertical."""
     rng = np.random.default_rng(3)
     count = max(rate_hz * 60, 60)
-    imu = np.zeros((count, 13))
+    imu = np.zeros((count, IMU_COLUMNS))
     imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 0.8 * -G, 0.6 * -G), 0.02, (count, 3))
     imu[:, GYRO : GYRO + 3] = rng.normal((0.0, 0.0, 0.03), 0.001, (count, 3))
     imu[:, MAG : MAG + 3] = math.nan
@@ -181,7 +182,7 @@ def test_every_imu_rate_levels_at_rest(rate_hz: int) -> None:
 
 def test_gyroscope_without_calibration_is_measured_at_rest() -> None:
     rng = np.random.default_rng(4)
-    imu = np.zeros((3000, 13))
+    imu = np.zeros((3000, IMU_COLUMNS))
     imu[:, ACCEL : ACCEL + 3] = rng.normal((0.0, 0.0, -G), 0.02, (3000, 3))
     imu[:, GYRO : GYRO + 3] = rng.normal(np.radians((14.0, -9.0, 4.0)), 0.002, (3000, 3))
     imu[:, MAG : MAG + 3] = rng.normal((21.0, 0.0, 43.0), 0.3, (3000, 3))

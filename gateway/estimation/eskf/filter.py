@@ -143,7 +143,7 @@ def start(s: State, p: Gains) -> None:
     s.mag_latency_s = p.mag_latency_s
     s.P[MAG_LATENCY, MAG_LATENCY] = p.mag_latency_var
     s.earth_field[0] = p.declination_rad
-    s.earth_field[1] = NAN
+    s.earth_field[1] = s.earth_field[2] = NAN
     s.fix_excess = 1.0
     begin_latency(s, p.gps_latency_s)
     clear_times(s)

@@ -22,6 +22,7 @@ from gateway.estimation.columns import (
     GPS_LAT,
     GPS_LON,
     GPS_SPEED_ACC,
+    GPS_STRENGTH,
     GPS_USABLE,
     GPS_V_ACC,
     GPS_VEL,
@@ -37,7 +38,7 @@ from gateway.estimation.eskf.alignment import (
 from gateway.estimation.eskf.faults import gap_limit_s, is_sound
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import compare_latencies
-from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron_by_dip, turn_heading
+from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron, turn_heading
 from gateway.estimation.eskf.predict import look_back, propagate
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
@@ -186,7 +187,8 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
 @compiled
 def learn_declination(s: State, row: FloatArray) -> None:
     """Take the Earth's field at a fix; a magnetic heading becomes a true one."""
-    s.earth_field[1] = row[GPS_DIP]
+    if math.isfinite(row[GPS_DIP] + row[GPS_STRENGTH]):
+        s.earth_field[1], s.earth_field[2] = row[GPS_DIP], row[GPS_STRENGTH]
     if not math.isfinite(row[GPS_DECLINATION]):
         return
     s.earth_field[0] = row[GPS_DECLINATION]
@@ -333,7 +335,7 @@ def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
     if s.was_aided == 0:
         s.was_aided = 1
         reset_states(s, GYRO_SCALE, p.gyro_scale_var)
-        raise_hard_iron_by_dip(s, s.earth_field[1])
+        raise_hard_iron(s)
 
 
 @compiled

@@ -4,12 +4,14 @@ Three checks precede the heading. A reading that does not change during a turn i
 must turn as the gyroscope does, or axes are swapped. And its norm and dip must be the usual ones; a
 new field that stays the same while the aircraft turns becomes the usual one [1]_. The hard iron
 itself is three states of the filter: turns separate it from the heading, since it turns with the
-body.
+body, and they change the norm.
 
 References
 ----------
 .. [1] D. Laidig and T. Seel, "VQF: Highly accurate IMU orientation estimation with bias estimation
    and magnetic disturbance rejection", Information Fusion 91, 2023, section 3.5.
+.. [2] R. Alonso and M. D. Shuster, "Complete linear attitude-independent magnetometer calibration",
+   Journal of the Astronautical Sciences 50, 2002.
 """
 
 import math
@@ -70,6 +72,8 @@ TURNING_RADPS: Final = 0.35
 HALF_WEIGHT_NORM: Final = 0.04
 HALF_WEIGHT_DIP_RAD: Final = 0.035
 """A field that differs by this in norm or dip counts half: a third of the tolerances."""
+NORM_NOISE_UT: Final = 4.5
+"""Changes of the norm with the attitude by the scales and axes of the sensor."""
 CORRELATION_S: Final = 1.0
 """Correlation time of compass errors: those of soft iron and currents change with the attitude."""
 UNAIDED_CORRELATION_S: Final = 2.5
@@ -77,7 +81,8 @@ UNAIDED_CORRELATION_S: Final = 2.5
 STEEP_DIP_RAD: Final = 74.0 * RAD_PER_DEG
 """Beyond this dip the horizontal field is too weak for the set noise, which then grows as 1/cos."""
 DIP_ERROR_RAD: Final = 3.0 * RAD_PER_DEG
-"""Error of the model's dip at a location, and of the sensor's scale, as angle."""
+NORM_ERROR: Final = 0.07
+"""Errors of the model's dip and norm at a location, with those of the sensor's scales."""
 
 TURN_SHARE: Final = 0.2
 """A turn is evaluated once it has changed the field by this share of its norm."""
@@ -151,11 +156,23 @@ def check_placement(s: State, mag_b: Vec3) -> None:
 
 
 @compiled
+def agreement(norm_off: float, dip_off: float) -> float:
+    """Return the weight of a field by its differences from the expected one."""
+    unlike = (norm_off / HALF_WEIGHT_NORM) ** 2 + (dip_off / HALF_WEIGHT_DIP_RAD) ** 2
+    return float(1.0 / (1.0 + unlike))
+
+
+@compiled
 def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> float:
-    """Compare a field with the usual one; return the weight of its heading, 0 to 1."""
+    """Compare a field with the usual one; return the weight of its heading, 0 to 1.
+
+    Before there is a usual one, it is compared with the Earth model's.
+    """
     if s.mag_ref[0] == 0.0:
         learn_field(s, p, norm, dip, dt)
-        return 1.0
+        if not math.isfinite(s.earth_field[2]):
+            return 1.0
+        return agreement(norm / s.earth_field[2] - 1.0, dip - s.earth_field[1])
     norm_off, dip_off = norm / s.mag_ref[0] - 1.0, dip - s.mag_ref[1]
     usual = abs(norm_off) < p.field_norm_tolerance and abs(dip_off) < p.field_dip_tolerance_rad
     s.mag_usual_s = s.mag_usual_s + dt if usual else 0.0
@@ -168,8 +185,7 @@ def field_weight(s: State, p: Gains, norm: float, dip: float, dt: float) -> floa
     learn_field(s, p, norm, dip, dt)
     if s.mag_disturbed == 0:
         s.mag_rejected_s = max(s.mag_rejected_s - 2.0 * dt, 0.0)
-        unlike = (norm_off / HALF_WEIGHT_NORM) ** 2 + (dip_off / HALF_WEIGHT_DIP_RAD) ** 2
-        return float(1.0 / (1.0 + unlike))
+        return agreement(norm_off, dip_off)
     s.mag_rejected_s = min(s.mag_rejected_s + dt, REJECT_MAX_S)
     return 0.0 if s.mag_rejected_s < REJECT_MAX_S else 0.5
 
@@ -217,7 +233,33 @@ def update_mag(s: State, p: Gains, mag_b: Vec3) -> None:
         start_heading(s, p, field_n, variance)
     else:
         update_heading(s, p, field_n, variance)
+    update_hard_iron(s, p, mag_b, weight, min(since_s, STALE_MAG_S))
     s.mag_used_s = s.time_s
+
+
+@compiled
+def update_hard_iron(s: State, p: Gains, mag_b: Vec3, weight: float, dt: float) -> None:
+    """Update the hard iron `b` by the norm of the field, which does not change with the attitude.
+
+    With the Earth's field `e`, `m = e + b` gives `|m|^2 = |e|^2 + 2 m b - |b|^2`. The difference of
+    that from its mean is linear in `b`, and contains neither the attitude nor `|e|` [2]_.
+    """
+    consider_unaided(s)
+    s.mag_mean_s += dt
+    share = dt / min(FIELD_TAU_S, s.mag_mean_s)
+    off = norm_sq(mag_b) - s.mag_mean[3]
+    s.mag_mean[3] += share * off
+    for k in range(3):
+        change = mag_b[k] - s.mag_mean[k]
+        s.mag_mean[k] += share * change
+        s.h[HARD_IRON + k] = 2.0 * change
+        off -= 2.0 * change * s.hard_iron_b[k]
+    if s.mag_mean_s < FIELD_TAU_S:
+        return
+    propagate(s, p)
+    variance = 4.0 * norm_sq(mag_b) * NORM_NOISE_UT**2 / weight
+    update_scalar(s, off, variance * max(1.0, CORRELATION_S / dt), p.gate_sq)
+    inject(s)
 
 
 @compiled
@@ -228,7 +270,6 @@ def heading_row(s: State, field_n: Vec3) -> None:
     heading through the dip), plus `(east x_n - north x_e) / level^2` for hard iron on a body axis
     `x`, plus the turn in the latency of the sample.
     """
-    clear_row(s)
     north, east, down = field_n
     level_sq = north * north + east * east
     s.h[ATT] = -down * north / level_sq
@@ -244,6 +285,20 @@ def heading_row(s: State, field_n: Vec3) -> None:
 
 
 @compiled
+def consider_unaided(s: State) -> None:
+    """Clear the row, and consider states that the compass must not change without GPS.
+
+    The level depends on the accelerometer alone then: the dip must not change it. And hard iron
+    turns the compass in step with each turn, as a scale error would.
+    """
+    clear_row(s)
+    if s.aided == 0:
+        consider(s, ATT, 2)
+        consider(s, ACCEL_BIAS, 3)
+        consider(s, GYRO_SCALE, 3)
+
+
+@compiled
 def declination(s: State) -> float:
     """Return the declination, rad; 0 while unknown."""
     return s.earth_field[0] if math.isfinite(s.earth_field[0]) else 0.0
@@ -255,6 +310,7 @@ def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     propagate(s, p)
     turn_heading(s, declination(s) - math.atan2(field_n[1], field_n[0]))
     reset_state(s, ATT + 2, NO_HEADING_VAR)
+    clear_row(s)
     heading_row(s, field_n)
     update_scalar(s, 0.0, variance, p.gate_sq)
     inject(s)
@@ -267,15 +323,9 @@ def start_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
 def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
     """Update by the direction of the horizontal field, whose errors last for a while."""
     propagate(s, p)
+    consider_unaided(s)
     heading_row(s, field_n)
-    correlation_s = CORRELATION_S
-    if s.aided == 0:
-        # Without GPS the level depends on the accelerometer alone: the dip must not change it. And
-        # hard iron turns the compass in step with each turn, as a scale error would.
-        consider(s, ATT, 2)
-        consider(s, ACCEL_BIAS, 3)
-        consider(s, GYRO_SCALE, 3)
-        correlation_s = UNAIDED_CORRELATION_S
+    correlation_s = CORRELATION_S if s.aided == 1 else UNAIDED_CORRELATION_S
     since_s = min(s.time_s - s.mag_used_s, STALE_MAG_S)
     off = wrap_pi(declination(s) - math.atan2(field_n[1], field_n[0]))
     update_scalar(s, off, variance * max(1.0, correlation_s / since_s), p.gate_sq)
@@ -284,22 +334,25 @@ def update_heading(s: State, p: Gains, field_n: Vec3, variance: float) -> None:
 
 
 @compiled
-def raise_hard_iron_by_dip(s: State, earth_dip_rad: float) -> None:
-    """Raise the variance of the hard iron by the difference of the dip from the Earth model's.
+def raise_hard_iron(s: State) -> None:
+    """Raise the variance of the hard iron by the difference of the field from the Earth model's.
 
-    Hard iron that changes the dip changes the heading as much. A heading that follows the compass
-    gets the same error.
+    Hard iron that changes norm and dip changes the heading as much. A heading that follows the
+    compass gets the same error.
     """
-    north, east, down = as_vec(s.field_n)
-    level_sq = north * north + east * east
-    if level_sq == 0.0 or not math.isfinite(earth_dip_rad):
+    field, norm = as_vec(s.field_n), s.earth_field[2]
+    level = math.hypot(field[0], field[1])
+    if level == 0.0 or not math.isfinite(norm):
         return
-    share = math.sin(math.atan2(down, math.sqrt(level_sq)) - earth_dip_rad)
-    excess = (share * share - DIP_ERROR_RAD**2) * (level_sq + down * down)
-    more = excess - s.P[HARD_IRON, HARD_IRON]
+    norm_off = math.hypot(level, field[2]) / norm - 1.0
+    dip_off = math.sin(math.atan2(field[2], level) - s.earth_field[1])
+    excess = max(norm_off * norm_off - NORM_ERROR**2, 0.0)
+    excess += max(dip_off * dip_off - DIP_ERROR_RAD**2, 0.0)
+    more = excess * norm * norm - s.P[HARD_IRON, HARD_IRON]
     if more <= 0.0:
         return
-    heading_row(s, as_vec(s.field_n))
+    clear_row(s)
+    heading_row(s, field)
     for k in range(HARD_IRON, HARD_IRON + 3):
         raise_variance(s, k, more)
         turned = s.h[k] * more
@@ -313,6 +366,7 @@ def reset_hard_iron(s: State, p: Gains) -> None:
     """Discard the hard iron that was found."""
     propagate(s, p)
     s.hard_iron_b[:] = 0.0
+    s.mag_mean_s = 0.0
     reset_states(s, HARD_IRON, hard_iron_var(s, p))
 
 

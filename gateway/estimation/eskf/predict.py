@@ -3,7 +3,7 @@
 With the attitude error in NED, `R` the integral of `R_nb`, `f` that of the specific force in NED
 and `dt` the time, the error state obeys [1]_
 
-    att' = att - R gyro_bias - R diag(gyro) gyro_scale
+    att' = att - R gyro_bias - R diag(rate) gyro_scale
     vel' = vel + att x f - R accel_bias
     pos' = pos + vel dt
 
@@ -24,6 +24,7 @@ import math
 from typing import Final
 
 from gateway.compiled import compiled
+from gateway.estimation.columns import FRESH_GPS_S
 from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import (
     ACCEL_BIAS,
@@ -85,9 +86,9 @@ def rate_of(s: State, gyro: Vec3) -> Vec3:
     """Return the angular rate without bias and scale error, rad/s."""
     b, e = s.gyro_bias_b, s.gyro_scale_b
     return (
-        gyro[0] - b[0] - e[0] * gyro[0],
-        gyro[1] - b[1] - e[1] * gyro[1],
-        gyro[2] - b[2] - e[2] * gyro[2],
+        (1.0 - e[0]) * (gyro[0] - b[0]),
+        (1.0 - e[1]) * (gyro[1] - b[1]),
+        (1.0 - e[2]) * (gyro[2] - b[2]),
     )
 
 
@@ -114,9 +115,9 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         s.pending_rotation[k, 0] += x[k] * dt
         s.pending_rotation[k, 1] += y[k] * dt
         s.pending_rotation[k, 2] += z[k] * dt
-        s.pending_rotation_gyro[k, 0] += x[k] * gyro[0] * dt
-        s.pending_rotation_gyro[k, 1] += y[k] * gyro[1] * dt
-        s.pending_rotation_gyro[k, 2] += z[k] * gyro[2] * dt
+        s.pending_rotation_gyro[k, 0] += x[k] * rate[0] * dt
+        s.pending_rotation_gyro[k, 1] += y[k] * rate[1] * dt
+        s.pending_rotation_gyro[k, 2] += z[k] * rate[2] * dt
         a = force + STANDARD_GRAVITY_MPS2 if k == 2 else force
         accel_sq += a * a
         s.integrals[6 + k] += (s.integrals[3 + k] + 0.5 * a * dt) * dt
@@ -125,6 +126,9 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         if s.aided == 1:
             s.pos_n[k] += (s.vel_n[k] + 0.5 * a * dt) * dt
             s.vel_n[k] += a * dt
+        elif k < 2 and s.time_s - s.fix_s < FRESH_GPS_S:
+            # A fix that no heading allows to fuse moves on by its velocity.
+            s.pos_n[k] += s.fix_vel[k] * dt
     s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(norm_sq(rate)))
     s.pending_noise[1] += p.accel_scale_sq * ACCELERATION_S * accel_sq * dt
     s.pending_s += dt

@@ -128,7 +128,7 @@ def begin_rest(s: State, p: Gains) -> None:
         off = max(off, abs(s.gyro_mean[k] - s.gyro_bias_b[k]))
         s.rest_bias_b[k] = s.gyro_mean[k]
     if s.rest_seen == 2:
-        require_bias_variance(s, off)
+        require_bias_variance(s, min(off, p.gyro_bias_change_radps))
     s.rest_seen = 1
     if off > USUAL_BIAS_RADPS:
         lose_attitude(s, p)

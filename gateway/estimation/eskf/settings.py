@@ -33,7 +33,7 @@ class EskfSettings(Settings, frozen=True):
     ] = 1.4
     gyro_scale: Annotated[
         float, setting("Relative scale error of each gyroscope axis.", ge=0.0, le=0.1)
-    ] = 0.04
+    ] = 0.03
     gyro_turn_deg: Annotated[
         float,
         setting(
@@ -42,7 +42,7 @@ class EskfSettings(Settings, frozen=True):
             ge=0.0,
             le=10.0,
         ),
-    ] = 0.2
+    ] = 0.25
     gyro_bias_degps: Annotated[
         float, setting("Initial gyroscope bias.", "deg/s", ge=0.01, le=20.0)
     ] = 0.6

@@ -97,7 +97,7 @@ class State:
     pending_rotation: Annotated[FloatArray, (3, 3)]
     """`R_nb`."""
     pending_rotation_gyro: Annotated[FloatArray, (3, 3)]
-    """`R_nb diag(gyro)`."""
+    """`R_nb diag(rate)`."""
     pending_noise: Annotated[FloatArray, (2,)]
     """Variances of angle and velocity beyond the sensors' noise densities."""
 
@@ -210,8 +210,9 @@ class State:
     """Angle of an apparent turn about the vertical at rest, since the compass last turned too."""
 
     # Magnetometer.
-    earth_field: Annotated[FloatArray, (2,)]
-    """Declination and dip of the Earth's field at the last fix, rad; NaN before."""
+    earth_field: Annotated[FloatArray, (3,)]
+    """Declination and dip of the Earth's field at the last fix in rad, and its norm in uT; NaN
+    before."""
     mag_s: float
     """Newest field that was compared with the usual one."""
     mag_used_s: float
@@ -235,6 +236,10 @@ class State:
     of the change of the norm, uT2."""
     mag_misplaced: int
     """1 while the field turns otherwise than the aircraft."""
+    mag_mean: Annotated[FloatArray, (4,)]
+    """Low-pass of the field in the body and of its square, uT and uT2."""
+    mag_mean_s: float
+    """Time that it has run."""
     field_n: Annotated[FloatArray, (3,)]
     """Field of the last heading update, uT."""
 

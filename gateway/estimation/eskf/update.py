@@ -51,8 +51,8 @@ from gateway.geometry.quaternion import (
 from gateway.records import Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
-NO_GATE_SQ: Final = 1e12
-"""A gate that no innovation reaches."""
+REST_GATE_SQ: Final = 4.0
+"""Two standard deviations: the rate at rest may be a slow turn."""
 GRAVITY_TOLERANCE: Final = 0.02
 """A mean force beyond gravity by more than this share, an MPU6050's scale error, accelerates."""
 LEVEL_INTERVAL_S: Final = 0.1
@@ -202,7 +202,7 @@ def update_rest(s: State, p: Gains) -> None:
     for k in range(3):
         clear_row(s)
         s.h[GYRO_BIAS + k] = 1.0
-        update_scalar(s, s.gyro_mean[k] - s.gyro_bias_b[k], REST_RATE_VAR, NO_GATE_SQ)
+        update_scalar(s, s.gyro_mean[k] - s.gyro_bias_b[k], REST_RATE_VAR, REST_GATE_SQ)
     if s.aided == 1:
         for k in range(3):
             clear_row(s)
