@@ -36,6 +36,7 @@ from gateway.compiled.entry_point import (
 KERNEL_MODULES: Final = (
     "gateway.estimation.eskf.filter",
     "gateway.estimation.smoother",
+    "gateway.estimation.paper",
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",
 )

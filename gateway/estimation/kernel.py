@@ -3,12 +3,13 @@
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
 
 from gateway.compiled import address_of
+from gateway.compiled.entry_point import EntryPoint
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     IMU_COLUMNS,
@@ -79,19 +80,31 @@ class FoundLatency:
     std_s: float
 
 
-class KernelEstimator:
+class Kernels(NamedTuple):
+    """The record of state of an estimator, and its entry points; all of them take both records."""
+
+    state: type
+    begin_state: EntryPoint[[int, int]]
+    imu_steps: EntryPoint[[int, int, int, int, int, int]]
+    gps_step: EntryPoint[[int, int, int, int]]
+    baro_step: EntryPoint[[int, int, float]] | None = None
+    """None if it has no use for a barometer."""
+
+
+class CompiledEstimator:
     """An estimator made of compiled kernels over one record of state.
 
     Parameters
     ----------
-    gains : Gains
+    kernels : Kernels
+    gains : object
         A record of constants.
     reference : ReferenceSettings
         GPS latency and declination.
     """
 
-    def __init__(self, gains: Gains, reference: ReferenceSettings) -> None:
-        self._gains = gains
+    def __init__(self, kernels: Kernels, gains: Any, reference: ReferenceSettings) -> None:
+        self._kernels, self._gains = kernels, gains
         self._gains_at = address_of(gains)
         self._reference = reference
         self._earth = EarthField(reference)
@@ -110,45 +123,14 @@ class KernelEstimator:
         self._begin()
 
     def _begin(self) -> None:
-        self._use(new_record(State))
-        kernels.begin_state(self._at, self._gains_at)
+        self._use(new_record(self._kernels.state))
+        self._kernels.begin_state(self._at, self._gains_at)
 
-    def _use(self, record: State) -> None:
+    def _use(self, record: Any) -> None:
         self._state, self._at = record, address_of(record)
-        self._step = kernels.imu_steps.bound(
+        self._step = self._kernels.imu_steps.bound(
             self._at, self._gains_at, 1, self._time_at, self._row_at, self._output_at
         )
-
-    @property
-    def state(self) -> State:
-        """A copy of the state, to be read."""
-        return copy_record(self._state)
-
-    @property
-    def gps_latency_s(self) -> tuple[float, float]:
-        """The latency in use, which the motion may have corrected, and the one that is set."""
-        used_s = float(self._state.gps_latency_s)
-        return used_s, self._reference.gps_latency_s
-
-    def latency_of(self, log: SampleLog) -> float:
-        """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
-        other = KernelEstimator(self._gains, self._reference)
-        other.restore(self.snapshot())
-        other.run(log)
-        found, set_s = other.found_latency(), self._reference.gps_latency_s
-        return set_s if found is None else latency_to_use(found.latency_s, set_s)
-
-    def found_latency(self) -> FoundLatency | None:
-        """Return the GPS latency that manoeuvres have shown so far; None where none has."""
-        std_s = latency_std(self._state)
-        if std_s > KNOWN_STD_S:
-            return None
-        return FoundLatency(float(self._state.latency_found[0]), std_s)
-
-    @property
-    def gains(self) -> Gains:
-        """The record of constants."""
-        return self._gains
 
     def snapshot(self) -> bytes:
         """Return the whole state, including the position on the Earth."""
@@ -158,69 +140,28 @@ class KernelEstimator:
         """Continue from a snapshot; raises ValueError for another estimator's."""
         kind = tuple[Packed, EarthLocation | None]
         packed, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._use(unpack_record(State, packed))
+        self._use(unpack_record(self._kernels.state, packed))
 
     def update_imu(self, sample: ImuSample) -> NavState:
-        """Advance by one IMU sample.
-
-        Parameters
-        ----------
-        sample : ImuSample
-            Its unfiltered values are used.
-
-        Returns
-        -------
-        NavState
-            State at its time.
-        """
+        """Advance by one IMU sample, and return the state at its time; see `select.Estimator`."""
         self._time_view[0] = sample.time_us
         _ROW.pack_into(self._row_view, 0, *imu_row(sample))
         self._step()
         return nav_state(sample.time_us, self._output)
 
     def update_baro(self, sample: BaroSample) -> None:
-        """Use one barometer sample.
-
-        Parameters
-        ----------
-        sample : BaroSample
-            Its pressure altitude is used.
-        """
-        kernels.baro_step(self._at, self._gains_at, sample.alt_pressure_m)
+        """Use one barometer sample, of which only the Kalman filter has use."""
+        if (step := self._kernels.baro_step) is not None:
+            step(self._at, self._gains_at, sample.alt_pressure_m)
 
     def update_gps(self, fix: GpsFix) -> None:
-        """Use one GPS fix at its arrival.
-
-        Parameters
-        ----------
-        fix : GpsFix
-            Fused as of the time it was valid.
-        """
+        """Use one GPS fix at its arrival, as of the time it was valid."""
         self._fix[:] = gps_row(fix, self._reference, self._earth)
-        kernels.gps_step(self._at, self._gains_at, fix.time_us, self._fix_at)
+        self._kernels.gps_step(self._at, self._gains_at, fix.time_us, self._fix_at)
 
     def fix_row(self, fix: GpsFix) -> GpsRow:
         """Lay out one fix of a log that is to be run as arrays."""
         return gps_row(fix, self._reference, self._earth)
-
-    def run(self, log: SampleLog) -> FloatArray:
-        """Advance over a whole log, with the same bits as sample by sample.
-
-        Parameters
-        ----------
-        log : SampleLog
-            At each IMU sample, the barometer samples and fixes that are not later come first.
-
-        Returns
-        -------
-        ndarray, shape (n, NAV_COLUMNS)
-            One row per IMU sample.
-        """
-        out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
-        log = contiguous(log)
-        arrays = log_arrays(log)
-        kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
-        return out
 
     def run_in_arrival_order(
         self,
@@ -257,7 +198,7 @@ class KernelEstimator:
         for end, record in (*aiding, (len(time_us), None)):
             if end > begin:
                 rows = (start + begin * size for start, size in starts)
-                kernels.imu_steps(self._at, self._gains_at, end - begin, *rows)
+                self._kernels.imu_steps(self._at, self._gains_at, end - begin, *rows)
                 begin = end
             if isinstance(record, BaroSample):
                 self.update_baro(record)
@@ -266,6 +207,71 @@ class KernelEstimator:
                 if on_fix is not None:
                     on_fix()
         return arrays[2]
+
+
+ESKF: Final = Kernels(
+    State, kernels.begin_state, kernels.imu_steps, kernels.gps_step, kernels.baro_step
+)
+
+
+class KernelEstimator(CompiledEstimator):
+    """The Kalman filter; its parameters are those of `CompiledEstimator`."""
+
+    _state: State
+    _gains: Gains
+
+    def __init__(self, gains: Gains, reference: ReferenceSettings) -> None:
+        super().__init__(ESKF, gains, reference)
+
+    @property
+    def state(self) -> State:
+        """A copy of the state, to be read."""
+        return copy_record(self._state)
+
+    @property
+    def gps_latency_s(self) -> tuple[float, float]:
+        """The latency in use, which the motion may have corrected, and the one that is set."""
+        used_s = float(self._state.gps_latency_s)
+        return used_s, self._reference.gps_latency_s
+
+    def latency_of(self, log: SampleLog) -> float:
+        """Return the GPS latency of a whole log, s: the set one, or that shown by manoeuvres."""
+        other = KernelEstimator(self._gains, self._reference)
+        other.restore(self.snapshot())
+        other.run(log)
+        found, set_s = other.found_latency(), self._reference.gps_latency_s
+        return set_s if found is None else latency_to_use(found.latency_s, set_s)
+
+    def found_latency(self) -> FoundLatency | None:
+        """Return the GPS latency that manoeuvres have shown so far; None where none has."""
+        std_s = latency_std(self._state)
+        if std_s > KNOWN_STD_S:
+            return None
+        return FoundLatency(float(self._state.latency_found[0]), std_s)
+
+    @property
+    def gains(self) -> Gains:
+        """The record of constants."""
+        return self._gains
+
+    def run(self, log: SampleLog) -> FloatArray:
+        """Advance over a whole log, with the same bits as sample by sample.
+
+        Parameters
+        ----------
+        log : SampleLog
+            At each IMU sample, the barometer samples and fixes that are not later come first.
+
+        Returns
+        -------
+        ndarray, shape (n, NAV_COLUMNS)
+            One row per IMU sample.
+        """
+        out = np.empty((len(log.imu_time_us), NAV_COLUMNS))
+        log = contiguous(log)
+        arrays = log_arrays(log)
+        kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
+        return out
 
 
 def estimate_latency(log: SampleLog) -> FoundLatency | None:

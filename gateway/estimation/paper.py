@@ -25,34 +25,63 @@ import math
 from typing import Annotated, Final, Literal
 
 import msgspec
+import numpy as np
 
-from gateway.estimation.columns import FRESH_GPS_S
-from gateway.estimation.reference import EarthField, EarthLocation, ReferenceSettings, is_usable
-from gateway.estimation.vector_filter import Kind, VectorFilter, design_highpass, design_lowpass
+from gateway.compiled import array_at, compiled, record_at
+from gateway.compiled.entry_point import EntryPoint
+from gateway.estimation.columns import (
+    ACCEL_FILTERED,
+    FLAG,
+    FRESH_GPS_S,
+    GPS_COLUMNS,
+    GPS_DECLINATION,
+    GPS_LAT,
+    GPS_USABLE,
+    GPS_VEL,
+    GYRO_FILTERED,
+    IMU_COLUMNS,
+    NAV_COLUMNS,
+    NAV_FLAGS,
+    NAV_LAT,
+    NAV_QUAT,
+    NAV_RATE,
+    NAV_VEL,
+    imu_vectors,
+)
+from gateway.estimation.kernel import CompiledEstimator, Kernels
+from gateway.estimation.record import (
+    FloatArray,
+    as_quat,
+    as_vec,
+    filled_record,
+    layout,
+    write_quat,
+    write_vec,
+)
+from gateway.estimation.reference import EarthField, ReferenceSettings
+from gateway.estimation.vector_filter import (
+    Kind,
+    design_highpass,
+    discretise,
+    filter_step,
+    prototype_of,
+)
 from gateway.geometry.angle import wrap_180, wrap_pi
 from gateway.geometry.geodesy import displacement_m, offset_deg
 from gateway.geometry.quaternion import (
-    IDENTITY,
+    difference,
     from_euler,
     from_rotation_vector,
     multiply,
+    norm_sq,
     normalise,
     rotate,
+    scaled,
     to_euler,
 )
-from gateway.records import (
-    UNKNOWN_VEC3,
-    BaroSample,
-    GpsFix,
-    ImuFlags,
-    ImuSample,
-    NavFlags,
-    NavState,
-    Quat,
-    Vec3,
-)
+from gateway.records import NAN, Vec3
 from gateway.settings import Settings, setting
-from gateway.units import DEG_PER_DEGE7, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
 
 GAP_S: Final = 2.5
 """A longer interval of the IMU is not integrated."""
@@ -68,11 +97,14 @@ MIN_COS_PITCH: Final = 0.05
 """Near the vertical the accelerometer does not give the roll."""
 LIMITS: Final = (500.0, 50.0)
 """Largest force in m/s2 and rate in rad/s that a sensor of this kind can measure."""
+NEVER_US: Final = -(1 << 62)
+"""A time before everything."""
 REST: Final = (0.035, 0.5, 0.1, 0.7)
 """At rest rate and force are this close to their means, rad/s and m/s2; the mean rate is no larger,
 rad/s, nor the GPS speed, m/s."""
 REST_S: Final = 1.5
 """Rest begins after this time; the means and the bias follow with it as time constant."""
+FIRST_RATE_HZ: Final = 100.0
 RATE_CHANGE: Final = 0.1
 """The filters are redesigned when the sample rate changes by this share."""
 
@@ -134,267 +166,341 @@ class PaperSettings(Settings, frozen=True):
     ] = "at_fix"
 
 
-class PaperState(msgspec.Struct):
+class PaperState:
     """All that the estimator keeps; times in microseconds on the gateway clock."""
 
-    time_us: int | None = None
-    q_nb: Quat = IDENTITY
-    rate_b_radps: Vec3 = UNKNOWN_VEC3
-    rate_hz: float = 100.0
-    mean_step_s: float = 0.0
-    filters: tuple[list[float] | None, list[float] | None] = (None, None)
-    gyro_mean: Vec3 = (0.0, 0.0, 0.0)
-    accel_mean: Vec3 = (0.0, 0.0, 0.0)
-    rest_s: float = 0.0
-    bias_b: Vec3 = (0.0, 0.0, 0.0)
-    mag_time_us: int | None = None
-    location: Vec3 = UNKNOWN_VEC3
+    started: int
+    time_us: int
+    q_nb: Annotated[FloatArray, (4,)]
+    rate_b: Annotated[FloatArray, (3,)]
+    """Angular rate without bias, rad/s."""
+    rate_hz: float
+    mean_step_s: float
+    lowpass: Annotated[FloatArray, (5,)]
+    highpass: Annotated[FloatArray, (5,)]
+    """Coefficients at `rate_hz`."""
+    delays: Annotated[FloatArray, (2, 6)]
+    """Of the low-pass and the high-pass, see `filter_step`."""
+    gyro_mean: Annotated[FloatArray, (3,)]
+    accel_mean: Annotated[FloatArray, (3,)]
+    rest_s: float
+    bias_b: Annotated[FloatArray, (3,)]
+    mag_us: int
+    declination_rad: float
+    location: Annotated[FloatArray, (3,)]
     """Latitude and longitude in deg, height in m."""
-    vel_n_mps: Vec3 = UNKNOWN_VEC3
-    fix_time_us: int | None = None
-    fix_from: Vec3 = UNKNOWN_VEC3
-    fix_location: Vec3 = UNKNOWN_VEC3
+    vel_n: Annotated[FloatArray, (3,)]
+    fix_us: int
+    fix_from: Annotated[FloatArray, (3,)]
+    fix_location: Annotated[FloatArray, (3,)]
     """The last fix, as received above, moved on by its latency here."""
-    fix_vel_n_mps: Vec3 = UNKNOWN_VEC3
-    gains: list[tuple[int, Vec3]] = []
-    """Times of recent samples, and the integral of the acceleration there, m/s."""
+    fix_vel: Annotated[FloatArray, (3,)]
+    gains: Annotated[FloatArray, (MOST_GAINS, 4)]
+    """Times of recent samples in us, and the integral of the acceleration there, m/s: a ring."""
+    first_gain: int
+    gain_count: int
 
 
-class PaperEstimator:
-    """The paper's fusion behind the interface of all estimators."""
+class PaperGains:
+    """The settings for compiled code; see `PaperSettings`."""
 
-    def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
-        self._settings, self._reference = settings, reference
-        self._earth = EarthField(reference)
-        s = settings
-        self._lowpass = VectorFilter(
-            lambda hz: design_lowpass(s.accel_filter, s.accel_cutoff_hz, hz, s.chebyshev_ripple_db)
-        )
-        self._highpass = VectorFilter(lambda hz: design_highpass(s.gyro_highpass_hz, hz))
-        self.reset()
-
-    def reset(self) -> None:
-        """Discard everything except the settings."""
-        self._earth.reset()
-        self._use(PaperState())
-
-    def _use(self, state: PaperState) -> None:
-        self._s = state
-        self._retune(state.rate_hz)
-        self._lowpass.state, self._highpass.state = state.filters
-
-    def _retune(self, rate_hz: float) -> None:
-        self._s.rate_hz = rate_hz
-        self._lowpass.retune(rate_hz)
-        self._highpass.retune(rate_hz)
-
-    def snapshot(self) -> bytes:
-        """Return the whole state."""
-        self._s.filters = (self._lowpass.state, self._highpass.state)
-        return msgspec.msgpack.encode((self._s, self._earth.state))
-
-    def restore(self, snapshot: bytes) -> None:
-        """Continue from a snapshot; raises ValueError for another estimator's."""
-        kind = tuple[PaperState, EarthLocation | None]
-        state, self._earth.state = msgspec.msgpack.decode(snapshot, type=kind)
-        self._use(state)
-
-    def update_baro(self, sample: BaroSample) -> None:
-        """Ignore the barometer: the paper does not use it."""
-
-    def update_imu(self, sample: ImuSample) -> NavState:
-        """Advance by one IMU sample; the standard deviations of the state are NaN."""
-        s, accel, gyro = self._s, sample.accel_b_mps2, sample.gyro_b_radps
-        sound = _is_below(accel, LIMITS[0]) and _is_below(gyro, LIMITS[1])
-        if s.time_us is None:
-            if not sound:
-                return self._nav(sample.time_us, sound)
-            s.time_us, s.gyro_mean, s.accel_mean = sample.time_us, gyro, accel
-            s.q_nb, s.rate_b_radps = from_euler(*_tilt(accel), 0.0), gyro
-        dt_s = (sample.time_us - s.time_us) / US_PER_S
-        if abs(dt_s) > GAP_S:
-            if dt_s < 0.0:
-                s.fix_time_us = s.mag_time_us = None
-            self._retune(s.rate_hz)
-            s.time_us, dt_s = sample.time_us, 0.0
-        if dt_s > 0.0:
-            s.time_us = sample.time_us
-            if sound:
-                self._advance(accel, gyro, sample.flags, dt_s)
-        mag = sample.mag_b_ut
-        if mag is not None and dt_s >= 0.0 and any(mag) and _is_below(mag, math.inf):
-            self._correct_yaw(mag)
-        return self._nav(s.time_us, sound)
-
-    def update_gps(self, fix: GpsFix) -> None:
-        """Blend one fix: eq. 1 to 8, moved on by its latency."""
-        if not is_usable(fix, self._reference):
-            return
-        s = self._s
-        alt_m = next(filter(math.isfinite, (fix.alt_amsl_m, s.fix_from[2])), 0.0)
-        location = (fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, alt_m)
-        self._earth.update(*location, fix.utc_us)
-        known = all(map(math.isfinite, fix.vel_n_mps))
-        vel = fix.vel_n_mps if known else self._bearing_velocity(location, fix.time_us)
-        s.fix_from, s.fix_time_us = location, fix.time_us
-        latency_s = self._reference.gps_latency_s
-        gained = self._gained_since(fix.time_us - round(latency_s * US_PER_S))
-        mean = (vel[0] + 0.5 * gained[0], vel[1] + 0.5 * gained[1], vel[2] + 0.5 * gained[2])
-        s.fix_location = _moved(location, mean, latency_s)
-        s.fix_vel_n_mps = (vel[0] + gained[0], vel[1] + gained[1], vel[2] + gained[2])
-        if not math.isfinite(s.location[0]):
-            s.location, s.vel_n_mps = s.fix_location, s.fix_vel_n_mps
-        self._blend_fix()
-
-    def _gained_since(self, time_us: int) -> Vec3:
-        """Return the change of velocity since a time, and discard older values."""
-        gains = self._s.gains
-        while len(gains) > 1 and gains[1][0] <= time_us:
-            del gains[0]
-        return _difference(gains[-1][1], gains[0][1]) if gains else (0.0, 0.0, 0.0)
-
-    def _bearing_velocity(self, location: Vec3, time_us: int) -> Vec3:
-        """Return speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
-        s = self._s
-        dt_s = 0.0 if s.fix_time_us is None else (time_us - s.fix_time_us) / US_PER_S
-        if not 0.0 < dt_s < POSITION_HOLD_S:
-            return (0.0, 0.0, 0.0)
-        north, east = displacement_m(*s.fix_from[:2], *location[:2], location[2])
-        return (north / dt_s, east / dt_s, (s.fix_from[2] - location[2]) / dt_s)
-
-    def _advance(self, accel: Vec3, gyro: Vec3, flags: ImuFlags, dt_s: float) -> None:
-        """Filter a sample, then advance attitude, velocity and position."""
-        s = self._s
-        self._follow_rate(dt_s)
-        accel_lowpass = accel if flags & ImuFlags.ACCEL_FILTERED else self._lowpass.step(accel)
-        gyro_highpass = gyro if flags & ImuFlags.GYRO_FILTERED else self._highpass.step(gyro)
-        self._follow_rest(accel, gyro, dt_s)
-        rate = _difference(gyro_highpass, s.bias_b)
-        step = from_rotation_vector((rate[0] * dt_s, rate[1] * dt_s, rate[2] * dt_s))
-        s.q_nb, s.rate_b_radps = normalise(multiply(s.q_nb, step)), rate
-        roll, pitch = _tilt(accel_lowpass)
-        if math.cos(pitch) >= MIN_COS_PITCH:
-            weight = self._settings.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
-            own = to_euler(s.q_nb)
-            s.q_nb = from_euler(
-                _blend_angle(weight, own[0], roll), _blend_angle(weight, own[1], pitch), own[2]
-            )
-        a, v = rotate(s.q_nb, accel_lowpass), s.vel_n_mps
-        gain = (a[0] * dt_s, a[1] * dt_s, (a[2] + STANDARD_GRAVITY_MPS2) * dt_s)
-        s.vel_n_mps = (v[0] + gain[0], v[1] + gain[1], v[2] + gain[2])
-        last = s.gains[-1][1] if s.gains else (0.0, 0.0, 0.0)
-        total = (last[0] + gain[0], last[1] + gain[1], last[2] + gain[2])
-        s.gains.append((s.time_us or 0, total))
-        del s.gains[:-MOST_GAINS]
-        s.location = _moved(s.location, s.vel_n_mps, dt_s)
-        if self._settings.blend == "every_sample":
-            self._blend_fix()
-
-    def _follow_rate(self, dt_s: float) -> None:
-        """Measure the sample rate, and redesign the filters when it has changed."""
-        s = self._s
-        s.mean_step_s += min(1.0, dt_s / REST_S) * (dt_s - s.mean_step_s)
-        rate_hz = 1.0 / s.mean_step_s if s.mean_step_s > 0.0 else s.rate_hz
-        if abs(rate_hz / s.rate_hz - 1.0) > RATE_CHANGE:
-            self._retune(rate_hz)
-
-    def _follow_rest(self, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
-        """Measure the gyroscope bias at rest."""
-        s, share = self._s, min(1.0, dt_s / REST_S)
-        s.gyro_mean, s.accel_mean = _mix(share, s.gyro_mean, gyro), _mix(share, s.accel_mean, accel)
-        fixed_us, now_us = s.fix_time_us, s.time_us or 0
-        age_s = math.inf if fixed_us is None else (now_us - fixed_us) / US_PER_S
-        quiet = (
-            math.dist(gyro, s.gyro_mean) < REST[0]
-            and math.dist(accel, s.accel_mean) < REST[1]
-            and math.hypot(*s.gyro_mean) < REST[2]
-            and not (age_s < FRESH_GPS_S and math.hypot(*s.fix_vel_n_mps) > REST[3])
-        )
-        s.rest_s = s.rest_s + dt_s if quiet else 0.0
-        if s.rest_s >= REST_S:
-            s.bias_b = _mix(share, s.bias_b, s.gyro_mean)
-
-    def _correct_yaw(self, mag_b_ut: Vec3) -> None:
-        """Blend yaw with the tilt-compensated compass: the second complementary filter."""
-        s = self._s
-        roll, pitch, yaw = to_euler(s.q_nb)
-        level = rotate(from_euler(roll, pitch, 0.0), mag_b_ut)
-        compass = math.atan2(-level[1], level[0])
-        if math.isfinite(self._earth.declination_rad):
-            compass += self._earth.declination_rad
-        weight = 0.0
-        if s.mag_time_us is not None and s.time_us is not None:
-            dt_s = max(s.time_us - s.mag_time_us, 0) / US_PER_S
-            weight = self._settings.alpha_yaw ** (dt_s / GAIN_INTERVAL_S)
-        s.q_nb = from_euler(roll, pitch, _blend_angle(weight, yaw, compass))
-        s.mag_time_us = s.time_us
-
-    def _blend_fix(self) -> None:
-        """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
-        s, settings = self._s, self._settings
-        s.vel_n_mps = _mix(1.0 - settings.alpha_accel, s.vel_n_mps, s.fix_vel_n_mps)
-        # The longitude may wrap between the two.
-        fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
-        fix = (s.fix_location[0], fix_lon, s.fix_location[2])
-        lat, lon, alt = _mix(1.0 - settings.beta_velocity, s.location, fix)
-        s.location = (lat, wrap_180(lon), alt)
-
-    def _nav(self, time_us: int, sound: bool) -> NavState:
-        s = self._s
-        return NavState(
-            time_us=time_us,
-            q_nb=s.q_nb,
-            rate_b_radps=s.rate_b_radps,
-            lat_deg=s.location[0],
-            lon_deg=s.location[1],
-            alt_amsl_m=s.location[2],
-            vel_n_mps=s.vel_n_mps,
-            attitude_std_rad=UNKNOWN_VEC3,
-            vel_std_mps=UNKNOWN_VEC3,
-            pos_std_m=UNKNOWN_VEC3,
-            flags=self._flags(time_us, sound),
-        )
-
-    def _flags(self, time_us: int, sound: bool) -> NavFlags:
-        s = self._s
-        flags = NavFlags(0) if s.time_us is None else NavFlags.ATTITUDE_VALID
-        if s.mag_time_us is not None and time_us - s.mag_time_us < STALE_MAG_S * US_PER_S:
-            flags |= NavFlags.USING_MAG
-            if math.isfinite(self._earth.declination_rad):
-                flags |= NavFlags.HEADING_VALID
-        if s.fix_time_us is not None:
-            age_s = (time_us - s.fix_time_us) / US_PER_S
-            if age_s < POSITION_HOLD_S:
-                flags |= NavFlags.POSITION_VALID | NavFlags.VELOCITY_VALID | NavFlags.ALTITUDE_VALID
-            fresh = age_s < FRESH_GPS_S
-            flags |= NavFlags.USING_GPS if fresh else NavFlags.DEAD_RECKONING | NavFlags.DEGRADED
-        return flags if sound else flags | NavFlags.SENSOR_FAULT | NavFlags.DEGRADED
+    damping: float
+    w0_sq: float
+    """Prototype of the low-pass."""
+    accel_cutoff_hz: float
+    gyro_highpass_hz: float
+    alpha_gyro: float
+    alpha_yaw: float
+    alpha_accel: float
+    beta_velocity: float
+    every_sample: int
+    """1 if fixes are blended at every sample."""
+    gps_latency_s: float
+    declination_rad: float
+    """NaN where it is looked up at the position of a fix."""
 
 
-def _is_below(v: Vec3, limit: float) -> bool:
-    return all(abs(x) < limit for x in v)
+@compiled
+def retune(s: PaperState, p: PaperGains, rate_hz: float) -> None:
+    """Redesign the filters, which start again at the next sample."""
+    s.rate_hz = rate_hz
+    lowpass = discretise(p.damping, p.w0_sq, p.accel_cutoff_hz, rate_hz)
+    highpass = design_highpass(p.gyro_highpass_hz, rate_hz)
+    for k in range(5):
+        s.lowpass[k], s.highpass[k] = lowpass[k], highpass[k]
+    s.delays[:] = NAN
 
 
-def _difference(a: Vec3, b: Vec3) -> Vec3:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
+@compiled
+def update_imu(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> bool:
+    """Advance by one IMU sample; return whether it is sound."""
+    gyro, accel, mag = imu_vectors(row)
+    sound = is_below(accel, LIMITS[0]) and is_below(gyro, LIMITS[1])
+    if s.started == 0:
+        if not sound:
+            return False
+        s.started, s.time_us = 1, time_us
+        write_vec(s.gyro_mean, gyro)
+        write_vec(s.accel_mean, accel)
+        write_vec(s.rate_b, gyro)
+        roll, pitch = tilt(accel)
+        write_quat(s.q_nb, from_euler(roll, pitch, 0.0))
+    dt_s = (time_us - s.time_us) / US_PER_S
+    if abs(dt_s) > GAP_S:
+        if dt_s < 0.0:
+            s.fix_us = s.mag_us = NEVER_US
+        retune(s, p, s.rate_hz)
+        s.time_us, dt_s = time_us, 0.0
+    if dt_s > 0.0:
+        s.time_us = time_us
+        if sound:
+            follow_rate(s, p, dt_s)
+            if row[ACCEL_FILTERED] == 0.0:
+                c = s.lowpass
+                accel_lowpass = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[0], accel)
+            else:
+                accel_lowpass = accel
+            rate = gyro
+            if row[GYRO_FILTERED] == 0.0:
+                c = s.highpass
+                rate = filter_step((c[0], c[1], c[2], c[3], c[4]), s.delays[1], gyro)
+            follow_rest(s, accel, gyro, dt_s)
+            advance(s, p, accel_lowpass, difference(rate, as_vec(s.bias_b)), dt_s)
+    if dt_s >= 0.0 and norm_sq(mag) > 0.0 and is_below(mag, math.inf):
+        correct_yaw(s, p, mag)
+    return sound
 
 
-def _mix(share: float, a: Vec3, b: Vec3) -> Vec3:
+@compiled
+def update_gps(s: PaperState, p: PaperGains, time_us: int, row: FloatArray) -> None:
+    """Blend one fix: eq. 1 to 8, moved on by its latency."""
+    if row[GPS_USABLE] == 0.0:
+        return
+    s.declination_rad = row[GPS_DECLINATION]
+    lat, lon, alt = as_vec(row[GPS_LAT : GPS_LAT + 3])
+    if not math.isfinite(alt):
+        alt = s.fix_from[2] if math.isfinite(s.fix_from[2]) else 0.0
+    vel = as_vec(row[GPS_VEL : GPS_VEL + 3])
+    if not math.isfinite(vel[0] + vel[1] + vel[2]):
+        vel = bearing_velocity(s, (lat, lon, alt), time_us)
+    write_vec(s.fix_from, (lat, lon, alt))
+    s.fix_us = time_us
+    gained = gained_since(s, time_us - round(p.gps_latency_s * US_PER_S))
+    mean = (vel[0] + 0.5 * gained[0], vel[1] + 0.5 * gained[1], vel[2] + 0.5 * gained[2])
+    write_vec(s.fix_location, moved((lat, lon, alt), mean, p.gps_latency_s))
+    write_vec(s.fix_vel, (vel[0] + gained[0], vel[1] + gained[1], vel[2] + gained[2]))
+    if not math.isfinite(s.location[0]):
+        write_vec(s.location, as_vec(s.fix_location))
+        write_vec(s.vel_n, as_vec(s.fix_vel))
+    blend_fix(s, p)
+
+
+@compiled
+def gained_since(s: PaperState, time_us: int) -> Vec3:
+    """Return the change of velocity since a time, and discard older values."""
+    if s.gain_count == 0:
+        return (0.0, 0.0, 0.0)
+    newest = s.gain_count - 1
+    while s.first_gain < newest and s.gains[(s.first_gain + 1) % MOST_GAINS, 0] <= time_us:
+        s.first_gain += 1
+    first, last = s.gains[s.first_gain % MOST_GAINS], s.gains[newest % MOST_GAINS]
+    return (last[1] - first[1], last[2] - first[2], last[3] - first[3])
+
+
+@compiled
+def bearing_velocity(s: PaperState, location: Vec3, time_us: int) -> Vec3:
+    """Return speed and bearing from one fix to the next: eq. 3 to 6 over a short way."""
+    f, dt_s = s.fix_from, (time_us - s.fix_us) / US_PER_S
+    if not 0.0 < dt_s < POSITION_HOLD_S:
+        return (0.0, 0.0, 0.0)
+    north, east = displacement_m(f[0], f[1], location[0], location[1], location[2])
+    return (north / dt_s, east / dt_s, (f[2] - location[2]) / dt_s)
+
+
+@compiled
+def advance(s: PaperState, p: PaperGains, accel: Vec3, rate: Vec3, dt_s: float) -> None:
+    """Advance attitude, velocity and position by a filtered sample."""
+    step = from_rotation_vector(scaled(rate, dt_s))
+    write_quat(s.q_nb, normalise(multiply(as_quat(s.q_nb), step)))
+    write_vec(s.rate_b, rate)
+    roll, pitch = tilt(accel)
+    if math.cos(pitch) >= MIN_COS_PITCH:
+        weight = p.alpha_gyro ** (dt_s / GAIN_INTERVAL_S)
+        own = to_euler(as_quat(s.q_nb))
+        roll, pitch = blend_angle(weight, own[0], roll), blend_angle(weight, own[1], pitch)
+        write_quat(s.q_nb, from_euler(roll, pitch, own[2]))
+    a, v, newest = rotate(as_quat(s.q_nb), accel), s.vel_n, s.gains[(s.gain_count - 1) % MOST_GAINS]
+    gain = (a[0] * dt_s, a[1] * dt_s, (a[2] + STANDARD_GRAVITY_MPS2) * dt_s)
+    row = s.gains[s.gain_count % MOST_GAINS]
+    row[0] = s.time_us
+    for k in range(3):
+        v[k] += gain[k]
+        row[1 + k] = newest[1 + k] + gain[k]
+    s.gain_count += 1
+    s.first_gain = max(s.first_gain, s.gain_count - MOST_GAINS)
+    write_vec(s.location, moved(as_vec(s.location), as_vec(v), dt_s))
+    if p.every_sample == 1:
+        blend_fix(s, p)
+
+
+@compiled
+def follow_rate(s: PaperState, p: PaperGains, dt_s: float) -> None:
+    """Measure the sample rate, and redesign the filters when it has changed."""
+    s.mean_step_s += min(1.0, dt_s / REST_S) * (dt_s - s.mean_step_s)
+    rate_hz = 1.0 / s.mean_step_s if s.mean_step_s > 0.0 else s.rate_hz
+    if abs(rate_hz / s.rate_hz - 1.0) > RATE_CHANGE:
+        retune(s, p, rate_hz)
+
+
+@compiled
+def follow_rest(s: PaperState, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
+    """Measure the gyroscope bias at rest."""
+    share = min(1.0, dt_s / REST_S)
+    write_vec(s.gyro_mean, mix(share, as_vec(s.gyro_mean), gyro))
+    write_vec(s.accel_mean, mix(share, as_vec(s.accel_mean), accel))
+    fresh = s.fix_us != NEVER_US and (s.time_us - s.fix_us) / US_PER_S < FRESH_GPS_S
+    quiet = (
+        math.sqrt(norm_sq(difference(gyro, as_vec(s.gyro_mean)))) < REST[0]
+        and math.sqrt(norm_sq(difference(accel, as_vec(s.accel_mean)))) < REST[1]
+        and math.sqrt(norm_sq(as_vec(s.gyro_mean))) < REST[2]
+        and not (fresh and math.sqrt(norm_sq(as_vec(s.fix_vel))) > REST[3])
+    )
+    s.rest_s = s.rest_s + dt_s if quiet else 0.0
+    if s.rest_s >= REST_S:
+        write_vec(s.bias_b, mix(share, as_vec(s.bias_b), as_vec(s.gyro_mean)))
+
+
+@compiled
+def correct_yaw(s: PaperState, p: PaperGains, mag_b: Vec3) -> None:
+    """Blend yaw with the tilt-compensated compass: the second complementary filter."""
+    roll, pitch, yaw = to_euler(as_quat(s.q_nb))
+    level = rotate(from_euler(roll, pitch, 0.0), mag_b)
+    compass = math.atan2(-level[1], level[0])
+    if math.isfinite(s.declination_rad):
+        compass += s.declination_rad
+    weight = 0.0
+    if s.mag_us != NEVER_US:
+        dt_s = max(s.time_us - s.mag_us, 0) / US_PER_S
+        weight = p.alpha_yaw ** (dt_s / GAIN_INTERVAL_S)
+    write_quat(s.q_nb, from_euler(roll, pitch, blend_angle(weight, yaw, compass)))
+    s.mag_us = s.time_us
+
+
+@compiled
+def blend_fix(s: PaperState, p: PaperGains) -> None:
+    """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
+    write_vec(s.vel_n, mix(1.0 - p.alpha_accel, as_vec(s.vel_n), as_vec(s.fix_vel)))
+    # The longitude may wrap between the two.
+    fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
+    fix = (s.fix_location[0], fix_lon, s.fix_location[2])
+    lat, lon, alt = mix(1.0 - p.beta_velocity, as_vec(s.location), fix)
+    write_vec(s.location, (lat, wrap_180(lon), alt))
+
+
+@compiled
+def flags_of(s: PaperState, sound: bool) -> int:
+    """Return the flags, see `NavFlags`."""
+    flags: int = FLAG.ATTITUDE_VALID if s.started == 1 else 0
+    if s.mag_us != NEVER_US and (s.time_us - s.mag_us) / US_PER_S < STALE_MAG_S:
+        flags |= FLAG.USING_MAG
+        if math.isfinite(s.declination_rad):
+            flags |= FLAG.HEADING_VALID
+    if s.fix_us != NEVER_US:
+        age_s = (s.time_us - s.fix_us) / US_PER_S
+        if age_s < POSITION_HOLD_S:
+            flags |= FLAG.POSITION_VALID | FLAG.VELOCITY_VALID | FLAG.ALTITUDE_VALID
+        fresh = age_s < FRESH_GPS_S
+        flags |= FLAG.USING_GPS if fresh else FLAG.DEAD_RECKONING | FLAG.DEGRADED
+    return flags if sound else flags | FLAG.SENSOR_FAULT | FLAG.DEGRADED
+
+
+@compiled
+def is_below(v: Vec3, limit: float) -> bool:
+    """Return whether the size of every component is below a limit."""
+    return abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit
+
+
+@compiled
+def mix(share: float, a: Vec3, b: Vec3) -> Vec3:
     """Return a vector a share of the way from one to another; exact at 0 and 1."""
     kept = 1.0 - share
     return (kept * a[0] + share * b[0], kept * a[1] + share * b[1], kept * a[2] + share * b[2])
 
 
-def _blend_angle(weight: float, own: float, measured: float) -> float:
-    return measured + weight * wrap_pi(own - measured)
+@compiled
+def blend_angle(weight: float, own: float, measured: float) -> float:
+    """Return the weighted mean of two angles, the short way round."""
+    return float(measured + weight * wrap_pi(own - measured))
 
 
-def _tilt(accel: Vec3) -> tuple[float, float]:
+@compiled
+def tilt(accel: Vec3) -> tuple[float, float]:
     """Return roll and pitch of a specific force that is gravity alone."""
-    return (math.atan2(-accel[1], -accel[2]), math.atan2(accel[0], math.hypot(*accel[1:])))
+    level = math.hypot(accel[1], accel[2])
+    return (math.atan2(-accel[1], -accel[2]), math.atan2(accel[0], level))
 
 
-def _moved(location: Vec3, vel: Vec3, dt_s: float) -> Vec3:
+@compiled
+def moved(location: Vec3, vel: Vec3, dt_s: float) -> Vec3:
     """Move latitude, longitude and height by a velocity."""
-    lat, lon = offset_deg(*location, vel[0] * dt_s, vel[1] * dt_s)
+    north_m, east_m = vel[0] * dt_s, vel[1] * dt_s
+    lat, lon = offset_deg(location[0], location[1], location[2], north_m, east_m)
     return (lat, lon, location[2] - vel[2] * dt_s)
+
+
+STATE_LAYOUT: Final = layout(PaperState)
+GAINS_LAYOUT: Final = layout(PaperGains)
+FLOAT: Final = np.dtype(np.float64)
+INT: Final = np.dtype(np.int64)
+
+
+@EntryPoint
+def begin_state(state: int, gains: int) -> None:
+    """Initialise a state of zeros."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    s.q_nb[0], s.declination_rad = 1.0, p.declination_rad
+    s.fix_us = s.mag_us = NEVER_US
+    for k in range(3):
+        s.rate_b[k] = s.location[k] = s.vel_n[k] = NAN
+        s.fix_from[k] = s.fix_location[k] = s.fix_vel[k] = NAN
+    retune(s, p, FIRST_RATE_HZ)
+
+
+@EntryPoint
+def imu_steps(state: int, gains: int, count: int, times: int, samples: int, outputs: int) -> None:
+    """Advance by IMU samples, with an output row each; standard deviations are NaN."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    time_us = array_at(times, (count,), INT)
+    rows = array_at(samples, (count, IMU_COLUMNS), FLOAT)
+    out = array_at(outputs, (count, NAV_COLUMNS), FLOAT)
+    for i in range(count):
+        sound = update_imu(s, p, time_us[i], rows[i])
+        out[i, :] = NAN
+        write_quat(out[i, NAV_QUAT : NAV_QUAT + 4], as_quat(s.q_nb))
+        write_vec(out[i, NAV_RATE : NAV_RATE + 3], as_vec(s.rate_b))
+        write_vec(out[i, NAV_LAT : NAV_LAT + 3], as_vec(s.location))
+        write_vec(out[i, NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
+        out[i, NAV_FLAGS] = float(flags_of(s, sound))
+
+
+@EntryPoint
+def gps_step(state: int, gains: int, arrival_us: int, fix: int) -> None:
+    """Use one fix."""
+    s, p = record_at(state, STATE_LAYOUT), record_at(gains, GAINS_LAYOUT)
+    update_gps(s, p, arrival_us, array_at(fix, (GPS_COLUMNS,), FLOAT))
+
+
+class PaperEstimator(CompiledEstimator):
+    """The paper's fusion behind the interface of all estimators; it has no use for a barometer."""
+
+    def __init__(self, settings: PaperSettings, reference: ReferenceSettings) -> None:
+        damping, w0_sq = prototype_of(settings.accel_filter, settings.chebyshev_ripple_db)
+        values = msgspec.structs.asdict(settings) | {
+            "damping": damping,
+            "w0_sq": w0_sq,
+            "every_sample": int(settings.blend == "every_sample"),
+            "gps_latency_s": reference.gps_latency_s,
+            "declination_rad": EarthField(reference).declination_rad,
+        }
+        kernels = Kernels(PaperState, begin_state, imu_steps, gps_step)
+        super().__init__(kernels, filled_record(PaperGains, values), reference)

@@ -5,11 +5,12 @@ A filter starts as if its first sample had been constant for ever, so it has no 
 
 import math
 from collections.abc import Callable
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.compiled import compiled
 from gateway.records import Vec3
 
 FloatArray = NDArray[np.float64]
@@ -18,6 +19,17 @@ Coefficients = tuple[float, float, float, float, float]
 """`b0, b1, b2, a1, a2` of the difference equation, with `a0 = 1`."""
 
 PASS_THROUGH: Final[Coefficients] = (1.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def prototype_of(kind: Kind, ripple_db: float) -> tuple[float, float]:
+    """Return damping and `w0^2` of the analogue prototype `w0^2 / (s^2 + damping s + w0^2)`.
+
+    Its cutoff is 1 rad/s.
+    """
+    if kind == "butterworth":
+        return math.sqrt(2.0), 1.0
+    mu = 0.5 * math.asinh(1.0 / math.sqrt(10.0 ** (0.1 * ripple_db) - 1.0))
+    return math.sqrt(2.0) * math.sinh(mu), 0.5 * math.cosh(2.0 * mu)
 
 
 def design_lowpass(
@@ -29,13 +41,14 @@ def design_lowpass(
     because its even order would otherwise shrink gravity by the ripple. The cutoff in Hz is -3 dB
     for Butterworth and the end of the ripple for Chebyshev.
     """
+    return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
+
+
+@compiled
+def discretise(damping: float, w0_sq: float, cutoff_hz: float, rate_hz: float) -> Coefficients:
+    """Apply the bilinear transform to a prototype; a cutoff beyond half the rate passes all."""
     if cutoff_hz >= 0.5 * rate_hz:
         return PASS_THROUGH
-    # Analogue prototype of cutoff 1 rad/s: w0^2 / (s^2 + damping s + w0^2).
-    damping, w0_sq = math.sqrt(2.0), 1.0
-    if kind == "chebyshev":
-        mu = 0.5 * math.asinh(1.0 / math.sqrt(10.0 ** (0.1 * ripple_db) - 1.0))
-        damping, w0_sq = math.sqrt(2.0) * math.sinh(mu), 0.5 * math.cosh(2.0 * mu)
     k = math.tan(math.pi * cutoff_hz / rate_hz)
     stiff = w0_sq * k * k
     norm = 1.0 / (1.0 + damping * k + stiff)
@@ -43,6 +56,7 @@ def design_lowpass(
     return (b0, 2.0 * b0, b0, 2.0 * (stiff - 1.0) * norm, (1.0 - damping * k + stiff) * norm)
 
 
+@compiled
 def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
     """Design a first-order high-pass; a cutoff of 0 Hz passes all."""
     if not 1e-6 < cutoff_hz < 0.5 * rate_hz:
@@ -52,33 +66,42 @@ def design_highpass(cutoff_hz: float, rate_hz: float) -> Coefficients:
     return (b0, -b0, 0.0, (k - 1.0) * b0, 0.0)
 
 
+@compiled
+def filter_step(c: Coefficients, z: Any, x: Vec3) -> Vec3:
+    """Filter one finite vector in transposed direct form II.
+
+    `z` are two delays for each axis, which are changed; NaN before the first sample.
+    """
+    if c == PASS_THROUGH:
+        return x
+    b0, b1, b2, a1, a2 = c
+    if math.isnan(z[0]):
+        gain = (b0 + b1 + b2) / (1.0 + a1 + a2)
+        for k in range(3):
+            z[2 * k], z[2 * k + 1] = (gain - b0) * x[k], (b2 - a2 * gain) * x[k]
+    y = (b0 * x[0] + z[0], b0 * x[1] + z[2], b0 * x[2] + z[4])
+    for k in range(3):
+        z[2 * k] = b1 * x[k] - a1 * y[k] + z[2 * k + 1]
+        z[2 * k + 1] = b2 * x[k] - a2 * y[k]
+    return y
+
+
 class VectorFilter:
-    """One filter on three axes, in transposed direct form II, designed for a sample rate in Hz."""
+    """One filter on three axes, designed for a sample rate in Hz."""
 
     def __init__(self, design: Callable[[float], Coefficients], rate_hz: float = 100.0) -> None:
         self._design = design
-        self._coefficients = design(rate_hz)
-        self.state: list[float] | None = None
-        """Two delays for each axis; None before the first sample. May be read and restored."""
+        self.retune(rate_hz)
 
     def retune(self, rate_hz: float) -> None:
         """Redesign for another sample rate; the filter starts again at the next sample."""
-        self._coefficients, self.state = self._design(rate_hz), None
+        self._coefficients = self._design(rate_hz)
+        self.state = [math.nan] * 6
+        """See `filter_step`. May be read and restored."""
 
     def step(self, x: Vec3) -> Vec3:
         """Filter one finite vector."""
-        if self._coefficients == PASS_THROUGH:
-            return x
-        b0, b1, b2, a1, a2 = self._coefficients
-        if self.state is None:
-            gain = (b0 + b1 + b2) / (1.0 + a1 + a2)
-            self.state = [d for v in x for d in ((gain - b0) * v, (b2 - a2 * gain) * v)]
-        z, y = self.state, [0.0, 0.0, 0.0]
-        for k, v in enumerate(x):
-            y[k] = b0 * v + z[2 * k]
-            z[2 * k] = b1 * v - a1 * y[k] + z[2 * k + 1]
-            z[2 * k + 1] = b2 * v - a2 * y[k]
-        return (y[0], y[1], y[2])
+        return filter_step(self._coefficients, self.state, x)
 
     def run(self, x: FloatArray) -> FloatArray:
         """Filter an array of shape (n, 3), as that many calls of `step`."""

@@ -20,7 +20,7 @@ from gateway.estimation.columns import (
     nav_row,
 )
 from gateway.estimation.columns import NAV_COLUMNS as STATE_COLUMNS
-from gateway.estimation.kernel import Aiding, KernelEstimator, SampleLog
+from gateway.estimation.kernel import Aiding, CompiledEstimator, KernelEstimator, SampleLog
 from gateway.estimation.select import EstimationSettings, Estimator
 from gateway.estimation.smoother import smooth
 from gateway.geometry.angle import wrap_180
@@ -128,15 +128,17 @@ def fuse(
         If it is to be smoothed and the clock was set back: there is no order to smooth in.
     """
     imu = samples.imu
-    if isinstance(estimator, KernelEstimator):
-        if smoothed:
-            return Fused(*smooth(estimator, _in_order(sample_log(samples, estimator))))
+    if smoothed:
+        if not isinstance(estimator, KernelEstimator):
+            raise TypeError(f"{type(estimator)} cannot be smoothed")
+        return Fused(*smooth(estimator, _in_order(sample_log(samples, estimator))))
+    if isinstance(estimator, CompiledEstimator):
         rows = imu_rows(imu.accel_b_mps2, imu.gyro_b_radps, imu.mag_b_ut, imu.flags)
         states = estimator.run_in_arrival_order(imu.time_us, rows, samples.aiding, on_fix)
-        return Fused(states, estimator.gps_latency_s[0])
-    if smoothed:
-        raise TypeError(f"{type(estimator)} cannot be smoothed")
-    return Fused(_fuse_singly(estimator, samples, on_fix), math.nan)
+    else:
+        states = _fuse_singly(estimator, samples, on_fix)
+    latency = latency_in_use(estimator)
+    return Fused(states, math.nan if latency is None else latency[0])
 
 
 def _fuse_singly(
