@@ -14,7 +14,7 @@ def test_default_estimator_is_kalman_filter() -> None:
 
 
 def test_unknown_estimator_is_refused() -> None:
-    with pytest.raises(ValueError, match="none of eskf, paper"):
+    with pytest.raises(ValueError, match="choose eskf, paper"):
         EstimationSettings(estimator="kalman")
 
 
