@@ -68,6 +68,8 @@ int32_t scaled(const char *text, uint32_t scale) {
     return number.negative ? -value : value;
 }
 
+uint16_t least(uint16_t a, uint16_t b) { return a < b ? a : b; }
+
 uint16_t dilution(const char *text) {
     const int32_t centi = scaled(text, 100);
     return centi <= 0 || centi >= DILUTION_UNKNOWN ? UNKNOWN : static_cast<uint16_t>(centi);
@@ -382,6 +384,18 @@ bool note(NmeaEpoch *epoch, const NmeaReader &reader, uint32_t begun_us) {
     return epoch->have_rmc && epoch->have_gga;
 }
 
+// One comes of each constellation; one without a solution of its own says nothing about the others.
+void note_gsa(NmeaEpoch *epoch, const NmeaFields &fields) {
+    if (fields.quality > epoch->gsa_type) {
+        epoch->gsa_type = fields.quality;
+        epoch->pdop_centi = epoch->vdop_centi = UNKNOWN;
+    }
+    if (fields.quality == epoch->gsa_type) {
+        epoch->pdop_centi = least(epoch->pdop_centi, fields.dilution[0]);
+        epoch->vdop_centi = least(epoch->vdop_centi, fields.dilution[2]);
+    }
+}
+
 }  // namespace
 
 bool nmea_read(NmeaReader *reader, uint8_t byte) {
@@ -423,9 +437,7 @@ void nmea_start(NmeaReader *reader, NmeaEpoch *epoch) {
 bool nmea_join(NmeaEpoch *epoch, const NmeaReader *reader, uint32_t begun_us, WireGpsFix *fix,
                WireGpsQuality *quality) {
     if (reader->kind == NMEA_GSA) {
-        epoch->gsa_type = reader->fields.quality;
-        epoch->pdop_centi = reader->fields.dilution[0];
-        epoch->vdop_centi = reader->fields.dilution[2];
+        note_gsa(epoch, reader->fields);
         return false;
     }
     if (reader->kind == NMEA_OTHER || !note(epoch, *reader, begun_us)) {

@@ -3,7 +3,8 @@
 //
 // A fix is complete when RMC and GGA of one time have come, in either order. Several talkers may
 // repeat them (GP, GL, GN): a time that has been delivered is not delivered again. GSA gives the fix
-// type and the vertical dilution; it belongs to the fix that ends next.
+// type and the vertical dilution; it belongs to the fix that ends next. Of several, one for each
+// constellation, the best fix type counts, with the least dilutions among those that have it.
 //
 // NMEA has no accuracies. They are made from the dilutions of precision with the range errors below,
 // so that an estimator weighs these fixes as what they are.

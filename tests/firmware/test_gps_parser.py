@@ -238,6 +238,22 @@ class TestNmea:
         ((fix, _),) = parse(data)
         assert (fix.fix_type, fix.fix_ok) == (fix_type, ok)
 
+    @pytest.mark.parametrize("modes", [(3, 1), (1, 3), (3, 2, 1), (2, 3)])
+    def test_best_gsa_of_several_constellations_counts(
+        self, parse: Parse, modes: tuple[int, ...]
+    ) -> None:
+        epoch = Epoch(np.random.default_rng(1))
+        data = b""
+        for mode in modes:
+            # The dilutions of a constellation without a fix are better here, and do not count.
+            epoch.pdop, epoch.vdop = (1.6, 1.3) if mode == 3 else (0.5, 0.5)
+            data += epoch.gsa(nav_mode=mode)
+        epoch.pdop = epoch.vdop = 99.99
+        data += epoch.gsa(nav_mode=3) + epoch.gga() + epoch.rmc()
+        ((fix, quality),) = parse(data)
+        assert (fix.fix_type, fix.fix_ok) == (GpsFixType.FIX_3D, True)
+        assert (quality.pdop_centi, quality.v_acc_cm) == (160, 130 * RANGE_ERROR_M)
+
     def test_velocity_down_is_the_difference_of_two_heights(self, parse: Parse) -> None:
         first, second = Epoch(np.random.default_rng(1)), Epoch(np.random.default_rng(1))
         second.utc = first.utc.replace(second=(first.utc.second + 1) % 60)
