@@ -298,6 +298,16 @@ def _options(
     for chosen, value in ((CONFIG, config), (SOCKET, socket)):
         context.call_on_close(partial(chosen.reset, chosen.set(value)))
     _begin_logging(verbose=verbose)
+    _settle_home()
+
+
+def _settle_home() -> None:
+    """Take the root as the home of a user without one, as of an unknown uid in a container."""
+    try:
+        Path.home()
+    except RuntimeError:
+        os.environ["HOME"] = "/"
+        log.warning("HOME is not set, and uid %d has no home; settings are below /", os.getuid())
 
 
 def _begin_logging(*, verbose: bool) -> None:

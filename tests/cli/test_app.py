@@ -14,6 +14,7 @@ import typer
 from typer.testing import CliRunner
 
 from gateway.cli.app import COMMANDS, FORMER, GROUPS, MODULES, MOVED, app, hoisted, load_command
+from tests.kit.cli import run
 
 CLI = Path(__file__).resolve().parents[2] / "gateway" / "cli"
 LARGE = (
@@ -179,3 +180,15 @@ def test_invalid_value_is_named_with_what_is_allowed(words: str, text: str) -> N
     found = CliRunner().invoke(app, words.split(), env={"COLUMNS": "200"})
     assert (found.exit_code, text in found.output) == (2, True)
     assert not re.search("Input should|Value error|parse string", found.output)
+
+
+def test_user_without_a_home_gets_defaults_and_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unknown(uid: int) -> None:
+        raise KeyError(uid)
+
+    monkeypatch.setattr("pwd.getpwuid", unknown)
+    monkeypatch.delenv("HOME")
+    assert "no recordings in /mavgate/recordings" in run("record", "list")
+    assert "HOME is not set" in caplog.text
