@@ -120,6 +120,22 @@ async def test_commands_of_stations_are_played_only_on_request(
     assert station.frames == wanted
 
 
+async def test_recorded_high_latency_messages_are_played(
+    tmp_path: Path, opened: ExitStack, station: Station
+) -> None:
+    vehicle = Sender(3)
+    records = [
+        TlogRecord(START_US + i, vehicle.pack(mavlink.MAVLink_high_latency2_message(*[i] * 27)))
+        for i in range(5)
+    ]
+    (tmp_path / "a.tlog").write_bytes(make_tlog(records))
+    daemon = make_daemon(tmp_path, opened, settings_of(station.url))
+    await daemon.start()
+    await station.until(len(records))
+    daemon.close()
+    assert station.frames == [record.frame for record in records]
+
+
 @pytest.mark.parametrize(
     "url",
     [

@@ -61,6 +61,8 @@ class _Subscription:
 
     client: Client
     bandwidth: Bandwidth | None
+    is_recording: bool
+    """Whether our frames are those of a recording that is played."""
     answered: int = 0
     """Bytes of answers since the bandwidth was planned last."""
     requested: dict[tuple[int, int], int] = field(default_factory=dict)
@@ -106,6 +108,7 @@ class _Subscription:
             if message_id != HIGH_LATENCY2:
                 return NO_MESSAGES
             return round(HIGH_LATENCY2_BYTES * US_PER_S / endpoint.budget)
+        is_ours = is_ours and not self.is_recording
         if message_id == HIGH_LATENCY2 and is_ours and message_id not in endpoint.allow:
             # Its content is sent there in full by other messages.
             return NO_MESSAGES
@@ -139,7 +142,8 @@ class OwnRoute:
 class Fanout:
     """Give frames to clients by their filters, rates and addresses; keep the routes."""
 
-    def __init__(self, signer: FrameSigner) -> None:
+    def __init__(self, signer: FrameSigner, *, is_recording: bool = False) -> None:
+        self._is_recording = is_recording
         self.others: dict[tuple[int, bytes], Route] = {}
         """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
         self.forwarded = 0
@@ -183,7 +187,7 @@ class Fanout:
     def add(self, client: Client) -> None:
         """Include a client from the next frame on."""
         bandwidth = _bandwidth(client.endpoint)
-        self._subscriptions[client.client_id] = _Subscription(client, bandwidth)
+        self._subscriptions[client.client_id] = _Subscription(client, bandwidth, self._is_recording)
         self._changed()
 
     def remove(self, client_id: int) -> None:
