@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import msgspec
+from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import TokenBucket
-from gateway.hub.round_trip import RoundTrip
+from gateway.hub.round_trip import PROBE_COMPONENT, RoundTrip
 from gateway.hub.router import Router
 from gateway.hub.routing_table import Origin, OwnVehicles
 from gateway.hub.send_queue import NOT_TELEMETRY_IDS, Numbering
@@ -84,7 +85,8 @@ class Hub:
     recordings : Path, optional
         Folder of the recordings that a fleet may fetch.
     keeps_order : bool, optional
-        Send frames in their order, without answers first, and drop none: for a recording.
+        Send frames in their order, without answers first, and drop none: for a recording, of which
+        HIGH_LATENCY2 is sent as all others.
     """
 
     def __init__(
@@ -109,13 +111,16 @@ class Hub:
             UNTRUSTED_READ_RATE, UNTRUSTED_READ_BURST, UNTRUSTED_READ_BURST
         )
         self._on_gone = on_gone
+        self._on_foreign = on_foreign
+        self._said = 0
+        """Sequence number of the next message of the gateway itself."""
         self._on_alert = on_alert
         self._alerts = ClientAlerts()
         self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)
         self._clients: dict[int, Client] = {}
         self._endpoints: dict[str, Client | Listener[Any]] = {}
         self._next_id = 1
-        self._fanout = Fanout(signer)
+        self._fanout = Fanout(signer, is_recording=keeps_order)
         self._round_trip = RoundTrip(signer)
         self._vehicles = OwnVehicles()
         self._router = Router(
@@ -227,6 +232,22 @@ class Hub:
         if self._vehicles.register(frame, now_us):
             self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
+
+    def say(self, messages: Iterable[Any]) -> bool:
+        """Send messages of this gateway as a component of each vehicle that it only routes.
+
+        Returns whether there is one.
+        """
+        now_us, systems = self.now_us(), self._router.routed_vehicles()
+        for message in messages:
+            for system in systems:
+                sender = dialect.MAVLink(None, system, PROBE_COMPONENT)
+                frame = frame_of(bytes(message.pack(sender)))
+                self._fanout.publish(frame, self._said, now_us)
+                if self._on_foreign is not None:
+                    self._on_foreign(frame.data)
+            self._said = self._said + 1 & 0xFF
+        return bool(systems)
 
     def set_interval(self, request: ClientInterval) -> None:
         """Send a client one message of one system at the interval that it requested."""

@@ -78,6 +78,15 @@ class Router:
         """Return the systems and components received from a client."""
         return self._table.origins(client_id) or self._untrusted.origins(client_id)
 
+    def routed_vehicles(self) -> set[int]:
+        """Return the systems of trusted clients that are no ground stations."""
+        return {
+            origin[0]
+            for client_id in self._clients
+            for origin in self._table.origins(client_id)
+            if origin[0] and not self._table.is_station(origin)
+        }
+
     def charge(self, client_id: int | None, size: int) -> None:
         """Charge a client for a frame to it, or for one to all that it has just requested."""
         payer = self._serving if client_id is None else client_id

@@ -25,8 +25,8 @@ from gateway.vehicle.plan import Location
 class RecorderVerbs:
     """`record.*`."""
 
-    def __init__(self, recorder: Recorder) -> None:
-        self._recorder = recorder
+    def __init__(self, recorder: Recorder, has_vehicle: Callable[[], bool] = lambda: True) -> None:
+        self._recorder, self._has_vehicle = recorder, has_vehicle
 
     def verbs(self) -> Verbs:
         """Return the handlers."""
@@ -69,6 +69,8 @@ class RecorderVerbs:
     def _note(self, text: str) -> RecorderStatus:
         if not text.strip():
             raise ControlError("the note is empty: describe what happens now")
+        if not self._has_vehicle():
+            raise ControlError("no vehicle is received, to whose recording the note could be added")
         if not self._recorder.mark(text):
             raise ControlError("sent to the ground stations, but in no file: nothing is recorded")
         return self._recorder.status()

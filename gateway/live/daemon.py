@@ -48,11 +48,14 @@ from gateway.vehicle.requests import (
     WARNING,
     Action,
     RecordingRequest,
+    Reply,
     Request,
     SavePlan,
     SaveSettings,
     StatusText,
 )
+from gateway.vehicle.telemetry.announcements import Announcer
+from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_splitter import message_id_of
 
 log = logging.getLogger(__name__)
@@ -60,8 +63,8 @@ log = logging.getLogger(__name__)
 LONGEST_WAIT_S: Final = 0.1
 """A sample may make something due sooner than was known when the timer was set."""
 SHORTEST_WAIT_S: Final = 0.001
-SECRET_MESSAGES: Final = frozenset({5, 256})
-"""CHANGE_OPERATOR_CONTROL and SETUP_SIGNING: a recording is shared more easily than a password."""
+SECRET_MESSAGES: Final = ids_of("CHANGE_OPERATOR_CONTROL", "SETUP_SIGNING")
+"""A recording is shared more easily than a password."""
 
 
 class Daemon:
@@ -110,6 +113,8 @@ class Daemon:
             signer=self._pipeline.signer,
             recordings=Path(settings.recording.folder).expanduser(),
         )
+        self._announcer = Announcer()
+        """Texts of a gateway without an aircraft of its own."""
         self._recorder = self._make_recorder()
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
@@ -150,7 +155,7 @@ class Daemon:
         return ControlServer(
             socket_path("run"),
             {"status": self.snapshot, "reload": self._reload_or_refuse},
-            RecorderVerbs(self._recorder).verbs(),
+            RecorderVerbs(self._recorder, self._has_vehicle).verbs(),
             mark_verbs(self._mark),
             SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
             client_verbs(self._hub),
@@ -274,12 +279,19 @@ class Daemon:
         except ConfigError as error:
             raise ControlError(f"settings not reloaded: {error}") from error
 
+    def _has_vehicle(self) -> bool:
+        return bool(self._pipeline.aircraft) or self._hub.say(())
+
     def _mark(self, location: Location | None, vehicle_id: int | None) -> None:
         self._perform(self._pipeline.mark(location, vehicle_id, self.now_us()))
 
     def _announce(self, is_trouble: bool, text: str) -> None:
         status = StatusText(WARNING if is_trouble else INFO, text)
-        self._perform(self._pipeline.say(status, self.now_us()))
+        if self._pipeline.aircraft:
+            self._perform(self._pipeline.say(status, self.now_us()))
+        else:
+            said = self._announcer.say(status, self.now_us())
+            self._hub.say([reply.message for reply in said if isinstance(reply, Reply)])
 
     async def _open_control(self) -> None:
         try:

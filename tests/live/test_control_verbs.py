@@ -60,6 +60,12 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(
     assert bench.announced[1] == (False, "Mark: here")
 
 
+async def test_note_that_no_vehicle_could_get_is_refused(bench: Bench, tmp_path: Path) -> None:
+    server = ControlServer(tmp_path / "s", RecorderVerbs(bench.recorder, lambda: False).verbs())
+    refused = await ask(server, "record.note", text="here")
+    assert "no vehicle is received" in refused["error"]
+
+
 async def test_recordings_are_listed_off_the_event_loop(
     bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

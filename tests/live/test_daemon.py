@@ -105,6 +105,24 @@ def test_requests_of_a_flooding_untrusted_client_are_recorded_up_to_a_quota(
     assert recorded[-1] == b"telemetry", "all the same"
 
 
+def test_note_without_an_own_aircraft_is_sent_by_the_hub(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[bytes] = []
+
+    def say(messages: list[mavlink.MAVLink_message]) -> bool:
+        said.extend(bytes(message.text.encode()) for message in messages)
+        return True
+
+    monkeypatch.setattr(daemon._hub, "say", say)
+    daemon._announce(False, "to the aircraft")
+    daemon._pipeline.aircraft.clear()
+    daemon._announce(False, "Mark: " + "x" * 50)
+    assert b"".join(said).startswith(b"Mark: xxx")
+    assert len(said) == 2
+    assert daemon._has_vehicle()
+
+
 @pytest.mark.parametrize("due_us", [0, 999_000_000])
 async def test_due_time_is_polled_neither_without_pause_nor_too_late(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch, due_us: int
