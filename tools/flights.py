@@ -28,6 +28,7 @@ from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuFlags, ImuRaw, ImuSa
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.units import DEGE7_PER_DEG
 from tools.simulated_flight import fly
 
 IMU_NAMES = ["ax", "ay", "az", "gx", "gy", "gz", "mx", "my", "mz"]
@@ -228,8 +229,8 @@ def _fix_of(time_us: int, row: list[float]) -> GpsFix:
         fix_type=GpsFixType.FIX_3D if row[0] else GpsFixType.NONE,
         fix_ok=bool(row[0]),
         satellites=0,
-        lat_dege7=round(row[1] * 1e7),
-        lon_dege7=round(row[2] * 1e7),
+        lat_dege7=round(row[1] * DEGE7_PER_DEG),
+        lon_dege7=round(row[2] * DEGE7_PER_DEG),
         alt_amsl_m=row[3],
         vel_n_mps=(row[4], row[5], row[6]),
         alt_ellipsoid_m=math.nan,

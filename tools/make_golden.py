@@ -23,6 +23,7 @@ from gateway.records import BaroRaw, GpsFix
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.units import DEGE7_PER_DEG
 from tools.simulated_flight import fly
 
 GOLDEN = Path(__file__).resolve().parent.parent / "tests" / "golden"
@@ -60,7 +61,7 @@ def write_log(path: Path) -> None:
                 baro = [f"{chain.baro(record).alt_pressure_m:.3f}"]
             case GpsFix():
                 if record.fix_ok:
-                    place = (record.lat_dege7 / 1e7, record.lon_dege7 / 1e7)
+                    place = (record.lat_dege7 / DEGE7_PER_DEG, record.lon_dege7 / DEGE7_PER_DEG)
                     vel = [f"{v:.3f}" for v in record.vel_n_mps]
                     gps = [f"{record.time_us / 1e6:.6f}", *(f"{p:.7f}" for p in place)]
                     gps += [f"{record.alt_amsl_m:.3f}", *vel]

@@ -26,6 +26,7 @@ from gateway.simulator.sensors import (
 )
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FLIGHT_S, FloatArray, Trajectory
+from gateway.units import DEGE7_PER_DEG
 from gateway.wire.payloads import ACCEL_RANGES_G, GYRO_RANGES_DPS, MAG_LSB_PER_GAUSS
 
 SampleRecord = ImuRaw | BaroRaw | GpsFix
@@ -98,8 +99,8 @@ class SimulatedFlight:
                 fix_type=GpsFixType(int(gps.fix_type[k])),
                 fix_ok=bool(gps.has_fix[k]),
                 satellites=int(gps.satellites[k]),
-                lat_dege7=round(float(gps.lat_deg[k]) * 1e7),
-                lon_dege7=round(float(gps.lon_deg[k]) * 1e7),
+                lat_dege7=round(float(gps.lat_deg[k]) * DEGE7_PER_DEG),
+                lon_dege7=round(float(gps.lon_deg[k]) * DEGE7_PER_DEG),
                 alt_amsl_m=float(gps.alt_amsl_m[k]),
                 vel_n_mps=(north, east, down),
                 alt_ellipsoid_m=float(gps.alt_amsl_m[k]) + self.settings.geoid_separation_m,

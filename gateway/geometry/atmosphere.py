@@ -20,11 +20,11 @@ def pressure_altitude_m(pressure_pa: float) -> float:
     return SCALE_M * (1.0 - float((pressure_pa / SEA_LEVEL_PA) ** EXPONENT))
 
 
-def pressure_at_height(alt_m: float) -> float:
-    """Convert a height above the 1013.25 hPa level to the static pressure in Pa.
+def pressure_at_height(alt_m: float, zero_pa: float = SEA_LEVEL_PA) -> float:
+    """Convert a height above the level of a pressure, in m, to the static pressure in Pa.
 
     NaN for a height beyond the formula.
     """
     if not alt_m < SCALE_M:
         return math.nan
-    return float(SEA_LEVEL_PA * (1.0 - alt_m / SCALE_M) ** (1.0 / EXPONENT))
+    return float(zero_pa * (1.0 - alt_m / SCALE_M) ** (1.0 / EXPONENT))

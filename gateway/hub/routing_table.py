@@ -20,6 +20,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
 from gateway.wire.mavlink_splitter import MavFrame
 
 Origin = tuple[int, int]
@@ -366,8 +367,7 @@ class RedundantLinks:
         self._groups = {client_id: tuple(sorted(group)) for client_id, group in groups.items()}
 
 
-HEARTBEAT_ID: Final = 0
-HOME_POSITION_ID: Final = 242
+HEARTBEAT_ID, HOME_POSITION_ID = MESSAGE_IDS["HEARTBEAT"], MESSAGE_IDS["HOME_POSITION"]
 GREETING: Final = (HEARTBEAT_ID, HOME_POSITION_ID)
 """In this order: a vehicle exists, and its home."""
 OWN_FRESH_US: Final = 5 * US_PER_S

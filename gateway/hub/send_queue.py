@@ -35,6 +35,7 @@ from pymavlink.dialects.v20 import all as dialect
 from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.routing_table import MAX_ORIGINS, Origin
 from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import ids_of
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame
 
@@ -163,16 +164,25 @@ def _parts(
     return at(low)
 
 
-ANSWER_IDS: Final = frozenset({0, 75, 76, 77, 253})
-"""HEARTBEAT, commands and their answers, STATUSTEXT: the next one does not replace a lost one."""
-URGENT_IDS: Final = frozenset({30, 31, 61, 69, 70})
-"""Attitudes, manual control and overrides."""
-BULK_IDS: Final = frozenset(
-    {20, 21, 22, 23, 36, 110, 148, 300, 320, 321, 322, 323, 324, 395, 396, 397, 410}
-    | set(range(37, 52)) - {42}
-    | {73}
-    | set(range(117, 123))
+ANSWER_IDS: Final = ids_of("HEARTBEAT", "COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
+"""The next one does not replace a lost one."""
+URGENT_IDS: Final = ids_of(
+    *("ATTITUDE", "ATTITUDE_QUATERNION", "ATTITUDE_QUATERNION_COV"),
+    *("MANUAL_CONTROL", "RC_CHANNELS_OVERRIDE"),
 )
+COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT = 395, 396, 410
+"""Messages that the dialect lacks."""
+BULK_IDS: Final = ids_of(
+    *("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_VALUE", "PARAM_SET", "PARAM_MAP_RC"),
+    *("PARAM_EXT_REQUEST_READ", "PARAM_EXT_REQUEST_LIST", "PARAM_EXT_VALUE", "PARAM_EXT_SET"),
+    *("PARAM_EXT_ACK", "MISSION_REQUEST_PARTIAL_LIST", "MISSION_WRITE_PARTIAL_LIST"),
+    *("MISSION_ITEM", "MISSION_ITEM_INT", "MISSION_REQUEST", "MISSION_REQUEST_INT"),
+    *("MISSION_SET_CURRENT", "MISSION_REQUEST_LIST", "MISSION_COUNT", "MISSION_CLEAR_ALL"),
+    *("MISSION_ITEM_REACHED", "MISSION_ACK", "SET_GPS_GLOBAL_ORIGIN", "GPS_GLOBAL_ORIGIN"),
+    *("FILE_TRANSFER_PROTOCOL", "LOG_REQUEST_LIST", "LOG_ENTRY", "LOG_REQUEST_DATA", "LOG_DATA"),
+    *("LOG_ERASE", "LOG_REQUEST_END", "AUTOPILOT_VERSION", "PROTOCOL_VERSION"),
+    *("COMPONENT_METADATA", "SERVO_OUTPUT_RAW"),
+) | {COMPONENT_INFORMATION, COMPONENT_INFORMATION_BASIC, EVENT}
 """Parameters, mission transfers, files, logs, versions: requested, and waited for."""
 NOT_TELEMETRY_IDS: Final = ANSWER_IDS | BULK_IDS
 """Messages that are never dropped while there is room, because they are not repeated."""

@@ -19,6 +19,7 @@ from pmtiles.writer import Writer
 from gateway import __version__
 from gateway.panel.map_tiles import GetBytes, PmTiles, file_reader
 from gateway.printable import reason_of
+from gateway.units import DEGE7_PER_DEG
 
 EARTH_M: Final = 6_378_137.0
 MAX_TILES: Final = 20_000
@@ -141,7 +142,7 @@ def extract_area(
 
 
 def _header_of(header: dict[str, Any], box: Box, zooms: range) -> dict[str, Any]:
-    south, west, north, east = (round(value * 1e7) for value in box)
+    south, west, north, east = (round(value * DEGE7_PER_DEG) for value in box)
     return {
         "tile_type": header["tile_type"],
         "tile_compression": header["tile_compression"],

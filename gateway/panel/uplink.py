@@ -23,8 +23,8 @@ from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlError, find_socket, request
 from gateway.panel.state.fleet import FleetState, command_long
 from gateway.records import NAN, Incoming, Outgoing
-from gateway.units import US_PER_S
-from gateway.vehicle.plan import DEGE7, Location
+from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.vehicle.plan import Location
 from gateway.wire.mavlink_splitter import frame_of, message_id_of, origin_of
 
 log = logging.getLogger(__name__)
@@ -212,8 +212,8 @@ class Uplink:
             mavlink.MAV_FRAME_GLOBAL,
             number,
             *(0, 0, 0.0, 0.0, 0.0, 0.0),
-            round(spot.lat_deg * DEGE7),
-            round(spot.lon_deg * DEGE7),
+            round(spot.lat_deg * DEGE7_PER_DEG),
+            round(spot.lon_deg * DEGE7_PER_DEG),
             spot.alt_amsl_m,
         )
         await self._until_acknowledged(system_id, number, message)

@@ -24,7 +24,7 @@ from gateway.recordings.tlog_scan import (
     scan,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import CRC_EXTRA, layout_of
+from gateway.wire.mavlink_messages import CRC_EXTRA, MESSAGE_IDS, ids_of, layout_of
 from gateway.wire.mavlink_splitter import PAYLOAD_V1, PAYLOAD_V2, START_V2, message_id_of
 from gateway.wire.timesync import GpsTime
 
@@ -54,11 +54,11 @@ FIRST_CIVIL_US: Final = 946_684_800 * US_PER_S
 """The year 2000: an earlier time counts from the start of a clock."""
 MAX_JUMPS: Final = 1000
 
-HEARTBEAT_ID: Final = 0
+HEARTBEAT_ID: Final = MESSAGE_IDS["HEARTBEAT"]
 LENGTH_AT: Final = 1
 """Offset of the payload's length in a frame."""
-UNRECORDED: Final = frozenset({235})
-"""HIGH_LATENCY2, for links too narrow for the rest: next to these in a recording a ground station
+UNRECORDED: Final = ids_of("HIGH_LATENCY2")
+"""For links too narrow for the rest: next to these in a recording a ground station
 would take each one for another state of the vehicle."""
 
 

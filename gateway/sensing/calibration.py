@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from gateway.geometry.rotation import Matrix3, determinant, is_rotation
 from gateway.records import ImuFlags, Int3, Vec3
 from gateway.settings import Settings, setting
-from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -25,7 +25,6 @@ FACE_UP: Final[Matrix3] = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 FULL_SCALE_COUNTS: Final = 32768.0
 GYRO_LSB_PER_DPS: Final = {250: 131.0, 500: 65.5, 1000: 32.8, 2000: 16.4}
 """MPU6050 register map, section 4.19."""
-UT_PER_GAUSS: Final = 100.0
 MAG_OVERFLOW: Final = -4096
 """The HMC5883L's own mark of an axis beyond its range."""
 

@@ -16,6 +16,7 @@ from gateway.simulator.gps import GPS_RATE_HZ, GpsSamples
 from gateway.simulator.sensors import ACCEL_RANGE, GYRO_RANGE, MAG_GAIN, DeviceClock, IntArray
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import FloatArray
+from gateway.units import DEGE7_PER_DEG
 from gateway.wire.payloads import (
     GPS_ACKNOWLEDGES,
     SENSOR_IMU,
@@ -224,7 +225,10 @@ def gps_payloads(gps: GpsSamples, clock: DeviceClock, geoid_separation_m: float)
     h_acc_cm, v_acc_cm = _held(gps.h_acc_m), _held(gps.v_acc_m)
     speed_acc_cmps, course_acc_cdeg = _held(gps.speed_acc_mps), _held(gps.course_acc_deg)
     pdop_centi = _held(gps.pdop)
-    lat_dege7, lon_dege7 = np.rint(gps.lat_deg * 1e7), np.rint(gps.lon_deg * 1e7)
+    lat_dege7, lon_dege7 = (
+        np.rint(gps.lat_deg * DEGE7_PER_DEG),
+        np.rint(gps.lon_deg * DEGE7_PER_DEG),
+    )
     vel_cmps = np.clip(np.rint(gps.vel_n_mps * 100.0), -INT16_MAX, INT16_MAX).astype(np.int64)
     for k, time_s in enumerate(gps.time_s.tolist()):
         itow_ms, node_us = int(gps.itow_ms[k]), clock.at(time_s)

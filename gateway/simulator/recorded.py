@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.geometry.atmosphere import SEA_LEVEL_PA
 from gateway.records import ImuFlags, NodeId
 from gateway.simulator.flight import GPS_BOOT_US, GPS_NODE, IMU_NODE, START_UNIX_US
 from gateway.simulator.gps import GpsSamples, gps_start, itow_ms_of
@@ -36,8 +37,6 @@ from gateway.simulator.sensors import (
     IMU_BOOT_US,
     INT16_MAX,
     MAG_LIMIT,
-    SEA_LEVEL_PA,
-    UT_PER_GAUSS,
     BoolArray,
     DeviceClock,
     IntArray,
@@ -49,7 +48,7 @@ from gateway.simulator.sensors import (
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.simulator.trajectory import FloatArray
-from gateway.units import STANDARD_GRAVITY_MPS2, counted
+from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS, counted
 from gateway.wire.payloads import ACCEL_RANGES_G, HMC5883L_LSB_PER_GAUSS
 
 ROWS: Final = 2048

@@ -24,11 +24,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.geometry.atmosphere import SEA_LEVEL_PA, pressure_at_height
 from gateway.geometry.geomagnetism import magnetic_field
 from gateway.records import ImuFlags, Vec3
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.trajectory import CRUISE_MPS, FloatArray, SensorMotion, Truth, rotate_inverse
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
 AXES: Final = 3
@@ -134,17 +135,12 @@ HARD_IRON_UT: Final = 14.0
 SOFT_IRON_SPREAD: Final = 0.05
 MAG_LIMIT: Final = 2047
 MAG_OVERFLOW: Final = -4096
-UT_PER_GAUSS: Final = 100.0
 FIELD_YEAR: Final = 2026.5
 
-SEA_LEVEL_PA: Final = 101_325.0
 SEA_LEVEL_SPREAD_PA: Final = 300.0
 BARO_NOISE_PA: Final = 3.0
 BARO_DRIFT_PA: Final = 8.0
 BARO_DRIFT_S: Final = 300.0
-ISA_KELVIN: Final = 288.15
-ISA_LAPSE_KELVIN_PER_M: Final = 0.0065
-ISA_EXPONENT: Final = 5.255_876
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,8 +271,7 @@ def errors_of(imu: Mpu6050, mag: Hmc5883l) -> SensorErrors:
 
 def pressure_at(alt_m: FloatArray, sea_level_pa: float) -> FloatArray:
     """Compute the ICAO standard atmosphere's pressure at heights in the troposphere."""
-    ratio = 1.0 - ISA_LAPSE_KELVIN_PER_M * alt_m / ISA_KELVIN
-    return np.asarray(sea_level_pa * ratio**ISA_EXPONENT)
+    return np.array([pressure_at_height(one_m, sea_level_pa) for one_m in alt_m.tolist()])
 
 
 def warm_degc(time_s: FloatArray) -> FloatArray:

@@ -16,8 +16,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import GpsFix, GpsFixType
 from gateway.settings import Settings, setting
+from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG
 
-DEGE7: Final = 1e7
 MAX_LAT_DEG: Final = 90.0
 MAX_LON_DEG: Final = 180.0
 
@@ -123,7 +123,7 @@ def is_good_enough(fix: GpsFix, accuracy_m: float, satellites: int) -> bool:
 
 def location_of(fix: GpsFix) -> Location:
     """Return the location of a fix."""
-    return Location(fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7, fix.alt_amsl_m)
+    return Location(fix.lat_dege7 * DEG_PER_DEGE7, fix.lon_dege7 * DEG_PER_DEGE7, fix.alt_amsl_m)
 
 
 def distance_and_bearing(here: Location, there: Location) -> tuple[float, float]:
@@ -188,14 +188,14 @@ class Item:
         if not located or (self.x, self.y) == (0, 0):
             return None
         height = height_amsl_m(self.z, self.frame, home_alt_m)
-        return Location(self.x / DEGE7, self.y / DEGE7, height)
+        return Location(self.x / DEGE7_PER_DEG, self.y / DEGE7_PER_DEG, height)
 
 
 def read_item(message: Any) -> Item:
     """Read an unchecked item from MISSION_ITEM_INT, or MISSION_ITEM with its floats in degrees."""
     x, y = message.x, message.y
     if message.get_type() == "MISSION_ITEM":
-        scale = DEGE7 if message.frame in GLOBAL_FRAMES else 1.0
+        scale = DEGE7_PER_DEG if message.frame in GLOBAL_FRAMES else 1.0
         x, y = (_integer(value * scale) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
     frame, command, autocontinue = message.frame, message.command, message.autocontinue
@@ -216,7 +216,7 @@ def write_item(
         return mavlink.MAVLink_mission_item_int_message(
             *target, sequence, item.frame, *fields, item.x, item.y, item.z, kind
         )
-    scale = DEGE7 if item.frame in GLOBAL_FRAMES else 1.0
+    scale = DEGE7_PER_DEG if item.frame in GLOBAL_FRAMES else 1.0
     frame = FLOAT_FRAMES.get(item.frame, item.frame)
     return mavlink.MAVLink_mission_item_message(
         *target, sequence, frame, *fields, item.x / scale, item.y / scale, item.z, kind
@@ -232,9 +232,9 @@ def check_item(item: Item, kind: int) -> int:
     elif item.command in LOCATED_COMMANDS:
         if item.frame not in GLOBAL_FRAMES:
             result = mavlink.MAV_MISSION_UNSUPPORTED_FRAME
-        elif not is_on_earth(item.x / DEGE7, 0.0):
+        elif not is_on_earth(item.x / DEGE7_PER_DEG, 0.0):
             result = mavlink.MAV_MISSION_INVALID_PARAM5_X
-        elif not is_on_earth(0.0, item.y / DEGE7):
+        elif not is_on_earth(0.0, item.y / DEGE7_PER_DEG):
             result = mavlink.MAV_MISSION_INVALID_PARAM6_Y
         elif math.isinf(item.z):
             result = mavlink.MAV_MISSION_INVALID_PARAM7

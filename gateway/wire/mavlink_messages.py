@@ -103,6 +103,11 @@ MESSAGE_NAMES: Final[dict[int, str]] = {
 MESSAGE_IDS: Final[dict[str, int]] = {name: number for number, name in MESSAGE_NAMES.items()}
 
 
+def ids_of(*names: str) -> frozenset[int]:
+    """Return the ids of messages by their names."""
+    return frozenset(MESSAGE_IDS[name] for name in names)
+
+
 @cache
 def base_size(message_id: int) -> int | None:
     """Return the size of a message without its extensions; None if MAVLink 1 lacks it.

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.panel.state.fleet import command_long
 from gateway.records import NAN
 from gateway.sensing.calibrating import fit_sphere
-from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +65,6 @@ def seen_cells(vectors: FloatArray) -> list[bool]:
     return seen
 
 
-UT_PER_GAUSS: Final = 100.0
 MILLI: Final = 1e-3
 NO_ANSWER_US: Final = 4 * US_PER_S
 """After the last message of a vehicle that never answered the command."""

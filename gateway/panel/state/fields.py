@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.units import US_PER_S
+from gateway.units import DEG_PER_DEGE7, US_PER_S
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -22,7 +22,7 @@ SHOWN_UNITS: Final = {
     "rad": (math.degrees(1.0), "°"),
     "rad/s": (math.degrees(1.0), "°/s"),
     "deg": (1.0, "°"),
-    "degE7": (1e-7, "°"),
+    "degE7": (DEG_PER_DEGE7, "°"),
     "cdeg": (1e-2, "°"),
     "deg/s": (1.0, "°/s"),
     "cm/s": (1e-2, "m/s"),

@@ -25,8 +25,8 @@ from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
 from gateway.recordings.status_texts import JoinedText, TextJoiner
 from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3
-from gateway.units import US_PER_S
-from gateway.vehicle.plan import DEGE7, Location
+from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.vehicle.plan import Location
 from gateway.wire.mavlink_splitter import message_id_of
 
 
@@ -309,7 +309,11 @@ class VehicleState:
         message = self.newest.get("HOME_POSITION")
         if message is None or not is_located(message.latitude, message.longitude):
             return None
-        return Location(message.latitude / DEGE7, message.longitude / DEGE7, message.altitude / MM)
+        return Location(
+            message.latitude / DEGE7_PER_DEG,
+            message.longitude / DEGE7_PER_DEG,
+            message.altitude / MM,
+        )
 
     def instant(self, now_us: int) -> Instant:
         """Return the present state."""
@@ -453,7 +457,7 @@ def _spot_of_fix(message: Any) -> Location | None:
         return None
     if not is_located(message.lat, message.lon):
         return None
-    return Location(message.lat / DEGE7, message.lon / DEGE7, message.alt / MM)
+    return Location(message.lat / DEGE7_PER_DEG, message.lon / DEGE7_PER_DEG, message.alt / MM)
 
 
 MAX_VEHICLES: Final = 32

@@ -31,7 +31,7 @@ from gateway.recordings.files import (
     skip_to,
     temporary_copy,
 )
-from gateway.recordings.formats.mavlink import MILLI, UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
+from gateway.recordings.formats.mavlink import MILLI, VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
@@ -44,7 +44,7 @@ from gateway.records import (
     NodeId,
     Vec3,
 )
-from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
+from gateway.units import DEG_PER_DEGE7, US_PER_S, UT_PER_GAUSS, counted
 
 LATE_US: Final = US_PER_S
 """Messages of one loop are not quite in order; one later than this has a damaged time."""

@@ -27,10 +27,9 @@ from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import FIRST_CIVIL_US, Batch, columns_of
 from gateway.recordings.tlog_scan import IntArray
 from gateway.records import NAN, UNKNOWN_VEC3, GpsFixType, ImuFlags, NavFlags, NavState, Quat, Vec3
-from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S
+from gateway.units import DEG_PER_DEGE7, PA_PER_HPA, STANDARD_GRAVITY_MPS2, US_PER_S, UT_PER_GAUSS
 from gateway.wire.mavlink_messages import layout_of
 
-UT_PER_GAUSS: Final = 100.0
 MILLI: Final = 1e-3
 CENTI: Final = 1e-2
 DEG_PER_HDG_ACC: Final = 1e-5

@@ -38,7 +38,7 @@ from gateway.recordings.files import (
     skip_to,
     temporary_copy,
 )
-from gateway.recordings.formats.mavlink import UT_PER_GAUSS, VELOCITY_AGE_US, autopilot_state
+from gateway.recordings.formats.mavlink import VELOCITY_AGE_US, autopilot_state
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
 from gateway.recordings.tlog import FIRST_CIVIL_US
 from gateway.records import (
@@ -53,7 +53,7 @@ from gateway.records import (
     NodeId,
     Vec3,
 )
-from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA, US_PER_S, counted
+from gateway.units import DEG_PER_DEGE7, M_PER_MM, PA_PER_HPA, US_PER_S, UT_PER_GAUSS, counted
 
 SOURCES: Final = {
     "IMU": ("sensor_combined",),

@@ -22,9 +22,9 @@ from typing import Any, Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ClientInterval
-from gateway.units import NS_PER_US, US_PER_S
+from gateway.units import DEGE7_PER_DEG, NS_PER_US, US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
-from gateway.vehicle.plan import DEGE7, GLOBAL_FRAMES
+from gateway.vehicle.plan import GLOBAL_FRAMES
 from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request, Service
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
@@ -73,7 +73,7 @@ class Command:
     def location(self) -> tuple[float, float, float]:
         """Latitude and longitude in deg, and height in m in its frame."""
         is_scaled = self.request.message.get_type() == "COMMAND_INT" and self.frame in GLOBAL_FRAMES
-        scale = DEGE7 if is_scaled else 1.0
+        scale = DEGE7_PER_DEG if is_scaled else 1.0
         x, y, z = self.params[4:]
         return x / scale, y / scale, z
 

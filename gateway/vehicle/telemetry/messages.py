@@ -21,16 +21,15 @@ from gateway.records import (
     NavState,
     Vec3,
 )
-from gateway.units import PA_PER_HPA, STANDARD_GRAVITY_MPS2
+from gateway.units import DEGE7_PER_DEG, PA_PER_HPA, STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.vehicle import encoding
 from gateway.vehicle.encoding import CUSTOM_MODES
-from gateway.vehicle.plan import DEGE7, Home, Location, distance_and_bearing, is_3d
+from gateway.vehicle.plan import Home, Location, distance_and_bearing, is_3d
 from gateway.vehicle.telemetry.health import ACCEL, GPS, GYRO, MAG, PRESSURE, Health
 
 MIN_COURSE_SPEED_MPS: Final = 0.5
 """Below this the direction of a GPS velocity is its noise."""
 
-UT_PER_GAUSS: Final = 100.0
 MM: Final = 1e3
 CM: Final = 1e2
 CENTI_DOP: Final = 1e2
@@ -123,8 +122,8 @@ def global_position_int(state: NavState, reference_alt_m: float) -> Any:
         heading = to_euler(state.q_nb)[2]
     return GLOBAL_POSITION_INT(
         boot_ms(state.time_us),
-        encoding.int32(state.lat_deg * DEGE7),
-        encoding.int32(state.lon_deg * DEGE7),
+        encoding.int32(state.lat_deg * DEGE7_PER_DEG),
+        encoding.int32(state.lon_deg * DEGE7_PER_DEG),
         encoding.int32(state.alt_amsl_m * MM),
         encoding.int32((state.alt_amsl_m - reference_alt_m) * MM),
         *(encoding.int16(speed * CM) for speed in state.vel_n_mps),
@@ -295,8 +294,8 @@ def raw_imu(sample: ImuSample, mag_b_ut: Vec3) -> Any:
 def gps_global_origin(origin: Location, time_us: int) -> Any:
     """Encode the origin of the local frame."""
     return mavlink.MAVLink_gps_global_origin_message(
-        encoding.int32(origin.lat_deg * DEGE7),
-        encoding.int32(origin.lon_deg * DEGE7),
+        encoding.int32(origin.lat_deg * DEGE7_PER_DEG),
+        encoding.int32(origin.lon_deg * DEGE7_PER_DEG),
         encoding.int32(origin.alt_amsl_m * MM),
         time_us,
     )
@@ -394,8 +393,8 @@ def estimator_status(state: NavState) -> Any:
 def home_position(home: Home) -> Any:
     """Encode home; its local position, the slope and the approach are not known."""
     return mavlink.MAVLink_home_position_message(
-        encoding.int32(home.location.lat_deg * DEGE7),
-        encoding.int32(home.location.lon_deg * DEGE7),
+        encoding.int32(home.location.lat_deg * DEGE7_PER_DEG),
+        encoding.int32(home.location.lon_deg * DEGE7_PER_DEG),
         encoding.int32(home.location.alt_amsl_m * MM),
         0.0,
         0.0,
@@ -456,8 +455,12 @@ def high_latency2(
         autopilot=autopilot,
         # The upper half of PX4's, as PX4 sends it.
         custom_mode=CUSTOM_MODES[autopilot] >> 16,
-        latitude=encoding.int32(state.lat_deg * DEGE7) if state is not None and known else 0,
-        longitude=encoding.int32(state.lon_deg * DEGE7) if state is not None and known else 0,
+        latitude=encoding.int32(state.lat_deg * DEGE7_PER_DEG)
+        if state is not None and known
+        else 0,
+        longitude=encoding.int32(state.lon_deg * DEGE7_PER_DEG)
+        if state is not None and known
+        else 0,
         altitude=encoding.int16(state.alt_amsl_m) if state is not None else 0,
         target_altitude=0,
         heading=encoding.uint8(yaw_deg % 360.0 / HALF_DEGREES, unknown=0),

@@ -45,6 +45,7 @@ import msgspec
 from gateway.hub.endpoint import is_loopback
 from gateway.hub.send_queue import BULK_IDS
 from gateway.printable import reason_of
+from gateway.wire.mavlink_messages import ids_of
 
 if TYPE_CHECKING:
     import zenoh
@@ -110,7 +111,7 @@ BATCHES: Final = 4
 """Batches of 64 KiB that may wait on a link: two thousand frames, and little memory a site."""
 GIVE_UP_S: Final = 10.0
 """Zenoh gives a message up after half of this, and closes the link."""
-RELIABLE_IDS: Final = BULK_IDS | {75, 76, 77, 253}
+RELIABLE_IDS: Final = BULK_IDS | ids_of("COMMAND_INT", "COMMAND_LONG", "COMMAND_ACK", "STATUSTEXT")
 """Parameters, missions, files, commands, their answers, texts: none of them is sent again."""
 MAX_CALLS: Final = 64
 """Calls at a time: sessions that open or end, and a query for each recording being fetched."""
