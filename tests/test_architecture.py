@@ -45,7 +45,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"recordings", "analysis", "extensions", "output"}
     | EDGES,
     "panel": FOUNDATION | STAGES | {"status", "recordings", "analysis", "batch"} | EDGES,
-    "fleet": FOUNDATION | STAGES | {"output"} | EDGES,
+    "fleet": FOUNDATION | STAGES | {"output", "recordings"} | EDGES,
     "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
     "live": FOUNDATION

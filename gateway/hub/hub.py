@@ -89,6 +89,9 @@ class Hub:
         HIGH_LATENCY2 is sent as all others.
     """
 
+    _said = 0
+    """Sequence number of the next message of the gateway itself."""
+
     def __init__(
         self,
         settings: HubSettings,
@@ -110,10 +113,7 @@ class Hub:
         self.untrusted_reads = TokenBucket(
             UNTRUSTED_READ_RATE, UNTRUSTED_READ_BURST, UNTRUSTED_READ_BURST
         )
-        self._on_gone = on_gone
-        self._on_foreign = on_foreign
-        self._said = 0
-        """Sequence number of the next message of the gateway itself."""
+        self._on_gone, self._on_foreign = on_gone, on_foreign
         self._on_alert = on_alert
         self._alerts = ClientAlerts()
         self._connections = LogRateLimiter(CONNECTIONS_IN_FULL, CONNECTIONS_NOT_LOGGED)

@@ -45,6 +45,7 @@ from gateway.geometry.angle import wrap_180
 from gateway.live.terminal import own_command
 from gateway.panel.access import RECORDINGS, ROLE, Role
 from gateway.recordings.columns import TableRow
+from gateway.recordings.convert import Pieces
 from gateway.recordings.files import TABLE, TLOG, format_of
 from gateway.recordings.index import Recording, RecordingError, check_free, find_recording
 from gateway.recordings.table import TableReader
@@ -115,8 +116,8 @@ async def answer_upload(
 
 def zip_stream(files: Sequence[Path]) -> Generator[bytes]:
     """Pack files into a ZIP archive, piece by piece; links and devices are left out."""
-    sink = _Sink()
-    with ZipFile(sink, "w", ZIP_DEFLATED) as packed:  # type: ignore[call-overload]
+    pieces = Pieces()
+    with ZipFile(pieces, "w", ZIP_DEFLATED) as packed:
         for path in files:
             with suppress(OSError), open_regular(path) as file:
                 info = ZipInfo.from_file(path, path.name, strict_timestamps=False)
@@ -124,8 +125,8 @@ def zip_stream(files: Sequence[Path]) -> Generator[bytes]:
                 with packed.open(info, "w", force_zip64=True) as entry:
                     while chunk := file.read(CHUNK):
                         entry.write(chunk)
-                        yield sink.take()
-    yield sink.take()
+                        yield pieces.taken()
+    yield pieces.taken()
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -135,25 +136,6 @@ def open_regular(path: Path) -> BinaryIO:
         os.close(handle)
         raise OSError(f"{path} is not a regular file")
     return os.fdopen(handle, "rb")
-
-
-class _Sink:
-    """A file that can be written but not sought, and gives away what was written."""
-
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-
-    def write(self, data: bytes) -> int:
-        self._parts.append(bytes(data))
-        return len(data)
-
-    def flush(self) -> None:
-        """Do nothing: the data is in memory."""
-
-    def take(self) -> bytes:
-        data = b"".join(self._parts)
-        self._parts.clear()
-        return data
 
 
 async def _store(

@@ -233,3 +233,35 @@ def _within(records: Iterable[TlogRecord], limits: Limits) -> Iterator[TlogRecor
             is_empty = False
     if is_empty:
         raise FlightError(NOTHING_WITHIN)
+
+
+class Pieces:
+    """A file to write that cannot be sought and gives away what was written."""
+
+    def __init__(self) -> None:
+        self.closed = False
+        self._written: list[bytes] = []
+        self._size = 0
+
+    def write(self, data: bytes) -> int:
+        """Take more of the file."""
+        self._written.append(bytes(data))
+        self._size += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return how much was written in all."""
+        return self._size
+
+    def flush(self) -> None:
+        """Do nothing: nothing is buffered elsewhere."""
+
+    def close(self) -> None:
+        """Close the stream."""
+        self.closed = True
+
+    def taken(self) -> bytes:
+        """Return the bytes that were written since the last call."""
+        data = b"".join(self._written)
+        self._written.clear()
+        return data

@@ -382,17 +382,6 @@ def _split_signal(body: bytes) -> tuple[RadioSignal, bytes]:
     return RadioSignal(-minus_rssi_dbm, snr / _SNR_PER_DB), body[_SIGNAL.size :]
 
 
-def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
-    """Read one radio payload."""
-    if len(data) < _HEADER.size:
-        return Fault(FaultKind.PAYLOAD, len(data))
-    first, address, seq, node_time_us = _HEADER.unpack_from(data)
-    payload = _read_body(first, address, data, _HEADER.size)
-    if isinstance(payload, FaultKind):
-        return Fault(payload, len(data))
-    return Header(_NODES[address], seq, node_time_us), payload
-
-
 def _read_body(first: int, address: int, data: bytes, begin: int) -> Payload | FaultKind:
     """Read the body of a payload, or return why that is impossible."""
     layout = _BODIES.get((first, len(data) - begin))

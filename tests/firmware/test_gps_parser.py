@@ -14,7 +14,8 @@ from pyubx2 import GET, UBXMessage, UBXReader
 from firmware.rig.build import make
 from firmware.rig.mcu import FIRMWARE
 from gateway.records import GpsFixType
-from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload, decode_payload
+from gateway.wire.payloads import GpsFixPayload, GpsQualityPayload
+from tests.kit.payloads import decode_payload
 
 pytestmark = [pytest.mark.io, pytest.mark.slow]
 

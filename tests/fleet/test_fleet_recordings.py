@@ -15,8 +15,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from gateway.cli.live import fleet as fleet_command
-from gateway.cli.live.fleet import FetchError, RecordingFetch
+from gateway.fleet import recording_fetch
+from gateway.fleet.recording_fetch import FetchError, RecordingFetch
 from gateway.fleet.remote_recordings import RemoteRecordings
 from gateway.hub.transports.zenoh import site_queries
 from gateway.hub.transports.zenoh.site_queries import (
@@ -98,7 +98,7 @@ class TestOverTheSession:
     async def test_fetch_continues_after_the_site_has_reconnected(
         self, world: World, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(fleet_command, "LARGEST", fleet_command.SMALLEST)
+        monkeypatch.setattr(recording_fetch, "LARGEST", recording_fetch.SMALLEST)
         await opened(world, folder)
         ask, asked = over(world), []
         gone, retried = threading.Event(), threading.Event()
@@ -110,7 +110,7 @@ class TestOverTheSession:
             return ask(verb, params, wait_s)
 
         def wait(seconds: float) -> None:
-            if seconds == fleet_command.RETRY_S:
+            if seconds == recording_fetch.RETRY_S:
                 retried.set()
                 back.wait(0.05)
 
@@ -128,7 +128,7 @@ class TestOverTheSession:
         assert await result_of(world, task) is True
         assert (to / NAME).read_bytes() == CONTENT
         offsets = [offset for verb, offset in asked if verb == "fleet.piece"]
-        assert sorted(set(offsets)) == [*range(0, SIZE, fleet_command.SMALLEST)], (
+        assert sorted(set(offsets)) == [*range(0, SIZE, recording_fetch.SMALLEST)], (
             "none from the start"
         )
 
@@ -312,7 +312,7 @@ class TestFetch:
     def test_site_that_never_answers_is_an_error(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(fleet_command, "SITE_TIMEOUT_S", -1.0)
+        monkeypatch.setattr(recording_fetch, "SITE_TIMEOUT_S", -1.0)
         with pytest.raises(FetchError, match="continues from here"):
             self.fetch(tmp_path, lambda *_: {"data": None})
 
@@ -327,7 +327,7 @@ class TestFetch:
         [
             (0.01, 0.01, [4, 8, 16, 32, 64, 128]),
             (0.1, 0.1, [16, 16, 16, 16]),
-            (3.0, fleet_command.SLOW_S, [16, 8, 4, 4]),
+            (3.0, recording_fetch.SLOW_S, [16, 8, 4, 4]),
         ],
         ids=["fast", "fitting", "slow"],
     )
@@ -343,4 +343,4 @@ class TestFetch:
         assert one.fetch(NAME, sum(kib) << 10, lambda _: None)
         assert [size for _, size in site.asked] == [size << 10 for size in kib]
         assert waits == pytest.approx([waited_s] * len(kib))
-        assert fleet_command.LARGEST == MAX_PIECE
+        assert recording_fetch.LARGEST == MAX_PIECE

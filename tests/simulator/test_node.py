@@ -16,9 +16,9 @@ from gateway.wire.payloads import (
     Header,
     ImuPayload,
     NodeStatusPayload,
-    decode_payload,
     encode_payload,
 )
+from tests.kit.payloads import decode_payload
 from tools.simulated_flight import fly
 
 SETTINGS = SimulatorSettings()

@@ -25,12 +25,12 @@ from gateway.wire.payloads import (
     ReceiverStatusFrame,
     chip_names,
     decode_content,
-    decode_payload,
     encode_foreign,
     encode_payload,
     encode_radio,
     encode_receiver_status,
 )
+from tests.kit.payloads import decode_payload
 
 NODE_STATUS_SIZES = {25, 31}
 """Firmware 1.0 sends it without the chips."""

@@ -1,22 +1,10 @@
-"""`mavgate fleet`: the vehicles of many sites, their state, and their recordings.
-
-A recording is fetched in pieces through the running fleet. A partial file is kept next to the
-target as `.NAME.part` until it is complete and its SHA-256 is that of the site's file: an
-incomplete file never looks complete. An existing partial file is continued, if it is the beginning
-of the site's file.
-"""
+"""`mavgate fleet`: the vehicles of many sites, their state, and their recordings."""
 
 import asyncio
-import base64
-import fcntl
-import hashlib
 import logging
-import os
-import shutil
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Final
+from typing import Annotated, Any, Final
 
 import msgspec
 import typer
@@ -27,13 +15,13 @@ from gateway.cli.support.control import ask, socket_of
 from gateway.cli.support.options import read_settings
 from gateway.cli.support.terminal import JsonOption, console_of, print_json, refuse, table_of
 from gateway.extras import require
+from gateway.fleet.recording_fetch import FetchError, RecordingFetch
 from gateway.hub.endpoint import SITE_NAME
 from gateway.live.control_socket import ControlError, request
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import detached_output, on_end_signals
-from gateway.output import sync_folder
 from gateway.printable import UNKNOWN
-from gateway.recordings.index import NEWEST, is_file_name
+from gateway.recordings.index import NEWEST
 from gateway.recordings.moment import civil_time
 from gateway.units import US_PER_S, counted
 
@@ -41,139 +29,6 @@ log = logging.getLogger(__name__)
 
 DISK_S: Final = 60.0
 """Longest wait for a file to be written: a worn card takes seconds for each step."""
-
-SMALLEST: Final = 4 << 10
-LARGEST: Final = 128 << 10
-"""Largest piece of one answer."""
-FAST_S: Final = 0.05
-SLOW_S: Final = 0.2
-RETRY_S: Final = 1.0
-SITE_TIMEOUT_S: Final = 60.0
-"""Longest wait for a disconnected site."""
-DIGEST_WAIT_S: Final = 330.0
-PIECE_WAIT_S: Final = 20.0
-READ_SIZE: Final = 1 << 20
-
-Ask = Callable[[str, dict[str, Any], float], Any]
-"""Asks a fleet: the verb, its parameters, the longest wait in seconds."""
-
-
-class FetchError(Exception):
-    """A file that cannot be fetched; the text says why, and what to do."""
-
-
-class RecordingFetch:
-    """Fetch files of one site into a folder."""
-
-    def __init__(
-        self,
-        site: str,
-        folder: Path,
-        ask: Ask,
-        *,
-        force: bool = False,
-        wait: Callable[[float], None] = time.sleep,
-    ) -> None:
-        self._site = site
-        self._folder = folder
-        self._ask = ask
-        self._force = force
-        self._wait = wait
-        self.piece_size = SMALLEST
-        """Adapted so that a piece takes about a tenth of a second: telemetry waits behind it."""
-
-    def fetch(self, name: str, size: int, advance: Callable[[int], None]) -> bool:
-        """Fetch one file, or the rest of it; return whether anything had to be fetched."""
-        if not is_file_name(name):
-            raise FetchError(f"the site lists {name!r}, which is not a file of a recording")
-        target, part = self._folder / name, self._folder / f".{name}.part"
-        if target.exists():
-            is_beginning = target.stat().st_size <= size and self._is_beginning(target, name)
-            if is_beginning and target.stat().st_size == size:
-                advance(size)
-                return False
-            if not (self._force or is_beginning):
-                raise FetchError(f"{target} exists and differs; use --force to replace it")
-        self._folder.mkdir(parents=True, exist_ok=True)
-        with part.open("a+b") as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise FetchError(f"{target} is being fetched by another program") from error
-            if target.exists() and not file.seek(0, os.SEEK_END):
-                # The existing file may be the beginning; otherwise the fetch starts from zero.
-                with target.open("rb") as known:
-                    shutil.copyfileobj(known, file)
-            self._fill(file, name, size, advance)
-            file.flush()
-            os.fsync(file.fileno())
-            part.replace(target)
-        sync_folder(self._folder)
-        return True
-
-    def _is_beginning(self, target: Path, name: str) -> bool:
-        with target.open("rb") as file:
-            digest = _digest_of(file).hexdigest()
-            return self._digest(name, file.tell()) == digest
-
-    def _fill(self, file: BinaryIO, name: str, size: int, advance: Callable[[int], None]) -> None:
-        """Fetch until the file is whole and is the site's."""
-        digest = _digest_of(file)
-        have = file.seek(0, os.SEEK_END)
-        if have and (have > size or digest.hexdigest() != self._digest(name, have)):
-            file.truncate(0)
-            digest, have = hashlib.sha256(), 0
-        advance(have)
-        while have < size:
-            piece = self._piece(name, have, min(self.piece_size, size - have))
-            if not piece:
-                raise FetchError(f"{name} has become shorter at the site; fetch it again")
-            file.write(piece)
-            digest.update(piece)
-            have += len(piece)
-            advance(len(piece))
-        if digest.hexdigest() != self._digest(name, size):
-            file.truncate(0)
-            raise FetchError(f"{name} has changed at the site meanwhile; fetch it again")
-
-    def _piece(self, name: str, offset: int, size: int) -> bytes:
-        params = {"file": name, "offset": offset, "size": size}
-        begin_s = time.monotonic()
-        data = base64.b64decode(self._persist("fleet.piece", params, "data", PIECE_WAIT_S))
-        took_s = time.monotonic() - begin_s
-        if took_s < FAST_S:
-            self.piece_size = min(self.piece_size * 2, LARGEST)
-        elif took_s > SLOW_S:
-            self.piece_size = max(self.piece_size // 2, SMALLEST)
-        # Leave the other half of the time to telemetry.
-        self._wait(min(took_s, SLOW_S))
-        return data
-
-    def _digest(self, name: str, size: int) -> str:
-        params = {"file": name, "size": size}
-        return self._persist("fleet.digest", params, "sha256", DIGEST_WAIT_S)
-
-    def _persist(self, verb: str, params: dict[str, Any], key: str, wait_s: float) -> str:
-        """Retry until there is an answer: links break and come back."""
-        end_s = time.monotonic() + SITE_TIMEOUT_S
-        while True:
-            answer: str | None = self._ask(verb, {"site": self._site, **params}, wait_s)[key]
-            if answer is not None:
-                return answer
-            if time.monotonic() > end_s:
-                raise FetchError(
-                    f"site {self._site} does not answer; the same command continues from here"
-                )
-            self._wait(RETRY_S)
-
-
-def _digest_of(file: BinaryIO) -> "hashlib._Hash":
-    digest = hashlib.sha256()
-    file.seek(0)
-    while piece := file.read(READ_SIZE):
-        digest.update(piece)
-    return digest
-
 
 app = typer.Typer()
 group = typer.Typer(

@@ -28,8 +28,7 @@ from gateway import __version__
 from gateway.geometry.geodesy import displacement_m
 from gateway.geometry.quaternion import multiply, to_euler
 from gateway.recordings.columns import unit_of
-from gateway.recordings.convert import FlightToWrite
-from gateway.recordings.formats.parquet import Pieces
+from gateway.recordings.convert import FlightToWrite, Pieces
 from gateway.recordings.positions import Position, position_of
 from gateway.recordings.status_texts import JoinedText, text_of
 from gateway.recordings.tlog import fields_of

@@ -14,7 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
-from gateway.recordings.convert import FlightToWrite
+from gateway.recordings.convert import FlightToWrite, Pieces
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
 from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
 from gateway.recordings.status_texts import text_of
@@ -28,39 +28,6 @@ from gateway.recordings.table import (
 from gateway.recordings.tlog import fields_of
 from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import message_id_of, origin_of
-
-
-class Pieces:
-    """Buffer written bytes until they are taken."""
-
-    def __init__(self) -> None:
-        self.closed = False
-        self._written: list[bytes] = []
-        self._size = 0
-
-    def write(self, data: bytes) -> int:
-        """Take more of the file."""
-        self._written.append(bytes(data))
-        self._size += len(data)
-        return len(data)
-
-    def tell(self) -> int:
-        """Return how much was written in all."""
-        return self._size
-
-    def flush(self) -> None:
-        """Do nothing: nothing is buffered elsewhere."""
-
-    def close(self) -> None:
-        """Close the stream."""
-        self.closed = True
-
-    def taken(self) -> bytes:
-        """Return the bytes that were written since the last call."""
-        data = b"".join(self._written)
-        self._written.clear()
-        return data
-
 
 ROWS: Final = 16_384
 """Of a row group, all that is in the memory at a time: some 40 MB."""

@@ -14,9 +14,9 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import NAN, GpsFix, NavState
 from gateway.settings import Settings
+from gateway.units import DEGE7_PER_DEG
 from gateway.vehicle import encoding
 from gateway.vehicle.plan import (
-    DEGE7,
     FENCE,
     GLOBAL_FRAMES,
     KINDS,
@@ -147,7 +147,7 @@ class PlanService:
         if self._telemetry.autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA or home is None:
             return ()
         at = home.location
-        x, y = round(at.lat_deg * DEGE7), round(at.lon_deg * DEGE7)
+        x, y = round(at.lat_deg * DEGE7_PER_DEG), round(at.lon_deg * DEGE7_PER_DEG)
         kind = (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_CMD_NAV_WAYPOINT, 1)
         return (Item(*kind, (0.0, 0.0, 0.0, 0.0), x, y, at.alt_amsl_m),)
 

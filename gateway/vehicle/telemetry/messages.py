@@ -440,12 +440,12 @@ def high_latency2(
     and the GPS failure flag. Nothing measures wind, airspeed or throttle.
     """
     failures = sum(flag for sensor, flag in FAILURES if not health.is_alive(sensor, now_us))
-    h_acc_m, v_acc_m = NAN, NAN
+    h_acc_m = v_acc_m = NAN
     if fix is None or not is_3d(fix):
         failures |= mavlink.HL_FAILURE_FLAG_GPS
     elif health.is_alive(GPS, now_us):
         h_acc_m, v_acc_m = fix.h_acc_m, fix.v_acc_m
-    known = state is not None and has_position(state)
+    known = state if state is not None and has_position(state) else None
     north, east, down = state.vel_n_mps if state is not None else (NAN, NAN, NAN)
     yaw_deg = math.degrees(to_euler(state.q_nb)[2]) if state is not None else NAN
     speed = encoding.uint8(math.hypot(north, east) * FIFTHS, unknown=0)
@@ -455,12 +455,8 @@ def high_latency2(
         autopilot=autopilot,
         # The upper half of PX4's, as PX4 sends it.
         custom_mode=CUSTOM_MODES[autopilot] >> 16,
-        latitude=encoding.int32(state.lat_deg * DEGE7_PER_DEG)
-        if state is not None and known
-        else 0,
-        longitude=encoding.int32(state.lon_deg * DEGE7_PER_DEG)
-        if state is not None and known
-        else 0,
+        latitude=encoding.int32(known.lat_deg * DEGE7_PER_DEG) if known is not None else 0,
+        longitude=encoding.int32(known.lon_deg * DEGE7_PER_DEG) if known is not None else 0,
         altitude=encoding.int16(state.alt_amsl_m) if state is not None else 0,
         target_altitude=0,
         heading=encoding.uint8(yaw_deg % 360.0 / HALF_DEGREES, unknown=0),
