@@ -64,6 +64,7 @@ from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, message_id_
 NUMBERS: Final = (
     *("0", "-1", "1", "47.0", "99999", "-99999", "inf", "-inf", "nan", "1e308", "5e-324", "1e999"),
     *("9223372036854775808", "99999999999999999999", "0x10", "1_0", "٣", "", " ", "x", '"', "\0"),
+    *("null", "N/A", "-", '"1,5"', "23:59:59.5", "0:00:01", "2026-06-11 14:25:30", "9999-12-31Z"),
 )
 MESSAGES: Final = tuple(mavlink.mavlink_map.values())
 HEAD: Final = encode_head(TableHeader(vehicle_id=1, unix_us_at_zero=1_780_000_000_000_000))
@@ -361,11 +362,12 @@ def ulog_messages(draw: st.DrawFn) -> bytes:
     """Make a format, a subscription, a row, or any other message of a ULog."""
     name = draw(st.sampled_from(TOPICS)).encode()
     number = struct.pack("<H", draw(st.integers(0, 3)))
+    instance = bytes([draw(st.integers(0, 2))])
     time_us = struct.pack("<Q", draw(TIMES))
     fields = ";".join(draw(st.lists(st.sampled_from(TOPIC_FIELDS), max_size=6)))
     kind, content = draw(
         st.sampled_from(
-            [(b"F", name + b":" + fields.encode() + b";"), (b"A", b"\0" + number + name)]
+            [(b"F", name + b":" + fields.encode() + b";"), (b"A", instance + number + name)]
         )
         | st.tuples(st.just(b"D"), st.binary(max_size=40).map(lambda row: number + time_us + row))
         | st.tuples(st.sampled_from([b"B", b"P", b"I", b"O", b"S", b"\0"]), st.binary(max_size=50))
@@ -407,6 +409,7 @@ def files(draw: st.DrawFn) -> tuple[str, bytes]:
         | st.tuples(st.just(".bin"), damaged(dataflash_messages()))
         | st.tuples(st.sampled_from([".csv", ".tlog"]), st.binary(max_size=200))
     )
+    data = draw(st.sampled_from([b"", bytes(90), b"\xff" * 3000, b"text, of a console\n"])) + data
     packed = draw(st.sampled_from(["", "gzip", "cut", "false"]))
     if not packed:
         return ending, data

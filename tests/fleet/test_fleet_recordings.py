@@ -219,7 +219,7 @@ class TestAnswers:
         (folder / "folder_01.tlog").mkdir()
         for name in ("pipe_01.tlog", "folder_01.tlog"):
             asked = json.dumps({"file": name, "size": 10, "digest": digest}).encode()
-            with pytest.raises(RefusedQueryError, match="no regular file"):
+            with pytest.raises(RefusedQueryError, match="not a regular file"):
                 RecordingAnswers(folder)(asked)
         listed = json.loads(RecordingAnswers(folder)(b""))
         sizes = {file["name"]: file["size"] for each in listed for file in each["files"]}
