@@ -8,15 +8,9 @@ import msgspec
 from firmware.rig.world import Moment, Solution, Vec3, World
 from gateway.simulator.flight import START_UNIX_US, SimulatedAircraft
 from gateway.simulator.gps import GPS_RATE_HZ
-from gateway.simulator.sensors import (
-    ACCEL_RANGE,
-    GYRO_LSB_PER_DPS,
-    GYRO_RANGE,
-    MAG_GAIN,
-    UT_PER_GAUSS,
-)
+from gateway.simulator.sensors import ACCEL_RANGE, GYRO_LSB_PER_DPS, GYRO_RANGE, MAG_GAIN
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.units import STANDARD_GRAVITY_MPS2, UT_PER_GAUSS
 from gateway.wire.payloads import ACCEL_RANGES_G, MAG_LSB_PER_GAUSS
 
 SAMPLE_HZ: Final = 1000

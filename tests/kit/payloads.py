@@ -1,6 +1,7 @@
 """Payloads of the radio, read as the receiver's line brings them."""
 
-from gateway.wire.payloads import Fault, Header, Payload, decode_content, encode_radio
+from gateway.records import Fault
+from gateway.wire.payloads import Header, Payload, decode_content, encode_radio
 
 
 def decode_payload(data: bytes) -> tuple[Header, Payload] | Fault:
