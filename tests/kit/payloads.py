@@ -1,6 +1,6 @@
 """Payloads of the radio, read as the receiver's line brings them."""
 
-from gateway.records import Fault
+from gateway.wire.framing import Fault
 from gateway.wire.payloads import Header, Payload, decode_content, encode_radio
 
 
