@@ -319,6 +319,10 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     blocks = chain(map(reader.feed, batches), [None])
     stream = (reader.flush() if cells is None else cells for cells in blocks)
     first = next((cells for cells in stream if len(cells)), None)
+    systems = {origin >> 8 for origin in source.senders.origins - source.senders.stations}
+    if first is None and options.system_id not in {None, *systems}:
+        listed = ", ".join(map(str, sorted(systems)))
+        raise FlightError(f"{path}: no vehicle {options.system_id} in this file; it has {listed}")
     if first is None:
         raise FlightError(
             f"{path}: contains no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"

@@ -374,3 +374,8 @@ def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, options: lis
         texts.append(message.text)
     log.close()
     assert "Mark: over the wood" in texts
+
+
+def test_unknown_vehicle_is_refused_with_those_of_the_file(tlog: Path, tmp_path: Path) -> None:
+    text = run("convert", tlog, "-o", tmp_path / "x.csv", "--system", "7", code=2)
+    assert f"{tlog}: no vehicle 7 in this file; it has 1" in text
