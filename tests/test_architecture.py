@@ -66,6 +66,8 @@ MAY_IMPORT: dict[str, set[str]] = {
 
 PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "hub"}
 IMPURE_PARTS = {
+    "hub/forwarding.py",
+    "hub/forwarding_step.py",
     "hub/hub.py",
     "hub/router.py",
     "hub/transports",

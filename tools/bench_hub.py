@@ -14,8 +14,8 @@ loopback. Three figures for each forwarder and N:
 
 The plain forwarder receives with a blocking `recvfrom` and sends with a blocking `sendto` for each
 client, looking at nothing. Forwarders take turns in short rounds, so that other load on the
-machine meets them alike; all are sent to from the same port. Such load only ever slows: the best
-round counts for the maximum and its CPU time, the median round for latencies.
+machine meets them alike; all are sent to from the same port, and run on a core of their own if
+there are two. The median of the rounds counts.
 
 "WebSocket" is the hub with its clients at a WebSocket port, "packed" the hub whose clients take
 several frames in one datagram. With `--systems` the source is a link with so many vehicles behind
@@ -38,12 +38,15 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 from rich import box
 from rich.console import Console
 from rich.table import Table
+
+from gateway.compiled.system_calls import receive_many, send_many
 
 CLIENTS = (1, 4, 16, 64)
 RATE_HZ = 1000
@@ -53,8 +56,12 @@ FRAMES = 20_000
 WINDOWS = (128, 32, 8)
 """Frames under way; a forwarder that loses some of the first window is given a smaller one."""
 STALL_S = 0.5
+BATCH = 64
+"""Frames that are sent or received by one call."""
 START_LIMIT_S = 20.0
 SO_TIMESTAMPNS = 35
+CORES = sorted(os.sched_getaffinity(0))
+"""The forwarder runs on the last one, source and clients on the first."""
 WEB = "WebSocket"
 """The hub again, its clients at a WebSocket port."""
 PACKED = "packed"
@@ -92,11 +99,29 @@ with asyncio.Runner(loop_factory=importlib.import_module(event_loop).new_event_l
 UVLOOP = "uvloop"
 """The hub again, on the event loop of that name."""
 
+REFERENCE = "mavlink-router"
+ROUTERS = {
+    REFERENCE: "-t 0 -e 127.0.0.1:{out} 127.0.0.1:{in}",
+    "mavp2p": "udps:127.0.0.1:{in} udpc:127.0.0.1:{out}",
+    "mavproxy": (
+        "--master=udpin:127.0.0.1:{in} --out=udp:127.0.0.1:{out} --daemon --non-interactive "
+        "--streamrate=-1 --state-basedir=/tmp"
+    ),
+}
+"""Arguments of the routers that are compared, as for `router`."""
+
 HANDSHAKE = (
     b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
     b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
 )
 
+COLUMNS = (
+    ("throughput", "delivered_per_s", ",.0f"),
+    ("throughput", "cpu_us_per_message", ".2f"),
+    ("latency", "cpu_percent", ".1f"),
+    ("latency", "p50_us", ".0f"),
+    ("latency", "p99_us", ".0f"),
+)
 Command = Callable[[int, list[int]], list[str]]
 
 
@@ -127,23 +152,23 @@ def plain(port: int, clients: list[int]) -> list[str]:
     return [sys.executable, "-c", PLAIN, str(port), *map(str, clients)]
 
 
-def mavlink_router(command: str) -> Command:
-    """Make the command line of mavlink-routerd."""
+def router(command: str) -> Command:
+    """Make the command line of another router from one with placeholders.
+
+    `{in}` is the port that it receives at; each word with `{out}` is repeated for the port of each
+    client, and an option before it too.
+    """
 
     def build(port: int, clients: list[int]) -> list[str]:
-        endpoints = [part for client in clients for part in ("-e", f"127.0.0.1:{client}")]
-        return [*shlex.split(command), "-t", "0", *endpoints, f"127.0.0.1:{port}"]
-
-    return build
-
-
-def mavproxy(command: str) -> Command:
-    """Make the command line of MAVProxy."""
-
-    def build(port: int, clients: list[int]) -> list[str]:
-        outs = [f"--out=udp:127.0.0.1:{client}" for client in clients]
-        options = ["--daemon", "--non-interactive", "--streamrate=-1", "--state-basedir=/tmp"]
-        return [*shlex.split(command), f"--master=udpin:127.0.0.1:{port}", *outs, *options]
+        words: list[str] = []
+        for word in shlex.split(command):
+            option = []
+            if "{out}" in word and words and words[-1].startswith("-"):
+                option = [words.pop()]
+            outputs = clients if "{out}" in word else [0]
+            for client in outputs:
+                words += [*option, word.replace("{in}", str(port)).replace("{out}", str(client))]
+        return words
 
     return build
 
@@ -212,6 +237,25 @@ def stamp_ns(ancillary: list[tuple[int, int, bytes]]) -> int:
     return int(seconds * 1_000_000_000 + nanoseconds)
 
 
+class Messages:
+    """Parts of a buffer as the kernel takes them: a `struct mmsghdr` each."""
+
+    def __init__(self, buffer: Any, count: int) -> None:
+        size = len(buffer) // count
+        parts = np.full((count, 2), size)
+        parts[:, 0] = buffer.ctypes.data + np.arange(count) * size
+        headers = np.zeros((count, 8), np.int64)
+        headers[:, 2] = parts.ctypes.data + np.arange(count) * parts.strides[0]
+        headers[:, 3] = 1
+        self.sizes = headers[:, 7]
+        self._headers = headers
+        self._kept = buffer, parts
+
+    def address_of(self, index: int) -> int:
+        """Return where a header is."""
+        return int(self._headers.ctypes.data) + index * self._headers.strides[0]
+
+
 class Bench:
     """A running forwarder with its source and its clients."""
 
@@ -234,12 +278,16 @@ class Bench:
         self._source.connect(("127.0.0.1", self.port))
         self._counts = [0] * clients
         self._stamps: list[list[int]] | None = None
+        self._sent = Messages(np.frombuffer(b"".join(frames), np.uint8), len(frames))
+        self._arrived = Messages(np.zeros(BATCH * 2048, np.uint8), BATCH)
         self.process = subprocess.Popen(
             command(self.port, [sink.getsockname()[1] for sink in self._sinks]),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             stdin=subprocess.DEVNULL,
         )
+        if len(CORES) > 1:
+            os.sched_setaffinity(self.process.pid, CORES[-1:])
         self._wait_until_up()
 
     def close(self) -> None:
@@ -262,9 +310,10 @@ class Bench:
         moved_ns = begin_ns
         while True:
             now_ns = time.perf_counter_ns()
-            while now_ns < end_ns and sent - lost - min(self._counts) < window:
-                self._send(self._frames[sent % FRAMES])
-                sent += 1
+            room = window - (sent - lost - min(self._counts))
+            while now_ns < end_ns and room > 0:
+                done = self._send_some(sent % FRAMES, room)
+                sent, room = sent + done, room - done
             if now_ns >= end_ns and min(self._counts) == sent:
                 break
             if self._drain(20):
@@ -362,6 +411,11 @@ class Bench:
         with contextlib.suppress(ConnectionRefusedError):
             self._source.send(frame)
 
+    def _send_some(self, first: int, most: int) -> int:
+        """Send frames from one on; return how many."""
+        count = min(most, BATCH, FRAMES - first)
+        return max(0, send_many(self._source.fileno(), self._sent.address_of(first), count))
+
     def _settle(self) -> None:
         """Read until nothing arrives for 0.1 s."""
         while self._drain(100):
@@ -379,12 +433,11 @@ class Bench:
 
     def _read(self, index: int) -> int:
         # Other frames, such as heartbeats, are shorter than ours; several of ours may be in one.
-        receive, length, count = self._sinks[index].recv, self._length, 0
-        try:
-            while True:
-                count += len(receive(2048)) // length
-        except BlockingIOError:
-            return count
+        file, total, count = self._sinks[index].fileno(), 0, BATCH
+        while count == BATCH:
+            count = receive_many(file, self._arrived.address_of(0), BATCH)
+            total += int((self._arrived.sizes[: max(0, count)] // self._length).sum())
+        return total
 
     def _read_stamps(self, index: int) -> int:
         assert self._stamps is not None
@@ -483,14 +536,9 @@ def lossless(bench: Bench, seconds: float) -> Throughput:
 
 
 def summed_up(results: list[dict[str, float]]) -> dict[str, float]:
-    """Take of each figure the best or the median round; of losses the sum."""
-    how: dict[str, Callable[[list[float]], float]] = {
-        "lost": sum,
-        "delivered_per_s": max,
-        "cpu_us_per_message": min,
-    }
+    """Take the median of the rounds for each figure, and the sum of the losses."""
     return {
-        key: how.get(key, statistics.median)([result[key] for result in results])
+        key: (sum if key == "lost" else statistics.median)([result[key] for result in results])
         for key in results[0]
     }
 
@@ -518,31 +566,24 @@ def measure(
 
 
 def show(report: dict[str, dict[str, dict[str, dict[str, float]]]]) -> None:
-    """Print the figures and how they compare."""
+    """Print the figures, with their ratios to the plain forwarder and to mavlink-router."""
     table = Table(title="Forwarding MAVLink, 44-byte frames, loopback", box=box.SIMPLE_HEAD)
-    for column in (
-        "clients", "forwarder", "lossless/s", "x plain", "CPU µs/msg", f"p50 µs @{RATE_HZ}/s",
-        "p99 µs", "x plain", "max µs", "CPU %", "lost",
-    ):  # fmt: skip
+    for column in ("clients", "forwarder", "lossless/s", "CPU µs/msg", f"CPU % @{RATE_HZ}/s",
+                   "p50 µs", "p99 µs", "lost"):  # fmt: skip
         table.add_column(column, justify="right")
     for clients, by_name in report.items():
-        plain = by_name["plain"]
         for name, figures in by_name.items():
-            fast, late = figures["throughput"], figures["latency"]
-            table.add_row(
-                clients,
-                name,
-                f"{fast['delivered_per_s']:,.0f}",
-                f"{fast['delivered_per_s'] / plain['throughput']['delivered_per_s']:.2f}",
-                f"{fast['cpu_us_per_message']:.2f}",
-                f"{late['p50_us']:.0f}",
-                f"{late['p99_us']:.0f}",
-                f"{late['p99_us'] / plain['latency']['p99_us']:.2f}",
-                f"{late['max_us']:.0f}",
-                f"{late['cpu_percent']:.1f}",
-                f"{fast['lost'] + late['lost']:.0f}",
-            )
-    Console(width=120).print(table)
+            cells = []
+            for part, key, form in COLUMNS:
+                value = figures[part][key]
+                bases = [by_name[base][part][key] for base in ("plain", REFERENCE)
+                         if base in by_name]  # fmt: skip
+                ratios = " ".join(f"{value / base:.2f}" for base in bases if base)
+                cells.append(f"{value:{form}} ({ratios})")
+            lost = figures["throughput"]["lost"] + figures["latency"]["lost"]
+            table.add_row(clients, name, *cells, f"{lost:.0f}")
+    Console(width=140).print(table)
+    print("in brackets: times the plain forwarder, times mavlink-router")
 
 
 def measure_systems(
@@ -597,13 +638,18 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of each single run")
     parser.add_argument("--clients", type=int, nargs="+", default=CLIENTS)
     parser.add_argument("--uvloop", action="store_true", help="compare the hub on uvloop")
-    parser.add_argument("--mavlink-router", metavar="COMMAND", help="compare mavlink-routerd")
-    parser.add_argument("--mavproxy", metavar="COMMAND", help="compare mavproxy.py")
+    for name in ROUTERS:
+        parser.add_argument(f"--{name}", metavar="COMMAND", help=f"compare {name}, by its command")
+    parser.add_argument(
+        "--router", action="append", default=[], metavar="NAME=COMMAND",
+        help="compare another router: its command with {in} and {out} for ports",
+    )  # fmt: skip
     parser.add_argument("--systems", type=int, help="only command so many vehicles behind one link")
     parser.add_argument(
         "--memory", type=int, metavar="MESSAGES", help="only watch memory over so many messages"
     )
     options = parser.parse_args()
+    os.sched_setaffinity(0, CORES[:1])
     report: dict[str, object] = {"load_before": os.getloadavg(), "cores": os.cpu_count()}
     forwarders: dict[str, Start] = {
         "plain": partial(Bench, plain),
@@ -613,10 +659,12 @@ def main() -> None:
     }
     if options.uvloop:
         forwarders[UVLOOP] = partial(Bench, hub(event_loop=UVLOOP))
-    if options.mavlink_router:
-        forwarders["mavlink-router"] = partial(Bench, mavlink_router(options.mavlink_router))
-    if options.mavproxy:
-        forwarders["mavproxy"] = partial(Bench, mavproxy(options.mavproxy))
+    for name, arguments in ROUTERS.items():
+        if command := getattr(options, name.replace("-", "_")):
+            forwarders[name] = partial(Bench, router(f"{command} {arguments}"))
+    for given in options.router:
+        name, _, command = given.partition("=")
+        forwarders[name] = partial(Bench, router(command))
     if options.memory:
         report["memory"] = watch_memory(options.memory)
     elif options.systems:

@@ -37,6 +37,7 @@ KERNEL_MODULES: Final = (
     "gateway.estimation.eskf.filter",
     "gateway.estimation.smoother",
     "gateway.estimation.paper",
+    "gateway.hub.forwarding_step",
     "gateway.recordings.tlog_scan",
     "gateway.geometry.quaternion",
 )

@@ -13,12 +13,13 @@ from typing import Any, Final
 
 import llvmlite.binding as llvm
 import numba
+import numpy as np
 from numba import carray, types  # type: ignore[attr-defined]
 from numba.core import codegen
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic, overload, typeof_impl
 
-from gateway.compiled import array_at, is_compiled, record_at
+from gateway.compiled import array_at, is_compiled, record_at, system_calls
 from gateway.compiled.entry_point import SOURCES_SYMBOL, EntryPoint
 
 Step = Callable[[str], None]
@@ -215,3 +216,40 @@ def _record_at(address: Any, layout: Any) -> Any:  # noqa: ARG001
         return carray(_pointer_to(address), 1, layout)[0]
 
     return view
+
+
+_ADDRESS, _INT, _LONG = types.voidptr, types.int32, types.int64
+_error_number: Any = types.ExternalFunction("__errno_location", _ADDRESS())
+_recvmmsg: Any = types.ExternalFunction("recvmmsg", _INT(_INT, _ADDRESS, _INT, _INT, _ADDRESS))
+_sendmmsg: Any = types.ExternalFunction("sendmmsg", _INT(_INT, _ADDRESS, _INT, _INT))
+_send: Any = types.ExternalFunction("send", _LONG(_INT, _ADDRESS, _LONG, _INT))
+_RECEIVE_FLAGS: Final = system_calls.MSG_DONTWAIT
+_SEND_FLAGS: Final = system_calls.MSG_DONTWAIT | system_calls.MSG_NOSIGNAL
+_ERROR_TYPE: Final = np.dtype(np.int32)
+
+
+@overload(system_calls.receive_many)
+def _receive_many(file: Any, headers: Any, count: Any) -> Any:  # noqa: ARG001
+    def call(file: Any, headers: Any, count: Any) -> Any:
+        found = _recvmmsg(file, _pointer_to(headers), count, _RECEIVE_FLAGS, _pointer_to(0))
+        return types.int64(found) if found >= 0 else -carray(_error_number(), 1, _ERROR_TYPE)[0]
+
+    return call
+
+
+@overload(system_calls.send_many)
+def _send_many(file: Any, headers: Any, count: Any) -> Any:  # noqa: ARG001
+    def call(file: Any, headers: Any, count: Any) -> Any:
+        found = _sendmmsg(file, _pointer_to(headers), count, _SEND_FLAGS)
+        return types.int64(found) if found >= 0 else -carray(_error_number(), 1, _ERROR_TYPE)[0]
+
+    return call
+
+
+@overload(system_calls.send_one)
+def _send_one(file: Any, data: Any, size: Any) -> Any:  # noqa: ARG001
+    def call(file: Any, data: Any, size: Any) -> Any:
+        found = _send(file, _pointer_to(data), size, _SEND_FLAGS)
+        return found if found >= 0 else -carray(_error_number(), 1, _ERROR_TYPE)[0]
+
+    return call

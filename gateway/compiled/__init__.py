@@ -36,7 +36,7 @@ def array_at(address: int, shape: tuple[int, ...], kind: Any) -> Any:
     The caller keeps that memory alive. `kind` is the numpy.dtype of the items, in compiled code a
     constant of its module.
     """
-    memory = (ctypes.c_char * (prod(shape) * kind.itemsize)).from_address(address)
+    memory = (ctypes.c_char * (prod(shape) * kind.itemsize)).from_address(int(address))
     return np.frombuffer(memory, kind).reshape(shape)
 
 

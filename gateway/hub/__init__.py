@@ -3,6 +3,8 @@
 Theory of operation
 -------------------
 
+    bytes ─ compiled step: route in its table? ──yes── the clients of the route
+                 │ no
     bytes ─ transport ─ MavFrame ─ cached route? ──yes── the clients of the route
                                         │ no
                                       Router ─┬─ our vehicles' requests (quota, one a turn)
@@ -13,10 +15,12 @@ Theory of operation
 1. A transport turns bytes into `MavFrame`s with the splitter. A frame's header is read once, there;
    after that everything uses the fields of the record, and the bytes are sent on unchanged.
 2. `fanout.Fanout` keeps, for each source and kind of frame, a `Route`: the clients that get it. A
-   hit is one dictionary look-up and one send per client; frames that need nothing else are counted
-   in bulk, a few times a second (`Route.settle`). The one rule: any change on which a route depends
-   (clients, options, requested intervals, bandwidths, paths to a system, our vehicles) clears all
-   routes, and the next frame of each kind is routed again.
+   route that needs nothing but the headers is entered into the table of `forwarding_step`, one
+   compiled function that receives, checks, looks up and sends; it counts in bulk, and the counts
+   are added a few times a second (`Route.settle`). Clients that need more of a frame than its
+   bytes, such as a queue or a rate limit, get it from Python after that. The one rule: any change
+   on which a route depends (clients, options, requested intervals, bandwidths, paths to a system,
+   our vehicles) clears all routes, the table too, and the next frame of each kind is routed again.
 3. `router.Router` handles frames without a cached route: our own that came back, round-trip
    requests, requests to our vehicles, frames that address a system, and the first broadcast of each
    kind. `routing_table.RoutingTable` has the paths to each system. `routing_table.DuplicateFilter`
@@ -32,6 +36,6 @@ Theory of operation
 An endpoint kind is one file in `transports/` over `base.Client` or `base.Listener`, with
 `datagram` and `stream` between for the common part of datagram sockets and of byte streams. No
 transport blocks or raises; each closes itself on an error, and `tick` opens it again. Everything
-but `transports/`, `hub.py` and `router.py` is pure: time is an argument, and nothing is read or
-written.
+but `transports/`, `hub.py`, `router.py` and the compiled step is pure: time is an argument, and
+nothing is read or written.
 """

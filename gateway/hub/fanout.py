@@ -23,6 +23,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint
+from gateway.hub.forwarding import Forwarding
+from gateway.hub.forwarding_step import IS_RECORDED, TARGETS
 from gateway.hub.limits import RateLimit
 from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.send_queue import (
@@ -32,7 +34,7 @@ from gateway.hub.send_queue import (
     SEQUENCE_MASK,
     Bandwidth,
 )
-from gateway.hub.transports.base import Client, Route
+from gateway.hub.transports.base import Client, OnForeign, Route, Targets
 from gateway.records import ClientInterval
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import base_size
@@ -142,8 +144,22 @@ class OwnRoute:
 class Fanout:
     """Give frames to clients by their filters, rates and addresses; keep the routes."""
 
-    def __init__(self, signer: FrameSigner, *, is_recording: bool = False) -> None:
+    def __init__(
+        self,
+        signer: FrameSigner,
+        forwarding: Forwarding | None = None,
+        on_foreign: OnForeign | None = None,
+        *,
+        is_recording: bool = False,
+    ) -> None:
         self._is_recording = is_recording
+        self.forwarding = forwarding or Forwarding()
+        self.forwarding.work[IS_RECORDED] = on_foreign is not None
+        self._on_foreign = on_foreign
+        self._targets: dict[tuple[tuple[int, int], ...], Targets] = {}
+        """Targets by client and limit of each: routes share them."""
+        self._targets_at: dict[int, Targets] = {}
+        """The same by address."""
         self.others: dict[tuple[int, bytes], Route] = {}
         """Routes by client and key of frames that are not only forwarded, such as heartbeats."""
         self.forwarded = 0
@@ -163,6 +179,9 @@ class Fanout:
         self.settle()
         self._own.clear()
         self.others.clear()
+        self.forwarding.clear()
+        self._targets.clear()
+        self._targets_at.clear()
         for subscription in self._subscriptions.values():
             subscription.client.routes.clear()
 
@@ -262,7 +281,6 @@ class Fanout:
         source: Client,
         path: SystemPath,
         rejects: Callable[[MavFrame, int], bool] | None,
-        on_foreign: Callable[[bytes], None] | None,
     ) -> Route:
         """Make the route of broadcasts like this one from a client; see `Route`."""
         if max(len(source.routes), len(self.others)) >= MAX_ROUTES:
@@ -273,7 +291,25 @@ class Fanout:
             if subscription.client is not source and interval_us != NO_MESSAGES:
                 limit = subscription.limit_of(frame.key, interval_us)
                 targets.append((subscription.client, limit))
-        return Route(frame.message_id, targets, source, path, rejects, on_foreign)
+        key = tuple((client.client_id, id(limit)) for client, limit in targets)
+        shared = self._targets.get(key)
+        if shared is None:
+            shared = self._targets[key] = Targets(targets)
+            self._targets_at[shared.address] = shared
+        return Route(frame.message_id, shared, source, path, rejects, self._on_foreign)
+
+    def keep_route(self, route: Route, source: Client, key: bytes) -> None:
+        """Forward all such frames of a client by a route from now on, without looking at them."""
+        source.routes[key] = route
+        route.enter(self.forwarding, key)
+
+    def finish_run(self, now_us: int) -> None:
+        """Do for a run of frames what the compiled step has left."""
+        run = self.forwarding.run()
+        targets = self._targets_at[self.forwarding.work[TARGETS]]
+        targets.finish(run, self.forwarding.failures(), now_us)
+        if self._on_foreign is not None:
+            self._on_foreign(run)
 
     def align(self, client_ids: Sequence[int]) -> None:
         """Send links to one peer the same frames, number for number, from now on.

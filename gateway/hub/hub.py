@@ -14,6 +14,8 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.endpoint import parse_endpoint
 from gateway.hub.fanout import Fanout
+from gateway.hub.forwarding import Forwarding
+from gateway.hub.forwarding_step import MOST
 from gateway.hub.limits import TokenBucket
 from gateway.hub.round_trip import PROBE_COMPONENT, RoundTrip
 from gateway.hub.router import Router
@@ -27,6 +29,7 @@ from gateway.hub.transports.base import (
     UNTRUSTED_READ_RATE,
     Client,
     Listener,
+    OnForeign,
 )
 from gateway.hub.transports.registry import CLIENTS, LISTENERS
 from gateway.records import ClientInterval, Incoming, Outgoing
@@ -73,7 +76,7 @@ class Hub:
     now_us : callable
         The gateway clock.
     on_foreign : callable, optional
-        Called with every frame of another system, once, byte for byte, as for a recorder.
+        Called with the frames of other systems, each once, byte for byte, as for a recorder.
     on_gone : callable, optional
         Called with the id of a client that has gone for good.
     on_alert : callable, optional
@@ -97,7 +100,7 @@ class Hub:
         settings: HubSettings,
         on_frame: Callable[[Incoming], None],
         now_us: Callable[[], int],
-        on_foreign: Callable[[bytes], None] | None = None,
+        on_foreign: OnForeign | None = None,
         on_gone: Callable[[int], None] | None = None,
         on_alert: Callable[[bool, str], None] | None = None,
         signer: FrameSigner | None = None,
@@ -110,9 +113,8 @@ class Hub:
         self.recordings = recordings
         self.signer = signer = signer or FrameSigner()
         self.now_us = now_us
-        self.untrusted_reads = TokenBucket(
-            UNTRUSTED_READ_RATE, UNTRUSTED_READ_BURST, UNTRUSTED_READ_BURST
-        )
+        burst = UNTRUSTED_READ_BURST
+        self.untrusted_reads = TokenBucket(UNTRUSTED_READ_RATE, burst, burst)
         self._on_gone, self._on_foreign = on_gone, on_foreign
         self._on_alert = on_alert
         self._alerts = ClientAlerts()
@@ -120,7 +122,10 @@ class Hub:
         self._clients: dict[int, Client] = {}
         self._endpoints: dict[str, Client | Listener[Any]] = {}
         self._next_id = 1
-        self._fanout = Fanout(signer, is_recording=keeps_order)
+        self.forwarding = _new_forwarding()
+        self._share_reads()
+        self._fanout = Fanout(signer, self.forwarding, on_foreign, is_recording=keeps_order)
+        self.finish_run = self._fanout.finish_run
         self._round_trip = RoundTrip(signer)
         self._vehicles = OwnVehicles()
         self._router = Router(
@@ -245,7 +250,7 @@ class Hub:
                 frame = frame_of(bytes(message.pack(sender)))
                 self._fanout.publish(frame, self._said, now_us)
                 if self._on_foreign is not None:
-                    self._on_foreign(frame.data)
+                    self._on_foreign((frame.data,))
             self._said = self._said + 1 & 0xFF
         return bool(systems)
 
@@ -332,11 +337,11 @@ class Hub:
         """Return the ports that listening endpoints have bound, in the order of the settings."""
         return tuple(listener.port for listener in self.listeners())
 
-    @property
-    def read_bytes(self) -> int:
-        """Bytes to read from one client at one wake-up: fewer where they may go to many."""
+    def _share_reads(self) -> None:
+        """Read the fewer bytes at one wake-up the more clients may get them."""
         fair = PASSED_ON_BYTES // max(len(self._clients), 1)
-        return min(max(fair, LEAST_READ_BYTES), READ_BYTES)
+        self.read_bytes = min(max(fair, LEAST_READ_BYTES), READ_BYTES)
+        self.forwarding.work[MOST] = self.read_bytes
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
@@ -350,6 +355,7 @@ class Hub:
     def appear(self, client: Client) -> None:
         """Add a client."""
         self._clients[client.client_id] = client
+        self._share_reads()
         self._fanout.add(client)
         self._log_connection(client, f"client {client.client_id}: {client.remote}")
 
@@ -392,6 +398,7 @@ class Hub:
         self._router.remove(client.client_id)
         self._vehicles.remove(client.client_id)
         if self._clients.pop(client.client_id, None):
+            self._share_reads()
             self._log_connection(client, f"client {client.client_id} has gone: {client.remote}")
             if self._on_gone is not None:
                 self._on_gone(client.client_id)
@@ -464,3 +471,11 @@ class Hub:
             for frame in requests:
                 if client.endpoint.passes(frame.message_id):
                     client.send(frame)
+
+
+def _new_forwarding() -> Forwarding:
+    """Return the memory of the compiled step; a warning says so if there is none."""
+    forwarding = Forwarding()
+    if forwarding.problem is not None:
+        log.warning("%s; Python forwards, at less than half the speed", forwarding.problem)
+    return forwarding

@@ -26,7 +26,7 @@ from gateway.hub.routing_table import (
     SystemPath,
 )
 from gateway.hub.stats import HubCounters
-from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.base import Client, HubContext, OnForeign
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
@@ -53,7 +53,7 @@ class Router:
         vehicles: OwnVehicles,
         round_trip: RoundTrip,
         on_frame: Callable[[Incoming], None],
-        on_foreign: Callable[[bytes], None] | None,
+        on_foreign: OnForeign | None,
         rejects: Callable[[bytes, int], bool] | None,
     ) -> None:
         self.counters = HubCounters()
@@ -215,9 +215,9 @@ class Router:
             path = path or SystemPath(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
-            route = self._fanout.make_route(frame, client, path, rejects, self._on_foreign)
+            route = self._fanout.make_route(frame, client, path, rejects)
             if telemetry and (self._rejects is None or not client.may_return):
-                client.routes[key] = route
+                self._fanout.keep_route(route, client, key)
             else:
                 self._fanout.others[source_id, key] = route
         route.forward(frame, now_us, is_checked=True)
@@ -225,7 +225,7 @@ class Router:
     def _count(self, frame: MavFrame) -> None:
         self.counters.forwarded += 1
         if self._on_foreign is not None:
-            self._on_foreign(frame.data)
+            self._on_foreign((frame.data,))
 
     def _ask(self, client: Client, frame: MavFrame, *, forwarded: bool) -> None:
         """Queue a request to our vehicles."""

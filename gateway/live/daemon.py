@@ -107,7 +107,7 @@ class Daemon:
             settings.hub,
             self._on_frame,
             self.now_us,
-            on_foreign=self._record,
+            on_foreign=self._record_foreign,
             on_gone=self._on_gone,
             on_alert=self._announce,
             signer=self._pipeline.signer,
@@ -325,6 +325,10 @@ class Daemon:
         if not incoming.forwarded and kept and self._budget.takes(client_id, len(frame), now_us):
             self._record(frame)
         self._perform(out)
+
+    def _record_foreign(self, frames: Sequence[bytes]) -> None:
+        for frame in frames:
+            self._record(frame)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""

@@ -10,7 +10,7 @@ played aircraft reach its player.
 import asyncio
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -260,10 +260,11 @@ class Uplink:
             self._heard = incoming.frame
             self._take(incoming.frame, played=played)
 
-        def on_foreign(frame: bytes) -> None:
-            # A broadcast arrives both as ours and as foreign.
-            if frame is not self._heard:
-                self._take(frame, played=played)
+        def on_foreign(frames: Sequence[bytes]) -> None:
+            for frame in frames:
+                # A broadcast arrives both as ours and as foreign.
+                if frame is not self._heard:
+                    self._take(frame, played=played)
 
         return Hub(HubSettings(endpoints=endpoints), on_frame, self._clock, on_foreign=on_foreign)
 

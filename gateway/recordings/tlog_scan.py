@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from gateway.compiled import address_of, array_at, compiled
 from gateway.compiled.entry_point import EntryPoint
+from gateway.wire.frame_scan import crc_holds
 
 ByteArray = NDArray[np.uint8]
 IntArray = NDArray[np.int64]
@@ -84,14 +85,6 @@ def _message_id(data: ByteArray, at: int) -> int:
 
 
 @compiled
-def _crc_step(crc: int, byte: int) -> int:
-    """CRC-16/MCRF4XX, one byte, without a table."""
-    tmp = (byte ^ crc) & 0xFF
-    tmp = (tmp ^ (tmp << 4)) & 0xFF
-    return (crc >> 8) ^ (tmp << 8) ^ (tmp << 3) ^ (tmp >> 4)
-
-
-@compiled
 def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
     """Return whether a complete frame's checksum holds: yes, no, or an unknown message."""
     message_id = _message_id(data, at)
@@ -99,11 +92,7 @@ def _checksum(data: ByteArray, at: int, extra: ExtraArray) -> int:
     if seed < 0:
         return _WAIT
     end = at + int(data[at + 1]) + (6 if data[at] == 0xFE else 10)
-    crc = 0xFFFF
-    for i in range(at + 1, end):
-        crc = _crc_step(crc, int(data[i]))
-    crc = _crc_step(crc, seed)
-    return _YES if crc == int(data[end]) | int(data[end + 1]) << 8 else _NO
+    return _YES if crc_holds(data, at + 1, end, seed) else _NO
 
 
 @compiled

@@ -43,8 +43,8 @@ OVERHEAD_V1: Final = 8
 OVERHEAD_V2: Final = 12
 SEQUENCE_V1: Final = 2
 SEQUENCE_V2: Final = 4
-KEY_V2: Final = slice(5, 10)
-"""Offset of `MavFrame.key` in a frame of version 2."""
+KEY_SIZE_V2: Final = 5
+"""Of `MavFrame.key` of a frame of version 2."""
 SIGNATURE_SIZE: Final = 13
 MAX_FALSE_STARTS: Final = 256
 """In one chunk; bytes with more are no MAVLink, and each costs a checksum of up to 255 bytes."""
@@ -97,6 +97,11 @@ class MavlinkSplitter:
         self._rest = data[unfinished:]
         _report(events, data, end, unfinished)
         return events
+
+    def take(self) -> bytes:
+        """Return the bytes of an unfinished frame, and discard them."""
+        rest, self._rest = self._rest, b""
+        return rest
 
     def reset(self) -> None:
         """Discard a half-received frame, as after reopening the port."""
@@ -152,17 +157,14 @@ def read_datagram(data: bytes) -> MavFrame | None:
     if len(data) < OVERHEAD_V2:
         return None
     extra = CRC_EXTRA.get(data[7] | data[8] << 8 | data[9] << 16)
-    return frame_of(data) if extra is not None and is_whole_frame(data, extra) else None
-
-
-def is_whole_frame(data: bytes, extra: bytes) -> bool:
-    """Return whether a datagram is one unsigned version 2 frame of the kind of a CRC_EXTRA."""
-    return (
-        data[0] == START_V2
+    is_whole = (
+        extra is not None
+        and data[0] == START_V2
         and data[1] + OVERHEAD_V2 == len(data)
         and not data[2]
         and mcrf4xx(data[1:-2] + extra) == data[-2] | data[-1] << 8
     )
+    return frame_of(data) if is_whole else None
 
 
 def frame_of(data: bytes) -> MavFrame:

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.hub.endpoint import parse_endpoint
+from gateway.hub.forwarding import new_client_words
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters
@@ -78,6 +79,7 @@ class KeepingClient(Client):
         self.counters = ClientCounters()
         self.routes = {}
         self.heard_us = None
+        self.words = new_client_words(client_id)
         self.now_us = 0
         self.sent: list[tuple[int, MavFrame]] = []
         self.write = lambda data: self.transmit(frame_of(data))
@@ -154,7 +156,7 @@ class Rig:
         **settings: object,
     ) -> Hub:
         wanted = HubSettings(endpoints=endpoints, **settings)
-        taps = (self.incoming.append, self.clock, self.foreign.append)
+        taps = (self.incoming.append, self.clock, self.foreign.extend)
         hub = Hub(wanted, *taps, signer=signer, recordings=recordings)
         self.closing.append(hub.close)
         hub.start()
@@ -233,10 +235,13 @@ class Rig:
 
 
 @pytest.fixture
-async def rig() -> AsyncIterator[Rig]:
-    """Return a rig; clients of its UDP ports need not prove that they receive."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(DatagramPeer, "is_proven", True)
-        rig = Rig()
-        yield rig
-        rig.close()
+def proven(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let clients of UDP ports not need to prove that they receive."""
+    monkeypatch.setattr(DatagramPeer, "is_proven", True)
+
+
+@pytest.fixture
+async def rig(proven: None) -> AsyncIterator[Rig]:
+    rig = Rig()
+    yield rig
+    rig.close()

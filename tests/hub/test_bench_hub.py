@@ -1,20 +1,20 @@
-"""Command lines of the forwarders that the hub is compared with, as in their manuals."""
+"""Command lines of the routers that the benchmark compares."""
 
-from tools.bench_hub import mavlink_router, mavproxy
+import pytest
 
-
-def test_mavlink_router() -> None:
-    build = mavlink_router("nice -n 5 /opt/mavlink-routerd")
-    assert build(14550, [14560, 14561]) == [
-        *("nice", "-n", "5", "/opt/mavlink-routerd"),
-        *("-t", "0"),
-        *("-e", "127.0.0.1:14560", "-e", "127.0.0.1:14561"),
-        "127.0.0.1:14550",
-    ]
+from tools.bench_hub import ROUTERS, router
 
 
-def test_mavproxy() -> None:
-    command = mavproxy("python mavproxy.py")(14550, [14560, 14561])
-    assert command[:3] == ["python", "mavproxy.py", "--master=udpin:127.0.0.1:14550"]
-    outs = [word for word in command if word.startswith("--out=")]
-    assert outs == ["--out=udp:127.0.0.1:14560", "--out=udp:127.0.0.1:14561"]
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (
+            f"nice -n 5 /opt/routerd {ROUTERS['mavlink-router']}",
+            "nice -n 5 /opt/routerd -t 0 -e 127.0.0.1:14560 -e 127.0.0.1:14561 127.0.0.1:14550",
+        ),
+        ("r in={in} {out}", "r in=14550 14560 14561"),
+        ("r --to {out} --from {in}", "r --to 14560 --to 14561 --from 14550"),
+    ],
+)
+def test_command_of_a_router_names_all_ports(command: str, expected: str) -> None:
+    assert router(command)(14550, [14560, 14561]) == expected.split()

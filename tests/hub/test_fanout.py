@@ -4,6 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.hub.fanout import MAX_ROUTES, Fanout
+from gateway.hub.forwarding_step import HAND_OVER, IS_PLAIN, RUN_SENT, STATUS
 from gateway.hub.routing_table import SystemPath
 from gateway.records import ClientInterval
 from gateway.wire.mavlink_signing import FrameSigner
@@ -45,7 +46,7 @@ def forward(fanout: Fanout, data: bytes, source: KeepingClient, now_us: int = 0)
     frame = frame_of(data)
     if frame.key not in source.routes:
         path = SystemPath(0, 0)
-        source.routes[frame.key] = fanout.make_route(frame, source, path, None, None)
+        source.routes[frame.key] = fanout.make_route(frame, source, path, None)
     source.routes[frame.key].forward(frame, now_us)
 
 
@@ -241,15 +242,24 @@ def test_forged_headers_do_not_fill_the_memory(fanout: Fanout) -> None:
     assert len(source.routes) <= MAX_ROUTES
 
 
-def test_datagrams_of_a_cached_route_are_counted_when_it_is_settled(
+def test_frames_of_the_compiled_step_are_counted_when_their_route_is_settled(
     fanout: Fanout, vehicle: Sender
 ) -> None:
     peer, source = (Peer(fanout, number, direct=True) for number in (1, 2))
-    path = SystemPath(0, 0)
+    path, forwarding = SystemPath(0, 0), fanout.forwarding
     frames = [vehicle.attitude() for _ in range(3)]
-    route = fanout.make_route(frame_of(frames[0]), source, path, None, None)
-    assert all(route.forward_datagram(frame, 70 + i) for i, frame in enumerate(frames))
-    assert not route.forward_datagram(frames[0][:-1] + b"?", 99)
+    route = fanout.make_route(frame_of(frames[0]), source, path, None)
+    fanout.keep_route(route, source, frame_of(frames[0]).key)
+    source.words[IS_PLAIN] = 1
+    step = forwarding.step(source.words, reads=False)
+    for now_us, frame in enumerate(frames, start=70):
+        forwarding.load(frame, now_us)
+        step()
+        assert forwarding.work[STATUS] == RUN_SENT
+        fanout.finish_run(now_us)
+    forwarding.load(frames[0][:-1] + b"?", 99)
+    step()
+    assert forwarding.work[STATUS] & HAND_OVER
     assert peer.frames == frames
     assert route.settle() == (3, sum(map(len, frames)))
     assert route.settle() == (0, 0)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from gateway.hub.transports.datagram import MAX_DATAGRAM
+from gateway.hub.forwarding_step import MAX_DATAGRAM
 from gateway.records import ClientInterval, Incoming
 
 pytestmark = pytest.mark.io
@@ -239,42 +239,18 @@ async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> Non
     assert second.is_empty()
 
 
-class Waiting:
-    """A socket with datagrams in it, which counts how often it is read."""
-
-    def __init__(self) -> None:
-        self.datagrams: list[bytes] = []
-        self.reads = 0
-
-    def recv(self, _size: int) -> bytes:
-        self.reads += 1
-        if not self.datagrams:
-            raise BlockingIOError
-        return self.datagrams.pop(0)
-
-
-async def test_single_datagrams_cost_one_read_and_a_burst_is_read_at_once(
-    rig: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    station = rig.station()
-    hub = await rig.open(f"udp:127.0.0.1:{station.port}")
+async def test_a_burst_is_read_at_once(rig: Any) -> None:
+    hub = rig.hub("udp-listen:127.0.0.1:0")
+    station = await rig.call(hub)
     (client,) = hub._clients.values()
-    waiting = Waiting()
-    monkeypatch.setattr(client, "_socket", waiting)
-    read = client._reader(waiting)
-
-    def wake_up(after_us: int, *datagrams: bytes) -> int:
-        rig.clock.us += after_us
-        waiting.datagrams += datagrams
-        waiting.reads = 0
-        read()
-        return waiting.reads
-
-    for _ in range(3):
-        assert (wake_up(1000, station.sender.heartbeat()), waiting.datagrams) == (1, [])
-    assert wake_up(1000, *(station.sender.heartbeat() for _ in range(10))) == 1
-    assert (wake_up(50), waiting.datagrams) == (10, [])
-    assert client.counters.received == 13
+    client.loop.remove_reader(client._socket)
+    for expected in (2, 20):
+        for _ in range(expected - client.counters.received):
+            station.send(station.sender.heartbeat())
+        client._read()
+        assert client.counters.received == expected
+    client._read()
+    assert client.state == "open"
 
 
 async def test_packed_frames_share_a_datagram(rig: Any) -> None:

@@ -135,7 +135,7 @@ class Site(Rig):
 
 
 @pytest.fixture
-async def site(router: Router) -> AsyncIterator[Site]:
+async def site(router: Router, proven: None) -> AsyncIterator[Site]:
     site = Site(router)
     yield site
     site.close()

@@ -2,17 +2,24 @@
 
 import asyncio
 import logging
+import os
 import socket
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
+import numpy as np
+
+from gateway.compiled import address_of
+from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import OPEN_TO_ALL, Endpoint, EndpointKind, is_loopback
+from gateway.hub.forwarding import Forwarding, Words, new_client_words
 from gateway.hub.limits import RateLimit, TokenBucket
 from gateway.hub.routing_table import Origin, SystemPath
+from gateway.hub.send_queue import RADIO_STATUS
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
 from gateway.printable import reason_of
@@ -20,13 +27,13 @@ from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import (
-    SEQUENCE_V2,
+    KEY_SIZE_V2,
     START_V2,
     Event,
     MavFrame,
     SplitFault,
     frame_of,
-    is_whole_frame,
+    read_datagram,
     to_mavlink1,
 )
 
@@ -44,11 +51,18 @@ RETRY_US: Final = US_PER_S
 """Between attempts to reopen a socket."""
 
 Write = Callable[[bytes], object]
+OnForeign = Callable[[Sequence[bytes]], None]
+"""Called with frames of other systems that are forwarded, in their order."""
 
 
 def not_open(data: bytes) -> int:
     """Write function of a client without an open socket; raises OSError."""
     raise ConnectionError(f"{len(data)} bytes for a socket that is not open")
+
+
+def raise_error(number: int) -> None:
+    """Raise the OSError of an error number of the system."""
+    raise OSError(number, os.strerror(number))
 
 
 @contextmanager
@@ -70,14 +84,15 @@ class HubContext(Protocol):
     now_us: Callable[[], int]
     signer: FrameSigner
     """Numbers and signs our own frames."""
+    forwarding: Forwarding
+    """Memory of the compiled step."""
     untrusted_reads: TokenBucket
     """Bytes that may still be read from all untrusted clients together."""
     recordings: Path | None
     """Folder of the recordings that a fleet may fetch, if any."""
 
-    @property
-    def read_bytes(self) -> int:
-        """Bytes to read from one client at one wake-up, before others get their turn."""
+    read_bytes: int
+    """Bytes to read from one client at one wake-up, before others get their turn."""
 
     def new_client_id(self) -> int:
         """Return an id that no client had before."""
@@ -87,6 +102,9 @@ class HubContext(Protocol):
 
     def deliver(self, client: "Client", frame: MavFrame, now_us: int) -> None:
         """Route one received frame for which there is no cached route."""
+
+    def finish_run(self, now_us: int) -> None:
+        """Do for a run of frames what the compiled step has left."""
 
     def appear(self, client: "Client") -> None:
         """Add a client."""
@@ -107,45 +125,81 @@ class HubContext(Protocol):
         """Remove a client and close it."""
 
 
+class Targets:
+    """The clients of some routes: those that the compiled step sends to, and others with limits."""
+
+    def __init__(self, targets: "Iterable[tuple[Client, RateLimit | None]]") -> None:
+        self.direct: list[Client] = []
+        self.others: list[tuple[Callable[[MavFrame], None], RateLimit | None]] = []
+        for client, limit in targets:
+            if limit is None and client.is_direct:
+                self.direct.append(client)
+            else:
+                self.others.append((client.send, limit))
+        words = [address_of(client.words) for client in self.direct]
+        self._memory = np.array([len(words), bool(self.others), *words])
+        self.address = address_of(self._memory)
+
+    def send(self, frame: MavFrame, now_us: int) -> None:
+        """Send a frame to every client; it is not counted as sent to direct ones."""
+        self._send_others(frame, now_us)
+        for client in self.direct:
+            client.send_rest((frame.data,))
+
+    def finish(self, run: list[bytes], failures: list[list[int]], now_us: int) -> None:
+        """Do for a run of frames what the compiled step has left."""
+        for index, sent, *failure in failures:
+            self.direct[index].send_rest(run[sent:], *failure)
+        if self.others:
+            for data in run:
+                self._send_others(frame_of(data), now_us)
+
+    def _send_others(self, frame: MavFrame, now_us: int) -> None:
+        for send, limit in self.others:
+            if limit is None or limit.is_due(now_us):
+                send(frame)
+
+
 class Route:
     """The clients that get one kind of frame from one client.
 
-    `targets` are those clients, and how often each gets a frame; `source` brings the frames of a
-    system by `path`. `rejects` returns whether a frame is dropped as a copy, `on_foreign` is called
-    with each forwarded one.
+    `source` brings the frames of a system by `path`. `rejects` returns whether a frame is dropped
+    as a copy, `on_foreign` is called with each forwarded one.
     """
-
-    __slots__ = (
-        "_datagram_bytes", "_datagrams", "_direct", "_extra", "_heard_us", "_limited",
-        "_on_foreign", "_others", "_path", "_rejects", "_sent_us", "_source",
-        "frames", "message_id", "size",
-    )  # fmt: skip
 
     def __init__(
         self,
         message_id: int,
-        targets: "Sequence[tuple[Client, RateLimit | None]]",
+        targets: Targets,
         source: "Client",
         path: SystemPath,
         rejects: Callable[[MavFrame, int], bool] | None,
-        on_foreign: Callable[[bytes], None] | None,
+        on_foreign: OnForeign | None,
     ) -> None:
         self.message_id = message_id
         self.frames = self.size = 0
         """Not yet in the counters of the direct clients."""
-        self._datagrams = self._datagram_bytes = self._heard_us = 0
-        """Not yet in the figures of the source and of the path either."""
+        self._targets = targets
         self._source = source
         self._path = path
-        self._sent_us = path.stream.sent_us
         self._rejects = rejects
         self._on_foreign = on_foreign
-        free = [client for client, limit in targets if limit is None]
-        self._direct = [client for client in free if client.is_direct]
-        self._others = [client.send for client in free if not client.is_direct]
-        self._limited = [(client.send, limit) for client, limit in targets if limit is not None]
-        needs_frame = bool(self._others or self._limited or rejects is not None)
-        self._extra = None if needs_frame else CRC_EXTRA.get(message_id)
+        self._words: Words | None = None
+
+    def enter(self, forwarding: Forwarding, key: bytes) -> None:
+        """Let the compiled step forward such frames, unless it needs more than their headers."""
+        seed = CRC_EXTRA.get(self.message_id)
+        is_plain = self._rejects is None and self.message_id != RADIO_STATUS
+        if (
+            seed
+            and is_plain
+            and len(key) == KEY_SIZE_V2
+            and len(self._targets.direct) < kernel.MAX_FAILED
+        ):
+            numbers_at = address_of(self._path.stream.sent_us)
+            self._words = forwarding.enter(
+                self._source.client_id, key, seed[0], self._targets.address, numbers_at
+            )
 
     def forward(self, frame: MavFrame, now_us: int, *, is_checked: bool = False) -> None:
         """Send a frame to every client; a rejected one to none."""
@@ -155,58 +209,23 @@ class Route:
                 self._path.stream.accept(frame.sequence, self._source.client_id, now_us)
             elif self._rejects(frame, now_us):
                 return
-        for send in self._others:
-            send(frame)
-        for send, limit in self._limited:
-            if limit.is_due(now_us):
-                send(frame)
         self.frames += 1
         self.size += len(frame.data)
-        self._write(frame.data)
-
-    def forward_datagram(self, data: bytes, now_us: int) -> bool:
-        """Send a datagram of this kind to every client, and count it in bulk; see `settle`.
-
-        Return False if it is not one valid frame, or the route needs more of the frame than its
-        bytes and its sequence number: then `forward` does it.
-        """
-        extra = self._extra
-        if extra is None or not is_whole_frame(data, extra):
-            return False
-        self._datagrams += 1
-        self._datagram_bytes += len(data)
-        self._heard_us = now_us
-        self._sent_us[data[SEQUENCE_V2]] = now_us
-        # As `_write` does: a call more would cost as much as all that is above.
-        for client in self._direct:
-            write = client.write
-            try:
-                write(data)
-            except OSError as error:
-                client.recover_uncounted(data, error)
+        self._targets.send(frame, now_us)
         if self._on_foreign is not None:
-            self._on_foreign(data)
-        return True
-
-    def _write(self, data: bytes) -> None:
-        for client in self._direct:
-            try:
-                client.write(data)
-            except OSError as error:
-                client.recover_uncounted(data, error)
-        if self._on_foreign is not None:
-            self._on_foreign(data)
+            self._on_foreign((frame.data,))
 
     def settle(self) -> tuple[int, int]:
         """Add the common counts to the clients' counters; return the frames and bytes."""
-        frames, size = self.frames, self.size
-        if datagrams := self._datagrams:
-            self._source.count_received(datagrams, self._datagram_bytes, self._heard_us)
-            self._path.count(datagrams, self._source.client_id, self._heard_us)
-            frames, size = frames + datagrams, size + self._datagram_bytes
-        self.frames = self.size = self._datagrams = self._datagram_bytes = 0
+        frames, size, words = self.frames, self.size, self._words
+        if words is not None and (count := words[kernel.FRAMES]):
+            self._source.count_received(count, words[kernel.SIZE], words[kernel.HEARD_US])
+            self._path.count(count, self._source.client_id, words[kernel.HEARD_US])
+            frames, size = frames + count, size + words[kernel.SIZE]
+            words[kernel.FRAMES] = words[kernel.SIZE] = 0
+        self.frames = self.size = 0
         if frames:
-            for client in self._direct:
+            for client in self._targets.direct:
                 client.counters.sent += frames
                 client.counters.bytes_sent += size
         return frames, size
@@ -236,6 +255,8 @@ class Client:
     """Cached routes of frames from here, by `MavFrame.key`; the fan-out clears them."""
     write: Write = field(default=not_open)
     """Sends one datagram at once or raises OSError; only of a client that is direct."""
+    words: Words = field(init=False)
+    """Its state in the compiled step."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
     may_return: ClassVar[bool] = True
     """Whether each frame from here may be one that was sent elsewhere and has returned."""
@@ -251,6 +272,7 @@ class Client:
         self.trusted = _is_trusted(self.endpoint, self.host)
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
+        self.words = new_client_words(self.client_id)
 
     def become(self, state: str, error: Exception | None = None) -> None:
         """Set the state and its reason."""
@@ -345,6 +367,17 @@ class Client:
             self._only_version1 = now_us - self._version1_since_us >= VERSION_PROBE_US
         return self.is_mavlink1 != before
 
+    def send_rest(self, frames: Iterable[bytes], number: int = 0, _part: int = 0) -> None:
+        """Send frames that will be counted as sent; the number is that of the first one's error."""
+        for data in frames:
+            try:
+                if number:
+                    raise_error(number)
+                self.write(data)
+            except OSError as error:
+                self.recover_uncounted(data, error)
+            number = 0
+
     def recover_uncounted(self, data: bytes, error: OSError) -> None:
         """Handle a failed `write` whose frame will still be counted as sent."""
         raise NotImplementedError
@@ -372,6 +405,36 @@ class Client:
             route.forward(frame, now_us)
         elif not self.endpoint.monitor:
             self.context.deliver(self, frame, now_us)
+
+    def go_on(self, step: Callable[[], None], now_us: int) -> None:
+        """Do what the compiled step has left to Python, until it has walked over what was read."""
+        work = self.context.forwarding.work
+        while (status := work[kernel.STATUS]) & (kernel.RUN_SENT | kernel.HAND_OVER):
+            if status & kernel.RUN_SENT:
+                self.context.finish_run(now_us)
+            if status & kernel.HAND_OVER:
+                self._take_over(now_us)
+            if self.words[kernel.INPUT] < 0:
+                # Closed meanwhile.
+                return
+            step()
+
+    def _take_over(self, now_us: int) -> None:
+        """Process a frame without a compiled route, or all that is left of a datagram."""
+        forwarding = self.context.forwarding
+        data, size = forwarding.rest(), forwarding.work[kernel.FRAME]
+        frame = read_datagram(data[:size]) if size and self.words[kernel.IS_PLAIN] else None
+        if frame is None:
+            forwarding.skip()
+            self.accept_rest(data, now_us)
+            return
+        forwarding.work[kernel.OFFSET] += size
+        self.counters.bytes_received += size
+        self.receive_frame(frame, now_us)
+
+    def accept_rest(self, data: bytes, now_us: int) -> None:
+        """Process received bytes, without the compiled step."""
+        raise NotImplementedError
 
     def count_received(self, frames: int, size: int, heard_us: int) -> None:
         """Count frames that were forwarded by cached routes."""

@@ -1,6 +1,8 @@
 """Base of datagram transports: one socket per peer, a short backlog, optional packing."""
 
 import asyncio
+import errno
+import os
 import socket
 import struct
 from collections import deque
@@ -8,6 +10,8 @@ from collections.abc import Callable, Collection
 from functools import partial
 from typing import Final
 
+from gateway.compiled.messages import way_to_send
+from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import Endpoint
 from gateway.hub.routing_table import HEARTBEAT_ID, Origin
 from gateway.hub.send_queue import Packer
@@ -20,25 +24,12 @@ from gateway.hub.transports.base import (
     not_open,
 )
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import (
-    KEY_V2,
-    DatagramSplitter,
-    MavFrame,
-    message_id_of,
-    read_datagram,
-)
+from gateway.wire.mavlink_splitter import DatagramSplitter, MavFrame, message_id_of, read_datagram
 
 UNPROVEN: Final = "unproven"
 """State of a client of a listening port that has not shown that it receives."""
+SENDING: Final = ("open", UNPROVEN)
 NOBODY_LISTENS: Final = "nobody listens there"
-MAX_DATAGRAM: Final = 4096
-"""Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
-are cut off."""
-READS: Final = (None,) * 64
-"""Most datagrams read at one wake-up, if they are small; faster to iterate than a range."""
-ALONE_US: Final = 300
-"""A datagram that arrives so long after the last wake-up is most likely the only one. A second
-read, which would raise BlockingIOError, is omitted; if there are more, the loop wakes again."""
 RECEIVE_BUFFER_BYTES: Final = 1 << 20
 """The default holds only about 256 small datagrams; a parameter upload bursts more."""
 IP_PKTINFO: Final = 8
@@ -62,6 +53,8 @@ class DatagramClient(Client):
     refused_us: int | None = None
     _socket: socket.socket | None = None
     _direct: Write = staticmethod(not_open)
+    _output = -1
+    """The connected socket that the compiled step may send to."""
     _read: Callable[[], None]
 
     def __post_init__(self) -> None:
@@ -98,7 +91,8 @@ class DatagramClient(Client):
 
     def close(self) -> None:
         """Close the socket."""
-        self.write = not_open
+        self.words[kernel.INPUT] = -1
+        self._use(not_open)
         self.counters.dropped += len(self._backlog)
         self._backlog.clear()
         if self._socket is not None:
@@ -114,21 +108,44 @@ class DatagramClient(Client):
         self._packer = self._packer_of(endpoint)
         super().reconfigure(endpoint)
 
-    def adopt(self, sock: socket.socket, write: Write) -> None:
-        """Use an open socket from now on."""
+    def adopt(self, sock: socket.socket, write: Write | None = None) -> None:
+        """Use an open socket from now on; `write` sends on one that is not connected."""
         self._socket = sock
-        self.write = self._direct = write
+        self.words[kernel.INPUT] = sock.fileno()
+        self._output = sock.fileno() if write is None else -1
+        self.words[kernel.WAY] = way_to_send(sock)
+        self._direct = write or sock.send
+        self._use(self._direct)
         self._revive()
         self._read = self._reader(sock)
         self.loop.add_reader(sock, self._read)
 
+    def _use(self, write: Write) -> None:
+        """Send by a function from now on; the compiled step sends if it is the direct one."""
+        self.write = write
+        self.words[kernel.OUTPUT] = self._output if write is self._direct else -1
+
+    def become(self, state: str, error: Exception | None = None) -> None:
+        """Set the state and its reason."""
+        super().become(state, error)
+        self._update_plain()
+
+    def _update_plain(self) -> None:
+        """Let Python process the next datagram if it is to change the state or ends a frame."""
+        self.words[kernel.IS_PLAIN] = self.state in SENDING and not self.splitter
+
+    def accept_rest(self, data: bytes, now_us: int) -> None:
+        """Process received bytes, without the compiled step."""
+        self.accept(data, now_us)
+
     def accept(self, data: bytes, now_us: int, sender: Address | None = None) -> None:
         """Process one datagram of this peer; `sender` distinguishes several."""
-        if self.state != "open":
+        if self.state not in SENDING:
             self._revive()
         frame = None if self.splitter else read_datagram(data)
         if frame is None:
             self.receive(self.splitter.feed(data, now_us, sender), len(data), now_us)
+            self._update_plain()
             return
         self.counters.bytes_received += len(data)
         self.receive_frame(frame, now_us)
@@ -165,7 +182,7 @@ class DatagramClient(Client):
     def _recover(self, data: bytes, frames: int, error: OSError) -> None:
         """Handle a failed send: wait for room, retry, or drop the frames."""
         if isinstance(error, BlockingIOError) and self._socket is not None:
-            self.write = self._wait
+            self._use(self._wait)
             self.loop.add_writer(self._socket, self._on_writable, self._socket)
             self._wait(data)
             self._count_sent(frames, len(data))
@@ -216,47 +233,72 @@ class DatagramClient(Client):
                 self.counters.sent -= 1
             self._backlog.popleft()
         self.loop.remove_writer(sock)
-        self.write = self._direct
+        self._use(self._direct)
 
     def _reader(self, sock: socket.socket) -> Callable[[], None]:
         """Return the function that reads a socket; its names are looked up once, not each time."""
-        context, routes, receive = self.context, self.routes, sock.recv
-        now, woken_us = context.now_us, 0
+        forwarding, now = self.context.forwarding, self.context.now_us
+        if not forwarding.is_compiled:
+            return partial(self._read_each, sock)
+        work, step = forwarding.work, forwarding.step(self.words, reads=True)
+        on = forwarding.step(self.words, reads=False)
 
         def read() -> None:
-            nonlocal woken_us
-            now_us = now()
-            is_alone = now_us - woken_us > ALONE_US
-            woken_us = now_us
-            size, most = 0, 0 if is_alone else context.read_bytes
-            try:
-                for _ in READS:
-                    data = receive(MAX_DATAGRAM)
-                    size += len(data)
-                    route = routes.get(data[KEY_V2])
-                    if (
-                        route is None
-                        or self.state != "open"
-                        or self.splitter
-                        or not route.forward_datagram(data, now_us)
-                    ):
-                        self.accept(data, now_us)
-                        if self._socket is not sock:
-                            return
-                    if size >= most:
-                        break
-            except OSError as error:
-                self._note_read_error(error)
+            now_us = work[kernel.NOW_US] = now()
+            step()
+            if work[kernel.STATUS]:
+                self.go_on(on, now_us)
+                self._end_read(sock)
             if not self.trusted:
-                self.limit_reads(sock, read, size)
+                self.limit_reads(sock, read, work[kernel.READ])
 
         return read
 
-    def _note_read_error(self, error: OSError) -> None:
-        if isinstance(error, ConnectionRefusedError):
+    def _end_read(self, sock: socket.socket) -> None:
+        """Handle an error, and keep what there is no time for in this turn of the loop."""
+        forwarding = self.context.forwarding
+        if forwarding.work[kernel.STATUS] & kernel.ERROR:
+            self._note_read_error(forwarding.work[kernel.ERROR_NUMBER])
+        if self._socket is sock and (unread := forwarding.unread()):
+            self.loop.remove_reader(sock)
+            self.loop.call_soon(self._read_later_part, sock, deque(unread))
+
+    def _read_later_part(self, sock: socket.socket, unread: deque[bytes]) -> None:
+        """Process datagrams that were read in an earlier turn of the loop."""
+        size = 0
+        while unread and size < self.context.read_bytes and self._socket is sock:
+            size += len(unread[0])
+            self.accept(unread.popleft(), self.context.now_us())
+        if self._socket is not sock:
+            return
+        if unread:
+            self.loop.call_soon(self._read_later_part, sock, unread)
+        else:
+            self._read_later(sock, self._read)
+
+    def _read_each(self, sock: socket.socket) -> None:
+        """Read a socket without the compiled step."""
+        size, most = 0, self.context.read_bytes
+        for _ in range(kernel.READS):
+            try:
+                data, address = sock.recvfrom(kernel.MAX_DATAGRAM)
+            except OSError as error:
+                self._note_read_error(error.errno)
+                break
+            size += len(data)
+            self._accept_from(data, address)
+            if size >= most or sock.fileno() < 0:
+                break
+        self.limit_reads(sock, partial(self._read_each, sock), size)
+
+    def _accept_from(self, data: bytes, _address: Address) -> None:
+        self.accept(data, self.context.now_us())
+
+    def _note_read_error(self, number: int | None) -> None:
+        if number == errno.ECONNREFUSED:
             self._note_refusal()
-        elif not isinstance(error, BlockingIOError):
-            self.become("unreachable", error)
+        elif number is not None and number != errno.EAGAIN:
+            self.become("unreachable", OSError(number, os.strerror(number)))
 
 
 class DatagramPeer(DatagramClient):
@@ -276,9 +318,9 @@ class DatagramPeer(DatagramClient):
     _spent: int = 0
     """Bytes that were sent while it was unproven."""
 
-    def adopt(self, sock: socket.socket, write: Write) -> None:
+    def adopt(self, sock: socket.socket, write: Write | None = None) -> None:
         """Use an open socket from now on."""
-        self._send_to_proven = write
+        self._send_to_proven = write or sock.send
         super().adopt(sock, write if self.is_proven else self._send_limited)
 
     def prove(self) -> None:
@@ -286,9 +328,11 @@ class DatagramPeer(DatagramClient):
         if self.is_proven or not self._spent:
             return
         self.is_proven = True
-        if self.write == self._direct:
-            self.write = self._send_to_proven
+        is_held = self.write is not self._direct
         self._direct = self._send_to_proven
+        if self._socket is not None:
+            self._output = self._socket.fileno()
+        self._use(self.write if is_held else self._direct)
         if self.state == UNPROVEN:
             self.become("open")
         self.reconfigure(self.endpoint)
@@ -328,8 +372,8 @@ class DatagramPeer(DatagramClient):
     def _note_refusal(self) -> None:
         """Stop sending until the next tick: a dead client costs more than a live one."""
         super()._note_refusal()
-        if self.write == self._direct:
-            self.write = self._hold
+        if self.write is self._direct:
+            self._use(self._hold)
 
     def _hold(self, data: bytes) -> None:
         self.counters.unheard += 1
@@ -338,7 +382,7 @@ class DatagramPeer(DatagramClient):
 
     def _end_hold(self) -> None:
         if self.write == self._hold:
-            self.write = self._direct
+            self._use(self._direct)
 
     def has_died(self, now_us: int) -> bool:
         """Return whether it failed, or is stale and its machine reports a closed port."""

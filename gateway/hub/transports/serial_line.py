@@ -12,6 +12,7 @@ from typing import Final
 
 import serial
 
+from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import BITS_PER_BYTE
 from gateway.hub.send_queue import RADIO_STATUS, Pacer
 from gateway.hub.transports.stream import QueuedClient
@@ -66,13 +67,21 @@ class SerialClient(QueuedClient):
             self.become("unreachable", error)
             return
         self._port = port
+        self.words[kernel.INPUT], self.words[kernel.IS_PLAIN] = port.fileno(), 1
         self._splitter.reset()
         self.become("open")
         self.loop.add_reader(port.fileno(), self._on_readable, port)
         self.context.greet(self)
 
+    def receive_frame(self, frame: MavFrame, now_us: int) -> None:
+        """Route one frame; those of the radio report the room in its buffer."""
+        if frame.message_id == RADIO_STATUS:
+            self.context.update_buffer(self, frame.free_percent)
+        super().receive_frame(frame, now_us)
+
     def close(self) -> None:
         """Close the port; waiting frames are lost."""
+        self.words[kernel.INPUT] = -1
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -135,10 +144,6 @@ class SerialClient(QueuedClient):
             self._broke(error)
             return
         if data:
-            events = self._splitter.feed(data)
-            for frame in events:
-                if isinstance(frame, MavFrame) and frame.message_id == RADIO_STATUS:
-                    self.context.update_buffer(self, frame.free_percent)
-            self.receive(events, len(data), self.context.now_us())
+            self.take(data, self.context.now_us())
         else:
             self._broke(OSError("the device hung up"))

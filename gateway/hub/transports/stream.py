@@ -6,15 +6,17 @@ connection when nothing was acknowledged for long.
 
 import asyncio
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Final
 
+from gateway.compiled.messages import STREAM
+from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import host_and_port
 from gateway.hub.send_queue import SendQueue
 from gateway.hub.transports.base import Client, Listener, Peer, new_socket
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter
+from gateway.wire.mavlink_splitter import MavFrame, MavlinkSplitter, frame_of
 
 ACCEPT_AGAIN_S: Final = 1.0
 """After which a connection is accepted that could not be."""
@@ -99,6 +101,24 @@ class QueuedClient(Client):
         super().__post_init__()
         self._queue = SendQueue(self.queue_bytes, self.context.is_own, self.context.signer)
         self._splitter = MavlinkSplitter()
+        self._step = self.context.forwarding.step(self.words, reads=False)
+
+    def take(self, data: bytes, now_us: int) -> None:
+        """Process a chunk of the stream: frames with compiled routes by the step."""
+        forwarding = self.context.forwarding
+        if not self.routes or not forwarding.is_compiled:
+            self.accept_rest(data, now_us)
+            return
+        rest = self._splitter.take()
+        # They are counted again.
+        self.counters.bytes_received -= len(rest)
+        forwarding.load(rest + data, now_us)
+        self._step()
+        self.go_on(self._step, now_us)
+
+    def accept_rest(self, data: bytes, now_us: int) -> None:
+        """Process received bytes, without the compiled step."""
+        self.receive(self._splitter.feed(data), len(data), now_us)
 
     @property
     def queue_bytes(self) -> int:
@@ -135,6 +155,27 @@ class StreamClient(QueuedClient):
     """Bytes written to the present segment."""
     _read: Callable[[], None]
 
+    @property
+    def is_direct(self) -> bool:
+        """Whether frames are sent as they are, unless others wait."""
+        return not self.is_mavlink1
+
+    def send_rest(self, frames: Iterable[bytes], _number: int = 0, part: int = 0) -> None:
+        """Send frames that will be counted as sent; the first was sent up to `part`."""
+        for data in frames:
+            self.counters.bytes_sent -= len(data) - part
+            if part and self._socket is not None:
+                self._write(self._socket, data[part:])
+            else:
+                self.counters.sent -= 1
+                self.transmit(frame_of(data))
+            part = 0
+
+    def _update_output(self) -> None:
+        """Let the compiled step send while nothing waits."""
+        is_idle = self._socket is not None and not self._partial and not self._queue
+        self.words[kernel.OUTPUT] = self.words[kernel.INPUT] if is_idle else -1
+
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once if nothing waits, else queue it."""
         if self._socket is None:
@@ -157,10 +198,14 @@ class StreamClient(QueuedClient):
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         self._socket = sock
+        words = self.words
+        words[kernel.INPUT] = sock.fileno()
+        words[kernel.IS_PLAIN], words[kernel.WAY] = 1, STREAM
         self._splitter.reset()
         self._read = partial(self._on_readable, sock)
         self.loop.add_reader(sock, self._read)
         self._begin()
+        self._update_output()
 
     def _begin(self) -> None:
         """Start the protocol on a new connection."""
@@ -169,6 +214,7 @@ class StreamClient(QueuedClient):
 
     def close(self) -> None:
         """Close the connection; waiting frames are lost."""
+        self.words[kernel.INPUT] = self.words[kernel.OUTPUT] = -1
         if self._socket is not None:
             self.loop.remove_reader(self._socket)
             self.loop.remove_writer(self._socket)
@@ -187,7 +233,7 @@ class StreamClient(QueuedClient):
 
     def accept(self, data: bytes, now_us: int) -> None:
         """Process received bytes."""
-        self.receive(self._splitter.feed(data), len(data), now_us)
+        self.take(data, now_us)
 
     def _write(self, sock: socket.socket, data: bytes) -> bool:
         """Write; keep the bytes that the socket does not accept and wait for room."""
@@ -205,6 +251,7 @@ class StreamClient(QueuedClient):
         self.counters.bytes_sent += taken
         self._partial = data[taken:]
         if self._partial:
+            self.words[kernel.OUTPUT] = -1
             self.loop.add_writer(sock, self._on_writable, sock)
         return not self._partial
 
@@ -217,6 +264,7 @@ class StreamClient(QueuedClient):
                 return
         self.loop.remove_writer(sock)
         self._sending_us = None
+        self._update_output()
 
     def _drop_stale(self, now_us: int) -> None:
         """Drop old telemetry on a connection that is too slow for it."""

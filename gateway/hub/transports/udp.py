@@ -88,7 +88,7 @@ class UdpClient(DatagramClient):
                 self.become("unreachable", error)
                 continue
             self.remote = host_and_port(*address[:2])
-            self.adopt(sock, sock.send)
+            self.adopt(sock)
             return
 
     def _connected(self, family: int, address: tuple[Any, ...]) -> socket.socket:

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from gateway.hub.endpoint import EndpointKind
 from gateway.hub.transports.base import new_socket
-from gateway.hub.transports.datagram import MAX_DATAGRAM, READS, DatagramClient
+from gateway.hub.transports.datagram import Address, DatagramClient
 
 MULTICAST_HOPS: Final = 1
 """The local network only."""
@@ -52,7 +52,7 @@ class GroupClient(DatagramClient):
             with new_socket(family, socket.SOCK_DGRAM) as sock:
                 if multicast:
                     self._listening = _listening_socket(family, address)
-                    self.loop.add_reader(self._listening, self._on_group, self._listening)
+                    self.loop.add_reader(self._listening, self._read_each, self._listening)
                     _prepare_sender(sock, address)
                 else:
                     sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
@@ -66,22 +66,12 @@ class GroupClient(DatagramClient):
         self.adopt(sock, lambda data: sock.sendto(data, address))
 
     def _reader(self, sock: socket.socket) -> Callable[[], None]:
-        return partial(self._on_group, sock)
+        # The compiled step does not distinguish senders.
+        return partial(self._read_each, sock)
 
-    def _on_group(self, sock: socket.socket) -> None:
-        size, most = 0, self.context.read_bytes
-        for _ in READS:
-            try:
-                data, address = sock.recvfrom(MAX_DATAGRAM)
-            except OSError as error:
-                self._note_read_error(error)
-                break
-            if address[:2] != self._own_address:
-                size += len(data)
-                self.accept(data, self.context.now_us(), address[:2])
-            if size >= most or sock.fileno() < 0:
-                break
-        self.limit_reads(sock, partial(self._on_group, sock), size)
+    def _accept_from(self, data: bytes, address: Address) -> None:
+        if address[:2] != self._own_address:
+            self.accept(data, self.context.now_us(), address[:2])
 
 
 def _route_source(family: int, address: tuple[object, ...]) -> tuple[Any, ...]:

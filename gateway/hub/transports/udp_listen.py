@@ -14,6 +14,7 @@ import socket
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint, host_and_port
+from gateway.hub.forwarding_step import MAX_DATAGRAM, READS
 from gateway.hub.transports.base import (
     READ_BYTES,
     RETRY_US,
@@ -25,8 +26,6 @@ from gateway.hub.transports.base import (
 )
 from gateway.hub.transports.datagram import (
     IP_PKTINFO,
-    MAX_DATAGRAM,
-    READS,
     Address,
     DatagramPeer,
     bound_socket,
@@ -126,7 +125,7 @@ class UdpListener(Listener[DatagramPeer]):
         client.identity, client.address = first.origin, address[:2]
         client.splitter = self._splitter.split_off(client.address)
         self._clients[client_id] = self._by_address[client.address] = client
-        client.adopt(sock, sock.send)
+        client.adopt(sock)
         self._context.appear(client)
         self._context.greet(client)
         self._pass_on_others(sock, address, local_host)
@@ -147,7 +146,7 @@ class UdpListener(Listener[DatagramPeer]):
     def _pass_on_others(self, sock: socket.socket, peer: Address, local_host: str) -> None:
         """Process datagrams of others that arrived between bind and connect of a socket."""
         size = 0
-        for _ in READS:
+        for _ in range(READS):
             try:
                 data, address = sock.recvfrom(MAX_DATAGRAM)
             except OSError:

@@ -23,7 +23,7 @@ from gateway.hub.transports.ws_protocol import (
 )
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_splitter import Event, MavFrame, SplitFault, SplitFaultKind
+from gateway.wire.mavlink_splitter import MavFrame
 
 HANDSHAKE_US: Final = 5 * US_PER_S
 """From the connection to the upgrade; a slower client only occupies a slot."""
@@ -76,6 +76,11 @@ class WebStream(StreamClient):
 
     def _wrap(self, frames: bytes) -> bytes:
         return self._encrypt(self._web.wrap(frames))
+
+    @property
+    def is_direct(self) -> bool:
+        """Whether frames are sent as they are: each is wrapped in a message."""
+        return False
 
     def transmit(self, frame: MavFrame) -> None:
         """Send one frame at once, or queue it if others wait or are to be packed with it."""
@@ -171,13 +176,10 @@ class WebStream(StreamClient):
         return data if self._tls is None else self._tls.wrap(data)
 
     def _receive_payload(self, found: WsInput, now_us: int) -> None:
-        events: list[Event] = []
         if found.payload:
-            events += self._splitter.feed(found.payload)
+            self.take(found.payload, now_us)
         if found.text_size:
-            events.append(SplitFault(SplitFaultKind.GARBAGE, found.text_size))
-        if events or found.payload:
-            self.receive(events, len(found.payload) + found.text_size, now_us)
+            self.count_garbage(found.text_size)
 
     def _flush(self) -> None:
         """Send the gathered frames."""

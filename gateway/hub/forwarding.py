@@ -1,0 +1,133 @@
+"""Memory of the compiled step that forwards: buffers, the table of routes, and what they count."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from gateway.compiled import address_of
+from gateway.compiled.entry_point import LibraryError
+from gateway.compiled.messages import LENGTH, PARTS, Outbox, headers_of
+from gateway.hub import forwarding_step as step
+
+MAX_COMPILED: Final = step.ENTRIES // 2
+"""Routes in the table; frames of further ones are forwarded by Python."""
+FIRST_LARGEST: Final = 280
+"""Size of a datagram, until some were received: the largest frame."""
+
+Words = memoryview
+
+
+def new_client_words(client_id: int) -> Words:
+    """Return the words of a client that is neither received from nor sent to yet."""
+    words = np.zeros(step.CLIENT_WORDS, np.int64)
+    words[step.CLIENT_ID], words[step.LARGEST] = client_id, FIRST_LARGEST
+    words[step.INPUT] = words[step.OUTPUT] = -1
+    return words.data
+
+
+class Forwarding:
+    """The memory of one hub; `problem` is the reason if there is no compiled step.
+
+    Parameters
+    ----------
+    is_compiled : bool
+        False lets Python forward, for a comparison.
+    """
+
+    def __init__(self, *, is_compiled: bool = True) -> None:
+        self.problem: LibraryError | None = None
+        self.is_compiled = is_compiled
+        try:
+            step.forward.load()
+        except LibraryError as error:
+            self.problem, self.is_compiled = error, False
+        buffer = np.zeros(step.READS * step.MAX_DATAGRAM, np.uint8)
+        begins = address_of(buffer) + np.arange(step.READS) * step.MAX_DATAGRAM
+        places = np.column_stack([begins, np.full(step.READS, step.MAX_DATAGRAM)])
+        received, self._outbox = headers_of(places), Outbox()
+        self._table = np.zeros((step.ENTRIES, 3), np.int64)
+        self._routes = np.zeros((MAX_COMPILED, step.ROUTE_WORDS), np.int64)
+        self._used = 0
+        self._failed = np.zeros((step.MAX_FAILED, step.FAILED_WORDS), np.int64)
+        memory = (buffer, received, self._outbox.words, self._table, self._failed)
+        work = np.zeros(step.WORDS, np.int64)
+        work[step.MOST] = len(buffer)
+        work[step.BUFFER_AT :] = [address_of(each) for each in memory]
+        self.work: Words = work.data
+        self._work_at = address_of(work)
+        self._buffer, self._lengths = buffer.data, received[:, LENGTH]
+        self._kept = (*memory, places)
+
+    def step(self, client: Words, *, reads: bool) -> Callable[[], None]:
+        """Return the step of a client that receives, or one that goes on."""
+        if not self.is_compiled:
+            return lambda: None
+        return step.forward.bound(self._work_at, address_of(client), int(reads))
+
+    def enter(
+        self, client_id: int, key: bytes, seed: int, targets_at: int, numbers_at: int
+    ) -> Words | None:
+        """Add the route of a client's frames of one key; return its counters, None without room.
+
+        The caller keeps the targets and the times by sequence number, which are passed by address.
+        """
+        if not self.is_compiled or self._used == MAX_COMPILED:
+            return None
+        row = self._routes[self._used]
+        self._used += 1
+        row[:] = seed, targets_at, numbers_at, 0, 0, 0
+        number = int.from_bytes(key, "little")
+        entry = step.entry_of(client_id, number)
+        while self._table[entry, step.KEY_CLIENT]:
+            entry = (entry + 1) % step.ENTRIES
+        self._table[entry] = client_id, number, address_of(row)
+        words: Words = row.data
+        return words
+
+    def clear(self) -> None:
+        """Discard all routes."""
+        if self._used:
+            self._used = 0
+            self._table[:, step.KEY_CLIENT] = 0
+
+    def load(self, data: bytes, now_us: int) -> None:
+        """Put a chunk of a stream, of at most 256 kB, in the place of a read."""
+        self._buffer[: len(data)] = data
+        self._lengths[0] = len(data)
+        work = self.work
+        work[step.NOW_US] = now_us
+        work[step.COUNT] = 1
+        work[step.AT] = work[step.OFFSET] = work[step.TAKEN] = 0
+
+    def run(self) -> list[bytes]:
+        """Return the frames of the run."""
+        buffer, begin = self._buffer, self.work[step.BUFFER_AT]
+        parts = self._outbox.parts[: self._outbox.words[PARTS]].tolist()
+        return [bytes(buffer[at - begin : at - begin + size]) for at, size in parts]
+
+    def failures(self) -> list[list[int]]:
+        """Return the clients that did not get the whole run, as in `forwarding_step.FAILED`."""
+        found: list[list[int]] = self._failed[: self.work[step.FAILED]].tolist()
+        return found
+
+    def rest(self) -> bytes:
+        """Return what is left of the present datagram."""
+        at, offset = self.work[step.AT], self.work[step.OFFSET]
+        begin = at * step.MAX_DATAGRAM
+        return bytes(self._buffer[begin + offset : begin + int(self._lengths[at])])
+
+    def skip(self) -> None:
+        """Go on to the next datagram."""
+        work = self.work
+        work[step.TAKEN] += int(self._lengths[work[step.AT]])
+        work[step.AT] += 1
+        work[step.OFFSET] = 0
+
+    def unread(self) -> list[bytes]:
+        """Return the datagrams that are left, and skip them."""
+        found = []
+        while self.work[step.AT] < self.work[step.COUNT]:
+            found.append(self.rest())
+            self.skip()
+        return found

@@ -1,0 +1,198 @@
+"""One compiled step that forwards the frames of a read: check, look up, send.
+
+Theory of operation. The step receives datagrams into a buffer (or finds the chunk of a stream
+there), walks over the frames, and gathers those whose route is known into a run. A run ends where
+the next frame goes to other clients; it is sent to each of its clients by one system call. The
+first bytes that need Python end the walk: Python handles them, moves on, and calls the step again,
+so that all frames stay in their order. They are:
+
+| bytes                                                               | status      |
+| ------------------------------------------------------------------- | ----------- |
+| no frame of MAVLink 2 with a route in the table and a good checksum | `HAND_OVER` |
+| a run that is recorded, has other clients, or was not sent to all   | `RUN_SENT`  |
+| an error of the socket                                              | `ERROR`     |
+| datagrams after one of these, or beyond the most bytes of a read    | `UNREAD`    |
+
+Counters are kept in the rows of the routes. All memory belongs to `forwarding.Forwarding`.
+"""
+
+import errno
+from typing import Any, Final
+
+import numpy as np
+
+from gateway.compiled import array_at, compiled
+from gateway.compiled.entry_point import EntryPoint
+from gateway.compiled.messages import (
+    HEADER_WORDS,
+    LAST_SIZE,
+    LENGTH,
+    OUTBOX_WORDS,
+    PARTS,
+    PARTS_AT,
+    ROOM,
+    group,
+    send_parts,
+)
+from gateway.compiled.system_calls import receive_many
+from gateway.wire.frame_scan import SEQUENCE, frame_holds, frame_key, frame_size
+
+MAX_DATAGRAM: Final = 4096
+"""Programs that join frames fill a packet of the network, at most some 2000 bytes; longer datagrams
+are cut off."""
+READS: Final = ROOM
+"""Most datagrams of a read, and most frames of a run."""
+HAND_OVER, RUN_SENT, ERROR, UNREAD = 1, 2, 4, 8
+
+STATUS, NOW_US, MOST, IS_RECORDED, COUNT, AT, OFFSET, TAKEN, READ, ERROR_NUMBER = range(10)
+"""Words of the state of a step: its result and the time; most bytes of a read, and whether Python
+takes each run; the number of datagrams, the present one and the offset in it; bytes walked over and
+read; the number of an error."""
+FRAME, TARGETS, FAILED, BUFFER_AT, HEADERS_AT, OUTBOX_AT, TABLE_AT, FAILED_AT = range(10, 18)
+"""Size of the frame that is handed over, if it is one; the address of the targets of the run, and
+the number of those that failed; addresses of the other memory."""
+WORDS: Final = 18
+CLIENT_ID, INPUT, OUTPUT, WAY, IS_PLAIN, LARGEST = range(6)
+"""Words of a client: its id; the file to receive from and to send to, or -1, and the way to send;
+whether its frames may be forwarded without Python; the size of its largest recent datagram."""
+CLIENT_WORDS: Final = 6
+SEED, TARGETS_OF, NUMBERS_AT, FRAMES, SIZE, HEARD_US = range(6)
+"""Words of a route: seed of the checksum, addresses of its targets and of the times by sequence
+number; frames, bytes, and the time of the last one."""
+ROUTE_WORDS: Final = 6
+TARGET_COUNT, HAS_OTHERS, FIRST_TARGET = range(3)
+"""Words of targets: how many follow, whether Python serves others, address of the first client."""
+KEY_CLIENT, KEY, ROUTE_AT = range(3)
+"""Words of an entry of the table."""
+ENTRIES: Final = 8192
+FAILED_WORDS: Final = 4
+"""Index of a client among the targets, frames that it was sent, number of the error, and bytes of
+the next frame that were sent."""
+MAX_FAILED: Final = 4096
+
+_INT: Final = np.dtype(np.int64)
+_BYTE: Final = np.dtype(np.uint8)
+_LEAST_DATAGRAM: Final = 32
+
+
+@EntryPoint
+def forward(work_at: int, client_at: int, reads: int) -> None:
+    """Receive, if wanted, and forward up to the first bytes that need Python."""
+    work = array_at(work_at, (WORDS,), _INT)
+    client = array_at(client_at, (CLIENT_WORDS,), _INT)
+    headers = array_at(work[HEADERS_AT], (READS, HEADER_WORDS), _INT)
+    outbox = array_at(work[OUTBOX_AT], (OUTBOX_WORDS,), _INT)
+    work[STATUS] = work[FAILED] = outbox[PARTS] = 0
+    if reads:
+        _receive(work, client, headers)
+    _walk(work, client, headers, outbox)
+    if not work[STATUS] & RUN_SENT:
+        _send_run(work, outbox)
+    if work[AT] < work[COUNT]:
+        work[STATUS] |= UNREAD
+
+
+@compiled
+def _receive(work: Any, client: Any, headers: Any) -> None:
+    """Receive about as many datagrams as `MOST` allows."""
+    work[AT] = work[OFFSET] = work[COUNT] = work[TAKEN] = work[READ] = 0
+    count = min(READS, max(1, (work[MOST] + client[LARGEST] - 1) // client[LARGEST]))
+    count = receive_many(client[INPUT], work[HEADERS_AT], count)
+    if count < 0:
+        if count != -errno.EAGAIN:
+            work[STATUS], work[ERROR_NUMBER] = ERROR, -count
+        return
+    work[COUNT] = count
+    # It falls slowly, so that a mixture of sizes is not underestimated.
+    largest = max(_LEAST_DATAGRAM, client[LARGEST] - client[LARGEST] // 4)
+    for k in range(count):
+        work[READ] += headers[k, LENGTH]
+        largest = max(largest, headers[k, LENGTH])
+    client[LARGEST] = largest
+
+
+@compiled
+def _walk(work: Any, client: Any, headers: Any, outbox: Any) -> None:
+    """Gather runs and send all but the last, up to the first bytes that need Python."""
+    data = array_at(work[BUFFER_AT], (READS * MAX_DATAGRAM,), _BYTE)
+    while work[AT] < work[COUNT] and work[TAKEN] < work[MOST]:
+        begin = work[AT] * MAX_DATAGRAM + work[OFFSET]
+        end = work[AT] * MAX_DATAGRAM + headers[work[AT], LENGTH]
+        while begin < end:
+            size = frame_size(data, begin, end)
+            found = _route_of(work, client, data, begin) if size and client[IS_PLAIN] else 0
+            if found == 0:
+                work[FRAME] = size
+                work[STATUS] |= HAND_OVER
+                return
+            route = array_at(found, (ROUTE_WORDS,), _INT)
+            if not frame_holds(data, begin, route[SEED]):
+                work[FRAME] = 0
+                work[STATUS] |= HAND_OVER
+                return
+            if outbox[PARTS] == READS or route[TARGETS_OF] != work[TARGETS]:
+                _send_run(work, outbox)
+                if work[STATUS] & RUN_SENT:
+                    return
+            _gather(work, outbox, route, data, begin, size)
+            begin += size
+            work[OFFSET] += size
+        work[TAKEN] += headers[work[AT], LENGTH]
+        work[AT] += 1
+        work[OFFSET] = 0
+
+
+@compiled
+def entry_of(client_id: int, key: int) -> int:
+    """Return where the search for a route in the table begins."""
+    return (key ^ key >> 13 ^ key >> 24 ^ client_id * 61) % ENTRIES
+
+
+@compiled
+def _route_of(work: Any, client: Any, data: Any, begin: int) -> int:
+    """Return the address of the route of a frame, or 0."""
+    key = frame_key(data, begin)
+    table = array_at(work[TABLE_AT], (ENTRIES, 3), _INT)
+    entry = entry_of(client[CLIENT_ID], key)
+    while table[entry, KEY_CLIENT]:
+        if table[entry, KEY] == key and table[entry, KEY_CLIENT] == client[CLIENT_ID]:
+            return int(table[entry, ROUTE_AT])
+        entry = (entry + 1) % ENTRIES
+    return 0
+
+
+@compiled
+def _gather(work: Any, outbox: Any, route: Any, data: Any, begin: int, size: int) -> None:
+    """Add a frame to the run, and count it."""
+    parts = array_at(outbox[PARTS_AT], (READS, 2), _INT)
+    parts[outbox[PARTS], 0], parts[outbox[PARTS], 1] = work[BUFFER_AT] + begin, size
+    outbox[PARTS] += 1
+    work[TARGETS] = route[TARGETS_OF]
+    numbers = array_at(route[NUMBERS_AT], (256,), _INT)
+    numbers[data[begin + SEQUENCE]] = route[HEARD_US] = work[NOW_US]
+    route[FRAMES] += 1
+    route[SIZE] += size
+
+
+@compiled
+def _send_run(work: Any, outbox: Any) -> None:
+    """Send the run to its clients, and discard it unless Python has to do more for it."""
+    if outbox[PARTS] == 0:
+        return
+    count = array_at(work[TARGETS], (1,), _INT)[TARGET_COUNT]
+    targets = array_at(work[TARGETS], (FIRST_TARGET + count,), _INT)
+    failed = array_at(work[FAILED_AT], (MAX_FAILED, FAILED_WORDS), _INT)
+    group(outbox)
+    for k in range(count):
+        client = array_at(targets[FIRST_TARGET + k], (CLIENT_WORDS,), _INT)
+        outbox[LAST_SIZE] = 0
+        sent = send_parts(outbox, client[OUTPUT], client[WAY]) if client[OUTPUT] >= 0 else 0
+        if sent < outbox[PARTS]:
+            row = work[FAILED]
+            failed[row, 0], failed[row, 1] = k, max(sent, 0)
+            failed[row, 2], failed[row, 3] = max(-sent, 0), outbox[LAST_SIZE]
+            work[FAILED] += 1
+    if work[FAILED] or targets[HAS_OTHERS] or work[IS_RECORDED]:
+        work[STATUS] |= RUN_SENT
+    else:
+        outbox[PARTS] = 0
