@@ -412,6 +412,9 @@ class Hub:
                 for before, each in zip(range(len(passing), 0, -1), passing, strict=True):
                     number = sequence - before & 0xFF
                     client.send(self.signer.sequence_and_sign(each, number, now_us))
+                if not client.is_proven:
+                    # Its answer proves that it receives.
+                    self._ask_round_trip([client], frame.origin[0], now_us)
 
     def _tick(self) -> None:
         # First, so that the next tick follows whatever happens below.
@@ -466,8 +469,11 @@ class Hub:
         systems = self._vehicles.systems(now_us)
         if not asked or not systems:
             return
-        requests = self._round_trip.ask(systems[0], now_us)
-        for client in asked:
+        self._ask_round_trip(asked, systems[0], now_us)
+
+    def _ask_round_trip(self, clients: Iterable[Client], system: int, now_us: int) -> None:
+        requests = self._round_trip.ask(system, now_us)
+        for client in clients:
             for frame in requests:
                 if client.endpoint.passes(frame.message_id):
                     client.send(frame)

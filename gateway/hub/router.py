@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import all as dialect
 
 from gateway.hub.fanout import Fanout
 from gateway.hub.limits import RequestQueue
-from gateway.hub.round_trip import RoundTrip, is_of_gateway
+from gateway.hub.round_trip import NOBODY, RoundTrip, is_of_gateway
 from gateway.hub.routing_table import (
     HEARTBEAT_ID,
     LATE,
@@ -263,8 +263,9 @@ class Router:
             return
         client = self._clients.get(incoming.client_id)
         systems = self._vehicles.systems(now_us)
-        if client is not None and systems:
-            answer = self._round_trip.answer(frame, systems[0], now_us)
+        if client is not None:
+            # A panel has no vehicle, and must answer to get the telemetry of a UDP port.
+            answer = self._round_trip.answer(frame, systems[0] if systems else NOBODY, now_us)
             if answer is not None:
                 self.charge(incoming.client_id, len(answer.data))
                 client.send(answer)

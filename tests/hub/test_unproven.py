@@ -138,3 +138,14 @@ async def test_heartbeats_reach_a_client_that_only_sends_heartbeats(rig: Rig) ->
         await port.fly(1)
     heartbeats = sum(frame[7:10] == bytes(3) for frame in port.frames)
     assert heartbeats >= 10
+
+
+async def test_program_with_a_hub_and_no_vehicle_proves_itself_by_its_answer(rig: Rig) -> None:
+    port = Port(rig)
+    panel = rig.hub(f"udp:127.0.0.1:{port.gateway.hub.listening_ports()[0]}")
+    await rig.until_open(panel)
+    await port.fly(1)
+    panel.send(rig.out(rig.sender(255, 190).heartbeat()))
+    await rig.quiet()
+    await port.fly(0.2)
+    assert port.state() == "open"

@@ -258,6 +258,8 @@ class Client:
     words: Words = field(init=False)
     """Its state in the compiled step."""
     loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop)
+    is_proven = True
+    """Whether it is certain that it receives; False only of peers whose address may be forged."""
     may_return: ClassVar[bool] = True
     """Whether each frame from here may be one that was sent elsewhere and has returned."""
     _version1_since_us: int | None = None

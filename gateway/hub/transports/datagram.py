@@ -39,7 +39,7 @@ BACKLOG_DATAGRAMS: Final = 256
 UNPROVEN_FACTOR: Final = 10
 """Bytes sent for each byte received, to a peer that has not proven that it receives: a heartbeat of
 a station pays for a vehicle's heartbeat and home, which is all that it waits for."""
-HEARTBEAT_RESERVE: Final = 60
+HEARTBEAT_RESERVE: Final = 42
 """Bytes of these that only heartbeats may use, or telemetry would leave no room for them."""
 UNPROVEN_IDLE_US: Final = 5 * US_PER_S
 """A peer that has not proven that it receives is removed after this time without a frame."""
@@ -314,7 +314,7 @@ class DatagramPeer(DatagramClient):
     """System and component of its first frame."""
     address: Address
     """Host and port of the peer."""
-    is_proven: bool = False
+    is_proven = False
     _spent: int = 0
     """Bytes that were sent while it was unproven."""
 
