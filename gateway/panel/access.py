@@ -14,25 +14,29 @@ import re
 import secrets
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
-from enum import StrEnum
 from http import HTTPStatus
 from typing import Final
 from urllib.parse import SplitResult, parse_qs, urlsplit
+from weakref import WeakValueDictionary
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import ClientDisconnect, cookie_parser
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from gateway.panel.connections import Client, address_group
+from gateway.panel.admission import Holder, Places, address_group
+from gateway.panel.admission import Role as Role
+from gateway.panel.connections import Client
 from gateway.panel.panel_settings import LOOPBACK, PanelSettings
 
 COOKIE: Final = "mavgate_panel"
 ROLE: Final = "mavgate.role"
 """Key of the scope with the user's role."""
+HOLDER: Final = "mavgate.holder"
+"""Key of the scope with the `Holder` of what the request opens."""
 MAX_BODY: Final = 1 << 20
 MAX_LOGIN_BODY: Final = 1 << 13
 LOGIN_S: Final = 10.0
@@ -56,6 +60,12 @@ CORS_HEADERS: Final = {
 MAX_DIGITS: Final = 18
 """Of a length; Python reads no number of more than some thousand."""
 WS_POLICY_VIOLATION: Final = 1008
+LARGE_ANSWERS: Final = re.compile(r"(/mavlink2rest)?(/v1)?/mavlink(/|$)|/path/|/history/")
+"""Answers that may have megabytes: one at a time for each session."""
+PIECE: Final = 1 << 16
+"""Bytes of an answer that are handed to the connection at once."""
+WRITE_S: Final = 30.0
+"""Longest time until a client has taken a piece; it holds memory for so long."""
 
 COST: Final = 1 << 15
 """scrypt's N with r = 8 and p = 1: 32 MB and some 0.1 s, once a login."""
@@ -63,11 +73,18 @@ BLOCK: Final = 8
 MEMORY: Final = 64 << 20
 SALT_BYTES: Final = 16
 SESSION_S: Final = 12 * 3600
-MAX_SESSIONS: Final = 64
+SESSIONS_OF_ADDRESS: Final = 16
+SESSIONS_OF_ROLE: Final = 32
 MAX_ATTEMPTS: Final = 5
 """Attempts of one address within `ATTEMPT_WINDOW_S`; a right password clears them."""
 ATTEMPT_WINDOW_S: Final = 60.0
 MAX_PEERS: Final = 256
+MAX_WAITING: Final = 4
+"""Passwords of one network that wait to be hashed."""
+MAX_NETWORKS: Final = 16
+"""Networks with passwords that wait: an operator waits for one hash of each, some seconds."""
+MAX_KNOWN: Final = 64
+"""Addresses of successful logins that are remembered."""
 
 NO_SCRIPT_POLICY: Final = (
     "default-src 'none'; style-src 'self'; img-src 'self'; form-action 'self'; base-uri 'none'; "
@@ -92,13 +109,6 @@ LOGIN_PAGE: Final = """<!doctype html><html lang="en"><meta charset="utf-8">
 </label><button>Open the panel</button></form></body></html>"""
 
 
-class Role(StrEnum):
-    """Role of a page's user."""
-
-    OPERATOR = "operator"
-    VIEWER = "viewer"
-
-
 def hash_password(password: str) -> str:
     """Hash a password for the settings file: `scrypt$N$salt$hash`."""
     salt = secrets.token_bytes(SALT_BYTES)
@@ -115,15 +125,74 @@ def matches(password: str, hashed: str) -> bool:
         return False
 
 
+class BusyError(Exception):
+    """Too many others wait."""
+
+
+class FairTurns:
+    """Let one caller at a time pass; those who wait get their turns by group, one after another."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, deque[asyncio.Future[None]]] = {}
+        self._is_taken = False
+
+    @asynccontextmanager
+    async def turn(self, group: str, *, is_known: bool) -> AsyncIterator[None]:
+        """Wait for a turn; raises BusyError if too many wait, which a known group never does."""
+        if self._is_taken:
+            waiting = self._waiting.get(group, ())
+            if len(waiting) >= MAX_WAITING or (
+                not waiting and not is_known and len(self._waiting) >= MAX_NETWORKS
+            ):
+                raise BusyError
+            turn = asyncio.get_running_loop().create_future()
+            self._waiting.setdefault(group, deque()).append(turn)
+            try:
+                await turn
+            except asyncio.CancelledError:
+                # Given the turn and cancelled at once: it is passed on.
+                if turn.done() and not turn.cancelled():
+                    self._pass_on()
+                raise
+        self._is_taken = True
+        try:
+            yield
+        finally:
+            self._pass_on()
+
+    def _pass_on(self) -> None:
+        while self._waiting:
+            group = next(iter(self._waiting))
+            turns = self._waiting.pop(group)
+            turn = turns.popleft()
+            if turns:
+                self._waiting[group] = turns
+            if not turn.done():
+                turn.set_result(None)
+                return
+        self._is_taken = False
+
+
 @dataclass(slots=True)
 class Logins:
     """Sessions, and the attempts of each address."""
 
     operator_hash: str
     viewer_hash: str
+    on_close: Callable[[str], object] = lambda _: None
+    """Called with the token of a session that has ended, for whatever reason."""
     _sessions: dict[str, tuple[Role, float]] = field(default_factory=dict)
+    _places: Places[str] = field(init=False)
     _attempts: dict[str, deque[float]] = field(default_factory=dict)
-    _hashing: asyncio.Lock = field(default_factory=asyncio.Lock)
+    _hashing: FairTurns = field(default_factory=FairTurns)
+    _known: dict[str, None] = field(default_factory=dict)
+    """Addresses from which a login has succeeded, the last one at the end."""
+
+    def __post_init__(self) -> None:
+        """Make the places of the sessions."""
+        self._places = Places(
+            SESSIONS_OF_ROLE, SESSIONS_OF_ADDRESS, SESSIONS_OF_ROLE, self.close_session
+        )
 
     @property
     def is_open(self) -> bool:
@@ -135,7 +204,10 @@ class Logins:
         if self.is_open:
             return Role.OPERATOR
         role, until_s = self._sessions.get(token, (None, 0.0))
-        return role if time.monotonic() < until_s else None
+        if time.monotonic() < until_s:
+            return role
+        self.close_session(token)
+        return None
 
     def may_attempt(self, host: str) -> bool:
         """Return whether an address may attempt a login, and count the attempt.
@@ -155,24 +227,35 @@ class Logins:
         return True
 
     async def check(self, host: str, password: str) -> Role | None:
-        """Return the role of a password; one password is hashed at a time, in a thread."""
-        async with self._hashing:
+        """Return the role of a password; one password is hashed at a time, in a thread.
+
+        Networks have turns, and so has each address from which a login has succeeded. Raises
+        BusyError if too many wait.
+        """
+        address = address_group(host)
+        is_known = address in self._known or host in LOOPBACK
+        async with self._hashing.turn(address if is_known else _network(host), is_known=is_known):
             role = await asyncio.to_thread(self._role_of_password, password)
         if role is not None:
-            self._attempts.pop(address_group(host), None)
+            self._attempts.pop(address, None)
+            self._known.pop(address, None)
+            self._known[address] = None
+            if len(self._known) > MAX_KNOWN:
+                del self._known[next(iter(self._known))]
         return role
 
-    def open_session(self, role: Role) -> str:
-        """Open a session and return its token."""
-        if len(self._sessions) >= MAX_SESSIONS:
-            self._sessions.pop(next(iter(self._sessions)))
+    def open_session(self, role: Role, host: str) -> str:
+        """Open a session and return its token; an older one of the role may end for it."""
         token = secrets.token_urlsafe(32)
+        self._places.admit(token, Holder(role, token, address_group(host)))
         self._sessions[token] = (role, time.monotonic() + SESSION_S)
         return token
 
     def close_session(self, token: str) -> None:
         """End a session."""
-        self._sessions.pop(token, None)
+        self._places.release(token)
+        if self._sessions.pop(token, None) is not None:
+            self.on_close(token)
 
     def _role_of_password(self, password: str) -> Role | None:
         if matches(password, self.operator_hash):
@@ -192,11 +275,17 @@ class AccessControl:
         app: ASGIApp,
         settings: PanelSettings,
         logins: Logins,
-        on_authenticated: Callable[[Client], None] = lambda _: None,
+        on_authenticated: Callable[[Client, Holder], None] = lambda *_: None,
+        on_stuck: Callable[[Client], None] = lambda _: None,
+        on_session_end: Callable[[str], None] = lambda _: None,
     ) -> None:
         self.app = app
         self._logins = logins
         self._on_authenticated = on_authenticated
+        self._on_stuck = on_stuck
+        self._on_session_end = on_session_end
+        self._large: WeakValueDictionary[object, asyncio.Lock] = WeakValueDictionary()
+        logins.on_close = self._end_session
         self._is_local = settings.address in LOOPBACK
         self._names = {*LOOPBACK, settings.address, *settings.hosts}
         self._secure = bool(settings.certificate)
@@ -226,9 +315,12 @@ class AccessControl:
         if scope["type"] == "http" and scope["path"] in ("/login", "/logout"):
             await self._serve_login(scope, receive, _with_headers(send))
         elif role is not None or scope["path"] == "/web/panel.css":
+            client = tuple(scope.get("client") or ("", 0))
+            token = "" if self._logins.is_open else token
             scope[ROLE] = role
-            if role is not None and scope.get("client"):
-                self._on_authenticated(tuple(scope["client"]))
+            scope[HOLDER] = holder = Holder(role, token, address_group(str(client[0])))
+            if role is not None:
+                self._on_authenticated(client, holder)
             await self._pass_on(scope, receive, send, token)
         elif scope["type"] == "http" and scope["path"] == "/":
             answer = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
@@ -288,13 +380,25 @@ class AccessControl:
         async def noted(message: Message) -> None:
             nonlocal began
             began = began or message["type"] == "http.response.start"
-            await send(message)
+            try:
+                await _send_in_pieces(send, message)
+            except TimeoutError:
+                # The rest is dropped, as for a client that has left.
+                self._on_stuck(tuple(scope.get("client") or ("", 0)))
 
         try:
-            await _answer(self.app, scope, counted, _with_headers(noted))
+            async with self._turn(scope):
+                await _answer(self.app, scope, counted, _with_headers(noted))
         except _TooLargeError:
             if not began:
                 await answer(scope, receive, _with_headers(send))
+
+    def _turn(self, scope: Scope) -> AbstractAsyncContextManager[None]:
+        """Wait for other large answers to the same session, or connection without one."""
+        if scope["method"] != "GET" or not LARGE_ANSWERS.match(scope["path"]):
+            return nullcontext()
+        key = scope[HOLDER].session or tuple(scope.get("client") or ())
+        return self._large.setdefault(key, asyncio.Lock())
 
     async def _pass_websocket(self, scope: Scope, receive: Receive, send: Send, token: str) -> None:
         """Pass a WebSocket on for as long as its session lasts."""
@@ -308,13 +412,19 @@ class AccessControl:
             if not sockets and self._sockets.get(token) is sockets:
                 del self._sockets[token]
 
+    def _end_session(self, token: str) -> None:
+        """End all that a session has opened."""
+        self._on_session_end(token)
+        for socket in self._sockets.get(token, ()):
+            socket.close_soon()
+
     async def _serve_login(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["method"] == "POST" and scope["path"] == "/logout":
             token = _token(Headers(scope=scope))
+            sockets = () if self._logins.is_open else tuple(self._sockets.get(token, ()))
             self._logins.close_session(token)
-            if not self._logins.is_open:
-                for socket in tuple(self._sockets.get(token, ())):
-                    await socket.close()
+            for socket in sockets:
+                await socket.close()
             response: Response = RedirectResponse("/login", HTTPStatus.SEE_OTHER)
             response.delete_cookie(COOKIE)
         elif scope["method"] == "POST":
@@ -334,14 +444,18 @@ class AccessControl:
             word = "Too many attempts; wait a minute."
             return HTMLResponse(LOGIN_PAGE.format(word=word), HTTPStatus.TOO_MANY_REQUESTS)
         password = parse_qs(body.decode(errors="replace")).get("password", [""])[0]
-        role = await self._logins.check(peer, password)
+        try:
+            role = await self._logins.check(peer, password)
+        except BusyError:
+            word = "Too many attempts of this network; try again in a moment."
+            return HTMLResponse(LOGIN_PAGE.format(word=word), HTTPStatus.TOO_MANY_REQUESTS)
         if role is None:
             word = "That is not the password."
             return HTMLResponse(LOGIN_PAGE.format(word=word), HTTPStatus.UNAUTHORIZED)
         response = RedirectResponse("/", HTTPStatus.SEE_OTHER)
         response.set_cookie(
             COOKIE,
-            self._logins.open_session(role),
+            self._logins.open_session(role, peer),
             httponly=True,
             samesite="strict",
             secure=self._secure,
@@ -357,6 +471,7 @@ class _SessionSocket:
         self._send = send
         self._is_valid = is_valid
         self._is_closed = False
+        self._closing: asyncio.Future[None] | None = None
 
     async def receive(self) -> Message:
         """Return the next message; a disconnect once the session has ended."""
@@ -375,6 +490,10 @@ class _SessionSocket:
             return
         self._is_closed = message["type"] == "websocket.close"
         await self._send(message)
+
+    def close_soon(self) -> None:
+        """Close the connection in the next turn of the loop."""
+        self._closing = asyncio.ensure_future(self.close())
 
     async def close(self) -> None:
         """Close the connection if it is still open."""
@@ -405,6 +524,22 @@ async def _answer(app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> N
         # Starlette's middleware misses an answer that nobody waits for any more.
         if not left:
             raise
+
+
+async def _send_in_pieces(send: Send, message: Message) -> None:
+    """Send a part of an answer; raises TimeoutError if the client does not take it.
+
+    The server waits for room between two pieces: of what is not read, only some are in memory.
+    """
+    body = message.get("body", b"")
+    for begin in range(0, len(body) - PIECE, PIECE):
+        part = {**message, "body": body[begin : begin + PIECE], "more_body": True}
+        async with asyncio.timeout(WRITE_S):
+            await send(part)
+    if len(body) > PIECE:
+        message = {**message, "body": body[(len(body) - 1) // PIECE * PIECE :]}
+    async with asyncio.timeout(WRITE_S):
+        await send(message)
 
 
 def _with_headers(send: Send, added: Mapping[str, str] = HEADERS) -> Send:
@@ -459,6 +594,12 @@ def _split(url: str) -> SplitResult:
     except ValueError:
         return urlsplit("")
     return parts
+
+
+def _network(host: str) -> str:
+    """Return the network of an address, /24 or /64, or what else it is."""
+    group = address_group(host)
+    return group.rpartition(".")[0] or group
 
 
 def _is_number(name: str) -> bool:

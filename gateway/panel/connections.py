@@ -1,100 +1,73 @@
-"""Connections to the panel: limits for clients that have not logged in, and header timeouts.
+"""Connections to the panel: places by role, header timeouts, and clients that do not read.
 
-Any client can open connections and send nothing. A connection counts as *anonymous* until a request
-on it has passed access control. Anonymous connections are limited per address and in total, beyond
-which the oldest one is closed, so connections remain for users; and each must send a complete
-request header in time, of a limited size.
+Any client can open connections and send nothing. A connection belongs to nobody until a request on
+it has passed access control; see `Places` for the limits. Each must send a complete request header
+in time, of a limited size.
 """
 
 import asyncio
-import ipaddress
 import logging
 import socket
 import ssl
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any, Final
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from gateway.hub.transports.stream import accept_each
+from gateway.panel.admission import Holder, Places, address_group
 
 log = logging.getLogger(__name__)
 
-MAX_CONNECTIONS: Final = 256
-"""Of all clients; a page needs up to eight."""
-MAX_ANONYMOUS: Final = 128
-MAX_ANONYMOUS_OF_ADDRESS: Final = 64
-"""A user behind the same address still gets in: the oldest ones are closed first."""
+CONNECTIONS_OF_SESSION: Final = 48
+"""A page needs up to eight."""
+CONNECTIONS_OF_ADDRESS: Final = 64
+CONNECTIONS_OF_ROLE: Final = 128
+"""Of operators, of viewers, and of clients that have not logged in."""
 HEADER_S: Final = 10.0
 """Longest time for a TLS handshake, and for a complete request header."""
 MAX_HEADER: Final = 1 << 16
 """Bytes of a request header; browsers send less than 8 kB."""
 BACKLOG: Final = 128
-IPV6_PREFIX: Final = 64
-"""Bits of the network that one IPv6 subscriber usually gets."""
-
 Client = tuple[str, int]
 """Address and port of a peer."""
 
 
-def address_group(host: str) -> str:
-    """Return the key by which an address is limited: itself, or the network of an IPv6 one."""
-    try:
-        address = ipaddress.ip_address(host.partition("%")[0])
-    except ValueError:
-        return host
-    if address.version == 4:
-        return host
-    if address.ipv4_mapped is not None:
-        return str(address.ipv4_mapped)
-    return str(ipaddress.ip_network((address, IPV6_PREFIX), strict=False))
-
-
 class ConnectionLimits:
-    """The open connections, and which of them are anonymous."""
+    """The open connections."""
 
     def __init__(self) -> None:
-        self._anonymous: dict[Client, socket.socket] = {}
-        self._known: dict[Client, socket.socket] = {}
+        self._sockets: dict[Client, socket.socket] = {}
+        self._places: Places[Client] = Places(
+            CONNECTIONS_OF_SESSION, CONNECTIONS_OF_ADDRESS, CONNECTIONS_OF_ROLE, self.shut
+        )
         self.refused = 0
         """Connections that were closed to keep to the limits."""
 
-    def admit(self, client: Client, sock: socket.socket) -> bool:
-        """Add a connection; the oldest anonymous one may be closed for it."""
-        self._remove_closed()
-        group = address_group(client[0])
-        of_group = [other for other in self._anonymous if address_group(other[0]) == group]
-        if len(of_group) >= MAX_ANONYMOUS_OF_ADDRESS:
-            self._evict(of_group[0])
-        elif len(self._anonymous) >= MAX_ANONYMOUS or (
-            self._anonymous and len(self._anonymous) + len(self._known) >= MAX_CONNECTIONS
-        ):
-            self._evict(next(iter(self._anonymous)))
-        if len(self._anonymous) + len(self._known) >= MAX_CONNECTIONS:
-            self.refused += 1
-            return False
-        self._anonymous[client] = sock
-        return True
+    def admit(self, client: Client, sock: socket.socket) -> None:
+        """Add a connection; an older one of nobody may be closed for it."""
+        for other in [other for other, each in self._sockets.items() if each.fileno() < 0]:
+            del self._sockets[other]
+            self._places.release(other)
+        self._sockets[client] = sock
+        self._places.admit(client, Holder(None, "", address_group(client[0])))
 
-    def authenticate(self, client: Client) -> None:
-        """Note that a request of a connection has passed access control."""
-        if (sock := self._anonymous.pop(client, None)) is not None:
-            self._known[client] = sock
+    def authenticate(self, client: Client, holder: Holder) -> None:
+        """Note whose connection it is: a request on it has passed access control."""
+        if client in self._sockets and self._places.holder(client) != holder:
+            self._places.admit(client, holder)
 
-    def _evict(self, client: Client) -> None:
+    def shut(self, client: Client) -> None:
+        """Close a connection, whatever waits to be sent."""
         self.refused += 1
-        sock = self._anonymous.pop(client)
-        try:
-            sock.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            # The peer has closed it already.
-            return
-
-    def _remove_closed(self) -> None:
-        for table in (self._anonymous, self._known):
-            for client in [client for client, sock in table.items() if sock.fileno() < 0]:
-                del table[client]
+        sock = self._sockets.pop(client, None)
+        self._places.release(client)
+        with suppress(OSError):
+            # The peer may have closed it already.
+            if sock is not None:
+                sock.shutdown(socket.SHUT_RDWR)
 
 
 class LimitedProtocol(HttpToolsProtocol):
@@ -103,7 +76,7 @@ class LimitedProtocol(HttpToolsProtocol):
     def __init__(self, *args: Any, **named: Any) -> None:
         super().__init__(*args, **named)
         self._header_timer: asyncio.TimerHandle | None = None
-        self._header_bytes = 0
+        self._header_bytes = self._headers = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Start the time limit of the first header."""
@@ -116,13 +89,15 @@ class LimitedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Parse data, unless a header is too long."""
-        if self._header_timer is not None:
+        """Parse data; close the connection if a header is too long."""
+        waits, headers = self._header_timer is not None, self._headers
+        super().data_received(data)
+        # Only bytes that are all of one header count: data may also hold the end of a body before
+        # it, or the beginning of its own.
+        if waits and self._header_timer is not None and self._headers == headers:
             self._header_bytes += len(data)
             if self._header_bytes > MAX_HEADER:
                 self.transport.abort()
-                return
-        super().data_received(data)
 
     def on_message_begin(self) -> None:
         """Start the time limit of a header."""
@@ -131,8 +106,11 @@ class LimitedProtocol(HttpToolsProtocol):
             self._await_header()
 
     def on_headers_complete(self) -> None:
-        """Stop the time limit of a header."""
+        """Stop the time limit of a header; refuse one that is too long."""
+        self._headers += 1
         self._note_header()
+        if len(self.url) + sum(len(name) + len(value) for name, value in self.headers) > MAX_HEADER:
+            raise ValueError(f"a header has at most {MAX_HEADER} bytes")
         super().on_headers_complete()
 
     def _await_header(self) -> None:
@@ -173,9 +151,7 @@ class LimitedServer(uvicorn.Server):
 
     def _admit(self, connection: socket.socket, address: Any) -> None:
         connection.setblocking(False)
-        if not self._limits.admit((str(address[0]), int(address[1])), connection):
-            connection.close()
-            return
+        self._limits.admit((str(address[0]), int(address[1])), connection)
         task = asyncio.get_running_loop().create_task(self._open(connection))
         self._opening.add(task)
         task.add_done_callback(self._opening.discard)

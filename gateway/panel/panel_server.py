@@ -15,8 +15,8 @@ import msgspec
 import uvicorn
 from fastapi import FastAPI
 from fastapi.middleware.gzip import GZipMiddleware
-from nicegui import Client, ui
 from nicegui import app as pages
+from nicegui import ui
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.staticfiles import StaticFiles
@@ -24,10 +24,11 @@ from starlette.websockets import WebSocket
 
 from gateway.clock import GatewayClock
 from gateway.live.terminal import on_end_signals, on_parent_gone
-from gateway.panel.access import ROLE, AccessControl, Logins, ScriptNonces
+from gateway.panel.access import HOLDER, ROLE, AccessControl, Logins, ScriptNonces
 from gateway.panel.connections import ConnectionLimits, LimitedProtocol, LimitedServer
 from gateway.panel.dialogues import Dialogues
 from gateway.panel.map_tiles import MapTiles
+from gateway.panel.open_pages import OpenPages
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.recording_files import RecordingJobs, add_recording_files
@@ -42,7 +43,6 @@ log = logging.getLogger(__name__)
 
 WS_QUEUE: Final = 4
 """Messages of a WebSocket that may wait to be handled, of at most 1 MB each."""
-MAX_PENDING_PAGES: Final = 16
 RECONNECT_S: Final = 30.0
 """A browser that reconnects within this time keeps its page."""
 LEAFLET: Final = Path(inspect.getfile(ui.leaflet)).parent / "dist" / "leaflet"
@@ -74,7 +74,9 @@ def run_panel(
     limits = ConnectionLimits()
     logins = Logins(settings.password, settings.viewer_password)
     config = uvicorn.Config(
-        AccessControl(app, settings, logins, limits.authenticate),
+        AccessControl(
+            app, settings, logins, limits.authenticate, limits.shut, parts.pages.end_session
+        ),
         http=LimitedProtocol,
         log_config=None,  # the log is the one of every command
         log_level="warning",
@@ -154,6 +156,7 @@ def make_parts(
         watch,
         RecordingJobs(),
         MapTiles(settings),
+        OpenPages(),
     )
 
 
@@ -175,11 +178,11 @@ def make_app(parts: PanelParts) -> FastAPI:
     app.mount("/web", _CheckedFiles(directory=WEB))
     app.mount("/leaflet", _CheckedFiles(directory=LEAFLET))
     _add_head()
-    pending = _PendingPages()
+    parts.pages.guard_socket()
 
     @ui.page("/")
     def _page(request: Request) -> None:
-        pending.add(ui.context.client)
+        parts.pages.add(ui.context.client, request.scope[HOLDER])
         build_page(parts, request.scope[ROLE])
 
     # The nonces are put into the text, which is then compressed: the last one added is outermost.
@@ -230,23 +233,6 @@ def _add_head() -> None:
     ui.add_head_html('<link rel="stylesheet" href="/web/tools.css">', shared=True)
     ui.add_head_html('<link rel="stylesheet" href="/leaflet/leaflet.css">', shared=True)
     ui.add_head_html('<script src="/web/telemetry_bus.js"></script>', shared=True)
-
-
-class _PendingPages:
-    """Pages that were loaded and have not connected yet, of which the oldest are deleted.
-
-    NiceGUI keeps each for a minute, and a client could load pages without running their scripts.
-    """
-
-    def __init__(self) -> None:
-        self._pages: dict[str, Client] = {}
-
-    def add(self, page: Client) -> None:
-        while len(self._pages) >= MAX_PENDING_PAGES:
-            self._pages.pop(next(iter(self._pages))).delete()
-        self._pages[page.id] = page
-        page.on_connect(lambda: self._pages.pop(page.id, None))
-        page.on_delete(lambda: self._pages.pop(page.id, None))
 
 
 class _CheckedFiles(StaticFiles):

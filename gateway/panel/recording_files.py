@@ -5,8 +5,9 @@ an upload gets a name that follows the rules of recordings. An upload is written
 file, checked, and only then gets its name. A download is packed while it is sent, so it needs no
 space on the disk.
 
-Exports and the catalogue are made by other processes, one at a time each, at a lower priority,
-so that neither the gateway nor the page waits for them.
+Exports and the catalogue are made by other processes at a lower priority, so that neither the
+gateway nor the page waits for them: one export of each role at a time, so that no operator waits
+for a viewer. A file is deleted once everyone who asked for it has fetched it.
 """
 
 import asyncio
@@ -19,8 +20,10 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import AsyncIterator, Callable, Generator, Sequence
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable, Generator, Hashable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from http import HTTPStatus
 from pathlib import Path, PurePath
@@ -29,6 +32,7 @@ from urllib.parse import quote
 from zipfile import ZIP_DEFLATED, ZipFile, ZipInfo
 
 from fastapi import FastAPI
+from starlette.background import BackgroundTask
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, PlainTextResponse, Response, StreamingResponse
 
@@ -43,7 +47,8 @@ from gateway.batch.catalogue import (
 )
 from gateway.geometry.angle import wrap_180
 from gateway.live.terminal import own_command
-from gateway.panel.access import RECORDINGS, ROLE, Role
+from gateway.panel.access import RECORDINGS, ROLE
+from gateway.panel.admission import LOCAL, Holder, Places, Role
 from gateway.recordings.columns import TableRow
 from gateway.recordings.convert import Pieces
 from gateway.recordings.files import TABLE, TLOG, format_of
@@ -289,7 +294,11 @@ EXPORT_S: Final = 900.0
 """Longest time for an export; a first start may compile for a minute of it."""
 KEPT_S: Final = 600.0
 """After which a file that was made and not fetched is deleted."""
-MAX_WAITING: Final = 4
+EXPORTS_OF_SESSION: Final = 2
+EXPORTS_OF_ROLE: Final = 4
+"""Exports that are being made, or wait for that: one of each role is made at a time."""
+MAX_EXPORTED: Final = 1 << 30
+"""Bytes of files that were made for one role, and not fetched; the oldest are deleted."""
 INDEX_AGAIN_S: Final = 20.0
 """Shortest time between two indexings."""
 FORMATS: Final = {
@@ -308,15 +317,29 @@ class ExportError(Exception):
     """A recording cannot be exported; the text says why."""
 
 
+@dataclass(eq=False)
+class _Export:
+    """A file that is made, or was."""
+
+    role: Role | None
+    task: "asyncio.Task[Path] | None" = None
+    users: int = 0
+    """Those who have asked for it and not fetched it."""
+    token: str = ""
+    size: int = 0
+
+
 class RecordingJobs:
     """The catalogue and the exports of all pages."""
 
     def __init__(self) -> None:
-        self._made: dict[str, tuple[Path, float]] = {}
-        """File and time of each export that was made, by its token."""
+        self._exports: dict[Hashable, _Export] = {}
+        """By role, recording and kind, oldest first."""
+        self._places: Places[Hashable] = Places(
+            EXPORTS_OF_SESSION, EXPORTS_OF_ROLE, EXPORTS_OF_ROLE
+        )
         self._folder: Path | None = None
-        self._exporting = asyncio.Lock()
-        self._waiting = 0
+        self._exporting: dict[Role | None, asyncio.Lock] = defaultdict(asyncio.Lock)
         self._indexing: asyncio.Task[None] | None = None
         self._indexed: object = None
         self._indexed_s = -INDEX_AGAIN_S
@@ -335,25 +358,40 @@ class RecordingJobs:
         self._indexed, self._indexed_s = state, time.monotonic()
         self._indexing = asyncio.get_running_loop().create_task(self._index(folder))
 
-    async def export(self, folder: Path, name: str, kind: str) -> str:
-        """Export a recording, and return the address of the file.
+    async def export(self, folder: Path, name: str, kind: str, holder: Holder = LOCAL) -> str:
+        """Export a recording, and return the address of the file; an equal one is used again.
 
         Raises ExportError if it cannot be made; RecordingError if there is no such recording.
         """
-        if self._waiting >= MAX_WAITING:
-            raise ExportError("other exports are being made; try again in a while")
-        find_recording(folder, name)
-        self._waiting += 1
+        recording = find_recording(folder, name)
+        key = (holder.role, folder, name, kind, recording.size, recording.modified_s)
+        export = self._exports.get(key)
+        if export is None:
+            if not self._places.admit(key, holder):
+                raise ExportError("other exports are being made; try again in a while")
+            export = self._exports[key] = _Export(holder.role)
+            export.task = asyncio.create_task(self._export(key, export, folder, name, kind))
+        task = export.task
+        assert task is not None
+        export.users += 1
         try:
-            async with self._exporting:
-                return await self._export(folder, name, kind)
-        finally:
-            self._waiting -= 1
+            await asyncio.shield(task)
+        except asyncio.CancelledError:
+            export.users -= 1
+            if not export.users:
+                task.cancel()
+                await asyncio.wait([task])
+            raise
+        return f"{EXPORTS}{export.token}"
 
     def close(self) -> None:
         """Delete what was made."""
         if self._indexing is not None:
             self._indexing.cancel()
+        for export in self._exports.values():
+            if export.task is not None:
+                export.task.cancel()
+        self._exports.clear()
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -362,32 +400,58 @@ class RecordingJobs:
 
         @app.get(EXPORTS + "{token}")
         async def _fetch(token: str) -> Response:
-            file, _ = self._made.get(token, (None, 0.0))
-            if file is None or not file.is_file():
-                return PlainTextResponse("this file is no longer there: export it again", 404)
-            return FileResponse(file, filename=file.name)
+            for key, export in self._exports.items():
+                if token and export.token == token and export.task is not None:
+                    file = export.task.result()
+                    fetched = BackgroundTask(self._note_fetched, key, export)
+                    return FileResponse(file, filename=file.name, background=fetched)
+            return PlainTextResponse("this file is no longer there: export it again", 404)
 
-    async def _export(self, folder: Path, name: str, kind: str) -> str:
-        self._delete_old()
+    async def _note_fetched(self, key: Hashable, export: _Export) -> None:
+        export.users -= 1
+        if export.users <= 0:
+            self._delete(key, export)
+
+    async def _export(
+        self, key: Hashable, export: _Export, folder: Path, name: str, kind: str
+    ) -> Path:
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="mavgate-export-"))
         token = secrets.token_urlsafe(16)
         work = self._folder / token
-        work.mkdir()
         try:
-            target = await _make(folder, work, name, kind)
+            async with self._exporting[export.role]:
+                work.mkdir()
+                target = await _make(folder, work, name, kind)
         except BaseException:
             # Half a file of a large recording may take gigabytes.
             shutil.rmtree(work, ignore_errors=True)
+            self._exports.pop(key, None)
             raise
-        self._made[token] = (target, time.monotonic())
-        return f"{EXPORTS}{token}"
+        finally:
+            self._places.release(key)
+        export.token, export.size = token, target.stat().st_size
+        self._make_room(export)
+        asyncio.get_running_loop().call_later(KEPT_S, self._delete, key, export)
+        return target
 
-    def _delete_old(self) -> None:
-        for token, (file, made_s) in list(self._made.items()):
-            if time.monotonic() - made_s > KEPT_S:
-                shutil.rmtree(file.parent, ignore_errors=True)
-                del self._made[token]
+    def _make_room(self, export: _Export) -> None:
+        """Delete the oldest files of a role beyond the limit of bytes."""
+        made = [
+            (key, each)
+            for key, each in self._exports.items()
+            if each.role is export.role and each.token
+        ]
+        excess = sum(each.size for _, each in made) - MAX_EXPORTED
+        for key, each in made:
+            if excess > 0 and each is not export:
+                excess -= each.size
+                self._delete(key, each)
+
+    def _delete(self, key: Hashable, export: _Export) -> None:
+        if self._folder is not None and self._exports.get(key) is export:
+            del self._exports[key]
+            shutil.rmtree(self._folder / export.token, ignore_errors=True)
 
     async def _index(self, folder: Path) -> None:
         try:

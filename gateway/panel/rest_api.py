@@ -14,8 +14,8 @@ References
 import asyncio
 import json
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Set
+from collections import Counter, deque
+from collections.abc import AsyncIterator, Callable, Iterator, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -26,7 +26,7 @@ from urllib.parse import quote
 
 from fastapi import APIRouter, Request, Response
 from pydantic_core import SchemaError, SchemaValidator, core_schema
-from starlette.responses import FileResponse
+from starlette.responses import FileResponse, StreamingResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway import __version__
@@ -36,6 +36,10 @@ from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, templ
 
 MAX_KINDS: Final = 8192
 """Enough for some fifty aircraft; forged ids must not fill the memory."""
+MAX_KINDS_OF_SYSTEM: Final = 1024
+"""An aircraft and its components send some hundred."""
+DROPPED_SHARE: Final = 8
+"""Divisor: part of a full table that is dropped at once, the entries updated longest ago."""
 
 Key = tuple[int, int, str]
 """System, component and name of the message."""
@@ -70,8 +74,10 @@ class MessageBook:
         self._now_s = now_s
         self._entries: dict[Key, _Entry] = {}
         self._heard: set[tuple[int, int]] = set()
-        self.left_out = 0
-        """Messages of kinds for which there was no room."""
+        self._kinds: Counter[int] = Counter()
+        """Entries by system."""
+        self.dropped = 0
+        """Entries that made room for others."""
 
     def take(self, message: Any, *, is_sent: bool = False) -> None:
         """Take in one message, received or sent from here."""
@@ -84,10 +90,22 @@ class MessageBook:
             entry.message = message
             entry.last_s = now_s
             entry.counter += 1
-        elif len(self._entries) < MAX_KINDS:
-            self._entries[key] = _Entry(message, now_s, now_s)
         else:
-            self.left_out += 1
+            if self._kinds[key[0]] >= MAX_KINDS_OF_SYSTEM:
+                self._drop(key[0])
+            elif len(self._entries) >= MAX_KINDS:
+                self._drop(None)
+            self._entries[key] = _Entry(message, now_s, now_s)
+            self._kinds[key[0]] += 1
+
+    def _drop(self, system_id: int | None) -> None:
+        """Drop the entries that were updated longest ago, of one system or of all."""
+        keys = [key for key in self._entries if system_id in (None, key[0])]
+        keys.sort(key=lambda key: self._entries[key].last_s)
+        for key in keys[: max(1, len(keys) // DROPPED_SHARE)]:
+            del self._entries[key]
+            self._kinds[key[0]] -= 1
+            self.dropped += 1
 
     def has_heard(self, system_id: int, component_id: int) -> bool:
         """Return whether anything came from a component."""
@@ -96,19 +114,21 @@ class MessageBook:
     def look_up(self, path: str) -> Any:
         """Return the value at a path such as `vehicles/1/components/1/messages/ATTITUDE`.
 
-        It is a JSON pointer without its first slash; empty is the whole tree. Raises KeyError if
-        there is none.
+        It is a JSON pointer without its first slash; empty is the whole tree. Entries are encoded
+        by `plain_entry`. Raises KeyError if there is none.
         """
         parts = path.split("/") if path else []
         node: Any = self._tree(parts)
         for part in parts:
+            if isinstance(node, _Entry):
+                node = node.as_json()
             if isinstance(node, dict):
                 node = node[part]
             elif isinstance(node, list) and part in map(str, range(len(node))):
                 node = node[int(part)]
             else:
                 raise KeyError(part)
-        return node
+        return node.as_json() if isinstance(node, _Entry) else node
 
     def _tree(self, parts: list[str]) -> dict[str, Any]:
         """Build as much of the tree as a path needs."""
@@ -118,7 +138,7 @@ class MessageBook:
             component = vehicle["components"].setdefault(
                 str(component_id), {"id": component_id, "messages": {}}
             )
-            component["messages"][name] = entry.as_json()
+            component["messages"][name] = entry
         return {"vehicles": vehicles}
 
     def _chosen(self, parts: list[str]) -> Iterator[tuple[Key, _Entry]]:
@@ -126,6 +146,12 @@ class MessageBook:
         for key, entry in self._entries.items():
             if all(want in ("", str(have)) for want, have in zip(wanted, key, strict=False)):
                 yield key, entry
+
+
+def plain_entry(value: object) -> dict[str, Any]:
+    """Return an entry of the tree as JSON, when the encoder reaches it."""
+    assert isinstance(value, _Entry)
+    return value.as_json()
 
 
 def _written(time_s: float) -> str:
@@ -219,9 +245,17 @@ def with_header(message: Any) -> dict[str, Any]:
     return {"header": header, "message": to_json(message)}
 
 
+ENCODER: Final = json.JSONEncoder(
+    indent=2, ensure_ascii=False, allow_nan=False, default=plain_entry
+)
+PIECE: Final = 1 << 14
+"""Letters that are encoded before others get their turn; a few ms."""
+JSON: Final = "application/json"
+
+
 def pretty(value: Any) -> str:
     """Write indented JSON; scripts rely on the line breaks."""
-    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
+    return ENCODER.encode(value)
 
 
 API_VERSION: Final = 0
@@ -283,9 +317,9 @@ class RestApi:
     async def read(self, path: str) -> Response:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
         try:
-            return _json(self._book.look_up(path))
+            return StreamingResponse(encode_in_pieces(self._book.look_up(path)), media_type=JSON)
         except KeyError:
-            return Response(NOTHING, media_type="application/json")
+            return Response(NOTHING, media_type=JSON)
 
     async def helper(self, name: str | None = None) -> Response:
         """Return an empty message of a name, to be filled in and sent."""
@@ -312,7 +346,7 @@ class RestApi:
             return _refused(f"Failed to parse input as UTF-8 string: {error}")
         except ValueError as error:
             return _refused(NOT_A_MESSAGE, str(error))
-        return Response("Ok.", media_type="application/json")
+        return Response("Ok.", media_type=JSON)
 
     async def follow(self, socket: WebSocket) -> None:
         """Send messages with names that match a regular expression; accept messages to send."""
@@ -411,7 +445,7 @@ def _read_json5(text: str) -> Any:
 
 def _refused(text: str, detail: str = "") -> Response:
     """Return mavlink2rest's text, on which its clients rely; the reason is in a header."""
-    answer = Response(text, HTTPStatus.NOT_FOUND, media_type="application/json")
+    answer = Response(text, HTTPStatus.NOT_FOUND, media_type=JSON)
     if detail:
         answer.headers["x-error-detail"] = quote(detail, safe=" '\":;,./()[]{}<>|=+*&-_")
     return answer
@@ -427,5 +461,18 @@ def _sender(header: Any) -> tuple[int, int]:
     return ids[0], ids[1]
 
 
+async def encode_in_pieces(value: Any) -> AsyncIterator[str]:
+    """Encode a part of the tree piece by piece: all of it may have megabytes."""
+    gathered, size = [], 0
+    for text in ENCODER.iterencode(value):
+        gathered.append(text)
+        size += len(text)
+        if size >= PIECE:
+            yield "".join(gathered)
+            gathered, size = [], 0
+            await asyncio.sleep(0)
+    yield "".join(gathered)
+
+
 def _json(value: Any, status: HTTPStatus = HTTPStatus.OK) -> Response:
-    return Response(pretty(value), status, media_type="application/json")
+    return Response(pretty(value), status, media_type=JSON)

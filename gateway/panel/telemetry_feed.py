@@ -6,12 +6,13 @@ nothing queues up here.
 """
 
 import asyncio
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 from fastapi import FastAPI
-from starlette.responses import Response
+from starlette.responses import Response, StreamingResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway.clock import GatewayClock
@@ -107,8 +108,7 @@ def add_tracks(app: FastAPI, fleet: FleetState) -> None:
         if vehicle is None:
             return Response(status_code=404)
         fixes = [(at.lat_deg, at.lon_deg, at.alt_amsl_m, at.time_us) for at in vehicle.fixes]
-        plain = {"track": vehicle.history.track(), "fixes": fixes}
-        return Response(msgspec.json.encode(plain), media_type="application/json")
+        return _streamed({"track": vehicle.history.track(), "fixes": fixes})
 
     @app.get(HISTORY_PATH)
     async def _history(system_id: int) -> Response:
@@ -117,9 +117,20 @@ def add_tracks(app: FastAPI, fleet: FleetState) -> None:
             return Response(status_code=404)
         history = vehicle.history
         step = max(1, len(history) // MAX_HISTORY + 1)
-        columns: dict[str, list[float]] = {"time_us": [*history.time_us[::step]]}
-        columns |= {
-            name: [float(f"{value:.9g}") for value in column[::step]]
-            for name, column in history.columns.items()
-        }
-        return Response(msgspec.json.encode(columns), media_type="application/json")
+        columns: dict[str, Sequence[float]] = {"time_us": [*history.time_us[::step]]}
+        columns |= {name: column[::step] for name, column in history.columns.items()}
+        return _streamed(columns)
+
+
+def _streamed(columns: Mapping[str, Sequence[Any]]) -> Response:
+    """Answer with a JSON object, column by column: all of it may have a megabyte."""
+
+    async def pieces() -> AsyncIterator[bytes]:
+        before = b"{"
+        for name, column in columns.items():
+            plain = [float(f"{x:.9g}") if isinstance(x, float) else x for x in column]
+            yield before + msgspec.json.encode(name) + b":" + msgspec.json.encode(plain)
+            before = b","
+        yield b"}"
+
+    return StreamingResponse(pieces(), media_type="application/json")

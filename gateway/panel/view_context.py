@@ -38,6 +38,7 @@ from gateway.clock import GatewayClock
 from gateway.panel.access import Role
 from gateway.panel.dialogues import Dialogue, Dialogues
 from gateway.panel.map_tiles import MapTiles
+from gateway.panel.open_pages import OpenPages
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
 from gateway.panel.recording_files import RecordingJobs
@@ -73,6 +74,7 @@ class PanelParts:
     jobs: RecordingJobs
     """The catalogue and the exports of recordings."""
     tiles: MapTiles
+    pages: OpenPages
 
     @property
     def recordings_folder(self) -> Path:

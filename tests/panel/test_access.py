@@ -445,3 +445,74 @@ def test_request_with_invalid_text_is_one_line_in_the_log(error: Exception, is_k
     record = logging.LogRecord("uvicorn.error", logging.ERROR, "", 0, "Invalid", (), cause)
     assert without_traceback(record)
     assert (record.exc_info is not None) == is_kept
+
+
+def get_scope(path: str, port: int) -> Scope:
+    headers = [(b"host", b"127.0.0.1")]
+    client = ("10.0.0.1", port)
+    return {"type": "http", "method": "GET", "path": path, "headers": headers, "client": client}
+
+
+async def answer_to(guard: AccessControl, path: str, send: Send, *, port: int = 1) -> None:
+    async def receive() -> Message:
+        return {"type": "http.request"}
+
+    await guard(get_scope(path, port), receive, send)
+
+
+@pytest.mark.parametrize(
+    ("path", "is_large"),
+    [
+        ("/v1/mavlink", True),
+        ("/mavlink2rest/mavlink/vehicles", True),
+        ("/history/1", True),
+        ("/path/1", True),
+        ("/", False),
+        ("/web/panel.css", False),
+    ],
+)
+async def test_large_answers_to_one_client_are_sent_one_after_another(
+    path: str, is_large: bool
+) -> None:
+    running: list[str] = []
+    peak: list[int] = []
+
+    async def answers(scope: Scope, receive: Receive, send: Send) -> None:
+        running.append(path)
+        peak.append(len(running))
+        await asyncio.sleep(0.01)
+        running.pop()
+
+    async def send(_: Message) -> None:
+        pass
+
+    guard = guarded()
+    guard.app = answers
+    await asyncio.gather(*(answer_to(guard, path, send) for _ in range(3)))
+    assert max(peak) == (1 if is_large else 3)
+    await asyncio.gather(*(answer_to(guard, path, send, port=port) for port in range(3)))
+    assert max(peak) == 3, "others are not waited for"
+
+
+async def test_client_that_takes_no_piece_of_an_answer_is_disconnected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(access, "WRITE_S", 0.01)
+    stuck: list[object] = []
+    sizes: list[int] = []
+
+    async def answers(scope: Scope, receive: Receive, send: Send) -> None:
+        await Response(bytes(3 * access.PIECE + 1))(scope, receive, send)
+
+    async def send(message: Message) -> None:
+        sizes.append(len(message.get("body", b"")))
+        if len(sizes) == 3:
+            await asyncio.Event().wait()
+
+    guard = AccessControl(answers, PanelSettings(), Logins("", ""), on_stuck=stuck.append)
+    await answer_to(guard, "/", send)
+    assert sizes == [0, access.PIECE, access.PIECE]
+    assert stuck == [("10.0.0.1", 1)]
+    sizes.append(0)
+    await answer_to(guard, "/", send)
+    assert sizes[4:] == [0, access.PIECE, access.PIECE, access.PIECE, 1]

@@ -1,6 +1,7 @@
 """Limits on connections of clients that have not logged in, with a server on loopback."""
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
@@ -11,15 +12,15 @@ from starlette.responses import PlainTextResponse
 from starlette.types import Receive, Scope, Send
 
 from gateway.panel import connections
+from gateway.panel.admission import Holder, Role, address_group
 from gateway.panel.connections import (
-    MAX_ANONYMOUS,
-    MAX_ANONYMOUS_OF_ADDRESS,
-    MAX_CONNECTIONS,
+    CONNECTIONS_OF_ADDRESS,
+    CONNECTIONS_OF_ROLE,
+    CONNECTIONS_OF_SESSION,
     MAX_HEADER,
     ConnectionLimits,
     LimitedProtocol,
     LimitedServer,
-    address_group,
 )
 
 REQUEST = b"GET /%s HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n"
@@ -47,45 +48,45 @@ def is_shut(sock: socket.socket) -> bool:
         return False
 
 
-def test_oldest_anonymous_connection_of_an_address_is_closed(
+def test_connection_for_which_there_is_no_place_is_closed(
     make: Callable[[], socket.socket],
 ) -> None:
     limits = ConnectionLimits()
     known, first = make(), make()
-    assert limits.admit(("10.0.0.1", 1), known)
-    limits.authenticate(("10.0.0.1", 1))
-    assert limits.admit(("10.0.0.1", 2), first)
-    other = make()
-    assert limits.admit(("10.0.0.2", 3), other)
-    for port in range(MAX_ANONYMOUS_OF_ADDRESS):
-        assert limits.admit(("10.0.0.1", 100 + port), make())
+    limits.admit(("10.0.0.1", 1), known)
+    limits.authenticate(("10.0.0.1", 1), Holder(Role.VIEWER, "s", "10.0.0.1"))
+    limits.admit(("10.0.0.1", 2), first)
+    for port in range(CONNECTIONS_OF_ADDRESS):
+        limits.admit(("10.0.0.1", 100 + port), make())
     assert is_shut(first)
     assert not is_shut(known)
-    assert not is_shut(other)
     assert limits.refused == 1
 
 
-def test_anonymous_connections_of_many_addresses_do_not_block_users(
+def test_connections_of_one_viewer_leave_places_for_everybody(
     make: Callable[[], socket.socket],
 ) -> None:
     limits = ConnectionLimits()
-    users = [make() for _ in range(MAX_CONNECTIONS - MAX_ANONYMOUS)]
-    for port, sock in enumerate(users):
-        client = (f"10.0.{port}.1", port)
-        assert limits.admit(client, sock)
-        limits.authenticate(client)
-    for port in range(300):
-        assert limits.admit((f"10.1.{port}.1", port), make())
-    assert limits.refused == 300 - MAX_ANONYMOUS
-    assert not any(map(is_shut, users))
+    operator = make()
+    limits.admit(("10.0.0.2", 1), operator)
+    limits.authenticate(("10.0.0.2", 1), Holder(Role.OPERATOR, "o", "10.0.0.2"))
+    viewers = [make() for _ in range(300)]
+    for port, sock in enumerate(viewers):
+        limits.admit(("10.0.0.1", port), sock)
+        limits.authenticate(("10.0.0.1", port), Holder(Role.VIEWER, "v", "10.0.0.1"))
+    assert sum(not is_shut(sock) for sock in viewers) == CONNECTIONS_OF_SESSION
+    newcomer = make()
+    limits.admit(("10.0.0.1", 1000), newcomer)
+    assert not is_shut(newcomer)
+    assert not is_shut(operator)
 
 
 def test_closed_connections_are_not_counted(make: Callable[[], socket.socket]) -> None:
     limits = ConnectionLimits()
-    for port in range(2 * MAX_CONNECTIONS):
+    for port in range(2 * CONNECTIONS_OF_ROLE):
         sock = make()
-        assert limits.admit(("10.0.0.1", port), sock)
-        limits.authenticate(("10.0.0.1", port))
+        limits.admit(("10.0.0.1", port), sock)
+        limits.authenticate(("10.0.0.1", port), Holder(Role.VIEWER, "s", "10.0.0.1"))
         sock.close()
     assert limits.refused == 0
 
@@ -164,4 +165,29 @@ async def test_connection_with_an_endless_header_is_closed() -> None:
         writer.write((b"x: " + b"y" * 1000 + b"\r\n") * (MAX_HEADER // 500))
         with pytest.raises((ConnectionError, asyncio.IncompleteReadError)):
             await reader.readexactly(1)
+        writer.close()
+
+
+@pytest.mark.io
+@pytest.mark.parametrize("size", [1000, MAX_HEADER, 300_000, 1_000_000])
+async def test_body_that_arrives_with_its_header_is_no_part_of_it(size: int) -> None:
+    async with served() as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        head = f"POST / HTTP/1.1\r\nhost: x\r\ncontent-length: {size}\r\n\r\n".encode()
+        # Another request follows in the same piece as the end of the body.
+        for _ in range(3):
+            writer.write(head + bytes(size) + REQUEST % b"")
+            for _ in range(2):
+                answer = await reader.readuntil(b"hello")
+                assert answer.startswith(b"HTTP/1.1 200"), answer
+        writer.close()
+
+
+@pytest.mark.io
+async def test_complete_header_that_is_too_long_is_refused() -> None:
+    async with served() as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(b"GET / HTTP/1.1\r\nx: " + b"y" * MAX_HEADER + b"\r\n\r\n")
+        with contextlib.suppress(ConnectionError):
+            assert b"200" not in await reader.readline()
         writer.close()

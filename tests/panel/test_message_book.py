@@ -1,5 +1,6 @@
 """The tree of newest messages, with its counts and times."""
 
+import json
 from datetime import datetime
 from typing import Any
 
@@ -49,7 +50,7 @@ def test_value_is_found_by_its_path(book: MessageBook) -> None:
     everything = book.look_up("")
     assert sorted(everything["vehicles"]) == ["1", "2"]
     whole = everything["vehicles"]["1"]["components"]["1"]["messages"]["ATTITUDE"]
-    assert book.look_up(ATTITUDE) == whole
+    assert book.look_up(ATTITUDE) == whole.as_json()
     assert list(book.look_up("vehicles/2/components")) == ["5"]
 
 
@@ -92,16 +93,33 @@ def test_unknown_path_raises_key_error(book: MessageBook, path: str) -> None:
         book.look_up(path)
 
 
-def test_number_of_forged_ids_is_bounded(
+@pytest.mark.parametrize("bound", ["MAX_KINDS", "MAX_KINDS_OF_SYSTEM"])
+def test_forged_ids_are_dropped_before_entries_that_are_updated(
+    book: MessageBook, wall: Wall, monkeypatch: pytest.MonkeyPatch, bound: str
+) -> None:
+    monkeypatch.setattr(rest_api, bound, 3)
+    for number in range(3, 10):
+        wall.now_s += 1
+        book.take(attitude(9))
+        of_system = bound == "MAX_KINDS_OF_SYSTEM"
+        book.take(attitude(0, 1, number) if of_system else attitude(0, number))
+    assert book.look_up(f"{ATTITUDE}/message/roll") == 9
+    everything = book.look_up("")["vehicles"]
+    kept = everything["1"]["components"] if of_system else everything
+    assert len(kept) == 3
+    assert book.dropped >= 5
+
+
+async def test_tree_is_encoded_in_pieces_as_it_is_in_one(
     book: MessageBook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rest_api, "MAX_KINDS", 3)
-    for system_id in range(3, 10):
-        book.take(attitude(0, system_id))
-    assert len(book.look_up("")["vehicles"]) == 3
-    assert book.left_out == 6
-    book.take(attitude(9))
-    assert book.look_up(f"{ATTITUDE}/message/roll") == 9
+    for number in range(20):
+        book.take(attitude(0, number + 3))
+    monkeypatch.setattr(rest_api, "PIECE", 100)
+    pieces = [piece async for piece in rest_api.encode_in_pieces(book.look_up(""))]
+    assert max(map(len, pieces)) < 200
+    assert "".join(pieces) == rest_api.pretty(book.look_up(""))
+    assert len(json.loads("".join(pieces))["vehicles"]) == 22
 
 
 def test_sent_message_is_listed_but_not_counted_as_received(book: MessageBook) -> None:

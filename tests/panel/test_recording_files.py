@@ -19,10 +19,10 @@ from gateway.batch.catalogue import Catalogue, CataloguedFile, FlightFigures
 from gateway.batch.facts import FlightFacts
 from gateway.panel import recording_files
 from gateway.panel.access import ROLE, Role
+from gateway.panel.admission import Holder
 from gateway.panel.recording_files import (
     CHUNK,
     FORMATS,
-    MAX_WAITING,
     ExportError,
     RecordingFacts,
     RecordingJobs,
@@ -261,18 +261,69 @@ async def test_failed_export_reports_the_reason_and_leaves_no_file(
     assert list(tmp_path.glob("mavgate-export-*")) == []
 
 
-async def test_number_of_waiting_exports_is_limited(exported: Path) -> None:
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Exports are made at once, and listed."""
+    names: list[str] = []
+
+    async def make(folder: Path, work: Path, name: str, kind: str) -> Path:
+        names.append(kind)
+        target = work / f"{name}.{kind}"
+        target.write_bytes(bytes(1000))
+        return target
+
+    monkeypatch.setattr(recording_files, "_make", make)
+    return names
+
+
+VIEWER = Holder(Role.VIEWER, "session", "10.0.0.1")
+
+
+async def test_exports_of_a_viewer_keep_no_operator_waiting(
+    exported: Path, made: list[str]
+) -> None:
     jobs = RecordingJobs()
-    async with asyncio.timeout(60.0), jobs._exporting:
+    async with asyncio.timeout(60.0), jobs._exporting[Role.VIEWER]:
         waiting = [
-            asyncio.create_task(jobs.export(exported, NAME, "kml")) for _ in range(MAX_WAITING)
+            asyncio.create_task(jobs.export(exported, NAME, kind, VIEWER))
+            for kind in ("kml", "gpx")
         ]
         await asyncio.sleep(0)
         with pytest.raises(ExportError, match="other exports"):
-            await jobs.export(exported, NAME, "kml")
-        for task in waiting:
-            task.cancel()
-        await asyncio.wait(waiting)
+            await jobs.export(exported, NAME, "csv", VIEWER)
+        await jobs.export(exported, NAME, "csv")
+    await asyncio.gather(*waiting)
+    assert made == ["csv", "kml", "gpx"]
+    jobs.close()
+
+
+async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
+    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    jobs, app = RecordingJobs(), FastAPI()
+    jobs.serve(app)
+    first, second = await asyncio.gather(
+        *(jobs.export(exported, NAME, "kml", VIEWER) for _ in range(2))
+    )
+    assert (first, made) == (second, ["kml"])
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+        assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    jobs.close()
+
+
+async def test_bytes_of_exports_are_bounded(
+    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(recording_files, "MAX_EXPORTED", 2500)
+    jobs = RecordingJobs()
+    for kind in ("csv", "kml", "gpx", "page"):
+        await jobs.export(exported, NAME, kind, VIEWER)
+    kept = sorted(file.suffix for file in tmp_path.glob("mavgate-export-*/*/*"))
+    assert kept == [".gpx", ".page"]
     jobs.close()
 
 

@@ -125,7 +125,8 @@ class RecordingsView:
         parts = self._context.parts
         text = f"{name}: making {FORMATS[kind][0]} …"
         with notify_failure(self._context), ongoing(text):
-            url = await parts.jobs.export(parts.recordings_folder, name, kind)
+            holder = parts.pages.holder(self._context.page)
+            url = await parts.jobs.export(parts.recordings_folder, name, kind, holder)
             ui.download.from_url(url)
 
     async def _open(self, name: str) -> None:
