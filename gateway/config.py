@@ -10,8 +10,8 @@ import logging
 import re
 import stat
 import textwrap
-import tomllib
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -29,6 +29,7 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.printable import UserError
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.toml_file import TomlError, read_toml, read_toml_text
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
 USUAL: Final = (
@@ -51,6 +52,8 @@ USUAL: Final = (
 """The settings that are changed most: those of the template."""
 COMMENT_WIDTH: Final = 96
 VEHICLE_IDS: Final = range(1, 32)
+MAX_ERRORS: Final = 20
+"""Errors of a file that are listed; to find the meant name of each unknown one takes a while."""
 
 log = logging.getLogger(__name__)
 
@@ -157,7 +160,7 @@ def save_endpoint(file: Path, url: str) -> None:
 
 def _document(file: Path) -> Any:
     try:
-        return tomlkit.parse(file.read_text(encoding="utf-8") if file.exists() else "")
+        return tomlkit.parse(read_toml_text(file) if file.exists() else "")
     except ValueError as error:
         raise OSError(errno.EINVAL, "is not TOML: repair or remove it", str(file)) from error
 
@@ -192,20 +195,15 @@ def render(settings: GatewaySettings, keys: Sequence[str] = ("",)) -> str:
 
 def _read(path: Path, kind: type[Settings]) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        line = 1 + error.object.count(b"\n", 0, error.start)
-        raise ConfigError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
-    try:
-        table = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # Also endless numbers, and endless brackets.
-        raise ConfigError(f"{path}: is not valid TOML: {error}") from error
+        table = read_toml(path)
+    except TomlError as error:
+        raise ConfigError(f"{path}: {error}") from error
     table, remarks = migrate_sections(table)
     for remark in remarks:
         log.warning("%s: %s", path, remark)
-    errors = [f"{path}: {error}" for error in _check(table, kind, "")]
+    errors = [f"{path}: {error}" for error in islice(_check(table, kind, ""), MAX_ERRORS)]
+    if len(errors) == MAX_ERRORS:
+        errors.append(f"{path}: has more errors, which are not listed")
     if errors:
         raise ConfigError("\n".join(errors))
     return table

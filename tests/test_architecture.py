@@ -24,6 +24,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "settings": set(),
     "compiled": set(),
     "output": set(),
+    "toml_file": set(),
     "geometry": {"records", "compiled"},
     "wire": FOUNDATION,
     "sensing": FOUNDATION,
@@ -37,7 +38,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "aircraft": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
     "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},
-    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "extras"},
+    "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "extras", "toml_file"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output", "printable"},
     "batch": FOUNDATION
     | STAGES
@@ -46,7 +47,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | EDGES,
     "panel": FOUNDATION | STAGES | {"status", "recordings", "analysis", "batch"} | EDGES,
     "fleet": FOUNDATION | STAGES | {"output", "recordings"} | EDGES,
-    "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output"} | EDGES,
+    "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output", "toml_file"} | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
     "live": FOUNDATION
     | STAGES

@@ -31,6 +31,9 @@ MAX_LINE: Final = 64 << 10
 MAX_PATH: Final = 107
 """Bytes of `sun_path`, less the zero at its end."""
 MAX_CONNECTIONS: Final = 16
+"""Of more, the one that has waited longest for a request is closed."""
+IDLE_S: Final = 60.0
+"""A connection without a request is closed after this time."""
 FOLDER_RIGHTS: Final = 0o700
 SOCKET_RIGHTS: Final = 0o600
 SERVICE_SOCKET_RIGHTS: Final = 0o660
@@ -92,7 +95,8 @@ class ControlServer:
         self._for_group = "RUNTIME_DIRECTORY" in os.environ
         self._socket: socket.socket | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._writers: dict[asyncio.StreamWriter, bool] = {}
+        """Open connections, and whether each waits for a request; the one waiting longest first."""
         self._verbs = {
             verb: (_parameters_of(handler), handler)
             for table in ({"verbs": self._list}, *tables)
@@ -183,21 +187,40 @@ class ControlServer:
 
         reader, writer = await asyncio.open_unix_connection(sock=connection, limit=MAX_LINE)
         # One that was accepted just before the end is served only after it.
-        is_refused = self._socket is None or len(self._writers) >= MAX_CONNECTIONS
-        if is_refused or not self._is_allowed(writer):
+        if self._socket is None or not self._is_allowed(writer) or not self._has_room():
             writer.close()
             return
-        self._writers.add(writer)
         try:
-            while line := await reader.readline():
+            while line := await self._next_line(reader, writer):
                 writer.write(await self.answer(line))
                 await writer.drain()
-        except (ConnectionError, ValueError):
-            # Gone, or a line beyond the limit.
+        except (ConnectionError, ValueError, TimeoutError):
+            # Gone, idle, or a line beyond the limit.
             log.debug("Control connection ended early")
         finally:
-            self._writers.discard(writer)
+            self._writers.pop(writer, None)
             writer.close()
+
+    async def _next_line(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bytes:
+        import asyncio
+
+        self._writers.pop(writer, None)
+        self._writers[writer] = True
+        async with asyncio.timeout(IDLE_S):
+            line = await reader.readline()
+        if writer in self._writers:
+            self._writers[writer] = False
+        return line
+
+    def _has_room(self) -> bool:
+        """Return whether there is room, after closing an idle connection if needed."""
+        if len(self._writers) >= MAX_CONNECTIONS:
+            idle = next((writer for writer, waits in self._writers.items() if waits), None)
+            if idle is None:
+                return False
+            del self._writers[idle]
+            idle.transport.abort()
+        return True
 
     def _is_allowed(self, writer: asyncio.StreamWriter) -> bool:
         """Check the peer's user; the folder's mode alone may be too permissive."""

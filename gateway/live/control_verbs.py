@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import os
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,6 +10,7 @@ from typing import Annotated, Final
 
 import msgspec
 
+from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, Verbs
 from gateway.live.recorder import Recorder
@@ -124,14 +126,8 @@ class SerialVerbs:
     async def _connect(self, port: str) -> SerialStatus:
         self._check_changeable()
         ports = await asyncio.to_thread(list_serial_ports)
-        # No other path: opening some devices has effects, as that of a watchdog, which restarts
-        # the machine.
         # The one of the settings may be chosen even if this machine does not list it.
-        known = {"auto", self._own, *(each.device for each in ports)}
-        if port not in known:
-            raise ControlError(
-                f"{port!r} is not a serial port here; there are {', '.join(sorted(known))}"
-            )
+        check_listed(port, {"auto", self._own, *(each.device for each in ports)})
         await self._port.connect(port)
         return self._port.status(ports)
 
@@ -145,10 +141,24 @@ class SerialVerbs:
             raise ControlError("the receiver is simulated: `mavgate run` uses a serial port")
 
 
+def check_listed(port: str, known: set[str]) -> None:
+    """Refuse a device that is not a known serial port.
+
+    Opening some devices has effects, as that of a watchdog, which restarts the machine.
+    """
+    if {port, os.path.realpath(port)}.isdisjoint(known):
+        listed = ", ".join(sorted(known)) or "none"
+        raise ControlError(f"{port!r} is not a serial port here; there are {listed}")
+
+
 def client_verbs(hub: Hub) -> Verbs:
     """Return the handlers of `clients.*`."""
 
-    def add(url: str) -> tuple[str, ...]:
+    async def add(url: str) -> tuple[str, ...]:
+        endpoint = parse_endpoint(url)
+        if endpoint.kind is EndpointKind.SERIAL:
+            ports = await asyncio.to_thread(list_serial_ports)
+            check_listed(endpoint.host, {each.device for each in ports})
         hub.add(url)
         return hub.endpoints()
 

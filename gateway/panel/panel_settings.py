@@ -1,5 +1,6 @@
 """Settings of the panel."""
 
+import base64
 import re
 from typing import Annotated, Final, Literal
 
@@ -23,6 +24,27 @@ class MapStyle(Settings, frozen=True):
     ]
     attribution: Annotated[str, setting("Attribution that the owner requires.")] = ""
     max_zoom: Annotated[int, setting("Greatest available zoom.", ge=1, le=24)] = 19
+
+
+LEAST_COST: Final = 1 << 14
+"""Least N of scrypt: fewer make a stolen hash easy to guess."""
+LEAST_BYTES: Final = 16
+"""Of salt and digest."""
+
+
+def why_weak(hashed: str) -> str:
+    """Return why a password's hash is not accepted; empty if it is."""
+    try:
+        _, cost, *parts = hashed.split("$")
+        number = int(cost) if cost.isascii() and cost.isdigit() and len(cost) < 9 else 0
+        salt, digest = (base64.b64decode(part, validate=True) for part in parts)
+    except ValueError:
+        return "it is not scrypt$N$salt$hash"
+    if number & (number - 1) or number < LEAST_COST:
+        return f"its N is not a power of two of at least {LEAST_COST}"
+    if min(len(salt), len(digest)) < LEAST_BYTES:
+        return f"its salt and its hash must have at least {LEAST_BYTES} bytes"
+    return ""
 
 
 class PanelSettings(Settings, frozen=True):
@@ -121,6 +143,9 @@ class PanelSettings(Settings, frozen=True):
 
     def __post_init__(self) -> None:
         """Refuse to be open to other machines without a password, and a key of nothing."""
+        for name in ("password", "viewer_password"):
+            if (hashed := getattr(self, name)) and (why := why_weak(hashed)):
+                raise ValueError(f"{name}: {why}; `mavgate panel --hash-password` makes one")
         for origin in self.origins:
             if not ORIGIN.fullmatch(origin):
                 raise ValueError(

@@ -22,8 +22,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from itertools import chain
 from pathlib import Path
-from tempfile import NamedTemporaryFile, gettempdir
-from typing import IO, BinaryIO, Final, Literal, cast
+from tempfile import TemporaryFile, gettempdir
+from typing import IO, Any, BinaryIO, Final, Literal, cast
 
 from gateway.printable import UserError
 from gateway.recordings.senders import Senders
@@ -48,6 +48,11 @@ TAIL: Final = 1 << 14
 """Some twenty rows."""
 MAX_HEAD: Final = 4 * MAX_LINE
 """Before the first row; a few kilobytes pack any number of zeros."""
+MAX_PACKED_RATIO: Final = 100
+"""Of a gzipped file. Recordings are packed to a third or a tenth, and a file of repeated lines to a
+thousandth, on which a reader of lines would work for minutes."""
+LEAST_BOMB: Final = 1 << 25
+"""Bytes from which on that matters: they are read in a second."""
 MAX_UNPACKED: Final = 1 << 30
 """Bytes to which a packed file may be unpacked at once, unless the settings give another limit; a
 megabyte of gzip can hold a gigabyte of zeros."""
@@ -193,7 +198,31 @@ def open_unpacked(path: Path) -> Iterator[tuple[BinaryIO, BinaryIO]]:
     """Open a file, gzipped or not, to read it to its end."""
     with _readable(path), open_recording(path) as raw:
         packed = raw.peek(len(GZIP_MAGIC)).startswith(GZIP_MAGIC)
-        yield (cast(BinaryIO, gzip.GzipFile(fileobj=raw)) if packed else raw), raw
+        yield (cast(BinaryIO, io.BufferedReader(_Unpacker(path, raw))) if packed else raw), raw
+
+
+class _Unpacker(io.RawIOBase):
+    """The content of a gzipped file, unless it is packed as no recording can be."""
+
+    def __init__(self, path: Path, raw: BinaryIO) -> None:
+        self._path = path
+        self._raw = raw
+        self._file = gzip.GzipFile(fileobj=raw)
+        self._size = 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """Read into a buffer; raises OSError for a bomb."""
+        data = self._file.read(len(buffer))
+        buffer[: len(data)] = data
+        self._size += len(data)
+        if self._size > max(MAX_PACKED_RATIO * self._raw.tell(), LEAST_BOMB):
+            why = f"is packed to less than 1/{MAX_PACKED_RATIO}, as no recording is"
+            raise OSError(errno.EFBIG, why, str(self._path))
+        return len(data)
 
 
 def open_recording(path: Path) -> io.BufferedReader:
@@ -252,8 +281,11 @@ def read_chunks(
 
 @contextmanager
 def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
-    """Have a file's content in a temporary one, which nobody cuts while it is read."""
-    copy = NamedTemporaryFile(prefix="mavgate-")  # noqa: SIM115
+    """Have a file's content in a temporary one, which nobody cuts while it is read.
+
+    It has no name, so that nothing is left of it if the process is killed; see `name_of`.
+    """
+    copy = TemporaryFile(prefix="mavgate-")  # noqa: SIM115
     try:
         for data in content:
             copy.write(data)
@@ -267,6 +299,11 @@ def temporary_copy(path: Path, content: Iterable[bytes]) -> Iterator[IO[bytes]]:
         raise OSError(error.errno, why, gettempdir()) from error
     with copy:
         yield copy
+
+
+def name_of(file: IO[bytes]) -> str:
+    """Return a name by which this process can open a file without a name."""
+    return f"/dev/fd/{file.fileno()}"
 
 
 def read_ends(path: Path) -> tuple[bytes, bytes]:

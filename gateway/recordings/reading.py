@@ -61,6 +61,7 @@ from gateway.recordings.table import (
 from gateway.recordings.tlog import JUMP_US, ORDER_US, TlogRecord
 from gateway.records import FusionState, NodeStatus
 from gateway.sensing.calibration import NodeCalibration
+from gateway.toml_file import TomlError, read_toml
 from gateway.units import counted
 
 TRACKER_LOG: Final = files("gateway.recordings.formats") / "tracker-log.toml"
@@ -206,13 +207,10 @@ def recorded_frames(
 def read_column_map(path: Path) -> ColumnMap:
     """Read a column map; raises FlightError if it is invalid."""
     try:
-        return msgspec.toml.decode(path.read_text(encoding="utf-8-sig"), type=ColumnMap)
-    except UnicodeDecodeError as error:
-        line = 1 + error.object.count(b"\n", 0, error.start)
-        raise FlightError(f"{path}: line {line}: is not UTF-8 text; save it as UTF-8") from error
-    except OSError as error:
-        raise FlightError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
+        return msgspec.convert(read_toml(path), ColumnMap)
+    except TomlError as error:
+        raise FlightError(f"{path}: {error}") from error
+    except msgspec.ValidationError as error:
         raise FlightError(f"{path}: is not a column map: {error}") from error
 
 

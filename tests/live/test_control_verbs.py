@@ -4,13 +4,15 @@ import math
 import threading
 from collections.abc import AsyncIterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 
-from gateway.live.control_socket import ControlServer
-from gateway.live.control_verbs import RecorderVerbs, mark_verbs
+from gateway.live import control_verbs
+from gateway.live.control_socket import ControlError, ControlServer
+from gateway.live.control_verbs import RecorderVerbs, client_verbs, mark_verbs
 from gateway.recordings.index import Recording
 from gateway.vehicle.plan import Location
 from tests.conftest import ManualClock
@@ -143,3 +145,24 @@ async def test_player_follows_its_verbs(clock: ManualClock, tmp_path: Path) -> N
     assert (await state("play.stop"))["state"] == "paused"
     assert played.ended.is_set()
     played.close()
+
+
+async def test_only_listed_serial_ports_are_added_as_clients(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    port = SimpleNamespace(device="/dev/ttyUSB9")
+    monkeypatch.setattr(control_verbs, "list_serial_ports", lambda: [port])
+    added: list[str] = []
+    hub: Any = SimpleNamespace(
+        add=added.append, remove=None, clients=None, endpoints=lambda: tuple(added)
+    )
+    add: Any = client_verbs(hub)["clients.add"]
+    link = tmp_path / "by-id"
+    link.symlink_to("/dev/ttyUSB9")
+    for device in ("/dev/pts/0", "/dev/watchdog", "/dev/zero", str(tmp_path)):
+        with pytest.raises(ControlError, match="is not a serial port here"):
+            await add(f"serial:{device}:57600")
+    wanted = [f"serial:{device}:57600" for device in ("/dev/ttyUSB9", link)]
+    for url in [*wanted, "udp:127.0.0.1:14550"]:
+        await add(url)
+    assert added == [*wanted, "udp:127.0.0.1:14550"]

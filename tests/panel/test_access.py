@@ -1,6 +1,7 @@
 """Access control of the page, in front of an application that accepts every request."""
 
 import asyncio
+import base64
 import contextlib
 import http
 import logging
@@ -33,12 +34,12 @@ from gateway.panel.access import (
     matches,
 )
 from gateway.panel.panel_server import PanelError, tls_files, without_traceback
-from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.panel_settings import LEAST_COST, PanelSettings
 
 HERE = "http://127.0.0.1:14590"
 with pytest.MonkeyPatch.context() as patch:
-    # A hash contains its cost: checking these takes less than a millisecond.
-    patch.setattr(access, "COST", 1 << 4)
+    # A hash contains its cost: checking these takes half of the time.
+    patch.setattr(access, "COST", LEAST_COST)
     OPERATOR, VIEWER = hash_password("tower"), hash_password("guest")
 
 
@@ -516,3 +517,28 @@ async def test_client_that_takes_no_piece_of_an_answer_is_disconnected(
     sizes.append(0)
     await answer_to(guard, "/", send)
     assert sizes[4:] == [0, access.PIECE, access.PIECE, access.PIECE, 1]
+
+
+SALT = base64.b64encode(bytes(16)).decode()
+
+
+@pytest.mark.parametrize(
+    "hashed",
+    [
+        "scrypt$",
+        "scrypt$x",
+        "scrypt$16384$$",
+        f"scrypt$16384${SALT}",
+        f"scrypt$8192${SALT}${SALT}",
+        f"scrypt$16385${SALT}${SALT}",
+        f"scrypt$-16384${SALT}${SALT}",
+        f"scrypt$16384${SALT}$AAAA",
+        f"scrypt$16384$AAAA${SALT}",
+        f"scrypt$16384${SALT}$?",
+    ],
+)
+@pytest.mark.parametrize("name", ["password", "viewer_password"])
+def test_malformed_and_weak_hashes_are_refused(name: str, hashed: str) -> None:
+    with pytest.raises(ValueError, match="--hash-password"):
+        PanelSettings(**{name: hashed})
+    PanelSettings(**{name: f"scrypt$16384${SALT}${SALT}"})

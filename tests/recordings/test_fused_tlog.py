@@ -124,7 +124,7 @@ def test_full_disk_of_a_copy_is_reported_with_its_folder(
     path = tmp_path / "a.bin"
     monkeypatch.setattr(
         recording_streams,
-        "NamedTemporaryFile",
+        "TemporaryFile",
         lambda **_: Path("/dev/full").open("wb"),  # noqa: SIM115
     )
     with (
@@ -133,3 +133,12 @@ def test_full_disk_of_a_copy_is_reported_with_its_folder(
     ):
         pass
     assert caught.value.filename == tempfile.gettempdir()
+
+
+def test_copy_has_no_name_so_that_nothing_is_left_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with temporary_copy(tmp_path / "a.bin", [b"content"]) as copy:
+        assert list(tmp_path.iterdir()) == []
+        assert Path(recording_streams.name_of(copy)).read_bytes() == b"content"

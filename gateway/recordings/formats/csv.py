@@ -47,6 +47,10 @@ LATE_US: Final = 60 * US_PER_S
 """A value measured this long before or after its line has a damaged time, or another clock's."""
 
 
+MAX_LISTED: Final = 20
+"""Unknown columns that are named."""
+
+
 class Column(Settings, frozen=True):
     """One column of a file: value = column * scale + offset."""
 
@@ -67,7 +71,7 @@ class ColumnMap(Settings, frozen=True):
         """Refuse a map to an unknown column."""
         unknown = sorted(set(self.columns) - set(COLUMNS) - set(EXTRA_FIELDS))
         if unknown:
-            raise ValueError(f"no such column here: {', '.join(unknown)}")
+            raise ValueError(f"no such column here: {', '.join(unknown[:MAX_LISTED])}")
         if "time_us" not in self.columns:
             raise ValueError("time_us must be mapped")
         if absent := _begun(self.columns) - self.columns.keys():

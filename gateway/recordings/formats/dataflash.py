@@ -27,6 +27,7 @@ from gateway.recordings.files import (
     DATAFLASH_BEGIN,
     Before,
     FlightError,
+    name_of,
     read_chunks,
     skip_to,
     temporary_copy,
@@ -406,7 +407,7 @@ def _open(path: Path, options: ReadOptions, damage: _PrintedDamage) -> Any:
         # The fast indexer prints to the terminal directly, not through Python.
         log.init_arrays_fast = log.init_arrays
         try:
-            damage.counting(lambda: kind.__init__(log, plain.name))
+            damage.counting(lambda: kind.__init__(log, name_of(plain)))
         except Exception as error:
             # Damage makes pymavlink raise anything, bare exceptions included.
             log.close()

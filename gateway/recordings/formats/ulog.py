@@ -34,6 +34,7 @@ from gateway.recordings.files import (
     ULOG_BEGIN,
     ULOG_HEAD,
     FlightError,
+    name_of,
     read_chunks,
     skip_to,
     temporary_copy,
@@ -403,7 +404,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
     whole = read_chunks(path, options.progress, options.unpacked_limit)
     rest, before = skip_to(ULOG_BEGIN, whole)
     with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:
-        log, unread = _load(path, content.name)
+        log, unread = _load(path, name_of(content))
     topics = {(data.name, data.multi_id): data.data for data in reversed(log.data_list)}
     known = log.initial_parameters.get(SYSTEM_ID, 1)
     is_id = isinstance(known, int) and 1 <= known <= 255

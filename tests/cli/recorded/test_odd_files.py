@@ -4,6 +4,7 @@ import gzip
 import os
 import struct
 import tempfile
+import time
 import tracemalloc
 from pathlib import Path
 
@@ -129,6 +130,20 @@ def test_packed_file_is_recognised_by_its_first_bytes_not_its_name(
     assert "100 records in 0:00.990" in run("info", path)
 
 
+@pytest.mark.parametrize("command", ["info", "fuse", "play"])
+def test_comment_lines_of_a_bomb_are_refused_in_a_moment(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "bomb.csv.gz"
+    with gzip.open(path, "wb") as file:
+        file.write(NAMES.encode() + b"\n")
+        for _ in range(400):
+            file.write(b"#\n" * (1 << 20))
+    words = ["-o", tmp_path / "out.csv"] if command == "fuse" else []
+    begin_s = time.process_time()
+    printed = run(command, path, *words, code=2)
+    assert "bomb.csv.gz: is packed to less than 1/100" in printed
+    assert time.process_time() - begin_s < 20.0
+
+
 def test_overlong_line_is_refused_within_bounded_memory(tmp_path: Path) -> None:
     path = tmp_path / "log.csv.gz"
     with gzip.open(path, "wb") as file:
@@ -169,8 +184,12 @@ def test_packed_log_beyond_the_unpacked_limit_is_refused_and_fills_neither_memor
     printed = run(command, path, *words, "--config", config, code=2)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert "bomb.gz: unpacks to more than 8 MB" in printed
-    assert "unpacked_limit_mb" in printed
+    if command == "play":
+        # All of it is read to find its format.
+        assert "bomb.gz: is packed to less than 1/100" in printed
+    else:
+        assert "bomb.gz: unpacks to more than 8 MB" in printed
+        assert "unpacked_limit_mb" in printed
     assert peak < 48 << 20
     assert not list(temporary.iterdir())
 

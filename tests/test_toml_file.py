@@ -1,0 +1,82 @@
+"""TOML files of users: hostile ones are refused in a moment, and the message says why."""
+
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gateway.config import MAX_ERRORS, ConfigError, load
+from gateway.recordings.files import FlightError
+from gateway.recordings.reading import read_column_map
+from gateway.toml_file import MAX_BYTES, MAX_DEPTH, TomlError, read_toml
+
+LIMIT_S = 5.0
+DEEP = 50_000
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        pytest.param(".".join(["a"] * DEEP) + " = 1", "line 1: is nested", id="dotted key"),
+        pytest.param("\n\n[" + ".".join(["a"] * DEEP) + "]", "line 3: is nested", id="section"),
+        pytest.param('"a" . ' * DEEP + "b = 1", "nested", id="quoted parts"),
+        pytest.param("x = " + "[" * DEEP, "nested", id="lists"),
+        pytest.param("x = " + "{a=" * DEEP, "nested", id="tables"),
+        pytest.param('x = """\n"""\ny = ' + "[" * DEEP, "line 3: is nested", id="after a text"),
+        pytest.param("# " + "x" * MAX_BYTES, "more than 1 MB", id="large"),
+        pytest.param("x = " + "1" * 100_000, "not valid TOML", id="long number"),
+    ],
+)
+def test_hostile_text_is_refused_in_a_moment(tmp_path: Path, text: str, why: str) -> None:
+    file = tmp_path / "file.toml"
+    file.write_text(text)
+    begin_s = time.process_time()
+    with pytest.raises(TomlError, match=why):
+        read_toml(file)
+    with pytest.raises(ConfigError, match=why):
+        load(file)
+    with pytest.raises(FlightError, match=why):
+        read_column_map(file)
+    assert time.process_time() - begin_s < LIMIT_S
+
+
+@pytest.mark.parametrize("reader", [load, read_column_map])
+def test_pipes_and_devices_are_refused(tmp_path: Path, reader: Callable[[Path], object]) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for path in (pipe, Path("/dev/zero")):
+        with pytest.raises((ConfigError, FlightError), match="is a pipe or a device"):
+            reader(path)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = 'a.b.c.d.e.f.g.h.i.j.k'  # [[[[[[[[[[",
+        'x = """\n[[[[[[[[[[\n{{{{{{{{{{\n"""',
+        "x = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH,
+        ".".join(["a"] * MAX_DEPTH) + " = 1.5",
+        "\n".join(f"a{n}.b.c = {n}.5" for n in range(1000)),
+        "x = [1.5, 2.5, 3.5, 4.5, 5.5, 6.5, 7.5, 8.5, 9.5, 10.5]",
+    ],
+)
+def test_usual_nesting_and_texts_with_brackets_are_read(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "file.toml"
+    file.write_text(text)
+    assert read_toml(file)
+
+
+def test_only_some_of_many_errors_are_listed(tmp_path: Path) -> None:
+    file = tmp_path / "file.toml"
+    file.write_text("\n".join(f"unknown{n} = 1" for n in range(30_000)))
+    begin_s = time.process_time()
+    with pytest.raises(ConfigError) as refused:
+        load(file)
+    assert len(str(refused.value).splitlines()) == MAX_ERRORS + 1
+    file.write_text("[columns]\n" + "\n".join(f"unknown{n} = 'x'" for n in range(30_000)))
+    with pytest.raises(FlightError) as unmapped:
+        read_column_map(file)
+    assert len(str(unmapped.value)) < 1000
+    assert time.process_time() - begin_s < LIMIT_S
