@@ -40,6 +40,7 @@ from gateway.vehicle.requests import (
     WARNING,
     Action,
     CalibrationMeasured,
+    LogWarning,
     RecordingRequest,
     SavePlan,
     SaveSettings,
@@ -59,7 +60,7 @@ class SettingsChanged:
 
 
 Recorded = FusedSample | BaroRaw | GpsFix | NodeStatus | SettingsChanged
-Order = ClientInterval | RecordingRequest | SaveSettings | SavePlan
+Order = ClientInterval | LogWarning | RecordingRequest | SaveSettings | SavePlan
 
 
 class Outputs(msgspec.Struct):

@@ -47,6 +47,7 @@ from gateway.vehicle.requests import (
     INFO,
     WARNING,
     Action,
+    LogWarning,
     RecordingRequest,
     Reply,
     Request,
@@ -410,6 +411,8 @@ class Daemon:
                 self._plans.save(order.vehicle_id, order.plan)
             case RecordingRequest():
                 (self._recorder.record if order.start else self._recorder.stop)()
+            case LogWarning():
+                log.warning("%s", order.text)
 
     def _calibrate(self, vehicle_id: int, calibration: NodeCalibration) -> None:
         """Use a calibration from now on, and write it to the aircraft's file."""

@@ -41,6 +41,8 @@ class Request:
     """Whether the client may change state: trusted, and signed where a key is set."""
     reason: str = ""
     """Why it may not, and the remedy."""
+    is_rejected: bool = False
+    """Whether its signature is wrong, so that it is not handled at all."""
 
     def reply(self, message: Any) -> Reply:
         """Answer the client that asked."""
@@ -95,6 +97,13 @@ class RecordingRequest:
 
 
 @dataclass(frozen=True, slots=True)
+class LogWarning:
+    """Write a line to the log."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrationMeasured:
     """A calibration of the calibrated samples, which the aircraft's own is then joined with."""
 
@@ -109,6 +118,7 @@ Action = (
     | SaveSettings
     | SavePlan
     | RecordingRequest
+    | LogWarning
     | CalibrationMeasured
 )
 
@@ -205,7 +215,7 @@ class RequestReader:
         self._mav: Any = mavlink.MAVLink(None)
 
     def read(self, incoming: Incoming, now_us: int) -> Request | None:
-        """Decode one whole frame; None if it is damaged, unknown, forged, or for others."""
+        """Decode one whole frame; None if it is damaged, unknown, or for others."""
         frame = incoming.frame
         message = self._decode(frame)
         if isinstance(message, str):
@@ -214,15 +224,16 @@ class RequestReader:
         if not self._is_for_us(message):
             return None
         allowed, reason = incoming.trusted, "" if incoming.trusted else NOT_TRUSTED
+        is_rejected = False
         if self.verifier is not None:
             signed = frame[0] == START_V2 and frame[2] & SIGNED
-            if signed and not self.verifier.accepts(frame, now_us):
+            if signed and (rejection := self.verifier.rejection(frame, now_us)):
                 self.faults[BAD_SIGNATURE] += 1
-                return None
+                allowed, reason, is_rejected = False, rejection, True
             if allowed and not signed:
                 allowed, reason = False, NOT_SIGNED
         sender = (message.get_srcSystem(), message.get_srcComponent())
-        return Request(incoming.client_id, *sender, message, allowed, reason)
+        return Request(incoming.client_id, *sender, message, allowed, reason, is_rejected)
 
     def _decode(self, frame: bytes) -> Any:
         """Decode a frame, or return what is wrong with it."""

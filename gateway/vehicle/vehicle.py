@@ -32,6 +32,7 @@ from gateway.vehicle.requests import (
     WARNING,
     Action,
     Answer,
+    LogWarning,
     Reply,
     Request,
     RequestLog,
@@ -72,6 +73,10 @@ OWN_SECTION: Final = "vehicle"
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
 """A refusal is announced to all at most this often: enough as a warning, without a flood."""
+
+REJECTION_INTERVAL_US: Final = 20 * US_PER_S
+"""A wrong signature is logged at most this often: a station with a wrong clock sends them for ever;
+all are listed by `status --requests`."""
 
 
 class Vehicle:
@@ -114,6 +119,7 @@ class Vehicle:
         self._announcements = Announcements(self.health)
         # Separate, so that untrusted clients cannot use up the quota of other events.
         self._refusal_texts = Announcer(REFUSALS_AT_ONCE, REFUSAL_INTERVAL_US)
+        self._rejection_due_us = 0
         self.plan = PlanService(
             system_id, self.telemetry, self._announcements.say, stored or StoredPlan()
         )
@@ -226,6 +232,8 @@ class Vehicle:
         request = self._reader.read(incoming, now_us)
         if request is None:
             return []
+        if request.is_rejected:
+            return self._note_rejected(request, now_us)
         self._control.on_request(request, now_us)
         service = self._services.get(request.message.get_type())
         if service is None:
@@ -242,6 +250,16 @@ class Vehicle:
         answers = service.handle(request, now_us)
         self.requests.add_failed(request, answers, now_us)
         return self._finish(answers)
+
+    def _note_rejected(self, request: Request, now_us: int) -> list[Action]:
+        """List a request with a wrong signature, and log one now and then."""
+        self.requests.add(request, f"refused: {request.reason}", now_us)
+        if now_us < self._rejection_due_us:
+            return []
+        self._rejection_due_us = now_us + REJECTION_INTERVAL_US
+        sender = f"system {request.system_id}, component {request.component_id}"
+        text = f"aircraft {self.system_id} refused the signature of {sender}: {request.reason}"
+        return [LogWarning(text)]
 
     def _refuse(
         self, service: Service, request: Request, reason: str, result: int, now_us: int

@@ -50,6 +50,8 @@ TICKS_PER_S: Final = 100_000
 NEW_STREAM_TICKS: Final = 60 * TICKS_PER_S
 """Largest age of the first timestamp of a stream."""
 GPS_TOLERANCE_US: Final = 2_000_000
+BEHIND_S: Final = 2.0
+"""A rejected timestamp that is older is the fault of a clock, rather than a repeated frame."""
 
 _TIMESTAMP: Final = slice(-12, -HASH_BYTES)
 """Between the link id and the hash."""
@@ -201,11 +203,21 @@ class Verifier:
 
     def accepts(self, data: bytes, now_us: int) -> bool:
         """Return whether a whole frame is signed by a holder of the key, and not a replay."""
+        return not self.rejection(data, now_us)
+
+    def rejection(self, data: bytes, now_us: int) -> str:
+        """Return why a signed frame is rejected; empty if it is accepted."""
         if not is_genuine(self._key, data):
-            return False
+            return "signed with another passphrase"
         stream = f"{data[-SIGNATURE_SIZE]}.{data[5]}.{data[6]}"
-        oldest = self._clock.oldest(now_us)
-        return self._timestamps.accept(self._key_id, stream, timestamp_of(data), oldest)
+        timestamp, oldest = timestamp_of(data), self._clock.oldest(now_us)
+        if self._timestamps.accept(self._key_id, stream, timestamp, oldest):
+            return ""
+        behind_s = (self._clock.timestamp(now_us) - timestamp) / TICKS_PER_S
+        if behind_s >= BEHIND_S:
+            # Two digits: one sender is one entry, whatever the delay of its frames.
+            return f"its clock is {float(f'{behind_s:.2g}'):.0f} s behind"
+        return "its signing timestamp was used before"
 
 
 WINDOW_TICKS: Final = 5 * TICKS_PER_S

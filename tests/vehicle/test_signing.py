@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from gateway.vehicle.requests import LogWarning
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import (
@@ -88,6 +89,30 @@ def test_replayed_frame_is_dropped(station: GroundStation) -> None:
 def test_first_frame_of_a_stream_is_dropped_if_it_is_old(station: GroundStation) -> None:
     sign(station, at_us=NOW_UNIX_US - 120_000_000)
     assert station.send(SET) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "behind_s", "reason"),
+    [
+        ("wrong", 0, "signed with another passphrase"),
+        ("wrong", 180, "signed with another passphrase"),
+        ("correct horse", 180, "its clock is 180 s behind"),
+        ("correct horse", 86_400, "its clock is 86000 s behind"),
+    ],
+)
+def test_refused_signature_is_listed_and_logged_with_its_reason(
+    station: GroundStation, key: str, behind_s: int, reason: str
+) -> None:
+    for _ in range(30):
+        sent_us = NOW_UNIX_US + station.clock.now_us - behind_s * 1_000_000
+        sign(station, key_from_passphrase(key), sent_us)
+        assert station.send(SET) == []
+        station.clock.now_us += 1_000_000
+    (entry,) = station.vehicle.requests.entries
+    assert (entry.system_id, entry.component_id, entry.count) == (255, 190, 30)
+    assert entry.outcome == f"refused: {reason}"
+    lines = [action.text for action in station.of(LogWarning)]
+    assert lines == [f"aircraft 1 refused the signature of system 255, component 190: {reason}"] * 2
 
 
 def test_forged_frame_does_not_lock_out_the_true_sender(station: GroundStation) -> None:
