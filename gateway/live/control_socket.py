@@ -32,6 +32,8 @@ MAX_PATH: Final = 107
 """Bytes of `sun_path`, less the zero at its end."""
 MAX_CONNECTIONS: Final = 16
 """Of more, the one that has waited longest for a request is closed."""
+BACKLOG: Final = 128
+"""Connections that wait in the kernel, since each wake-up accepts one."""
 IDLE_S: Final = 60.0
 """A connection without a request is closed after this time."""
 FOLDER_RIGHTS: Final = 0o700
@@ -164,7 +166,7 @@ class ControlServer:
             sock.setblocking(False)
             sock.bind(str(self.path))
             self.path.chmod(SERVICE_SOCKET_RIGHTS if self._for_group else SOCKET_RIGHTS)
-            sock.listen(MAX_CONNECTIONS)
+            sock.listen(BACKLOG)
         except OSError:
             sock.close()
             raise

@@ -1,0 +1,261 @@
+"""Attack a gateway and a panel that this program starts on loopback; print held or fell.
+
+    .venv/bin/python -m tools.attack                 # two minutes; --only WORD for some
+
+Each attack is one that guests, local programs or hostile files can make. It holds if the operator
+is still served, and the gateway sends, stores and computes no more than its limits allow.
+"""
+
+import argparse
+import asyncio
+import contextlib
+import gzip
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import Final
+from urllib.parse import urlsplit
+
+import websockets
+from pymavlink.dialects.v20 import common as mavlink
+
+from gateway.hub.transports.datagram import UNPROVEN_FACTOR
+from gateway.live.control_socket import ControlError, request
+from gateway.panel.access import hash_password
+from tests.kit.process import Process
+from tests.ports import free_port
+
+OPERATOR, VIEWER = "operator's", "viewer's"
+COMMAND_S: Final = 30.0
+"""Longest time for a command to refuse a hostile file; its start takes some seconds."""
+CONFIG = """
+[recording]
+folder = "{folder}/recordings"
+[hub]
+endpoints = ["udp-listen:127.0.0.1:{port}"]
+[panel]
+port = 0
+map_styles = []
+password = "{operator}"
+viewer_password = "{viewer}"
+"""
+
+
+@dataclass
+class Target:
+    """A demo and a panel that shows it."""
+
+    folder: Path
+    port: int
+    """Its listening UDP port."""
+    link: str = ""
+    """Address of the panel."""
+
+    def connection(self) -> HTTPConnection:
+        """Connect to the panel."""
+        return HTTPConnection(urlsplit(self.link).netloc, timeout=COMMAND_S)
+
+    def log_in(self, password: str) -> str:
+        """Open a session and return its cookie."""
+        connection = self.connection()
+        kind = {"content-type": "application/x-www-form-urlencoded"}
+        connection.request("POST", "/login", f"password={password}", kind)
+        cookie = connection.getresponse().headers["set-cookie"].partition(";")[0]
+        connection.close()
+        return str(cookie)
+
+    def status_of(self, cookie: str, method: str = "GET", body: bytes | None = None) -> int:
+        """Ask for the page, or post to the REST API; return the status of the answer."""
+        connection = self.connection()
+        path = "/v1/mavlink" if method == "POST" else "/"
+        connection.request(method, path, body, {"cookie": cookie})
+        status = connection.getresponse().status
+        connection.close()
+        return status
+
+
+def forged_source(target: Target) -> bool:
+    """Send one heartbeat from an address that never answers, and count the bytes to it."""
+    sender = mavlink.MAVLink(None, 255, 190)
+    heartbeat = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(sender)
+    received = 0
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as silent:
+        silent.settimeout(1.0)
+        silent.sendto(heartbeat, ("127.0.0.1", target.port))
+        end_s = time.monotonic() + 8.0
+        while time.monotonic() < end_s:
+            with contextlib.suppress(TimeoutError):
+                received += len(silent.recv(65535))
+    return 0 < received <= UNPROVEN_FACTOR * len(heartbeat)
+
+
+def idle_control_connections(target: Target) -> bool:
+    """Open connections to the control socket that ask nothing."""
+    path = target.folder / "mavgate" / "run.sock"
+    with contextlib.ExitStack() as opened:
+        for _ in range(64):
+            idle = opened.enter_context(socket.socket(socket.AF_UNIX))
+            idle.connect(str(path))
+        return isinstance(request(path, "verbs"), list)
+
+
+def devices_as_clients(target: Target) -> bool:
+    """Let the gateway open devices that are no serial ports."""
+    path = target.folder / "mavgate" / "run.sock"
+    for device in ("/dev/null", "/dev/ptmx", "/dev/zero"):
+        try:
+            request(path, "clients.add", {"url": f"serial:{device}:57600"})
+        except ControlError:
+            continue
+        return False
+    return True
+
+
+def viewer_sessions(target: Target) -> bool:
+    """Log in as a viewer until no place is left, and load pages without their scripts."""
+    operator = target.log_in(OPERATOR)
+    viewers = [target.log_in(VIEWER) for _ in range(70)]
+    pages = [target.status_of(viewers[-1]) for _ in range(40)]
+    return target.status_of(operator) == 200 and set(pages) == {200}
+
+
+def viewer_websockets(target: Target) -> bool:
+    """Open WebSockets as a viewer until no connection is left."""
+    operator, viewer = target.log_in(OPERATOR), target.log_in(VIEWER)
+
+    async def open_all() -> bool:
+        url = f"ws://{urlsplit(target.link).netloc}/v1/ws/mavlink"
+        async with contextlib.AsyncExitStack() as opened:
+            connected = 0
+            for _ in range(260):
+                with contextlib.suppress(websockets.WebSocketException, OSError):
+                    connect = websockets.connect(
+                        url, additional_headers={"cookie": viewer}, close_timeout=0.2
+                    )
+                    await opened.enter_async_context(connect)
+                    connected += 1
+            assert connected > 200
+            return await asyncio.to_thread(target.status_of, operator) == 200
+
+    return asyncio.run(open_all())
+
+
+def large_bodies(target: Target) -> bool:
+    """Post bodies of up to a megabyte; the next request is answered."""
+    operator = target.log_in(OPERATOR)
+    bodies = (b"[" * 300_000, b'{"a":' * 150_000, bytes(900_000), b'"' + b"\\" * 700_000)
+    answered = {target.status_of(operator, "POST", body) for body in bodies}
+    return answered <= {400, 404, 413} and target.status_of(operator) == 200
+
+
+def hostile_settings(target: Target) -> bool:
+    """Check settings files that take long to parse, or never end."""
+    texts = {
+        "keys.toml": ".".join(["a"] * 50_000) + " = 1",
+        "unknown.toml": "\n".join(f"unknown{n} = 1" for n in range(30_000)),
+        "lists.toml": "x = " + "[" * 100_000,
+    }
+    for name, text in texts.items():
+        (target.folder / name).write_text(text)
+    pipe = target.folder / "pipe.toml"
+    os.mkfifo(pipe)
+    files = [*(target.folder / name for name in texts), pipe, Path("/dev/zero")]
+    return all(_refuses("check-config", str(file)) for file in files)
+
+
+def packed_comments(target: Target) -> bool:
+    """Read a small file that unpacks to hundreds of millions of lines."""
+    bomb = target.folder / "bomb.csv.gz"
+    with gzip.open(bomb, "wb", compresslevel=9) as file:
+        for _ in range(200):
+            file.write(b"#\n" * (1 << 20))
+    return _refuses("info", str(bomb))
+
+
+def _refuses(*arguments: str) -> bool:
+    command = [sys.executable, "-m", "gateway.cli", *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, timeout=COMMAND_S, check=False)
+    except subprocess.TimeoutExpired:
+        return False
+    return done.returncode not in (0, 1) and b"Traceback" not in done.stderr
+
+
+Attacks = Mapping[str, Callable[[Target], bool]]
+"""By name; each returns whether the target held."""
+OF_FILES: Final = {
+    "hostile settings files": hostile_settings,
+    "comment lines packed to a thousandth": packed_comments,
+}
+OF_GATEWAY: Final = {
+    "one datagram with a forged source": forged_source,
+    "idle control connections": idle_control_connections,
+    "devices as serial clients": devices_as_clients,
+}
+OF_PANEL: Final = {
+    "70 sessions and 40 pages of a viewer": viewer_sessions,
+    "260 WebSockets of a viewer": viewer_websockets,
+    "bodies of up to a megabyte": large_bodies,
+}
+
+
+@contextlib.contextmanager
+def started(folder: Path, *, panel: bool) -> Iterator[Target]:
+    """Start a demo, and a panel if one is wanted."""
+    (folder / "recordings").mkdir()
+    target = Target(folder, free_port())
+    hashes = {"operator": hash_password(OPERATOR), "viewer": hash_password(VIEWER)}
+    config = CONFIG.format(folder=folder, port=target.port, **hashes)
+    with contextlib.ExitStack() as opened:
+        demo = opened.enter_context(Process(folder, "demo", "--plain", "--no-panel", config=config))
+        socket_path = folder / "mavgate" / "run.sock"
+        while not socket_path.exists():
+            assert demo.process.poll() is None, demo.log.read_text()
+            time.sleep(0.1)
+        if panel:
+            target.link = opened.enter_context(Process(folder, "panel", config=config)).link()
+        yield target
+
+
+def run(attacks: Attacks, target: Target) -> bool:
+    """Run attacks and print their outcome; return whether all held."""
+    held = True
+    for name, attack in attacks.items():
+        begin_s = time.monotonic()
+        try:
+            outcome = attack(target)
+        except (OSError, AssertionError, ControlError) as error:
+            print(f"{name}: {error!r}")
+            outcome = False
+        held = held and outcome
+        print(f"{'held' if outcome else 'FELL'}  {time.monotonic() - begin_s:5.1f} s  {name}")
+    return held
+
+
+def main() -> None:
+    """Run all attacks, or those with a word in their name."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", metavar="WORD", default="", help="attacks with this word")
+    only = parser.parse_args().only
+
+    def chosen(attacks: Attacks) -> Attacks:
+        return {name: attack for name, attack in attacks.items() if only in name}
+
+    with tempfile.TemporaryDirectory() as name:
+        held = run(chosen(OF_FILES), Target(Path(name), 0))
+        of_gateway, of_panel = chosen(OF_GATEWAY), chosen(OF_PANEL)
+        if of_gateway or of_panel:
+            with started(Path(name), panel=bool(of_panel)) as target:
+                held = run({**of_gateway, **of_panel}, target) and held
+    sys.exit(0 if held else 1)
+
+
+if __name__ == "__main__":
+    main()
