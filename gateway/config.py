@@ -170,6 +170,27 @@ def _write_document(file: Path, document: Any, rights: int) -> None:
     write_new(file, [tomlkit.dumps(document).encode()], overwrite=True, rights=rights)
 
 
+def exposed_secrets(
+    file: Path, settings: GatewaySettings, aircraft: Mapping[int, AircraftSettings]
+) -> list[str]:
+    """Return a warning for each file with a passphrase that other users can read."""
+    passphrases = [
+        settings.vehicle.signing_passphrase,
+        *(s.passphrase for s in settings.fleet.site),
+    ]
+    files = [file] if any(passphrases) else []
+    files += [
+        aircraft_file(settings, vehicle_id)
+        for vehicle_id, each in aircraft.items()
+        if each.vehicle.signing_passphrase
+    ]
+    return [
+        f"{each} has a passphrase, and other users can read it: chmod o-r {each}"
+        for each in files
+        if each.exists() and each.stat().st_mode & stat.S_IROTH
+    ]
+
+
 def aircraft_file(settings: GatewaySettings, vehicle_id: int) -> Path:
     """Return the path of one aircraft's file."""
     return aircraft_folder(settings) / f"{vehicle_id}.toml"

@@ -12,6 +12,7 @@ from gateway.config import (
     ConfigError,
     GatewaySettings,
     aircraft_file,
+    exposed_secrets,
     load,
     load_aircraft,
     render,
@@ -304,3 +305,27 @@ def test_wrong_value_is_described_without_texts_of_libraries(
 def test_sources_besides_the_receiver_are_found(added: tuple[str, ...], found: bool) -> None:
     hub = HubSettings(endpoints=(*HubSettings().endpoints, *added))
     assert hub.has_other_sources == found
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "is_exposed"),
+    [
+        ('[vehicle]\nsigning_passphrase = "x"', 0o644, True),
+        ('[vehicle]\nsigning_passphrase = "x"', 0o640, False),
+        ('[[fleet.site]]\nname = "a"\npassphrase = "x"', 0o604, True),
+        ("", 0o644, False),
+    ],
+)
+def test_passphrase_that_others_can_read_is_named(
+    tmp_path: Path, text: str, mode: int, is_exposed: bool
+) -> None:
+    file = tmp_path / "gateway.toml"
+    file.write_text(f'aircraft_folder = "{tmp_path}"\n{text}')
+    file.chmod(mode)
+    settings = load(file)
+    assert bool(exposed_secrets(file, settings, {})) is is_exposed
+    aircraft = tmp_path / "1.toml"
+    aircraft.write_text('[vehicle]\nsigning_passphrase = "x"')
+    aircraft.chmod(0o644)
+    own = exposed_secrets(file, settings, load_aircraft(settings))
+    assert f"{aircraft} has a passphrase" in own[-1]

@@ -12,6 +12,7 @@ from gateway.hub.endpoint import SITE_NAME
 from gateway.hub.transports.zenoh.session import off_loop, recordings_key
 from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
 from gateway.live.control_socket import ControlError, Verbs
+from gateway.recordings.index import check_name, is_file_name
 
 log = logging.getLogger(__name__)
 
@@ -69,11 +70,26 @@ class RemoteRecordings:
 
 
 def _lists_in(answers: list[tuple[str, bytes]]) -> dict[str, list[RemoteRecording]]:
-    """Decode the lists of sites; a malformed one is left out, with a warning."""
+    """Decode the lists of sites; malformed ones, and names, are left out with a warning."""
     found = {}
     for site, data in answers:
         try:
-            found[site] = msgspec.json.decode(data, type=list[RemoteRecording])
+            listed = msgspec.json.decode(data, type=list[RemoteRecording])
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             log.warning("site %s: malformed list of recordings: %s", site, error)
+            continue
+        found[site] = [each for each in listed if _has_sound_names(each)]
+        if left_out := len(listed) - len(found[site]):
+            log.warning("site %s: %d recordings with unusual names are left out", site, left_out)
     return found
+
+
+def _has_sound_names(recording: RemoteRecording) -> bool:
+    """Return whether all names follow the rules of an upload: they become names of files here."""
+    try:
+        check_name(recording.name)
+        for file in recording.files:
+            check_name(file.name)
+    except ValueError:
+        return False
+    return all(is_file_name(file.name) for file in recording.files)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -23,6 +24,7 @@ from gateway.hub.transports.zenoh.site_queries import (
     MAX_PIECE,
     RecordingAnswers,
     RefusedQueryError,
+    RemoteFile,
     RemoteRecording,
 )
 from gateway.live.control_socket import ControlError, request
@@ -183,6 +185,27 @@ async def test_malformed_list_of_one_site_hides_no_others() -> None:
     session = MagicMock(patterns=["*"], query=query)
     found = await RemoteRecordings(session)._list()
     assert found == {"sound": [RemoteRecording("one", [], 1.5)]}
+
+
+@pytest.mark.parametrize(
+    "name", ["\x1b]0;x\x07", "a\nb", "../a", "", "last", "a\u202eb", "x" * 200]
+)
+async def test_recording_with_an_unusual_name_is_left_out(name: str) -> None:
+    usual = RemoteRecording("one", [RemoteFile("one_01.tlog", 5)], 1.5)
+    listed = [
+        usual,
+        RemoteRecording(name, [RemoteFile("one_01.tlog", 5)], 1.5),
+        RemoteRecording("two", [RemoteFile(f"{name}_01.tlog", 5)], 1.5),
+    ]
+
+    async def query(key: str, payload: bytes, timeout_s: float) -> Any:
+        return {"site": msgspec.json.encode(listed)}
+
+    session = MagicMock(patterns=["*"], query=query)
+    found = (await RemoteRecordings(session)._list())["site"]
+    assert usual in found
+    assert name not in {each.name for each in found}
+    assert len(found) == (2 if name == "last" else 1)
 
 
 class TestAnswers:

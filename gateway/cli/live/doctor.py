@@ -19,7 +19,7 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.support.options import CONFIG, USER_CONFIG, folder_of, read_settings
+from gateway.cli.support.options import CONFIG, USER_CONFIG, folder_of, read_settings, settings_file
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.config import (
@@ -27,6 +27,7 @@ from gateway.config import (
     ConfigError,
     GatewaySettings,
     aircraft_folder,
+    exposed_secrets,
     load,
     load_aircraft,
     render,
@@ -93,6 +94,8 @@ def check_aircraft(settings: GatewaySettings) -> Iterator[Diagnosis]:
     except ConfigError as error:
         yield fail("aircraft", str(error))
         return
+    for warning in exposed_secrets(settings_file(), settings, found):
+        yield fail("secrets", warning)
     yield _writable("aircraft", folder, f"{len(found)} with settings of their own in {folder}")
 
 
@@ -332,6 +335,8 @@ def check_config(
         return
     settings = load(file)
     aircraft = load_aircraft(settings)
+    for warning in exposed_secrets(file, settings, aircraft):
+        console_of(stderr=True).print(warning, style="yellow")
     for endpoint in map(parse_endpoint, settings.hub.endpoints):
         if endpoint.port == 0 and endpoint.kind in LISTENING:
             refuse(

@@ -40,11 +40,14 @@ def read_settings(file: Path | None = None) -> GatewaySettings:
     from gateway.config import GatewaySettings, load
 
     file = file or CONFIG.get()
-    if file is None:
-        file = USER_CONFIG.expanduser()
-        if not file.exists():
-            return GatewaySettings()
-    return load(file)
+    if file is None and not settings_file().exists():
+        return GatewaySettings()
+    return load(file or settings_file())
+
+
+def settings_file() -> Path:
+    """Return the settings file that the user has named, or the user's own, which may not exist."""
+    return CONFIG.get() or USER_CONFIG.expanduser()
 
 
 def output_file(text: str, endings: Collection[str], *names: str) -> Any:
