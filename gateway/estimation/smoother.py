@@ -255,6 +255,7 @@ def run_forward(
         for i in range(nodes[k], nodes[k + 1]):
             now_us, row = imu_time_us[i], row_at(log.imu, i, IMU_COLUMNS)
             baros, fixes = update_aiding(s, p, log, now_us, baros, fixes)
+            s.blend_n[:] = 0.0
             update_imu(s, p, now_us, row)
             move_copy(copy, p, now_us, row, s.imu_s == s.time_s, F)
             share_raised(s, copy)
@@ -400,8 +401,9 @@ def _correct(
         std[:] = np.sqrt(std**2 + np.maximum(variance[:, first : first + 3], 0.0))
     attitude_std = out[:, NAV_ATTITUDE_STD : NAV_ATTITUDE_STD + 3]
     flags = out[:, NAV_FLAGS].astype(np.int64)
-    flags[attitude_std[:, :2].max(axis=1) >= LEVEL_VALID_RAD] &= ~FLAG.ATTITUDE_VALID
-    flags[attitude_std[:, 2] >= HEADING_VALID_RAD] &= ~FLAG.HEADING_VALID
+    # NaN, before the filter has begun, compares false.
+    flags[~(attitude_std[:, :2].max(axis=1) < LEVEL_VALID_RAD)] &= ~FLAG.ATTITUDE_VALID
+    flags[~(attitude_std[:, 2] < HEADING_VALID_RAD)] &= ~FLAG.HEADING_VALID
     out[:, NAV_FLAGS] = flags
 
 

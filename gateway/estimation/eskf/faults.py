@@ -16,6 +16,7 @@ from typing import Final
 
 from gateway.compiled import compiled
 from gateway.estimation.eskf.integrity import LOST_LEVEL_RAD, lose_attitude
+from gateway.estimation.eskf.latency import clear_velocities
 from gateway.estimation.eskf.magnetometer import begin_turn
 from gateway.estimation.eskf.predict import propagate, rate_of
 from gateway.estimation.eskf.rest import is_usual_bias
@@ -281,10 +282,14 @@ def bridge_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
     if s.aided == 1:
         # Fixes in the gap have moved position and velocity already.
         flown_s = min(s.time_s - s.fix_s, dt)
-        turn = from_rotation_vector((0.0, 0.0, about * flown_s))
-        write_vec(s.vel_n, rotate(turn, as_vec(s.vel_n)))
+        half_rad = 0.5 * about * flown_s
+        turn = from_rotation_vector((0.0, 0.0, half_rad))
+        # The mean velocity of an arc has the direction of its chord.
+        mean = rotate(turn, as_vec(s.vel_n))
+        write_vec(s.vel_n, rotate(turn, mean))
+        chord = math.sin(half_rad) / half_rad if abs(half_rad) > 1e-6 else 1.0
         for k in range(3):
-            s.pos_n[k] += s.vel_n[k] * flown_s
+            s.pos_n[k] += mean[k] * flown_s * (chord if k < 2 else 1.0)
         add_gap_variance(s, turned_var, flown_s)
     else:
         add_gap_variance(s, turned_var, 0.0)
@@ -326,6 +331,7 @@ def add_gap_variance(s: State, turned_var: float, flown_s: float) -> None:
 def close_gap(s: State) -> None:
     """Discard everything that needs an unbroken IMU."""
     s.history_count = 0
+    clear_velocities(s)
     s.pair_s = NEVER_S
     s.sound_s = s.rest_s = 0.0
     s.at_rest = 0

@@ -66,7 +66,7 @@ from gateway.estimation.eskf.integrity import (
     reset_accel_bias,
     reset_gyro_bias,
 )
-from gateway.estimation.eskf.latency import begin_latency, clear_velocities
+from gateway.estimation.eskf.latency import begin_latency
 from gateway.estimation.eskf.magnetometer import (
     STALE_MAG_S,
     hard_iron_var,
@@ -155,7 +155,6 @@ def clear_times(s: State) -> None:
     s.mag_s = s.mag_used_s = s.fix_s = s.update_s = s.level_s = NEVER_S
     s.baro_s = s.reject_last[0] = s.track_from[0] = s.zero_from[0] = NEVER_S
     s.reject_s, s.zero_velocity_wrong = 0.0, 0
-    clear_velocities(s)
     close_gap(s)
 
 
@@ -197,7 +196,7 @@ def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s
     bridge_gap(s, p, gyro, accel, since_s)
     follow_step(s, gyro, since_s)
     check_sensors(s, gyro, accel, clipped, since_s)
-    s.imu_s = s.time_s
+    s.imu_s, s.sound_s = s.time_s, 0.0
 
 
 @compiled
@@ -358,12 +357,14 @@ def write_position(s: State, row: FloatArray) -> None:
     row[NAV_ALT] = -s.pos_n[2] if s.has_height == 1 or s.baro_s != NEVER_S else NAN
     if s.has_origin == 0:
         return
-    lat, lon = offset_deg(s.origin[0], s.origin[1], 0.0, s.pos_n[0], s.pos_n[1])
-    row[NAV_LAT], row[NAV_LON] = lat, lon
+    north, east = s.pos_n[0] + s.blend_n[0], s.pos_n[1] + s.blend_n[1]
+    row[NAV_LAT], row[NAV_LON] = offset_deg(s.origin[0], s.origin[1], 0.0, north, east)
     if s.aided == 1:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.vel_n))
         write_std(row, NAV_VEL_STD, s, VEL)
         write_std(row, NAV_POS_STD, s, POS)
+        for k in range(2):
+            row[NAV_POS_STD + k] = math.hypot(row[NAV_POS_STD + k], s.blend_n[k])
     elif s.time_s - s.fix_s < FRESH_GPS_S:
         write_vec(row[NAV_VEL : NAV_VEL + 3], as_vec(s.fix_vel))
 

@@ -73,6 +73,9 @@ BASELINE_S: Final = 2.0 * PAIR_S
 ZERO_S: Final = 3.0
 ZERO_MPS: Final = 2.0
 """Fixes that move so fast for this time contradict a velocity of exactly zero."""
+AFTER_GAP_S: Final = 2.0
+"""For so long after a gap, corrections of the position are blended in, and fixes, some of which may
+have waited, show no latency."""
 STATIONARY_MPS: Final = 0.1
 """A receiver at rest reports up to this speed, and may repeat itself."""
 SLOWEST_FIXES_S: Final = 1.1
@@ -120,7 +123,7 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     set_error_variances(s, p, row)
     arrival_s = (arrival_us - s.base_us) * 1e-6
     reported = as_vec(row[GPS_VEL : GPS_VEL + 3])
-    if is_sound(reported, FASTEST_MPS):
+    if is_sound(reported, FASTEST_MPS) and s.sound_s > AFTER_GAP_S:
         compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
     pos = position_of(s, row)
@@ -144,7 +147,10 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
         # Integrals that do not reach back: the fix moves on by its own velocity.
         since_s = valid_s - wanted_s
         pos = (pos[0] + vel[0] * since_s, pos[1] + vel[1] * since_s, pos[2] + vel[2] * since_s)
+    north, east = s.pos_n[0] + s.blend_n[0], s.pos_n[1] + s.blend_n[1]
     use_fix(s, p, row, pos, vel, reported, s.time_s - valid_s)
+    if s.was_aided == 1 and s.sound_s < AFTER_GAP_S:
+        s.blend_n[0], s.blend_n[1] = north - s.pos_n[0], east - s.pos_n[1]
 
 
 @compiled

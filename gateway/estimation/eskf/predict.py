@@ -71,6 +71,8 @@ BIAS_CHANCE_SQ: Final = 6.0
 """A sum is chance up to this multiple of its variance: chi-squared of 1, 98.6 %."""
 BIAS_RAISE_S: Final = 0.3
 """Time in which the rest is added to the variance of the bias."""
+BLEND_S: Final = 1.0
+"""Time constant with which a corrected position is blended in after a gap."""
 STEP_LIMIT: Final = 1e4
 """A larger squared change from sample to sample is a fault, and NaN compares false."""
 MEANS_S: Final = 0.05
@@ -129,6 +131,8 @@ def integrate(s: State, p: Gains, gyro: Vec3, accel: Vec3, dt: float) -> None:
         elif k < 2 and s.time_s - s.fix_s < FRESH_GPS_S:
             # A fix that no heading allows to fuse moves on by its velocity.
             s.pos_n[k] += s.fix_vel[k] * dt
+    for k in range(2):
+        s.blend_n[k] -= min(1.0, dt / BLEND_S) * s.blend_n[k]
     s.pending_noise[0] += p.gyro_turn_var * (dt * math.sqrt(norm_sq(rate)))
     s.pending_noise[1] += p.accel_scale_sq * ACCELERATION_S * accel_sq * dt
     s.pending_s += dt

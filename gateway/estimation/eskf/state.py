@@ -131,6 +131,9 @@ class State:
     # GPS.
     origin: Annotated[FloatArray, (2,)]
     """Latitude and longitude of the zero of `pos_n`, deg."""
+    blend_n: Annotated[FloatArray, (2,)]
+    """Added to the position that is put out, north and east: a correction after a gap, as it is
+    blended in."""
     has_origin: int
     aided: int
     """1 while velocity and position are estimated, from a fix on until dead reckoning ends."""
