@@ -5,6 +5,7 @@ were processed, on the gateway clock.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from gateway.aircraft import AircraftSettings
 from gateway.estimation.columns import NAV_ALT, NAV_FLAGS, NAV_LAT, NAV_LON, NAV_QUAT, NAV_VEL
 from gateway.estimation.reference import is_usable
-from gateway.estimation.select import make_estimator
+from gateway.estimation.select import Estimator, make_estimator
 from gateway.geometry.angle import wrap_180
 from gateway.geometry.geodesy import radii_m
 from gateway.recordings.columns import NAV, NODE_TIME, RAW, has_group
@@ -291,14 +292,20 @@ def _track_of_cells(cells: FloatArray) -> FlightTrack:
 
 def fuse_track(flight: Flight, settings: FusionSettings) -> FlightTrack:
     """Fuse a flight causally, from the samples only, with the estimator that the settings name."""
-    return track_of(
-        flight.time_us, fuse(flight.samples, make_estimator(settings.estimation)).states
-    )
+    estimator = estimator_of(flight, settings)
+    return track_of(flight.time_us, fuse(flight.samples, estimator).states)
+
+
+def estimator_of(flight: Flight, settings: FusionSettings) -> Estimator:
+    """Build the estimator that the settings name, in the state stored at the begin if that fits."""
+    with suppress(ValueError):
+        return flight.samples.estimator(settings.estimation)
+    return make_estimator(settings.estimation)
 
 
 def smooth_track(flight: Flight, settings: FusionSettings) -> tuple[FlightTrack, float]:
     """Smooth a flight; also return the GPS latency that was used, s. See `fuse`."""
-    estimator = make_estimator(with_estimator(settings, SMOOTHED_ESTIMATOR).estimation)
+    estimator = estimator_of(flight, with_estimator(settings, SMOOTHED_ESTIMATOR))
     fused = fuse(flight.samples, estimator, smoothed=True)
     # Smoothed states are in the order of time, in which a late sample is not.
     states = np.empty_like(fused.states)

@@ -19,7 +19,7 @@ import msgspec
 
 from gateway import __version__
 from gateway.analysis.case import Case, make_case, outage_error_m, summarise, withheld_error_m
-from gateway.analysis.flight import Flight, flight_of_files
+from gateway.analysis.flight import Flight, estimator_of, flight_of_files
 from gateway.analysis.sweep import Axis, SweepError, grid, make_contest, run_trial, score_of
 from gateway.batch.executors import Executor, WorkFailed
 from gateway.batch.facts import began_text
@@ -30,7 +30,6 @@ from gateway.batch.storage import (
     stamp_of_item,
     without_user,
 )
-from gateway.estimation.select import make_estimator
 from gateway.output import write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import fuse
@@ -113,7 +112,7 @@ class FuseTask(FlightTask):
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
         read, case = _judged(files, self.options, name)
-        states = fuse(read.flight.samples, make_estimator(case.fusion.estimation)).states
+        states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
         lines = fused_lines(read.header, read.flight.time_us, states)
         fused = {f"fused/{name}.csv": b"".join(lines)}
         return Worked(read.vehicle, read.began, _figures(case), fused)

@@ -3,13 +3,20 @@
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 
-from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs, latency_in_use
+from gateway.aircraft import (
+    Aircraft,
+    AircraftSettings,
+    FusedStates,
+    Outputs,
+    latency_in_use,
+    make_fusion,
+)
 from gateway.estimation.columns import (
     GPS_COLUMNS,
     NAV_ALT,
@@ -46,7 +53,7 @@ from gateway.recordings.columns import (
 from gateway.recordings.reading import settings_of
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader
 from gateway.recordings.tlog import ORDER_US
-from gateway.records import BaroSample, FusionState, GpsFix, GpsFixType
+from gateway.records import BaroSample, FusionState, GpsFix, GpsFixType, NavFlags
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import ImuLog, IntArray, SensorChain
 from gateway.settings import Settings
@@ -75,6 +82,13 @@ def with_reference(settings: Chosen, **changes: object) -> Chosen:
     return msgspec.structs.replace(settings, estimation=estimation)
 
 
+VALID: Final = int(
+    NavFlags.ATTITUDE_VALID
+    | NavFlags.HEADING_VALID
+    | NavFlags.POSITION_VALID
+    | NavFlags.VELOCITY_VALID
+    | NavFlags.ALTITUDE_VALID
+)
 SMOOTHED_ESTIMATOR: Final = "eskf"
 """The filter that the smoother goes over."""
 
@@ -86,6 +100,14 @@ class Samples:
     imu: ImuLog
     aiding: list[Aiding]
     """Heights and fixes, each with the number of the IMU sample before which it arrived."""
+    calibration: NodeCalibration = field(default_factory=NodeCalibration)
+    begin: FusionState | None = None
+    """The state that is stored before the first sample."""
+
+    def estimator(self, estimation: EstimationSettings) -> Estimator:
+        """Build an estimator in the stored state; ValueError if that is of other settings."""
+        settings = AircraftSettings(calibration=self.calibration, estimation=estimation)
+        return make_fusion(settings, self.begin)[1]
 
 
 class Fused(NamedTuple):
@@ -207,7 +229,15 @@ def has_sample(cells: FloatArray) -> BoolArray:
 def samples_of(blocks: Iterable[TableBlock], calibration: NodeCalibration) -> Samples:
     """Calibrate all rows of one aircraft."""
     chain = SensorChain(calibration)
-    parts = [samples_of_cells(block.cells, chain) for block in blocks]
+    parts: list[Samples] = []
+    begin: FusionState | None = None
+    rows = 0
+    for block in blocks:
+        for row, comment in block.comments:
+            if rows + row == 0 and isinstance(comment, FusionState):
+                begin = comment
+        parts.append(samples_of_cells(block.cells, chain))
+        rows += len(block)
     parts = parts or [samples_of_cells(NO_ROWS, chain)]
     counts = np.cumsum([0, *(len(part.imu) for part in parts)]).tolist()
     columns = (
@@ -218,7 +248,7 @@ def samples_of(blocks: Iterable[TableBlock], calibration: NodeCalibration) -> Sa
         for before, part in zip(counts, parts, strict=False)
         for k, record in part.aiding
     ]
-    return Samples(ImuLog(*columns), aiding)
+    return Samples(ImuLog(*columns), aiding, calibration, begin)
 
 
 def samples_of_cells(cells: FloatArray, chain: SensorChain) -> Samples:
@@ -360,13 +390,16 @@ def interpolated_positions(fixes: FloatArray, latency_s: float) -> Correct:
 
 
 def smoothed_states(smooth_us: IntArray, smoothed: FloatArray) -> Correct:
-    """Replace each state by the smoothed one of its time, except its flags."""
+    """Replace each state by the smoothed one of its time; flags of what is in use stay."""
 
     def correct(time_us: IntArray, states: FloatArray) -> FloatArray:
         at = np.searchsorted(smooth_us, time_us).clip(0, max(len(smooth_us) - 1, 0))
         found = states.copy()
         known = np.flatnonzero(smooth_us[at] == time_us)
         found[known, :NAV_FLAGS] = smoothed[at[known], :NAV_FLAGS]
+        flags = found[known, NAV_FLAGS].astype(np.int64) & ~VALID
+        flags |= smoothed[at[known], NAV_FLAGS].astype(np.int64) & VALID
+        found[known, NAV_FLAGS] = flags
         return found
 
     return correct

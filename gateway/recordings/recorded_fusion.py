@@ -295,7 +295,12 @@ class RecordedFusion:
         """Smooth the rows; a remark states a latency that is not the one that is set."""
         samples = samples_of(blocks, self.aircraft.calibration)
         try:
-            fused = fuse(samples, _kalman_filter(self.aircraft), smoothed=True)
+            estimator = samples.estimator(self.aircraft.estimation)
+        except ValueError as error:
+            self._table.remarks.append(NOT_RESTORED.format(error))
+            estimator = _kalman_filter(self.aircraft)
+        try:
+            fused = fuse(samples, estimator, smoothed=True)
         except ValueError as error:
             raise FlightError(f"{file}: {error}") from error
         set_s = self.aircraft.estimation.reference.gps_latency_s

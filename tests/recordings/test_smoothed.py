@@ -6,11 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gateway.analysis.flight import flight_of_files, fuse_track, smooth_track
+from gateway.estimation.columns import NAV_ALT, NAV_ATTITUDE_STD, NAV_FLAGS, NAV_LAT, NAV_VEL
 from gateway.estimation.record import FloatArray, IntArray
+from gateway.recordings.columns import NAV, has_group, row_to_line
 from gateway.recordings.files import FlightError
+from gateway.recordings.reading import header_for
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.table import encode_head, encode_line
+from gateway.records import NavFlags
 from tests.kit.cli import invoke
-from tests.recordings.flights import OPTIONS
+from tests.recordings.flights import OPTIONS, fly_from_the_middle
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "take_off.csv.gz"
 HEAD_LINES = 2
@@ -48,3 +54,47 @@ def test_clock_set_back_is_refused_with_advice(tmp_path: Path) -> None:
     assert refused.exit_code == 2
     with pytest.raises(FlightError, match=f"{text}.*leave out --smooth"):
         RecordedFusion([own], OPTIONS, smooth=True)
+
+
+def recording_from_the_middle(folder: Path, rng: np.random.Generator, *, state: bool) -> Path:
+    settings, stored, rows = fly_from_the_middle("eskf", rng)
+    lines = [encode_head(header_for(settings, 1)), encode_line(stored) if state else ""]
+    path = folder / f"{state}.csv"
+    path.write_text("".join([*lines, *map(row_to_line, rows)]))
+    return path
+
+
+def test_recording_begun_in_flight_is_smoothed_from_its_stored_state(tmp_path: Path) -> None:
+    firsts = {}
+    for state in (False, True):
+        path = recording_from_the_middle(tmp_path, np.random.default_rng(3), state=state)
+        firsts[state] = RecordedFusion([path], OPTIONS, smooth=True).states()[1][0]
+        causal = RecordedFusion([path], OPTIONS).states()[1][0]
+    assert firsts[False][NAV_ATTITUDE_STD] > 0.3
+    assert firsts[True][NAV_ATTITUDE_STD] < 0.1
+    np.testing.assert_allclose(firsts[True][:4], causal[:4], atol=0.05)
+    np.testing.assert_allclose(firsts[True][NAV_ALT], causal[NAV_ALT], atol=5.0)
+    # The report too.
+    flight = flight_of_files([path], OPTIONS, name="cut")[0]
+    for track in (fuse_track(flight, flight.fusion), smooth_track(flight, flight.fusion)[0]):
+        np.testing.assert_allclose(track.alt_amsl_m[0], causal[NAV_ALT], atol=5.0)
+
+
+@pytest.mark.parametrize("state", [False, True])
+def test_flags_of_smoothed_rows_claim_nothing_that_is_not_known(
+    tmp_path: Path, rng: np.random.Generator, state: bool
+) -> None:
+    path = recording_from_the_middle(tmp_path, rng, state=state)
+    fusion = RecordedFusion([path], OPTIONS, smooth=True)
+    cells = np.concatenate([block.cells for block in fusion.table().blocks])
+    cells = cells[has_group(cells, NAV)][:, NAV][:, 1:]
+    flags = cells[:, NAV_FLAGS].astype(int)
+    for flag, column in (
+        (NavFlags.ATTITUDE_VALID, NAV_ATTITUDE_STD),
+        (NavFlags.HEADING_VALID, NAV_ATTITUDE_STD + 2),
+        (NavFlags.POSITION_VALID, NAV_LAT),
+        (NavFlags.VELOCITY_VALID, NAV_VEL),
+        (NavFlags.ALTITUDE_VALID, NAV_ALT),
+    ):
+        assert np.isfinite(cells[(flags & int(flag)) != 0, column]).all()
+    assert (flags & int(NavFlags.ATTITUDE_VALID)).any()
