@@ -18,8 +18,8 @@ from typing import Annotated, Any, Final
 import msgspec
 import tomlkit
 
-from gateway.aircraft import AircraftSettings
-from gateway.estimation.select import EstimationSettings, migrate_sections
+from gateway.aircraft import AircraftSettings, migrate_sections
+from gateway.estimation.select import EstimationSettings
 from gateway.fleet.settings import FleetSettings
 from gateway.hub.settings import HubSettings
 from gateway.live.serial_port import SerialSettings

@@ -1,6 +1,8 @@
 """Properties of signals: the two low-passes of the paper, power spectrum and Allan deviation."""
 
+import math
 import timeit
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, get_args
 
@@ -10,7 +12,14 @@ from scipy import signal
 
 from gateway.analysis.flight import FloatArray
 from gateway.estimation.paper import PaperSettings
-from gateway.estimation.vector_filter import Coefficients, Kind, VectorFilter, design_lowpass
+from gateway.estimation.vector_filter import (
+    Coefficients,
+    Kind,
+    discretise,
+    filter_step,
+    prototype_of,
+)
+from gateway.records import Vec3
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 PAPER_RATE_HZ: Final = 1000.0
@@ -19,6 +28,39 @@ RESPONSE_POINTS: Final = 400
 STEP_S: Final = 0.5
 TIMED_SAMPLES: Final = 5_000
 TIMED_RUNS: Final = 3
+
+
+def design_lowpass(
+    kind: Kind, cutoff_hz: float, rate_hz: float, ripple_db: float = 1.0
+) -> Coefficients:
+    """Design a second-order low-pass; see `discretise`.
+
+    Chebyshev is of type I, with its ripple in dB. The cutoff in Hz is -3 dB for Butterworth and the
+    end of the ripple for Chebyshev.
+    """
+    return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
+
+
+class VectorFilter:
+    """One filter on three axes, designed for a sample rate in Hz."""
+
+    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float = 100.0) -> None:
+        self._design = design
+        self.retune(rate_hz)
+
+    def retune(self, rate_hz: float) -> None:
+        """Redesign for another sample rate; the filter starts again at the next sample."""
+        self._coefficients = self._design(rate_hz)
+        self.state = [math.nan] * 6
+        """See `filter_step`. May be read and restored."""
+
+    def step(self, x: Vec3) -> Vec3:
+        """Filter one finite vector."""
+        return filter_step(self._coefficients, self.state, x)
+
+    def run(self, x: FloatArray) -> FloatArray:
+        """Filter an array of shape (n, 3), as that many calls of `step`."""
+        return np.array([self.step((v[0], v[1], v[2])) for v in x.tolist()]).reshape(-1, 3)
 
 
 @dataclass(frozen=True, slots=True)

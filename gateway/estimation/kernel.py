@@ -21,7 +21,7 @@ from gateway.estimation.columns import (
 )
 from gateway.estimation.eskf import filter as kernels
 from gateway.estimation.eskf.latency import KNOWN_STD_S, latency_std, latency_to_use
-from gateway.estimation.eskf.settings import EskfSettings, Gains, make_gains
+from gateway.estimation.eskf.settings import Gains
 from gateway.estimation.eskf.state import State
 from gateway.estimation.record import (
     FloatArray,
@@ -272,22 +272,3 @@ class KernelEstimator(CompiledEstimator):
         arrays = log_arrays(log)
         kernels.run(self._at, self._gains_at, address_of(arrays), address_of(out))
         return out
-
-
-def estimate_latency(log: SampleLog) -> FoundLatency | None:
-    """Estimate the time from the moment for which fixes are valid to their arrival.
-
-    Parameters
-    ----------
-    log : SampleLog
-        A whole flight; the velocities of its fixes are used.
-
-    Returns
-    -------
-    FoundLatency or None
-        None where no manoeuvre shows it, or the fixes have no velocity.
-    """
-    reference = ReferenceSettings()
-    estimator = KernelEstimator(make_gains(EskfSettings(), reference), reference)
-    estimator.run(log)
-    return estimator.found_latency()

@@ -72,9 +72,11 @@ from gateway.geometry.quaternion import (
     difference,
     from_euler,
     from_rotation_vector,
+    is_below,
     multiply,
     norm_sq,
     normalise,
+    part_way,
     rotate,
     scaled,
     to_euler,
@@ -356,8 +358,8 @@ def follow_rate(s: PaperState, p: PaperGains, dt_s: float) -> None:
 def follow_rest(s: PaperState, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
     """Measure the gyroscope bias at rest."""
     share = min(1.0, dt_s / REST_S)
-    write_vec(s.gyro_mean, mix(share, as_vec(s.gyro_mean), gyro))
-    write_vec(s.accel_mean, mix(share, as_vec(s.accel_mean), accel))
+    write_vec(s.gyro_mean, part_way(as_vec(s.gyro_mean), gyro, share))
+    write_vec(s.accel_mean, part_way(as_vec(s.accel_mean), accel, share))
     fresh = s.fix_us != NEVER_US and (s.time_us - s.fix_us) / US_PER_S < FRESH_GPS_S
     quiet = (
         math.sqrt(norm_sq(difference(gyro, as_vec(s.gyro_mean)))) < REST[0]
@@ -367,7 +369,7 @@ def follow_rest(s: PaperState, accel: Vec3, gyro: Vec3, dt_s: float) -> None:
     )
     s.rest_s = s.rest_s + dt_s if quiet else 0.0
     if s.rest_s >= REST_S:
-        write_vec(s.bias_b, mix(share, as_vec(s.bias_b), as_vec(s.gyro_mean)))
+        write_vec(s.bias_b, part_way(as_vec(s.bias_b), as_vec(s.gyro_mean), share))
 
 
 @compiled
@@ -389,11 +391,11 @@ def correct_yaw(s: PaperState, p: PaperGains, mag_b: Vec3) -> None:
 @compiled
 def blend_fix(s: PaperState, p: PaperGains) -> None:
     """Blend velocity and position with the fix: eq. 1, 2, 7 and 8 as recursions."""
-    write_vec(s.vel_n, mix(1.0 - p.alpha_accel, as_vec(s.vel_n), as_vec(s.fix_vel)))
+    write_vec(s.vel_n, part_way(as_vec(s.vel_n), as_vec(s.fix_vel), 1.0 - p.alpha_accel))
     # The longitude may wrap between the two.
     fix_lon = s.location[1] + wrap_180(s.fix_location[1] - s.location[1])
     fix = (s.fix_location[0], fix_lon, s.fix_location[2])
-    lat, lon, alt = mix(1.0 - p.beta_velocity, as_vec(s.location), fix)
+    lat, lon, alt = part_way(as_vec(s.location), fix, 1.0 - p.beta_velocity)
     write_vec(s.location, (lat, wrap_180(lon), alt))
 
 
@@ -412,19 +414,6 @@ def flags_of(s: PaperState, sound: bool) -> int:
         fresh = age_s < FRESH_GPS_S
         flags |= FLAG.USING_GPS if fresh else FLAG.DEAD_RECKONING | FLAG.DEGRADED
     return flags if sound else flags | FLAG.SENSOR_FAULT | FLAG.DEGRADED
-
-
-@compiled
-def is_below(v: Vec3, limit: float) -> bool:
-    """Return whether the size of every component is below a limit."""
-    return abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit
-
-
-@compiled
-def mix(share: float, a: Vec3, b: Vec3) -> Vec3:
-    """Return a vector a share of the way from one to another; exact at 0 and 1."""
-    kept = 1.0 - share
-    return (kept * a[0] + share * b[0], kept * a[1] + share * b[1], kept * a[2] + share * b[2])
 
 
 @compiled

@@ -4,16 +4,11 @@ A filter starts as if its first sample had been constant for ever, so it has no 
 """
 
 import math
-from collections.abc import Callable
 from typing import Any, Final, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from gateway.compiled import compiled
 from gateway.records import Vec3
 
-FloatArray = NDArray[np.float64]
 Kind = Literal["butterworth", "chebyshev"]
 Coefficients = tuple[float, float, float, float, float]
 """`b0, b1, b2, a1, a2` of the difference equation, with `a0 = 1`."""
@@ -32,21 +27,13 @@ def prototype_of(kind: Kind, ripple_db: float) -> tuple[float, float]:
     return math.sqrt(2.0) * math.sinh(mu), 0.5 * math.cosh(2.0 * mu)
 
 
-def design_lowpass(
-    kind: Kind, cutoff_hz: float, rate_hz: float, ripple_db: float = 1.0
-) -> Coefficients:
-    """Design a second-order low-pass by the bilinear transform: eq. 17 and 18 for Butterworth.
-
-    Chebyshev is of type I, with its ripple in dB; deviation: it is scaled to unit gain at 0 Hz,
-    because its even order would otherwise shrink gravity by the ripple. The cutoff in Hz is -3 dB
-    for Butterworth and the end of the ripple for Chebyshev.
-    """
-    return discretise(*prototype_of(kind, ripple_db), cutoff_hz, rate_hz)
-
-
 @compiled
 def discretise(damping: float, w0_sq: float, cutoff_hz: float, rate_hz: float) -> Coefficients:
-    """Apply the bilinear transform to a prototype; a cutoff beyond half the rate passes all."""
+    """Apply the bilinear transform to a prototype: eq. 17 and 18 for Butterworth.
+
+    Deviation: it is scaled to unit gain at 0 Hz, because the even order of Chebyshev would
+    otherwise shrink gravity by the ripple. A cutoff beyond half the sample rate passes all.
+    """
     if cutoff_hz >= 0.5 * rate_hz:
         return PASS_THROUGH
     k = math.tan(math.pi * cutoff_hz / rate_hz)
@@ -84,25 +71,3 @@ def filter_step(c: Coefficients, z: Any, x: Vec3) -> Vec3:
         z[2 * k] = b1 * x[k] - a1 * y[k] + z[2 * k + 1]
         z[2 * k + 1] = b2 * x[k] - a2 * y[k]
     return y
-
-
-class VectorFilter:
-    """One filter on three axes, designed for a sample rate in Hz."""
-
-    def __init__(self, design: Callable[[float], Coefficients], rate_hz: float = 100.0) -> None:
-        self._design = design
-        self.retune(rate_hz)
-
-    def retune(self, rate_hz: float) -> None:
-        """Redesign for another sample rate; the filter starts again at the next sample."""
-        self._coefficients = self._design(rate_hz)
-        self.state = [math.nan] * 6
-        """See `filter_step`. May be read and restored."""
-
-    def step(self, x: Vec3) -> Vec3:
-        """Filter one finite vector."""
-        return filter_step(self._coefficients, self.state, x)
-
-    def run(self, x: FloatArray) -> FloatArray:
-        """Filter an array of shape (n, 3), as that many calls of `step`."""
-        return np.array([self.step((v[0], v[1], v[2])) for v in x.tolist()]).reshape(-1, 3)

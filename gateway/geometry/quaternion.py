@@ -62,6 +62,19 @@ def scaled(v: Vec3, factor: float) -> Vec3:
 
 
 @compiled
+def is_below(v: Vec3, limit: float) -> bool:
+    """Return whether the size of every component is below a limit; false if one is not finite."""
+    return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
+
+
+@compiled
+def part_way(a: Vec3, b: Vec3, share: float) -> Vec3:
+    """Return the vector a share of the way from one to another; exact at 0 and 1."""
+    kept = 1.0 - share
+    return (kept * a[0] + share * b[0], kept * a[1] + share * b[1], kept * a[2] + share * b[2])
+
+
+@compiled
 def norm_sq(v: Vec3) -> float:
     """Return the squared length of a vector."""
     return v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

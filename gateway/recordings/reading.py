@@ -19,8 +19,7 @@ import msgspec
 import numpy as np
 
 from gateway import __version__
-from gateway.aircraft import AircraftSettings
-from gateway.estimation.select import migrate_sections
+from gateway.aircraft import AircraftSettings, migrate_sections
 from gateway.extras import how_to_add
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.columns import TIMES, BoolArray, TableRow

@@ -18,7 +18,8 @@ import numpy as np
 
 from gateway import __version__
 from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs
-from gateway.estimation.kernel import FoundLatency, KernelEstimator, SampleLog, estimate_latency
+from gateway.estimation.eskf.settings import EskfSettings, make_gains
+from gateway.estimation.kernel import FoundLatency, KernelEstimator, SampleLog
 from gateway.estimation.reference import ReferenceSettings
 from gateway.estimation.select import make_estimator
 from gateway.pipeline import Pipeline, PipelineSettings
@@ -180,6 +181,13 @@ def check_latency(file: Path, table: RecordedTable, aircraft: AircraftSettings) 
             f"{file}: its manoeuvres show a GPS latency of {_in_words(found)}, "
             f"but gps_latency_s is {set_s:.2f} s"
         )
+
+
+def estimate_latency(log: SampleLog) -> FoundLatency | None:
+    """Estimate the GPS latency of a whole flight; None where no manoeuvre shows it."""
+    estimator = KernelEstimator(make_gains(EskfSettings(), USUAL), USUAL)
+    estimator.run(log)
+    return estimator.found_latency()
 
 
 def smoothed_latency_in_words(used_s: float, set_s: float) -> str:

@@ -4,8 +4,9 @@ from typing import Any
 
 import pytest
 
+from gateway.aircraft import migrate_sections
 from gateway.estimation.eskf.settings import EskfSettings
-from gateway.estimation.select import EstimationSettings, make_estimator, migrate_sections
+from gateway.estimation.select import EstimationSettings, make_estimator
 from tests.estimation.samples import imu, times
 
 

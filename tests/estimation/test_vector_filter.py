@@ -2,13 +2,8 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from gateway.estimation.vector_filter import (
-    PASS_THROUGH,
-    Coefficients,
-    VectorFilter,
-    design_highpass,
-    design_lowpass,
-)
+from gateway.analysis.signals import VectorFilter, design_lowpass
+from gateway.estimation.vector_filter import PASS_THROUGH, Coefficients, design_highpass
 
 
 def gain(c: Coefficients, frequency_hz: float, rate_hz: float) -> float:

@@ -6,6 +6,7 @@ from typing import Annotated, Final
 import numpy as np
 import typer
 
+from gateway.aircraft import DEPRECATED
 from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -26,7 +27,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import console_of, refuse
 from gateway.estimation.record import IntArray
-from gateway.estimation.select import DEPRECATED, ESTIMATORS
+from gateway.estimation.select import ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines

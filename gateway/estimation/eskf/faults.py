@@ -26,9 +26,11 @@ from gateway.estimation.record import FloatArray, as_quat, as_vec, write_quat, w
 from gateway.geometry.quaternion import (
     difference,
     from_rotation_vector,
+    is_below,
     multiply,
     norm_sq,
     normalise,
+    part_way,
     rotate,
     rotate_inverse,
     scaled,
@@ -76,12 +78,6 @@ WANDER_RADPS: Final = 0.05
 
 
 @compiled
-def is_sound(v: Vec3, limit: float) -> bool:
-    """Return whether a vector is finite and within a limit."""
-    return bool(abs(v[0]) < limit and abs(v[1]) < limit and abs(v[2]) < limit)
-
-
-@compiled
 def is_zero_sample(gyro: Vec3, accel: Vec3) -> bool:
     """Return whether a sample is all zeros, as of a sensor that has just been reset."""
     return not (gyro[0] or gyro[1] or gyro[2] or accel[0] or accel[1] or accel[2])
@@ -91,7 +87,7 @@ def is_zero_sample(gyro: Vec3, accel: Vec3) -> bool:
 def is_start(s: State, gyro: Vec3, accel: Vec3) -> bool:
     """Return whether the filter may start with a sample, and set the fault if not."""
     force = math.sqrt(norm_sq(accel)) / STANDARD_GRAVITY_MPS2
-    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
     s.fault = 0 if sound and START_SHARES[0] < force < START_SHARES[1] else 1
     return s.fault == 0
 
@@ -138,7 +134,7 @@ def check_sensor(s: State, k: int, v: Vec3, limit: float, other_same: bool, dt: 
     most = LARGEST_CHANGE[k][0] + LARGEST_CHANGE[k][1] * dt + TIMES_USUAL * s.usual_change[k]
     if math.isfinite(change):
         s.usual_change[k] += dt / (USUAL_S + dt) * (min(change, most) - s.usual_change[k])
-    if not is_sound(v, limit) or s.stuck_s[k] >= STUCK_S:
+    if not is_below(v, limit) or s.stuck_s[k] >= STUCK_S:
         return 2
     return 1 if change > most else 0
 
@@ -245,16 +241,6 @@ def interpolate(
     s.pending_noise[1] += moved + 0.25 * unseen_s * unseen_s * turned * norm_sq(accel)
     share = 0.5 * unseen_s / dt
     return part_way(gyro, gyro_before, share), part_way(accel, accel_before, share)
-
-
-@compiled
-def part_way(a: Vec3, b: Vec3, share: float) -> Vec3:
-    """Return the vector a share of the way from one to another."""
-    return (
-        a[0] + share * (b[0] - a[0]),
-        a[1] + share * (b[1] - a[1]),
-        a[2] + share * (b[2] - a[2]),
-    )
 
 
 @compiled

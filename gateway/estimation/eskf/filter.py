@@ -49,7 +49,6 @@ from gateway.estimation.eskf.faults import (
     gap_limit_s,
     interpolate,
     is_hanging,
-    is_sound,
     is_start,
     is_zero_sample,
     substitute_accel,
@@ -106,6 +105,7 @@ from gateway.estimation.eskf.update import (
 from gateway.estimation.record import FloatArray, as_quat, as_vec, layout, write_quat, write_vec
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.geometry.geodesy import offset_deg
+from gateway.geometry.quaternion import is_below
 from gateway.records import NAN, UNKNOWN_VEC3, Vec3
 from gateway.units import RAD_PER_DEG
 
@@ -189,7 +189,7 @@ def update_imu(s: State, p: Gains, time_us: int, row: FloatArray) -> None:
 @compiled
 def end_gap(s: State, p: Gains, gyro: Vec3, accel: Vec3, clipped: float, since_s: float) -> None:
     """Bridge a gap at the first sound sample after it."""
-    sound = is_sound(gyro, GYRO_LIMIT_RADPS) and is_sound(accel, ACCEL_LIMIT_MPS2)
+    sound = is_below(gyro, GYRO_LIMIT_RADPS) and is_below(accel, ACCEL_LIMIT_MPS2)
     if not sound or is_zero_sample(gyro, accel):
         s.fault = 1
         return

@@ -35,7 +35,7 @@ from gateway.estimation.eskf.alignment import (
     TRACK_NOISE_MPS,
     add_velocity,
 )
-from gateway.estimation.eskf.faults import gap_limit_s, is_sound
+from gateway.estimation.eskf.faults import gap_limit_s
 from gateway.estimation.eskf.integrity import check_attitude, lose_attitude
 from gateway.estimation.eskf.latency import compare_latencies
 from gateway.estimation.eskf.magnetometer import STALE_MAG_S, raise_hard_iron, turn_heading
@@ -62,7 +62,7 @@ from gateway.estimation.eskf.update import (
 )
 from gateway.estimation.record import FloatArray, as_quat, as_vec, write_vec
 from gateway.geometry.geodesy import displacement_m, offset_deg
-from gateway.geometry.quaternion import body_axes, difference, norm_sq, scaled
+from gateway.geometry.quaternion import body_axes, difference, is_below, norm_sq, scaled
 from gateway.records import NAN, Vec3
 from gateway.units import STANDARD_GRAVITY_MPS2
 
@@ -123,14 +123,14 @@ def update_gps(s: State, p: Gains, arrival_us: int, row: FloatArray) -> None:
     set_error_variances(s, p, row)
     arrival_s = (arrival_us - s.base_us) * 1e-6
     reported = as_vec(row[GPS_VEL : GPS_VEL + 3])
-    if is_sound(reported, FASTEST_MPS) and s.sound_s > AFTER_GAP_S:
+    if is_below(reported, FASTEST_MPS) and s.sound_s > AFTER_GAP_S:
         compare_latencies(s, p.gps_latency_s, arrival_s, reported)
     wanted_s = arrival_s - s.gps_latency_s
     pos = position_of(s, row)
     if is_zero_velocity_wrong(s, pos, reported):
         reported = (NAN, NAN, NAN)
     vel, vel_s = complete_velocity(s, wanted_s, pos, reported)
-    sound = is_sound(vel, FASTEST_MPS)
+    sound = is_below(vel, FASTEST_MPS)
     if sound:
         write_vec(s.fix_vel, vel)
     if arrival_s - s.imu_s > gap_limit_s(s):
@@ -177,7 +177,7 @@ def is_new_fix(s: State, row: FloatArray) -> bool:
     lat, lon, vel = row[GPS_LAT], row[GPS_LON], as_vec(row[GPS_VEL : GPS_VEL + 3])
     if row[GPS_USABLE] == 0.0 or not math.isfinite(lat + lon):
         return False
-    last, has_velocity = s.fix_last, is_sound(vel, FASTEST_MPS)
+    last, has_velocity = s.fix_last, is_below(vel, FASTEST_MPS)
     repeated = lat == last[0] and lon == last[1]
     if has_velocity:
         repeated = repeated and norm_sq(difference(vel, as_vec(last[2:5]))) == 0.0
@@ -224,7 +224,7 @@ def position_of(s: State, row: FloatArray) -> Vec3:
 @compiled
 def is_level_sound(vel: Vec3) -> bool:
     """Return whether a velocity has sound horizontal components."""
-    return is_sound((vel[0], vel[1], 0.0), FASTEST_MPS)
+    return is_below((vel[0], vel[1], 0.0), FASTEST_MPS)
 
 
 @compiled
@@ -251,11 +251,11 @@ def complete_velocity(s: State, valid_s: float, pos: Vec3, vel: Vec3) -> tuple[V
     """
     f = s.track_from
     dt = valid_s - f[0]
-    if is_sound(vel, FASTEST_MPS) or not 0.0 <= dt < BASELINE_S:
+    if is_below(vel, FASTEST_MPS) or not 0.0 <= dt < BASELINE_S:
         f[0] = valid_s
         track = ((pos[0] - f[1]) / dt, (pos[1] - f[2]) / dt, (pos[2] - f[3]) / dt)
         write_vec(f[1:4], pos)
-        if is_sound(vel, FASTEST_MPS):
+        if is_below(vel, FASTEST_MPS):
             return vel, valid_s
         known = 0.0 <= dt <= MAX_PAIR_S
         climb = track[2] if known and math.isfinite(track[2]) else 0.0
@@ -331,7 +331,7 @@ def follow_fix(s: State, pos: Vec3, lag: float) -> None:
 def restart_at(s: State, p: Gains, pos: Vec3, vel: Vec3, lag: float) -> None:
     """Take position and velocity from one fix, `lag` seconds old; NaN where it has none."""
     propagate(s, p)
-    sound = is_sound(vel, FASTEST_MPS)
+    sound = is_below(vel, FASTEST_MPS)
     reset_states(s, VEL, FIRST_VELOCITY_VAR if sound else NO_VELOCITY_VAR)
     write_vec(s.vel_n, vel if sound else (0.0, 0.0, 0.0))
     for k in range(2):
