@@ -158,6 +158,52 @@ def measure_files(folder: Path, count: int) -> dict[str, float]:
     return found
 
 
+HOLE = 2 << 30
+"""Bytes of zeros in a sparse file."""
+
+
+def run_of(*command: str) -> dict[str, float]:
+    """Run a program; return how long it took, and its own greatest memory."""
+    begin = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return {"s": time.perf_counter() - begin, "memory_mb": usage.ru_maxrss / 1024}
+
+
+def measure_edits(folder: Path, count: int) -> dict[str, float]:
+    """Filter, cut, merge and renumber a flight; the baseline is mavlogdump's filter."""
+    path, out = folder / "flight.tlog", str(folder / "out.tlog")
+    if not path.exists():
+        write_flight(path, count)
+    mavgate = (sys.executable, "-m", "gateway.cli", "convert", "-o", out, "--force", str(path))
+    dump = (sys.executable, str(Path(sys.executable).with_name("mavlogdump.py")), "-q", "-o", out)
+    sparse = folder / "sparse.tlog"
+    with path.open("rb") as file:
+        data = file.read(1 << 20)
+    with sparse.open("wb") as file:
+        file.write(data)
+        file.seek(HOLE, os.SEEK_CUR)
+        file.write(data)
+    runs = {
+        "filter": (*mavgate, "--without", "ATTITUDE"),
+        "cut": (*mavgate, "--from", "10"),
+        "renumber": (*mavgate, "--as", "1:2"),
+        "merge_with_itself": (*mavgate, str(path), "--merge"),
+        "sparse_2_gb": (*mavgate[:-1], str(sparse), "--without", "ATTITUDE"),
+        "mavlogdump_filter": (*dump, "--nottypes", "ATTITUDE", str(path)),
+    }
+    found: dict[str, float] = {"messages": count}
+    for name, command in runs.items():
+        figures = run_of(*command)
+        found |= {f"{name}_{unit}": figure for unit, figure in figures.items()}
+        if not name.startswith("sparse"):
+            found[f"{name}_frames_per_s"] = count / figures["s"]
+    return found
+
+
 def timed(job: Callable[[], Any]) -> tuple[float, Any]:
     """Run a job and return how long it took and what it gave."""
     begin = time.perf_counter()
@@ -391,10 +437,16 @@ def main() -> None:
     parser.add_argument("--messages", type=int, default=1_000_000)
     parser.add_argument("--json", type=Path)
     parser.add_argument("--files", action="store_true", help="only convert and sum up")
+    parser.add_argument("--edits", action="store_true", help="only make tlogs of tlogs")
     args = parser.parse_args()
     results: dict[str, dict[str, float]] = {}
     with tempfile.TemporaryDirectory(prefix="mavgate-bench-") as name:
         folder = Path(name)
+        if not args.files:
+            results["edits"] = measure_edits(folder, args.messages)
+            show("Tlogs made of tlogs", results["edits"])
+        if args.edits:
+            return
         results["files"] = measure_files(folder, args.messages)
         show("Files: processor time of each command", results["files"])
         if args.files:

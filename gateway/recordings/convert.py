@@ -8,7 +8,14 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-from gateway.recordings.files import NO_RECORDING, TLOG, FlightError, format_of, open_tlog
+from gateway.recordings.files import (
+    NO_RECORDING,
+    TLOG,
+    FlightError,
+    TlogSource,
+    format_of,
+    open_tlog,
+)
 from gateway.recordings.formats.maps import (
     DRAWN_IDS,
     VehicleTrack,
@@ -18,6 +25,7 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
+from gateway.recordings.merging import batched
 from gateway.recordings.moment import time_us_of
 from gateway.recordings.reading import (
     NOTHING_WITHIN,
@@ -35,7 +43,8 @@ from gateway.recordings.reading import (
 from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
-from gateway.recordings.tlog import Stamper, TlogRecord, encode_record
+from gateway.recordings.tlog import Stamper, TlogRecord
+from gateway.recordings.tlog_editing import TlogEditor, TlogEdits
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 
@@ -55,9 +64,11 @@ class FlightToWrite:
         fuse: bool = False,
         smooth: bool = False,
         message: str | None = None,
+        edits: TlogEdits | None = None,
     ) -> None:
         self.files, self.options, self.title, self.message = files, options, title, message
         self._limits, self._smooth = limits, smooth
+        self._edits = edits or TlogEdits()
         kinds = {format_of(file) for file in files}
         self.is_mavlink = kinds == {TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
@@ -71,15 +82,28 @@ class FlightToWrite:
         """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
         if not self.is_mavlink:
             return _within(self._sent(), self._limits)
-        sources = [open_tlog(file) for file in self.files]
-        for source in sources:
-            self.senders.merge(source.senders)
-            self._remarks += [f"{source.path}: {text}" for text in source.remarks]
-        recorded = recorded_frames(sources, self.options.progress)
+        recorded = recorded_frames(self._open(), self.options.progress)
         first = next(recorded, None)
         if first is None:
             raise FlightError(f"{', '.join(map(str, self.files))}: {NO_RECORDING}")
         return _within(chain([first], recorded), self._limits)
+
+    def tlog(self) -> Iterator[bytes]:
+        """Yield the MAVLink as a tlog, with the edits."""
+        editor = TlogEditor(self._edits, self._limits, self.remark)
+        if not self.is_mavlink:
+            yield from editor.apply(batched(self._sent()), self.senders)
+            return
+        sources = self._open()
+        yield from editor.apply(editor.joined(sources, self.options.progress), self.senders)
+
+    def _open(self) -> list[TlogSource]:
+        """Open the files as MAVLink; their senders are known then."""
+        sources = [open_tlog(file) for file in self.files]
+        for source in sources:
+            self.senders.merge(source.senders)
+            self._remarks += [f"{source.path}: {text}" for text in source.remarks]
+        return sources
 
     def vehicle_messages(
         self, wanted: Iterable[int] = (), system_id: int | None = None
@@ -207,11 +231,7 @@ NOT_DRAWN: Final = (
     "all MAVLink messages but positions, attitude and texts",
 )
 
-add_writer(
-    ".tlog",
-    lambda flight: (encode_record(record.time_us, record.frame) for record in flight.frames()),
-    Lacks(of_tables=NOT_FUSED),
-)
+add_writer(".tlog", FlightToWrite.tlog, Lacks(of_tables=NOT_FUSED))
 add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))
 add_writer(".kml", _drawn(to_kml), Lacks(*NOT_DRAWN))
 add_writer(".gpx", _drawn(to_gpx), Lacks(*NOT_DRAWN))

@@ -163,6 +163,31 @@ class Batch:
         shifted[indices] = times.view(np.uint8).reshape(-1, TIME_SIZE)
         return shifted.tobytes()
 
+    def chosen(self, wanted: NDArray[np.bool_]) -> "Batch":
+        """Return the batch with some of its records only; its damage is still listed."""
+        if wanted.all():
+            return self
+        columns = (self.starts, self.sizes, self.time_us, self.origins, self.message_ids)
+        starts, sizes, time_us, origins, message_ids = (column[wanted] for column in columns)
+        return replace(
+            self, starts=starts, sizes=sizes, time_us=time_us, origins=origins,
+            message_ids=message_ids,
+        )  # fmt: skip
+
+    def encoded(self) -> bytes:
+        """Return the records as the bytes of a tlog, at the times of the batch."""
+        edited = bytearray(self.data)
+        times = np.maximum(self.time_us, 0).astype(">u8")
+        np.frombuffer(edited, np.uint8)[self.starts[:, None] + np.arange(TIME_SIZE)] = times.view(
+            np.uint8
+        ).reshape(-1, TIME_SIZE)
+        ends = self.starts + TIME_SIZE + self.sizes
+        is_first = np.ones(len(self), np.bool_)
+        is_first[1:] = self.starts[1:] != ends[:-1]
+        begins, view = self.starts[is_first].tolist(), memoryview(edited)
+        stops = ends[np.roll(is_first, -1)].tolist()
+        return b"".join([view[begin:end] for begin, end in zip(begins, stops, strict=True)])
+
     def records(self, wanted: IntArray | None = None) -> Iterator[TlogRecord]:
         """Yield the records, or some of them by their numbers."""
         data = self.data

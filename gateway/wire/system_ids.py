@@ -51,6 +51,7 @@ def rename_systems(
     rename: Callable[[int], int],
     *,
     sign: Sign | None = None,
+    drop_signature: bool = False,
 ) -> MavFrame | None:
     """Return a frame from another sender, with other system ids in its fields.
 
@@ -64,6 +65,8 @@ def rename_systems(
         Returns the new id of a system; called for ids from 1 to 255.
     sign : callable, optional
         Signs the result if the frame is signed and changes.
+    drop_signature : bool, optional
+        Whether a signed frame that changes becomes an unsigned one if there is no `sign`.
 
     Returns
     -------
@@ -73,7 +76,10 @@ def rename_systems(
     fields = _renamed_fields(frame, rename) if frame.message_id in FIELDS else {}
     if sender == frame.origin[0] and not fields:
         return frame
-    return edit_frame(frame, system=sender, fields=fields, sign=sign if frame.signed else None)
+    return edit_frame(
+        frame, system=sender, fields=fields, sign=sign if frame.signed else None,
+        drop_signature=drop_signature,
+    )  # fmt: skip
 
 
 def _renamed_fields(frame: MavFrame, rename: Callable[[int], int]) -> dict[str, Any]:

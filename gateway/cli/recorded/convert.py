@@ -1,7 +1,9 @@
 """`mavgate convert` and `fuse`: files that are made of recordings."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import typer
@@ -17,7 +19,6 @@ from gateway.cli.support.recording_options import (
     PositionOption,
     SensorOption,
     SmoothOption,
-    SystemOption,
     ToOption,
     print_remarks,
     progress_of,
@@ -30,14 +31,27 @@ from gateway.estimation.record import IntArray
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
+from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
+from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, message_ids_of
+from gateway.recordings.tlog_editing import Renumbering, TlogEdits
 from gateway.units import US_PER_S, counted
+from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()
 
 ONE_KIND: Final = ".parquet"
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 """Formats made from a recording's tlogs, which hold all its vehicles and messages."""
+
+
+PANEL: Final = "Tlog to tlog"
+"""Heading of these options in the help."""
+
+
+def _option(name: str, text: str, **how: Any) -> Any:
+    """Return an option for tlogs that are made of tlogs."""
+    return typer.Option(name, help=text, rich_help_panel=PANEL, **how)
 
 
 @app.command()
@@ -56,14 +70,50 @@ def convert(
     smooth: SmoothOption = False,
     fuse_with: FuseWithOption = "recorded",
     position: PositionOption = "causal",
-    system: SystemOption = None,
+    system: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--system", min=1, max=255, help="Vehicle of a tlog to use; for a tlog also several."
+        ),
+    ] = None,
+    component: Annotated[
+        list[int] | None,
+        _option("--component", "Keep frames of this component; may be repeated.", min=0, max=255),
+    ] = None,
     message: Annotated[
-        str | None,
-        typer.Option("--message", help="For Parquet: this MAVLink message instead of the table."),
+        list[str] | None,
+        _option(
+            "--message",
+            "Keep messages of this name, id or pattern (CAMERA_*); may be repeated. For Parquet: "
+            "this message instead of the table.",
+        ),
+    ] = None,
+    without: Annotated[
+        list[str] | None,
+        _option("--without", "Leave out messages of this name, id or pattern; may be repeated."),
+    ] = None,
+    while_state: Annotated[
+        Literal["armed"] | None, _option("--while", "Keep the time while a vehicle is armed.")
+    ] = None,
+    margin_s: Annotated[
+        float,
+        _option("--margin", "Keep so much before and after --while, s.", min=0.0, max=MAX_MARGIN_S),
+    ] = 0.0,
+    merge: Annotated[
+        bool | None,
+        _option(
+            "--merge/--join",
+            "Leave out the copies of frames that several files hold, and align their clocks; or "
+            "keep all. By default files are merged if they overlap.",
+        ),
+    ] = None,
+    rename: Annotated[
+        list[str] | None,
+        _option("--as", "OLD:NEW gives a system another id, also where it is addressed."),
     ] = None,
     force: ForceOption = False,
 ) -> None:
-    """Convert, trim and join recordings.
+    """Convert, trim, join, merge and edit recordings.
 
     Convert between tlogs and tables, or to a track for a map, MCAP for Foxglove, or Parquet. Logs
     of other autopilots (tlog, ULog, DataFlash) become tables that can be fused, and so does a CSV
@@ -71,8 +121,11 @@ def convert(
     """
     if smooth and not fuse:
         refuse("--smooth smooths what --fuse fuses: give both")
-    if message and output.suffix != ONE_KIND:
-        refuse(f"--message is for {ONE_KIND}, which holds one kind of message a file")
+    edits = _read_edits(
+        system, component, message, without, merge=merge, rename=rename,
+        margin_s=margin_s if while_state else None,
+    )  # fmt: skip
+    _check_edits(edits, output, message or [], system or [])
     of_tlogs = not fuse and (output.suffix in FROM_TLOGS or message)
     files = recorded_files(files, "tlogs" if of_tlogs else "tables")
     with progress_of(files) as advance:
@@ -81,7 +134,7 @@ def convert(
             columns,
             choice=fuse_with,
             position=position,
-            system_id=system,
+            system_id=system[0] if system else None,
             sensors=read_sensors(sensor),
             progress=advance,
         )
@@ -92,7 +145,8 @@ def convert(
             title=output.stem,
             fuse=fuse,
             smooth=smooth,
-            message=message,
+            message=message[0] if message else None,
+            edits=edits if output.suffix == ".tlog" else None,
         )
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
@@ -101,6 +155,51 @@ def convert(
     if lacks and message is None:
         print_remarks([f"Dropped: {lacks}"])
     console_of().print(f"{output}: {size / 1e6:.3f} MB")
+
+
+def _read_edits(
+    system: Sequence[int] | None,
+    component: Sequence[int] | None,
+    message: Sequence[str] | None,
+    without: Sequence[str] | None,
+    *,
+    merge: bool | None,
+    rename: Sequence[str] | None,
+    margin_s: float | None,
+) -> TlogEdits:
+    """Read the options of a tlog that is made of tlogs; raises FlightError if one is invalid."""
+    choice = FrameChoice(
+        frozenset(system or ()),
+        frozenset(component or ()),
+        message_ids_of(message or ()),
+        message_ids_of(without or ()),
+    )
+    frames = (Renumbering(_read_renames(rename)),) if rename else ()
+    return TlogEdits(choice, margin_s, merge, frames)
+
+
+def _read_renames(texts: Sequence[str]) -> dict[int, int]:
+    found: dict[int, int] = {}
+    for text in texts:
+        numbers = text.split(":")
+        is_valid = len(numbers) == 2 and all(one.isascii() and one.isdigit() for one in numbers)
+        old, new = map(int, numbers) if is_valid else (0, 0)
+        if not (1 <= old <= LAST_ID and 1 <= new <= LAST_ID) or old in found:
+            raise FlightError(f"--as {text}: write OLD:NEW once a system, ids from 1 to {LAST_ID}")
+        found[old] = new
+    return found
+
+
+def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: list[int]) -> None:
+    """Refuse edits for formats other than tlogs."""
+    if output.suffix == ".tlog":
+        return
+    choice = edits.choice
+    if message and (output.suffix != ONE_KIND or len(message) > 1):
+        refuse(f"--message is for .tlog, and one message for {ONE_KIND}")
+    other = replace(edits, choice=replace(choice, systems=frozenset(), messages=frozenset()))
+    if other != TlogEdits() or len(system) > 1:
+        refuse(f"the options under {PANEL!r} in the help are for an output that ends in .tlog")
 
 
 LEAST_RATE_HZ: Final = 10.0

@@ -1,0 +1,208 @@
+"""Tlogs joined or merged: by time, and without the copies that several receivers recorded.
+
+Theory of operation. Two programs that record the same link write the same frames, each at the time
+of its own clock. A frame whose bytes occur once in each file is a copy, and the difference of its
+times is the offset of the clocks plus the difference of the delays. Most copies have nearly the
+same difference, so the densest second of all differences holds it, and its median is the offset. A
+sample of the frames is enough: those whose last bytes, which are a checksum or a signature, are
+divisible by a power of two that grows with the file.
+"""
+
+import heapq
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+from operator import itemgetter
+from typing import Final
+
+import numpy as np
+
+from gateway.recordings.tlog import Batch, TlogRecord, TlogScanner, encode_record
+from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.units import US_PER_S
+
+MAX_SAMPLE: Final = 50_000
+"""Frames of a file that are kept to compare: some 10 MB."""
+WINDOW_US: Final = US_PER_S
+"""Copies of a frame lie within this time of each other, once the clocks are aligned."""
+LEAST_COPIES: Final = 10
+"""Fewer frames may be equal by chance: parameters are the same in every flight."""
+MAX_PENDING: Final = 100_000
+"""Frames whose copies are waited for; a file may give all its frames one time."""
+PIECE: Final = 4096
+"""Records that become one batch: some 250 kB."""
+
+
+class FrameSample:
+    """A sample of the frames of a file, with their times, and the range of its times."""
+
+    def __init__(self) -> None:
+        self.first_us: int | None = None
+        self.last_us: int | None = None
+        self.step = 1
+        """Frames whose last two bytes are divisible by this are in the sample."""
+        self.frames: dict[bytes, int | None] = {}
+        """Time of each frame; None if it occurs again."""
+
+    def add(self, batch: Batch) -> None:
+        """Take in the next batch of the file."""
+        if not len(batch):
+            return
+        least, greatest = int(batch.time_us.min()), int(batch.time_us.max())
+        self.first_us = least if self.first_us is None else min(self.first_us, least)
+        self.last_us = greatest if self.last_us is None else max(self.last_us, greatest)
+        data = np.frombuffer(batch.data, np.uint8).astype(np.int64)
+        ends = batch.starts + TIME_SIZE + batch.sizes
+        keys = data[ends - 2] | data[ends - 1] << 8
+        for record in batch.records(np.flatnonzero(keys % self.step == 0)):
+            known = record.frame in self.frames
+            self.frames[record.frame] = None if known else record.time_us
+        while len(self.frames) > MAX_SAMPLE:
+            self.step *= 2
+            self.frames = {
+                frame: time_us
+                for frame, time_us in self.frames.items()
+                if int.from_bytes(frame[-2:], "little") % self.step == 0
+            }
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """The offset of a file's clock to that of another one."""
+
+    offset_us: int
+    """To be added to the file's times."""
+    copies: int
+    """Frames of the sample that both files hold."""
+
+
+def clock_offset(sample: FrameSample, reference: FrameSample) -> ClockOffset | None:
+    """Estimate the offset of a file's clock; None if too few frames are copies."""
+    differences = np.sort(
+        [
+            there_us - here_us
+            for frame, here_us in sample.frames.items()
+            if here_us is not None and (there_us := reference.frames.get(frame)) is not None
+        ]
+    )
+    if len(differences) < LEAST_COPIES:
+        return None
+    counts = np.searchsorted(differences, differences + WINDOW_US, "right")
+    counts -= np.arange(len(differences))
+    best = int(np.argmax(counts))
+    count = int(counts[best])
+    if count < LEAST_COPIES:
+        return None
+    return ClockOffset(int(np.median(differences[best : best + count])), count)
+
+
+@dataclass(slots=True)
+class Alignment:
+    """How the files of one flight lie to each other."""
+
+    samples: list[FrameSample] = field(default_factory=list)
+    offsets: list[ClockOffset | None] = field(default_factory=list)
+    """Of each file to the first one; None if it has no copies of frames of another file."""
+
+    def add(self, batches: Iterable[Batch]) -> None:
+        """Take in the next file."""
+        sample = FrameSample()
+        for batch in batches:
+            sample.add(batch)
+        found: list[ClockOffset] = []
+        for earlier, known in zip(self.samples, self.offsets, strict=True):
+            if (offset := clock_offset(sample, earlier)) is not None:
+                base_us = known.offset_us if known else 0
+                found.append(ClockOffset(offset.offset_us + base_us, offset.copies))
+        self.samples.append(sample)
+        self.offsets.append(max(found, key=lambda each: each.copies, default=None))
+
+    @property
+    def shifts_us(self) -> list[int]:
+        """Return what must be added to the times of each file."""
+        return [0 if offset is None else offset.offset_us for offset in self.offsets]
+
+    def order(self, shifts_us: Sequence[int]) -> list[int]:
+        """Return the files' numbers by their begin; files without records come last."""
+        begins = [
+            (sample.first_us is None, (sample.first_us or 0) + shift_us, number)
+            for number, (sample, shift_us) in enumerate(zip(self.samples, shifts_us, strict=True))
+        ]
+        return [number for *_, number in sorted(begins)]
+
+    def overlap_us(self, shifts_us: Sequence[int]) -> int:
+        """Return the longest time that is in two files."""
+        longest_us, end_us = 0, -(1 << 62)
+        for number in self.order(shifts_us):
+            sample, shift_us = self.samples[number], shifts_us[number]
+            if sample.first_us is None or sample.last_us is None:
+                continue
+            last_us = sample.last_us + shift_us
+            longest_us = max(longest_us, min(end_us, last_us) - sample.first_us - shift_us)
+            end_us = max(end_us, last_us)
+        return longest_us
+
+
+@dataclass(slots=True)
+class _Pending:
+    time_us: int
+    seen: set[int]
+    """Files in which it was found."""
+
+
+class Copies:
+    """Recognise the frames that another file has brought already."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        """Copies found."""
+        self._pending: dict[bytes, list[_Pending]] = {}
+        self._order: deque[bytes] = deque()
+
+    def is_copy(self, time_us: int, file: int, frame: bytes) -> bool:
+        """Take the next frame of a file, in the order of aligned times."""
+        entries = self._pending.get(frame)
+        for entry in entries or ():
+            if file not in entry.seen and abs(time_us - entry.time_us) <= WINDOW_US:
+                entry.seen.add(file)
+                self.count += 1
+                return True
+        self._pending.setdefault(frame, []).append(_Pending(time_us, {file}))
+        self._order.append(frame)
+        while len(self._order) > MAX_PENDING or self._is_old(self._order[0], time_us):
+            self._drop(self._order.popleft())
+        return False
+
+    def _is_old(self, frame: bytes, time_us: int) -> bool:
+        return time_us - self._pending[frame][0].time_us > 2 * WINDOW_US
+
+    def _drop(self, frame: bytes) -> None:
+        entries = self._pending[frame]
+        del entries[0]
+        if not entries:
+            del self._pending[frame]
+
+
+def by_time(
+    files: Sequence[Iterable[Batch]], shifts_us: Sequence[int], copies: Copies | None = None
+) -> Iterator[TlogRecord]:
+    """Yield the records of all files in order of their shifted times, without copies if wanted."""
+
+    def shifted(number: int) -> Iterator[tuple[int, int, bytes]]:
+        for batch in files[number]:
+            for record in batch.records():
+                yield record.time_us + shifts_us[number], number, record.frame
+
+    streams = [shifted(number) for number in range(len(files))]
+    for time_us, number, frame in heapq.merge(*streams, key=itemgetter(0)):
+        if copies is None or not copies.is_copy(time_us, number, frame):
+            yield TlogRecord(time_us, frame)
+
+
+def batched(records: Iterable[TlogRecord]) -> Iterator[Batch]:
+    """Put records into batches again."""
+    scanner, rest = TlogScanner(), iter(records)
+    while piece := b"".join(encode_record(r.time_us, r.frame) for r in islice(rest, PIECE)):
+        yield scanner.feed(piece)
+    yield scanner.feed(b"", final=True)

@@ -1,0 +1,146 @@
+"""Records of a tlog that are kept: by sender, message, time, and while a vehicle is armed.
+
+All of these take batches and return batches with fewer records; the frames stay as they are.
+"""
+
+import difflib
+import math
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.files import FlightError
+from gateway.recordings.moment import Moment, time_us_of
+from gateway.recordings.senders import Senders
+from gateway.recordings.tlog import HEARTBEAT_ID, Batch, columns_of
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+
+BoolArray = NDArray[np.bool_]
+
+MAX_MARGIN_S: Final = 600.0
+"""Records of so long before arming are held in memory: some 30 MB at 50 kB/s."""
+_LONG_AGO_US: Final = -(1 << 62)
+_NEVER_US: Final = 1 << 62
+
+
+@dataclass(frozen=True, slots=True)
+class FrameChoice:
+    """Frames by sender and message; an empty set does not restrict."""
+
+    systems: frozenset[int] = frozenset()
+    components: frozenset[int] = frozenset()
+    messages: frozenset[int] = frozenset()
+    without: frozenset[int] = frozenset()
+    """Ids of messages that are left out."""
+
+    def apply(self, batch: Batch) -> Batch:
+        """Return the batch with the chosen frames only."""
+        wanted = np.ones(len(batch), np.bool_)
+        for values, chosen in (
+            (batch.origins >> 8, self.systems),
+            (batch.origins & 0xFF, self.components),
+            (batch.message_ids, self.messages),
+        ):
+            if chosen:
+                wanted &= np.isin(values, [*chosen])
+        if self.without:
+            wanted &= ~np.isin(batch.message_ids, [*self.without])
+        return batch.chosen(wanted)
+
+
+def message_ids_of(patterns: Iterable[str]) -> frozenset[int]:
+    """Return the ids of messages given by id, name, or pattern as `CAMERA_*`.
+
+    Raises FlightError if a pattern fits no message.
+    """
+    found: set[int] = set()
+    for pattern in patterns:
+        if pattern.isascii() and pattern.isdigit():
+            found.add(int(pattern))
+            continue
+        name = pattern.upper()
+        ids = {key for known, key in MESSAGE_IDS.items() if fnmatchcase(known, name)}
+        if not ids:
+            near = difflib.get_close_matches(name, MESSAGE_IDS, 1)
+            hint = f"; did you mean {near[0]}?" if near else "; give its id if it is a vendor's"
+            raise FlightError(f"no MAVLink message is named {pattern}{hint}")
+        found |= ids
+    return frozenset(found)
+
+
+def within(
+    batches: Iterable[Batch], limits: tuple[Moment | None, Moment | None]
+) -> Iterator[Batch]:
+    """Yield the records between two moments, both included."""
+    begin, end = limits
+    begin_us, end_us = _LONG_AGO_US, _NEVER_US
+    first_us: int | None = None
+    for batch in batches:
+        if first_us is None and len(batch):
+            first_us = int(batch.time_us[0])
+            begin_us = begin_us if begin is None else time_us_of(begin, first_us)
+            end_us = end_us if end is None else time_us_of(end, first_us)
+        yield batch.chosen((batch.time_us >= begin_us) & (batch.time_us <= end_us))
+
+
+class ArmedState:
+    """Whether any vehicle is armed, by the heartbeats of the autopilots."""
+
+    def __init__(self, senders: Senders) -> None:
+        self._senders = senders
+        self._armed: set[int] = set()
+
+    def armed(self, batch: Batch) -> BoolArray:
+        """Return for each record whether a vehicle is armed then."""
+        found = np.empty(len(batch), np.bool_)
+        rows = np.flatnonzero(batch.message_ids == HEARTBEAT_ID)
+        modes = columns_of(batch, rows, HEARTBEAT_ID)["base_mode"]
+        at = 0
+        for row, mode in zip(rows.tolist(), modes.tolist(), strict=True):
+            origin = int(batch.origins[row])
+            if origin != self._senders.vehicle(origin >> 8).origin:
+                continue
+            found[at:row] = bool(self._armed)
+            at = row
+            if mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED:
+                self._armed.add(origin)
+            else:
+                self._armed.discard(origin)
+        found[at:] = bool(self._armed)
+        return found
+
+
+def while_armed(batches: Iterable[Batch], senders: Senders, margin_s: float) -> Iterator[Batch]:
+    """Yield the records while a vehicle is armed, and those of a margin before and after.
+
+    Batches are held until their records are further back than the margin; raises ValueError if
+    that is too long.
+    """
+    if not 0.0 <= margin_s <= MAX_MARGIN_S:
+        raise ValueError(f"a margin of {margin_s:g} s; 0 to {MAX_MARGIN_S:g}")
+    state, margin_us = ArmedState(senders), math.ceil(margin_s * 1e6)
+    held: deque[tuple[Batch, BoolArray]] = deque()
+    newest_us = _LONG_AGO_US
+    for batch in batches:
+        if not len(batch):
+            yield batch
+            continue
+        times, armed = batch.time_us, state.armed(batch)
+        before = np.maximum.accumulate(np.where(armed, times, newest_us))
+        after = np.minimum.accumulate(np.where(armed, times, _NEVER_US)[::-1])[::-1]
+        newest_us = int(before[-1])
+        first_us = int(after[0])
+        for earlier, wanted in held:
+            wanted |= earlier.time_us >= first_us - margin_us
+        held.append((batch, (before >= times - margin_us) | (after <= times + margin_us)))
+        while held and held[0][0].time_us[-1] < times[-1] - margin_us:
+            earlier, wanted = held.popleft()
+            yield earlier.chosen(wanted)
+    for earlier, wanted in held:
+        yield earlier.chosen(wanted)

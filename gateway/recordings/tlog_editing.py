@@ -1,0 +1,203 @@
+"""Tlogs made of tlogs: joined or merged, cut, chosen, and edited frame by frame.
+
+Each step takes the batches of the one before, so a file of any size needs the same memory. What is
+not edited stays byte for byte.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gateway.recordings.files import NO_RECORDING, FlightError, Progress, TlogSource
+from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
+from gateway.recordings.reading import NOTHING_WITHIN, Limits
+from gateway.recordings.selection import FrameChoice, while_armed, within
+from gateway.recordings.senders import Senders
+from gateway.recordings.tlog import Batch, encode_record
+from gateway.units import US_PER_S, counted
+from gateway.wire.mavlink_messages import MESSAGE_NAMES
+from gateway.wire.mavlink_splitter import frame_of
+from gateway.wire.system_ids import FIELDS, rename_systems
+
+BoolArray = NDArray[np.bool_]
+
+NOTHING_LEFT: Final = "no record fits all of these options"
+
+
+class FrameEdit(Protocol):
+    """A change of single frames."""
+
+    shift_us: int
+    """To be added to the recorded times."""
+
+    def affects(self, batch: Batch) -> BoolArray:
+        """Return which records of a batch may change."""
+        ...
+
+    def edit(self, frame: bytes) -> bytes | None:
+        """Return a frame after the change; None if it must be left out."""
+        ...
+
+
+class Renumbering:
+    """Other system ids, in headers and in all fields that hold one."""
+
+    shift_us = 0
+
+    def __init__(self, system_ids: Mapping[int, int]) -> None:
+        self._system_ids = system_ids
+
+    def affects(self, batch: Batch) -> BoolArray:
+        """Return which records may hold a system id that changes."""
+        is_from: BoolArray = np.isin(batch.origins >> 8, [*self._system_ids])
+        return is_from | np.isin(batch.message_ids, [*FIELDS])
+
+    def edit(self, frame: bytes) -> bytes | None:
+        """Return a frame with other ids; None of an unknown message, which has no checksum."""
+        read = frame_of(frame)
+        sender = self._renamed(read.origin[0])
+        found = rename_systems(read, sender, self._renamed, drop_signature=True)
+        return None if found is None else found.data
+
+    def _renamed(self, system_id: int) -> int:
+        return self._system_ids.get(system_id, system_id)
+
+
+@dataclass(frozen=True, slots=True)
+class TlogEdits:
+    """The changes between the files that are read and the tlog that is written."""
+
+    choice: FrameChoice = field(default_factory=FrameChoice)
+    armed_margin_s: float | None = None
+    """Keep only the time while a vehicle is armed, and so much before and after."""
+    merge: bool | None = None
+    """Leave out copies of frames that several files hold; by default if the files overlap."""
+    frames: tuple[FrameEdit, ...] = ()
+
+    @property
+    def are_none(self) -> bool:
+        """Whether the records stay as they are."""
+        return self == TlogEdits(merge=self.merge)
+
+
+class TlogEditor:
+    """Apply edits to the records of some files; the remarks are complete at the end."""
+
+    def __init__(
+        self,
+        edits: TlogEdits,
+        limits: Limits,
+        remark: Callable[[str], None],
+    ) -> None:
+        self._edits, self._limits, self._remark = edits, limits, remark
+        self._left_out: Counter[int] = Counter()
+        """Frames that could not be edited, by message."""
+
+    def joined(
+        self, sources: Sequence[TlogSource], progress: Progress | None = None
+    ) -> Iterator[Batch]:
+        """Yield the records of all files in order of time; copies are left out by a merge."""
+        if len(sources) == 1:
+            yield from self._intact(sources[0], progress)
+            return
+        alignment = Alignment()
+        for source in sources:
+            alignment.add(source.batches())
+        merge = self._edits.merge
+        if merge is None:
+            overlap_us = alignment.overlap_us(alignment.shifts_us)
+            merge = overlap_us > WINDOW_US
+        shifts_us = alignment.shifts_us if merge else [0] * len(sources)
+        ordered = [sources[number] for number in alignment.order(shifts_us)]
+        if alignment.overlap_us(shifts_us) <= 0:
+            for source in ordered:
+                yield from self._intact(source, progress)
+            return
+        copies = Copies() if merge else None
+        files = [self._intact(source, progress) for source in sources]
+        yield from batched(by_time(files, shifts_us, copies))
+        if copies is not None:
+            self._remark_merge(sources, alignment, copies)
+
+    def apply(self, batches: Iterable[Batch], senders: Senders) -> Iterator[bytes]:
+        """Yield the bytes of the new tlog; raises FlightError if nothing is left."""
+        edits, total, kept = self._edits, 0, 0
+
+        def all_records() -> Iterator[Batch]:
+            nonlocal total
+            for batch in batches:
+                total += len(batch)
+                yield batch
+
+        chosen: Iterable[Batch] = within(all_records(), self._limits)
+        if edits.armed_margin_s is not None:
+            chosen = while_armed(chosen, senders, edits.armed_margin_s)
+        for batch in chosen:
+            wanted = edits.choice.apply(batch)
+            kept += len(wanted)
+            yield self._edited(wanted)
+        kept -= self._left_out.total()
+        if not kept:
+            is_cut = self._limits != (None, None) and edits.are_none
+            raise FlightError(
+                NO_RECORDING if not total else NOTHING_WITHIN if is_cut else NOTHING_LEFT
+            )
+        if not edits.are_none:
+            self._remark(f"kept {kept} of {counted(total, 'record')}")
+        for message_id, count in sorted(self._left_out.items()):
+            name = MESSAGE_NAMES.get(message_id, f"unknown message {message_id}")
+            self._remark(f"left out {counted(count, 'frame')} of {name}")
+
+    def _edited(self, batch: Batch) -> bytes:
+        shift_us = sum(edit.shift_us for edit in self._edits.frames)
+        if shift_us:
+            batch = replace(batch, time_us=batch.time_us + shift_us)
+        affected = [edit.affects(batch) for edit in self._edits.frames]
+        if not len(batch) or not np.any(affected):
+            return batch.encoded()
+        pieces = []
+        is_affected = np.any(affected, axis=0).tolist()
+        for record, may_change in zip(batch.records(), is_affected, strict=True):
+            frame: bytes | None = record.frame
+            for edit in self._edits.frames if may_change else ():
+                frame = None if frame is None else edit.edit(frame)
+            if frame is None:
+                self._left_out[frame_of(record.frame).message_id] += 1
+            else:
+                pieces.append(encode_record(record.time_us, frame))
+        return b"".join(pieces)
+
+    def _intact(self, source: TlogSource, progress: Progress | None) -> Iterator[Batch]:
+        """Yield the records of a file, and report the bytes that belong to none."""
+        runs = size = end = 0
+        for batch in source.batches(progress):
+            for damage in batch.damage:
+                # A run may go on in the next batch.
+                runs += damage.offset != end or not runs
+                end = damage.offset + damage.size
+                size += damage.size
+            runs += batch.unfinished > 0
+            size += batch.unfinished
+            yield batch
+        if size:
+            self._remark(
+                f"{source.path}: left out {counted(size, 'byte')} in {counted(runs, 'place')}, "
+                "which hold no record"
+            )
+
+    def _remark_merge(
+        self, sources: Sequence[TlogSource], alignment: Alignment, copies: Copies
+    ) -> None:
+        for source, offset in list(zip(sources, alignment.offsets, strict=True))[1:]:
+            if offset is None:
+                self._remark(f"{source.path}: has too few copies to compare clocks; times are kept")
+            else:
+                self._remark(
+                    f"{source.path}: moved by {offset.offset_us / US_PER_S:+.3f} s to the clock of "
+                    f"{sources[0].path}, by {counted(offset.copies, 'frame')} of a sample"
+                )
+        self._remark(f"left out {counted(copies.count, 'copied frame')}")
