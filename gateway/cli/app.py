@@ -254,6 +254,7 @@ class LazyGroup(TyperGroup):
         return found
 
 
+ISO: Final = "%Y-%m-%d %H:%M:%S"
 log = logging.getLogger(__name__)
 app = typer.Typer(
     name="mavgate",
@@ -320,7 +321,7 @@ def _begin_logging(*, verbose: bool) -> None:
 
         form = "%(message)s"
         shown = Console(file=cast(IO[str], _CurrentStderr()))
-        handler = RichHandler(console=shown, show_path=False)
+        handler = RichHandler(console=shown, show_path=False, log_time_format=ISO)
     handler.addFilter(LogLimit())
     handler.setFormatter(PrintableFormatter(form))
     logging.basicConfig(level=level, handlers=[handler])

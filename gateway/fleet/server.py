@@ -245,6 +245,9 @@ class FleetServer:
     async def _set_id(self, site: str, system_id: int, own_id: int) -> list[str]:
         if not SITE_NAME.fullmatch(site):
             raise ControlError(f"site {site!r}: only letters, digits, . _ and - are allowed")
+        known = {*self._sites, *(named for (named, _), _ in self._ids.items())}
+        if site not in known:
+            raise ControlError(f"unknown site {site!r}; known: {', '.join(sorted(known))}")
         if own_id == LEFT_OUT:
             self._ids.leave_out(site, system_id)
         else:

@@ -204,14 +204,20 @@ class Session:
 
     def failed(self, reason: str, now_us: int) -> list[SessionAction]:
         """Note that files could not be opened or written; this is retried later."""
-        closing: list[SessionAction] = [ClosePart()] if self.state is SessionState.RECORDING else []
+        begun = self.state is SessionState.RECORDING
+        closing: list[SessionAction] = [ClosePart()] if begun else []
         if self.state is SessionState.OPENING:
             self.part -= 1
         self.state, self._retry_us = SessionState.BLOCKED, now_us + RETRY_US
         known, self.reason = reason == self.reason, reason
         if known:
             return closing
-        return [*closing, Announce(is_trouble=True, text=f"Recording stopped: {reason}")]
+        return [
+            *closing,
+            Announce(
+                is_trouble=True, text=f"Recording {'stopped' if begun else 'not started'}: {reason}"
+            ),
+        ]
 
     def poll(
         self, now_us: int, unix_us: int, part_bytes: int, free_bytes: int, *, jumped: bool = False

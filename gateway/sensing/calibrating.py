@@ -207,7 +207,8 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
     _check_spread(field, radius, "turn the aircraft about all its axes, upside down too")
     advice = f"{IRON_ADVICE}, and turn it further"
     if not FIELD_UT[0] <= radius <= FIELD_UT[1]:
-        raise CalibrationError(f"a field of {radius:.0f} uT is not the Earth's: {advice}")
+        text = f"the fit gave {radius:.0f} uT, which is not the Earth's field"
+        raise CalibrationError(f"{text}: {advice}")
     fit = _fit_sphere(field, strength_ut or radius, skew=True, start=centre)
     axes = np.abs(np.linalg.eigvalsh(np.array(fit.matrix)))
     _check_bound("hard iron", _length(fit.bias), MAX_HARD_IRON_UT, " uT", advice)

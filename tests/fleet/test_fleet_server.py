@@ -192,6 +192,10 @@ async def test_id_that_cannot_be_saved_is_an_error(
     def refuse(*_: object, **__: object) -> int:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
+    world.fleet._ids.set_by_hand("field-a", 1, 5)
+    unknown = {"site": "field-z", "system_id": 1, "own_id": 77}
+    with pytest.raises(ControlError, match=r"unknown site 'field-z'; known: .*field-a"):
+        await asyncio.to_thread(request, world.fleet.control_socket, "fleet.id", unknown)
     params = {"site": "field-a", "system_id": 1, "own_id": 77}
     with monkeypatch.context() as patch:
         patch.setattr(id_map, "write_new", refuse)
@@ -264,7 +268,7 @@ async def test_status_shows_round_trip_and_rate(world: World) -> None:
     assert site_of(world, "field-a")["vehicles"][0]["rate_hz"] > 0
     shown = await run("fleet", "status")
     head, *rows = [line.split() for line in shown.splitlines() if line.strip()][1:]
-    assert head == ["site", "ms", "system", "id", "here", "Hz", "age", "s", "lost"]
+    assert head == ["site", "RTT", "ms", "system", "id", "here", "Hz", "age", "s", "lost"]
     assert {row[0] for row in rows} >= {"field-a", "field-b"}
     listed = json.loads(await run("fleet", "status", "--json"))
     assert {site["name"] for site in listed["sites"]} == {"field-a", "field-b"}

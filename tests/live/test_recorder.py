@@ -316,7 +316,7 @@ async def test_save_needs_a_recording_and_a_good_name(bench: Bench) -> None:
         await bench.recorder.save("x")
     await bench.turn()
     await bench.record(FRAMES)
-    with pytest.raises(RecordingError, match="no name"):
+    with pytest.raises(RecordingError, match="not a name"):
         await bench.recorder.save("../x")
 
 
@@ -333,7 +333,7 @@ async def test_failed_start_is_reported_and_retried(
 ) -> None:
     bench.recorder.folder.write_text("a file where the folder should be")
     bench.recorder.start()
-    assert bench.troubles == ["Recording stopped: File exists"]
+    assert bench.troubles == ["Recording not started: File exists"]
     bench.recorder.folder.unlink()
     await bench.turn(RETRY_US / 1e6)
     assert bench.recorder.status().state == "recording"

@@ -13,6 +13,7 @@ import pytest
 from nicegui import Client
 from nicegui.page import page
 
+from gateway.batch.catalogue import FlightFigures
 from gateway.panel.dialogues import Dialogue
 from gateway.panel.estimator_trial import ComparisonError
 from gateway.panel.state.parameters import ParameterEntry, ParameterMeta
@@ -193,7 +194,6 @@ def test_angles_of_a_parameter_are_shown_in_degrees() -> None:
 
 
 def test_unknown_figures_of_a_recording_are_dashes() -> None:
-    row = dict.fromkeys(("error", "duration", "distance", "highest", "loss"))
-    assert _facts_cells(row) == ("—", "—", "—", ("—", ""))
-    row |= {"duration": 61.2, "distance": math.nan, "highest": 7.4, "loss": 0.1}
-    assert _facts_cells(row) == ("0:01:01", "—", "7 m", ("10.0%", "warn"))
+    assert _facts_cells(FlightFigures(61.2)) == ("0:01:01", "—", "—", ("—", ""))
+    figures = FlightFigures(3601.0, distance=math.nan, highest=7.4, loss=0.1)
+    assert _facts_cells(figures) == ("1:00:01", "—", "7 m", ("10.0%", "warn"))

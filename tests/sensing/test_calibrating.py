@@ -148,7 +148,7 @@ def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: s
     [
         (sphere(np.random.default_rng(1), 300, 45.0) + np.array([0, 0, 201]), "hard iron 201"),
         (sphere(np.random.default_rng(1), 300, 45.0) * [1.0, 2.1, 1.0], "soft iron"),
-        (sphere(np.random.default_rng(1), 300, 120.0), "a field of 120 uT"),
+        (sphere(np.random.default_rng(1), 300, 120.0), "the fit gave 120 uT"),
         (
             sphere(np.random.default_rng(1), 300, 45.0)
             * (1.0 + 0.2 * np.random.default_rng(2).normal(size=(300, 1))),

@@ -105,8 +105,9 @@ def calibrate(
 ) -> None:
     """Calibrate an aircraft's sensors and save the result with its residuals.
 
-    Each step is saved when it is done. A running gateway gives the samples and uses the result at
-    once; without one, or with --port, the receiver is read.
+    Each step is saved when it is done; the exit code is 1 if one is not. A running
+    gateway gives the samples and uses the result at once; without one, or with --port, the receiver
+    is read.
     """
     settings = read_settings()
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
@@ -134,7 +135,10 @@ def calibrate(
         serial = settings.serial
         serial = serial if port is None else msgspec.structs.replace(serial, port=port)
         poses = poses_from(_capture_live(vehicle) if is_live else capture_from(serial, vehicle))
-    _show(old, calibrate_each(chosen, poses, old, save, field_ut))
+    new, missing = calibrate_each(chosen, poses, old, save, field_ut)
+    _show(old, new)
+    if missing:
+        raise typer.Exit(1)
 
 
 def calibrate_each(
@@ -143,26 +147,30 @@ def calibrate_each(
     calibration: NodeCalibration,
     save: Callable[[NodeCalibration], None],
     field_ut: float | None = None,
-) -> NodeCalibration:
+) -> tuple[NodeCalibration, list[Step]]:
     """Run the steps; each is saved when it is done, so aborting loses only the present one.
 
-    A failed step is reported, and the next one starts.
+    A failed step is reported, and the next one starts. Returns the calibration, and the steps that
+    are missing.
     """
+    missing: list[Step] = []
     for number, step in enumerate(steps):
         if len(steps) > 1:
             console.print(f"\nStep {number + 1} of {len(steps)}: {step}")
         try:
             calibration = _solve(step, poses(step), calibration, field_ut)
         except CalibrationError as error:
+            missing.append(step)
             console.print(f"{step}: {error}", style="red")
         except (KeyboardInterrupt, typer.Abort):
+            missing += steps[number:]
             left = ", ".join(steps[number:])
             console.print(f"\nCancelled (interrupted). Remaining steps: {left}.", style="yellow")
             break
         else:
             console.print(f"{step}: done", style="green")
             save(calibration)
-    return calibration
+    return calibration, missing
 
 
 def _solve(

@@ -80,8 +80,8 @@ def setup(
 ) -> None:
     """Guide through the first start: receiver, sensors, radio, GPS, calibration.
 
-    Each calibration is saved when it is done. The gateway must not run meanwhile: the receiver's
-    port is read by one program at a time.
+    Each calibration is saved when it is done; the exit code is 1 if one is not. The gateway
+    must not run meanwhile: the receiver's port is read by one program at a time.
     """
     settings = read_settings()
     serial = settings.serial if port is None else replace(settings.serial, port=port)
@@ -112,6 +112,8 @@ def _guide(
     console.print("Start the gateway with `mavgate run`, and a ground station on UDP port 14550.")
     console.print("A step that failed can be repeated: `mavgate calibrate gyro`, `level` or `mag`.")
     console.print("For the accelerometer, `mavgate calibrate accel` asks for all six sides.")
+    if done < len(STEPS):
+        raise typer.Exit(1)
 
 
 def _find(serial: SerialSettings) -> SerialSettings:

@@ -29,8 +29,8 @@ SENSORS: Final = {
 _BEGINS: Final = (
     (re.compile(r"^(.+) silent$"), "node {0}", "{0} silent", "no radio packets"),
     (re.compile(r"^Receiver lost: (.+)$"), "receiver", "Receiver lost", "{0}"),
-    (re.compile(r"^(?:Recording stopped|Cannot record): (.+)$"), "recording", "Recording failed",
-     "{0}"),
+    (re.compile(r"^(?:Recording (?:not started|stopped)|Cannot record): (.+)$"), "recording",
+     "Recording failed", "{0}"),
 )  # fmt: skip
 """Texts of the gateway that begin an alert, and its key, title and detail."""
 _ENDS: Final = (

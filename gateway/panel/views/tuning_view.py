@@ -292,9 +292,8 @@ class TuningView:
             self._group = ui.select([ALL], value=ALL, on_change=self._draw)
             self._group.props('dense outlined options-dense aria-label="Group"')
             self._state = ui.label().classes("soft")
-            store = ui.button("Store all", icon="save", on_click=self._store)
-            store.props("no-caps unelevated dense")
-            allow(store, "" if self._context.may_change else "You are logged in as a viewer.")
+            self._button = ui.button("Store all", icon="save", on_click=self._store)
+            self._button.props("no-caps unelevated dense")
             again = ui.button(icon="refresh", on_click=self._reload)
             again.props('flat round dense aria-label="Read all parameters again"')
         with ui.element("div").classes("tuning"):
@@ -325,6 +324,10 @@ class TuningView:
         self._refresh()
 
     def _refresh(self) -> None:
+        reason = "This aircraft is played from a recording." if self._context.is_playback else ""
+        allow(
+            self._button, reason if self._context.may_change else "You are logged in as a viewer."
+        )
         dialogue = self._context.dialogue
         if dialogue is None:
             self._state.set_text("")

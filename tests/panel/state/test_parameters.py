@@ -198,7 +198,7 @@ def test_metadata_describes_every_parameter(lose_every: int) -> None:
     bench = Bench(files, lose_every=lose_every)
     bench.run(files.read("/general.json", bench.now_us), 5.0)
     path = parameter_path(files.files["/general.json"])
-    assert path == "/parameter.json.xz"
+    assert path == "/parameter-1.json.xz"
     bench.run(files.read(path, bench.now_us), 60.0 if lose_every else 5.0)
     metas = parse_parameters(files.files[path])
     assert metas.keys() == parameters.entries.keys()

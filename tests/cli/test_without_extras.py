@@ -1,0 +1,70 @@
+"""Every command runs in an environment without any extra: a line instead of a traceback."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from gateway.cli.app import COMMANDS, MOVED, load_command
+from gateway.extras import EXTRAS
+
+pytestmark = [pytest.mark.io, pytest.mark.slow]
+
+NEEDS = {
+    "panel": "panel", "page x": "panel", "run --panel --port none": "panel",
+    "map get --source a --around 1,2": "panel", "report": "plot", "batch report x -o o": "plot",
+    "fleet": "fleet", "batch fuse s3://x -o o": "batch",
+    "batch info s3://x -o o": "batch", "batch sweep s3://x -o o --vary alpha=0.1,0.2": "batch",
+}  # fmt: skip
+"""The commands that need an extra, which they name."""
+PROGRAM = """
+import json, sys
+sys.modules.update(dict.fromkeys({blocked!r}))
+from typer.testing import CliRunner
+from gateway.cli.app import app
+found = {{}}
+for words in {lines!r}:
+    done = CliRunner().invoke(app, words.split())
+    ended = done.exception is None or isinstance(done.exception, SystemExit)
+    found[words] = [done.exit_code, done.output, "" if ended else repr(done.exception)]
+print(json.dumps(found))
+"""
+
+
+def leaves_of(command: Any, words: str) -> list[str]:
+    below = getattr(command, "commands", {}).items()
+    return [leaf for name, each in below for leaf in leaves_of(each, f"{words} {name}")] or [words]
+
+
+LEAVES = [leaf for name in COMMANDS for leaf in leaves_of(load_command(name), name)]
+ENDLESS = {"run", "demo"}
+"""They serve until they are interrupted."""
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    folder = tmp_path_factory.mktemp("home")
+    lines = [*NEEDS, *(leaf for leaf in LEAVES if leaf not in ENDLESS)]
+    blocked = [module for modules in EXTRAS.values() for module in modules]
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM.format(blocked=blocked, lines=lines)],
+        capture_output=True, text=True, check=False, cwd=folder, stdin=subprocess.DEVNULL,
+        env={"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder), "PATH": "/usr/bin:/bin"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_no_command_ends_in_a_traceback(found: dict[str, Any]) -> None:
+    assert {words: error for words, (_, _, error) in found.items() if error} == {}
+    assert len(found) > len(MOVED) + len(COMMANDS)
+
+
+@pytest.mark.parametrize(("words", "extra"), [pair for pair in NEEDS.items() if pair[1]])
+def test_missing_extra_is_one_line(found: dict[str, Any], words: str, extra: str) -> None:
+    code, output, _ = found[words]
+    assert code == 2
+    assert f" needs the extra {extra}; to install it: " in output
+    assert len(output.splitlines()) == 1
