@@ -235,13 +235,9 @@ class Rig:
 
 
 @pytest.fixture
-def proven(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let clients of UDP ports not need to prove that they receive."""
+async def rig(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Rig]:
+    """Return a rig; clients of its UDP ports need not prove that they receive."""
     monkeypatch.setattr(DatagramPeer, "is_proven", True)
-
-
-@pytest.fixture
-async def rig(proven: None) -> AsyncIterator[Rig]:
     rig = Rig()
     yield rig
     rig.close()

@@ -17,6 +17,7 @@ import pytest
 import zenoh
 
 from gateway.hub.hub import Hub
+from gateway.hub.transports.datagram import DatagramPeer
 from gateway.hub.transports.zenoh import client as zenoh_client
 from gateway.hub.transports.zenoh import session as zenoh_session
 from gateway.hub.transports.zenoh.session import (
@@ -135,7 +136,8 @@ class Site(Rig):
 
 
 @pytest.fixture
-async def site(router: Router, proven: None) -> AsyncIterator[Site]:
+async def site(router: Router, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Site]:
+    monkeypatch.setattr(DatagramPeer, "is_proven", True)
     site = Site(router)
     yield site
     site.close()
