@@ -54,7 +54,7 @@ def test_only_regular_files_are_replaced(tmp_path: Path, kind: str) -> None:
     elif kind == "folder":
         path.mkdir()
     before = path.lstat()
-    with pytest.raises(OSError, match="no regular file"):
+    with pytest.raises(OSError, match="is not a regular file"):
         write_new(path, [b"new"], overwrite=True)
     assert os.path.samestat(before, path.lstat())
     assert (tmp_path / "other").read_bytes() == b"kept"
@@ -134,7 +134,7 @@ def test_folder_that_is_not_empty_needs_overwrite(tmp_path: Path) -> None:
         check_folder(tmp_path)
     check_folder(tmp_path, overwrite=True)
     for below in (tmp_path / "a", tmp_path / "a" / "b" / "c"):
-        with pytest.raises(OSError, match="no folder"):
+        with pytest.raises(OSError, match="is not a folder"):
             check_folder(below, overwrite=True)
 
 

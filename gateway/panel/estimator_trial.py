@@ -116,9 +116,10 @@ def _flight_of(frames: TimedFrames, settings: FusionSettings) -> tuple[Flight, i
         )
     except ValueError as error:
         raise ComparisonError("no sensor samples came yet") from error
-    if flight.duration_s < LEAST_S or flight.rate_hz < LEAST_HZ:
+    rate_hz = (len(flight.time_us) - 1) / max(flight.duration_s, 1.0 / LEAST_HZ)
+    if flight.duration_s < LEAST_S or rate_hz < LEAST_HZ:
         raise ComparisonError(
-            f"{flight.duration_s:.0f} s of samples at {flight.rate_hz:.0f} Hz; "
+            f"{flight.duration_s:.0f} s of samples at {rate_hz:.0f} Hz; "
             f"{LEAST_S:.0f} s at {LEAST_HZ:.0f} Hz are needed"
         )
     return flight, reader.unix_us_at_zero or 0

@@ -449,11 +449,13 @@ def _load(path: Path, copy: str) -> tuple[Any, int]:
     # Damage that it prints to the terminal is reported as remarks.
     with contextlib.redirect_stdout(io.StringIO()):
         try:
-            _check_formats(ULog(_Content(copy), parse_header_only=True).message_formats)
-            file = _Content(copy)
-            return ULog(file, list(TOPICS)), file.unread
+            with _Content(copy) as head:
+                _check_formats(ULog(head, parse_header_only=True).message_formats)
+            with _Content(copy) as file:
+                log = ULog(file, list(TOPICS))
         except (ULogException, *BROKEN) as error:
             raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error
+    return log, file.unread
 
 
 def _check_formats(formats: dict[str, Any]) -> None:

@@ -238,8 +238,8 @@ def test_table_with_a_byte_order_mark_is_read(tmp_path: Path) -> None:
         (bytes(range(128, 200)), "map.toml: line 1: is not UTF-8 text; save it as UTF-8"),
         (b'[columns]\ntime_us = "t"\n\xe4 = "x"\n', "map.toml: line 3: is not UTF-8"),
         (b"[columns]\nfoo = 3\n", "map.toml: is not a column map"),
-        (b"[columns", "map.toml: is not a column map"),
-        (b"x = " + b"[" * 10_000, "map.toml: is not a column map"),
+        (b"[columns", "map.toml: is not valid TOML"),
+        (b"x = " + b"[" * 10_000, "map.toml: line 1: is nested in more than 8 levels"),
     ],
 )
 def test_invalid_column_map_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
