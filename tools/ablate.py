@@ -95,6 +95,10 @@ MECHANISMS: Final = (
         "hard iron by the model's field", "fixes", "raise_hard_iron", NOTHING,
         ("magnetometer.raise_hard_iron",),
     ),
+    Mechanism(
+        "hard iron by the norm", "magnetometer", "update_hard_iron", NOTHING,
+        ("magnetometer.update_hard_iron",),
+    ),
     Mechanism("time of validity of a fix", "fixes", "look_back", at_present, VALIDITY),
     Mechanism("GPS latency from motion", "latency", "slew_latency", NOTHING, ("latency",)),
     Mechanism(
@@ -104,11 +108,8 @@ MECHANISMS: Final = (
     Mechanism("faults of inertial sensors", "faults", "check_sensor", ZERO, SENSORS),
 )  # fmt: skip
 FULL: Final = "full filter"
-FLIGHTS: Final = (
-    *("arduplane", "quad106", "phantom", "mocap", "car_", "walk"),
-    *("broad_06", "broad_30", "broad_33"),
-)
-DISTURBED: Final = ("arduplane", "phantom", "broad_06")
+FLIGHTS: Final = ("arduplane", "quad106", "phantom", "mocap", "car_", "walk", "px4_", "broad_")
+DISTURBED: Final = ("arduplane", "phantom_rtk", "broad_06")
 """Words in the names of the flights that are scored as recorded, and with disturbances."""
 EQUAL: Final = 0.01
 """A flight whose errors change by a smaller share counts as equal."""

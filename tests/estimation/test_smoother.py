@@ -17,6 +17,7 @@ from gateway.estimation.columns import (
     NAV_LAT,
     NAV_POS_STD,
 )
+from gateway.estimation.eskf.filter import COMPASS_RAD
 from gateway.estimation.eskf.state import STATES
 from gateway.estimation.reference import NO_DECLINATION_RAD
 from gateway.estimation.select import EstimationSettings, make_estimator
@@ -180,3 +181,9 @@ def test_smoothing_reduces_errors_of_real_car(data_dir) -> None:
     assert valid[1].sum() > valid[0].sum()
     sure = smoothed[:, NAV_ATTITUDE_STD + 2] < HEADING_VALID_RAD
     np.testing.assert_array_equal(valid[1], sure)
+
+
+@pytest.mark.slow
+def test_smoothing_does_not_average_out_lasting_errors_of_the_compass(flight: Flight) -> None:
+    std_rad = run_smoothed(flight)[flight.counts, NAV_ATTITUDE_STD + 2]
+    assert std_rad.min() > COMPASS_RAD

@@ -115,8 +115,9 @@ MAX_ALTITUDE_M: Final = 30_000.0
 """Largest pressure altitude of a sound barometer."""
 LEVEL_VALID_RAD: Final = 0.1
 """A level is valid up to this standard deviation."""
-MOUNTING_RAD: Final = 1.0 * RAD_PER_DEG
-"""Error of the declination, and of the compass axes on their board."""
+COMPASS_RAD: Final = 2.0 * RAD_PER_DEG
+"""Error of the declination, of the compass axes on their board, and by soft iron. It is in the
+output alone: it lasts, so no average over the flight reduces it, as the smoother's."""
 UNAIDED_VALID_S: Final = 1.0
 """A position that is not estimated is valid for this time after its fix."""
 
@@ -341,7 +342,7 @@ def heading_std_rad(s: State) -> float:
     """Return the standard deviation of the heading with its systematic errors."""
     if s.heading_known == 0:
         return math.sqrt(NO_HEADING_VAR)
-    variance = max(s.P[ATT + 2, ATT + 2], 0.0) + MOUNTING_RAD * MOUNTING_RAD
+    variance = max(s.P[ATT + 2, ATT + 2], 0.0) + COMPASS_RAD * COMPASS_RAD
     if s.heading_true == 0:
         variance += NO_DECLINATION_RAD * NO_DECLINATION_RAD
     return math.sqrt(variance)
