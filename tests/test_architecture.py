@@ -55,6 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     | {"status", "config", "recordings", "output", "extras"}
     | EDGES,
     "extensions": {"printable"},
+    "outputs": FOUNDATION | {"wire", "recordings", "extras"} | EDGES,
     "player": FOUNDATION | STAGES | JOINED | {"recordings", "config"} | EDGES,
     "cli": FOUNDATION
     | STAGES
@@ -79,7 +80,7 @@ PURE_FOLDERS = {"panel/state"}
 PURE_FILES = {"batch/facts.py"} | {
     f"recordings/{name}.py"
     for name in (
-        *("columns", "table", "tlog", "tlog_scan", "answers", "moment", "play"),
+        *("newest", "columns", "table", "tlog", "tlog_scan", "answers", "moment", "play"),
         *("formats/csv", "formats/maps", "formats/mavlink"),
     )
 }
@@ -195,7 +196,8 @@ def test_stages_import_no_edge() -> None:
         if module.startswith(("gateway.live", "gateway.hub.transports"))
     }
     assert knowing <= (
-        {"cli", "config", "flashing", "fleet", "hub", "live", "panel", "player"} | {"batch"}
+        {"cli", "config", "flashing", "fleet", "hub", "live", "panel", "player", "outputs"}
+        | {"batch"}
     )
 
 

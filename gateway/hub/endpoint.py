@@ -38,7 +38,7 @@ treated like TCP clients.
 
 import ipaddress
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Final
@@ -177,8 +177,19 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
 """Options that only some kinds have."""
 HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
 """Kinds whose frames go to hosts by their addresses, one by one."""
-ADDED_KINDS: Final[set[str]] = set()
-"""Kinds of other packages, which parse the rest of the URL themselves."""
+
+
+@dataclass(frozen=True, slots=True)
+class AddedKind:
+    """A kind of another package, which parses the rest of the URL itself."""
+
+    options: frozenset[str] = frozenset()
+    """Its own options; one that is named like a common option replaces it."""
+    check: "Callable[[Endpoint], None]" = lambda _endpoint: None
+    """Raises ValueError if it does not understand an endpoint."""
+
+
+ADDED_KINDS: Final[dict[str, AddedKind]] = {}
 ALIASES: Final = {
     "udpin": "udp-listen",
     "udps": "udp-listen",
@@ -238,6 +249,8 @@ class Endpoint:
     """Keys of a fleet: `site`, or those of mavlink-server, `mavlink_raw` or `mavlink_json`."""
     config: str = ""
     """Zenoh's own configuration file; empty for none."""
+    added: dict[str, str] = field(default_factory=dict)
+    """Options that only its added kind has, as they are written."""
 
     @property
     def address(self) -> str:
@@ -269,10 +282,12 @@ def parse_endpoint(url: str) -> Endpoint:
         kind, rest = _kind_and_rest(address)
         host, port = _split_address(kind, rest)
         options = _options(kind, query)
+        added_kind = ADDED_KINDS.get(kind, AddedKind())
+        added = {key: options.pop(key) for key in added_kind.options & options.keys()}
         site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
         if kind == EndpointKind.ZENOH:
             _check_fleet(site, keys)
-        return Endpoint(
+        endpoint = Endpoint(
             url=url,
             kind=kind,
             host=host,
@@ -294,9 +309,12 @@ def parse_endpoint(url: str) -> Endpoint:
             site=site,
             keys=keys,
             config=options.get("config", ""),
+            added=added,
         )
+        added_kind.check(endpoint)
     except ValueError as error:
         raise ValueError(f"endpoint {url!r}: {error}") from None
+    return endpoint
 
 
 def host_and_port(host: object, port: object) -> str:
@@ -361,7 +379,8 @@ def stays_here(endpoint: Endpoint) -> bool:
 
 def _options(kind: str, query: str) -> dict[str, str]:
     """Read the options; each may be given once, or their order would decide which one counts."""
-    known = COMMON_OPTIONS | OWN_OPTIONS.get(kind, frozenset())
+    own = ADDED_KINDS[kind].options if kind in ADDED_KINDS else OWN_OPTIONS.get(kind, frozenset())
+    known = COMMON_OPTIONS | own
     options: dict[str, str] = {}
     for key, value in parse_qsl(query, keep_blank_values=True):
         if key not in known:

@@ -21,7 +21,7 @@ class HubSettings(Settings, frozen=True):
             "udp-multicast:GROUP:PORT, tcp:HOST:PORT, tcp-listen:HOST:PORT, ws:HOST:PORT, "
             "ws-listen:HOST:PORT (56781 is usual), wss:HOST:PORT, wss-listen:HOST:PORT, "
             "zenoh:tcp/HOST:7447?site=NAME, "
-            "serial:DEVICE:BAUD; "
+            "serial:DEVICE:BAUD, or outputs that are not MAVLink, such as nmea:udp:HOST:10110; "
             "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
         ),
     ] = ENDPOINTS

@@ -134,7 +134,7 @@ def _take(flight: PageFlight, message: VehicleMessage, reader: Any, track: Conti
     vehicle = flight.aircraft.setdefault(system_id, VehicleState(system_id, "recorded"))
     with suppress(mavlink.MAVError):
         vehicle.take(reader.decode(bytearray(message.frame)), time_us)
-    if (at := message.position) is None or vehicle.position is None:
+    if (at := message.position) is None or vehicle.state.position is None:
         return
     place = (time_us, at.lat_deg, at.lon_deg, message.boot_us)
     flight.distances.setdefault(system_id, GroundDistance()).update(*place)

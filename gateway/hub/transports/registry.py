@@ -1,9 +1,17 @@
 """Which transport serves which kind of endpoint."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, Final
 
-from gateway.hub.endpoint import ADDED_KINDS, JSON_KEYS, RAW_KEYS, SITE_KEYS, Endpoint, EndpointKind
+from gateway.hub.endpoint import (
+    ADDED_KINDS,
+    JSON_KEYS,
+    RAW_KEYS,
+    SITE_KEYS,
+    AddedKind,
+    Endpoint,
+    EndpointKind,
+)
 from gateway.hub.transports.base import Client, HubContext, Listener
 from gateway.hub.transports.serial_line import SerialClient
 from gateway.hub.transports.tcp import TcpClient, TcpListener
@@ -57,7 +65,12 @@ LISTENERS: Final[dict[str, Callable[[HubContext, Endpoint], Listener[Any]]]] = {
 }
 
 
-def add_endpoint_kind(word: str, make: ClientMaker) -> None:
+def add_endpoint_kind(
+    word: str,
+    make: ClientMaker,
+    options: Iterable[str] = (),
+    check: Callable[[Endpoint], None] = lambda _endpoint: None,
+) -> None:
     """Add a kind of endpoint URL.
 
     Parameters
@@ -67,6 +80,11 @@ def add_endpoint_kind(word: str, make: ClientMaker) -> None:
     make : callable
         Creates the client of one endpoint from the hub, the client's id and the endpoint; a
         subclass of `Client` has this signature.
+    options : iterable of str, optional
+        Options of its own, which are in `Endpoint.added` as they are written; one that is named
+        like a common option replaces it.
+    check : callable, optional
+        Called when a URL is read; raises ValueError if it does not understand the endpoint.
 
     Raises
     ------
@@ -75,5 +93,5 @@ def add_endpoint_kind(word: str, make: ClientMaker) -> None:
     """
     if word in CLIENTS or word in LISTENERS:
         raise ValueError(f"endpoint kind {word!r} already exists")
-    ADDED_KINDS.add(word)
+    ADDED_KINDS[word] = AddedKind(frozenset(options), check)
     CLIENTS[word] = make

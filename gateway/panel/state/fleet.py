@@ -12,18 +12,9 @@ import pymap3d.vincenty as vincenty
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.angle import wrap_180
-from gateway.geometry.quaternion import from_euler
-from gateway.recordings.positions import (
-    RANKS,
-    Position,
-    TrackPoint,
-    is_located,
-    named_position,
-    position_of,
-)
-from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
+from gateway.recordings.newest import NewestState, VehicleComponents
+from gateway.recordings.positions import TrackPoint, is_located
 from gateway.recordings.status_texts import JoinedText, TextJoiner
-from gateway.recordings.tlog import fields_of
 from gateway.records import NAN, UNKNOWN_VEC3
 from gateway.units import DEGE7_PER_DEG, US_PER_S
 from gateway.vehicle.plan import Location
@@ -144,18 +135,11 @@ class StatusTexts:
 
 MM: Final = 1e3
 CM: Final = 1e2
-UNKNOWN_MV: Final = 65535
 UNKNOWN_U32: Final = 0xFFFFFFFF
-UNKNOWN_SATELLITES: Final = 255
-UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 
 MAX_TRACK: Final = 20_000
 """Moments of the history: more than an hour at 5 Hz; the oldest are dropped."""
 TRACK_INTERVAL_US: Final = 200_000
-POSITION_FRESH_US: Final = 3 * US_PER_S
-"""Positions of a poorer source are left out so long after one of a better source."""
-ATTITUDE_FRESH_US: Final = US_PER_S
-"""The quaternion is preferred to the angles unless it is older than this."""
 
 PLANES: Final = frozenset((1, 16, 17, 19, 20, 21, 22, 23, 24, 25, 28))
 COPTERS: Final = frozenset((2, 3, 13, 14, 15, 29, 35))
@@ -227,8 +211,10 @@ class VehicleState:
         """How often the path was restarted."""
         self.newest: dict[str, Any] = {}
         """The newest message of its autopilot by name, as pymavlink decodes it."""
-        self.heard_us: dict[str, int] = {}
-        """When that came, on the panel's clock in µs."""
+        self.state = NewestState()
+        """The rules by which position, attitude and so on are taken from these."""
+        self.heard_us = self.state.heard_us
+        """When each came, on the panel's clock in µs."""
         self.history = FlightHistory()
         """Its states so far, a few a second."""
         self.fixes: deque[TrackPoint] = deque(maxlen=MAX_TRACK)
@@ -237,15 +223,9 @@ class VehicleState:
         """STATUSTEXT, the newest last."""
         self.exact_mark: Location | None = None
         """The mark from the gateway's control socket, exact where MAVLink is rounded."""
-        self.position: Position | None = None
-        """The newest of its best source."""
-        self._position_us = -POSITION_FRESH_US
-        self._position_rank = len(RANKS)
-        self._frame_origin: Position | None = None
         self._moved_us = 0
         self._takers: dict[str, Callable[[Any, int], None]] = {
             "STATUSTEXT": self.texts.take,
-            "GPS_GLOBAL_ORIGIN": self._take_origin,
             "GPS_RAW_INT": self._take_fix,
             "ATTITUDE": self._note_motion,
             "ATTITUDE_QUATERNION": self._note_motion,
@@ -255,12 +235,14 @@ class VehicleState:
         """Take in one decoded message of this system's autopilot."""
         name = message.get_type()
         self.newest[name] = message
-        self.heard_us[name] = now_us
+        has_moved = self.state.take(name, vars(message), now_us)
         self.texts.poll(now_us)
         if taker := self._takers.get(name):
             taker(message, now_us)
-        if message.get_msgId() in RANKS:
-            self._take_position(message, now_us)
+        if has_moved:
+            self._moved_us = now_us
+            if now_us - self.history.newest_us >= TRACK_INTERVAL_US:
+                self.history.add(now_us, self.instant(now_us))
 
     @property
     def name(self) -> str:
@@ -284,15 +266,9 @@ class VehicleState:
         self.fixes.clear()
         self.generation += 1
 
-    def _age_s(self, now_us: int, *names: str) -> float:
-        """Return the age of the newest of some messages; NaN if none came."""
-        heard_us = max((self.heard_us[name] for name in names if name in self.heard_us), default=0)
-        return (now_us - heard_us) / US_PER_S if heard_us else NAN
-
     def silent_s(self, now_us: int) -> float:
         """Return how long no heartbeat came; infinite if none ever did."""
-        heard_us = self.heard_us.get("HEARTBEAT")
-        return math.inf if heard_us is None else (now_us - heard_us) / US_PER_S
+        return self.state.age_us(now_us, "HEARTBEAT") / US_PER_S
 
     @property
     def model(self) -> str:
@@ -317,10 +293,9 @@ class VehicleState:
 
     def instant(self, now_us: int) -> Instant:
         """Return the present state."""
-        get = self.newest.get
-        q_nb, rates = self._attitude()
-        at, position, hud = self.position, get("GLOBAL_POSITION_INT"), get("VFR_HUD")
-        fix, beat = get("GPS_RAW_INT"), get("HEARTBEAT")
+        get, state = self.newest.get, self.state
+        (q_nb, rates), (battery_v, battery_percent) = state.attitude(), state.battery()
+        at, hud, fix = state.position, get("VFR_HUD"), get("GPS_RAW_INT")
         mark, distance_m, bearing_deg = self._mark()
         return Instant(
             system_id=self.system_id,
@@ -338,37 +313,31 @@ class VehicleState:
             alt_home_m=at.alt_home_m if at else NAN,
             vel_n_mps=at.vel_n_mps if at else UNKNOWN_VEC3,
             groundspeed_mps=hud.groundspeed if hud else (at.groundspeed_mps if at else NAN),
-            airspeed_mps=_airspeed_mps(hud),
+            airspeed_mps=state.airspeed_mps(),
             climb_mps=hud.climb if hud else NAN,
-            heading_deg=_heading_deg(position, hud),
+            heading_deg=state.heading_deg(),
             pos_std_m=self._pos_std_m(),
             fix_type=fix.fix_type if fix else 0,
-            satellites=_satellites(fix),
+            satellites=state.satellites(),
             fix=_spot_of_fix(fix),
             home=self.home,
             mark=mark,
             mark_distance_m=distance_m,
             mark_bearing_deg=bearing_deg,
-            **_battery(get("BATTERY_STATUS"), get("SYS_STATUS")),
+            battery_v=battery_v,
+            battery_percent=battery_percent,
             attitude_s=self._age_s(now_us, "ATTITUDE_QUATERNION", "ATTITUDE"),
-            position_s=(now_us - self._position_us) / US_PER_S if at else NAN,
+            position_s=(now_us - state.position_us) / US_PER_S if at else NAN,
             hud_s=self._age_s(now_us, "VFR_HUD"),
             gps_s=self._age_s(now_us, "GPS_RAW_INT"),
             battery_s=self._age_s(now_us, "BATTERY_STATUS", "SYS_STATUS"),
-            armed=bool(beat and beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED),
+            armed=state.is_armed(),
         )
 
-    def _attitude(self) -> tuple[tuple[float, float, float, float], tuple[float, float, float]]:
-        quaternion, angles = self.newest.get("ATTITUDE_QUATERNION"), self.newest.get("ATTITUDE")
-        age_us = self.heard_us.get("ATTITUDE", 0) - self.heard_us.get("ATTITUDE_QUATERNION", 0)
-        if quaternion is not None and age_us < ATTITUDE_FRESH_US:
-            q_nb = (quaternion.q1, quaternion.q2, quaternion.q3, quaternion.q4)
-            return q_nb, _rates(quaternion)
-        if angles is None:
-            return UNKNOWN_QUAT, UNKNOWN_VEC3
-        turned = (angles.roll, angles.pitch, angles.yaw)
-        q_nb = from_euler(*turned) if all(map(math.isfinite, turned)) else UNKNOWN_QUAT
-        return q_nb, _rates(angles)
+    def _age_s(self, now_us: int, *names: str) -> float:
+        """Return the age of the newest of some messages; NaN if none came."""
+        age_us = self.state.age_us(now_us, *names)
+        return NAN if math.isinf(age_us) else age_us / US_PER_S
 
     def _pos_std_m(self) -> float:
         """Return the position's standard deviation: the estimator's, or the GPS receiver's."""
@@ -379,7 +348,7 @@ class VehicleState:
 
     def _mark(self) -> tuple[Location | None, float, float]:
         """Return the mark, and the distance and bearing reported by the aircraft."""
-        way, at = self.newest.get("NAV_CONTROLLER_OUTPUT"), self.position
+        way, at = self.newest.get("NAV_CONTROLLER_OUTPUT"), self.state.position
         if way is None or at is None or not way.wp_dist:
             return self.exact_mark, NAN, NAN
         bearing_deg, distance_m = float(way.target_bearing % 360), float(way.wp_dist)
@@ -392,24 +361,6 @@ class VehicleState:
     def _note_motion(self, _message: Any, now_us: int) -> None:
         self._moved_us = now_us
 
-    def _take_origin(self, message: Any, _now_us: int) -> None:
-        self._frame_origin = named_position(fields_of(bytes(message.get_msgbuf())))
-
-    def _take_position(self, message: Any, now_us: int) -> None:
-        """Take a valid position, unless a better source sent one shortly before."""
-        message_id = message.get_msgId()
-        rank, age_us = RANKS[message_id], now_us - self._position_us
-        if rank > self._position_rank and age_us < POSITION_FRESH_US:
-            return
-        fields = fields_of(bytes(message.get_msgbuf()))
-        found = position_of(message_id, fields, self._frame_origin)
-        if found is None:
-            return
-        self.position, self._position_us, self._position_rank = found, now_us, rank
-        self._moved_us = now_us
-        if now_us - self.history.newest_us >= TRACK_INTERVAL_US:
-            self.history.add(now_us, self.instant(now_us))
-
     def _take_fix(self, message: Any, now_us: int) -> None:
         spot = _spot_of_fix(message)
         if spot is None:
@@ -417,39 +368,6 @@ class VehicleState:
         last = self.fixes[-1] if self.fixes else None
         if last is None or (last.lat_deg, last.lon_deg) != (spot.lat_deg, spot.lon_deg):
             self.fixes.append(TrackPoint(now_us, spot.lat_deg, spot.lon_deg, spot.alt_amsl_m))
-
-
-def _battery(battery: Any, system: Any) -> dict[str, float]:
-    """Return voltage and remaining charge, each NaN if unknown."""
-    volts = [mv / MM for mv in battery.voltages if mv != UNKNOWN_MV] if battery else []
-    if not volts and system and system.voltage_battery != UNKNOWN_MV:
-        volts = [system.voltage_battery / MM]
-    sources = [source.battery_remaining for source in (battery, system) if source]
-    percent = next((value for value in sources if value >= 0), NAN)
-    return {"battery_v": sum(volts) if volts else NAN, "battery_percent": float(percent)}
-
-
-def _satellites(fix: Any) -> float:
-    """Return the number of satellites; a log without it has a fix of none."""
-    if fix is None or fix.satellites_visible == UNKNOWN_SATELLITES:
-        return NAN
-    has_fix = fix.fix_type >= mavlink.GPS_FIX_TYPE_2D_FIX
-    return float(fix.satellites_visible) if fix.satellites_visible or not has_fix else NAN
-
-
-def _rates(message: Any) -> tuple[float, float, float]:
-    return (message.rollspeed, message.pitchspeed, message.yawspeed)
-
-
-def _airspeed_mps(hud: Any) -> float:
-    """Return the airspeed; unknown where the field repeats the ground speed: there is no sensor."""
-    return NAN if hud is None or hud.airspeed == hud.groundspeed else float(hud.airspeed)
-
-
-def _heading_deg(position: Any, hud: Any) -> float:
-    if position is not None and position.hdg != 65535:
-        return float(position.hdg / CM)
-    return float(hud.heading % 360) if hud is not None else NAN
 
 
 def _spot_of_fix(message: Any) -> Location | None:
@@ -488,8 +406,7 @@ class FleetState:
         """Of played aircraft, by their played system ids."""
         self.version = 0
         """Counts the messages, so that a reader knows whether there is new data."""
-        self._components: dict[int, int] = {}
-        """The vehicle's component of each system; see `Senders`."""
+        self._components = VehicleComponents()
         self._listeners: list[Listener] = []
         self._on_discard: list[Callable[[int], None]] = []
 
@@ -526,15 +443,9 @@ class FleetState:
     def take(self, message: Any, now_us: int) -> None:
         """Take in a decoded message; those of ground stations and other components are ignored."""
         system_id, component_id = message.get_srcSystem(), message.get_srcComponent()
-        if not 0 < system_id < FIRST_GROUND_STATION:
-            return
-        # Other components, such as a camera, have the system id of their vehicle.
         is_beat = message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT
-        if component_id == AUTOPILOT:
-            self._components[system_id] = AUTOPILOT
-        elif is_beat and message.autopilot != mavlink.MAV_AUTOPILOT_INVALID:
-            self._components.setdefault(system_id, component_id)
-        if component_id != self._components.get(system_id):
+        autopilot = message.autopilot if is_beat else None
+        if not self._components.includes(system_id, component_id, autopilot):
             return
         vehicle = self.vehicles.get(system_id)
         if vehicle is None:

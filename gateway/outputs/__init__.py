@@ -1,0 +1,38 @@
+"""Endpoints that are not MAVLink: NMEA 0183, Cursor on Target, MQTT, GDL90, antenna rotators.
+
+They are added as any other package adds a kind of endpoint; see docs/extend.md. The module of a
+kind has its name, and is imported when an endpoint of it is used.
+"""
+
+from functools import partial
+from importlib import import_module
+from typing import Any, Final
+
+from gateway.hub.endpoint import ADDED_KINDS, Endpoint
+from gateway.hub.transports.base import Client, HubContext
+from gateway.hub.transports.registry import add_endpoint_kind
+
+KINDS: Final = {
+    "nmea": ("rate", "vehicle"),
+}
+"""The options of each kind."""
+
+
+def _output_class(kind: str) -> Any:
+    return import_module(f"gateway.outputs.{kind}").OUTPUT
+
+
+def _make(context: HubContext, client_id: int, endpoint: Endpoint) -> Client:
+    client: Client = _output_class(endpoint.kind)(context, client_id, endpoint)
+    return client
+
+
+def _check(kind: str, endpoint: Endpoint) -> None:
+    _output_class(kind).check(endpoint)
+
+
+def extend() -> None:
+    """Add the kinds that are not there yet."""
+    for kind, options in KINDS.items():
+        if kind not in ADDED_KINDS:
+            add_endpoint_kind(kind, _make, options, partial(_check, kind))

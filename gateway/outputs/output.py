@@ -1,0 +1,152 @@
+"""Base of the outputs: the states of the vehicles, composed at a rate, given to a carrier.
+
+An output is a client of the hub: the filters of its endpoint decide which frames it sees, and so
+which systems. It asks for no message that it does not read.
+"""
+
+import asyncio
+import ssl
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+from typing import ClassVar, Final
+
+from gateway.clock import unix_time_us
+from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
+from gateway.hub.transports.base import Client
+from gateway.outputs.carrier import Carrier, client_context, target_of
+from gateway.recordings.newest import STATE_IDS, NewestState, NewestVehicles
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import MavFrame
+
+HEARD_US: Final = 60 * US_PER_S
+"""A vehicle that was not heard for longer has gone."""
+MIN_RATE_HZ, MAX_RATE_HZ = 0.01, 50.0
+
+
+class Output(Client):
+    """An endpoint that sends the states of vehicles in a format of its own, and receives none."""
+
+    may_return = False
+    carriers: ClassVar[Collection[str]] = ()
+    """The carriers that its URL may name."""
+    default_rate_hz: ClassVar[float] = 1.0
+    wanted_ids: ClassVar[frozenset[int]] = STATE_IDS
+    """The messages that it reads; empty for all."""
+    _timer: asyncio.TimerHandle | None = None
+    unix_us = staticmethod(unix_time_us)
+    """The civil time."""
+
+    def __post_init__(self) -> None:
+        """Narrow the filter of its endpoint, and start without a connection."""
+        self.endpoint = self._narrowed(self.endpoint)
+        super().__post_init__()
+        self.vehicles = NewestVehicles()
+        self.configure()
+        self.carrier = self._make_carrier()
+
+    @classmethod
+    def check(cls, endpoint: Endpoint) -> None:
+        """Raise ValueError if the endpoint is not understood."""
+        target_of(endpoint.host, cls.carriers)
+        _rate_hz(endpoint, cls.default_rate_hz)
+        _vehicle_id(endpoint)
+
+    def configure(self) -> None:
+        """Read the options of the endpoint."""
+        self.interval_s = 1.0 / _rate_hz(self.endpoint, self.default_rate_hz)
+        self.vehicle_id = _vehicle_id(self.endpoint)
+
+    def compose(self, now_us: int) -> Iterable[bytes]:
+        """Return the messages that are due; called at the rate of the endpoint."""
+        raise NotImplementedError
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Take in one frame."""
+        self.vehicles.feed(frame, self.context.now_us())
+
+    def tick(self, now_us: int) -> None:
+        """Open the carrier if it is not open, and start the timer."""
+        if not self.carrier.is_open and self._is_retry_due(now_us):
+            self.carrier.open()
+        if self._timer is None:
+            self._timer = self.loop.call_later(self.interval_s, self._turn)
+
+    def reconfigure(self, endpoint: Endpoint) -> None:
+        """Apply changed options of the same endpoint."""
+        super().reconfigure(self._narrowed(endpoint))
+        self.configure()
+
+    def close(self) -> None:
+        """Close the carrier, and stop."""
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self.carrier.close()
+
+    def put(self, data: bytes) -> None:
+        """Send one message now."""
+        sent, dropped = self.carrier.send(data)
+        self.counters.sent += sent
+        self.counters.bytes_sent += sent * len(data)
+        self.counters.dropped += dropped
+
+    def heard(self, now_us: int) -> dict[int, NewestState]:
+        """Return the chosen vehicle, or all that were heard lately, by their system ids."""
+        return {
+            system_id: state
+            for system_id, state in sorted(self.vehicles.states.items())
+            if self.vehicle_id in (0, system_id)
+            and state.age_us(now_us, *state.heard_us) <= HEARD_US
+        }
+
+    def chosen(self, now_us: int) -> NewestState | None:
+        """Return the chosen vehicle, by default the one with the lowest system id."""
+        return next(iter(self.heard(now_us).values()), None)
+
+    def position_unix_us(self, state: NewestState, now_us: int) -> int:
+        """Return the civil time of a vehicle's position, µs since 1970."""
+        return self.unix_us() - (now_us - state.position_us)
+
+    def _turn(self) -> None:
+        # First, so that the next turn follows whatever happens below.
+        self._timer = self.loop.call_later(self.interval_s, self._turn)
+        for data in self.compose(self.context.now_us()):
+            self.put(data)
+
+    def _make_carrier(self) -> Carrier:
+        return Carrier(
+            self.endpoint.host,
+            self.carriers,
+            self.become,
+            self.context.settings.max_clients,
+            self._tls_context,
+        )
+
+    def _tls_context(self) -> ssl.SSLContext:
+        given = self.endpoint.added
+        authority = given.get("authority") or self.context.settings.tls_authority
+        return client_context(authority, given.get("certificate", ""), given.get("key", ""))
+
+    def _narrowed(self, endpoint: Endpoint) -> Endpoint:
+        """Return the endpoint with the messages that are read here as the only ones that pass."""
+        if not self.wanted_ids:
+            return endpoint
+        allow = self.wanted_ids & endpoint.allow if endpoint.allow else self.wanted_ids
+        return replace(endpoint, allow=allow or frozenset({NO_MESSAGES}))
+
+
+def _rate_hz(endpoint: Endpoint, default_hz: float) -> float:
+    text = endpoint.added.get("rate")
+    try:
+        rate_hz = default_hz if text is None else float(text)
+    except ValueError:
+        raise ValueError(f"rate {text!r} is not a number in Hz") from None
+    if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
+        raise ValueError(f"rate {text!r} is not {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz")
+    return rate_hz
+
+
+def _vehicle_id(endpoint: Endpoint) -> int:
+    """Return the system id of the chosen vehicle; 0 for any."""
+    text = endpoint.added.get("vehicle")
+    return 0 if text is None else number_from(text, "vehicle", 1, 249)

@@ -1,0 +1,280 @@
+"""The newest state of live vehicles from their MAVLink: one reader for pages, outputs and metrics.
+
+Of each vehicle it keeps the newest message of each name. The position is that of the best source
+(see `positions`), unless a better one is interrupted; it is valid for outputs while it is not old
+and the vehicle's estimator, if it reports its quality, has an absolute position. Pure: time is an
+argument.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.geometry.quaternion import from_euler
+from gateway.recordings.positions import (
+    FIX_2D,
+    RANKS,
+    UNKNOWN_U16,
+    Position,
+    named_position,
+    position_of,
+)
+from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION
+from gateway.recordings.tlog import fields_of
+from gateway.records import NAN, UNKNOWN_VEC3, Quat, Vec3
+from gateway.units import M_PER_CM, M_PER_MM, MV_PER_V, US_PER_S
+from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS, MESSAGE_NAMES, ids_of
+from gateway.wire.mavlink_splitter import MavFrame
+
+Fields = Mapping[str, Any]
+
+POSITION_FRESH_US: Final = 3 * US_PER_S
+"""Positions of a poorer source are left out so long after one of a better source."""
+POSITION_OLD_US: Final = 5 * US_PER_S
+"""An older position is not sent: five times the usual interval of a radio."""
+QUALITY_OLD_US: Final = 15 * US_PER_S
+"""An older report of an estimator does not concern the present position."""
+ATTITUDE_FRESH_US: Final = US_PER_S
+"""The quaternion is preferred to the angles unless it is older than this."""
+UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
+UNKNOWN_SATELLITES: Final = 255
+LEAST_SPEED_MPS: Final = 0.2
+"""Below it a velocity has no direction."""
+_PRESENT: Final = ("GLOBAL_POSITION_INT", "GLOBAL_POSITION_INT_COV", "LOCAL_POSITION_NED")
+_ABSOLUTE, _CONSTANT = mavlink.ESTIMATOR_POS_HORIZ_ABS, mavlink.ESTIMATOR_CONST_POS_MODE
+"""Bits of ESTIMATOR_STATUS, and the same ones of ArduPilot's EKF_STATUS_REPORT."""
+STATE_IDS: Final = frozenset(RANKS) | ids_of(
+    *("HEARTBEAT", "ATTITUDE", "ATTITUDE_QUATERNION", "VFR_HUD", "BATTERY_STATUS", "SYS_STATUS"),
+    *("HOME_POSITION", "GPS_GLOBAL_ORIGIN", "ESTIMATOR_STATUS", "EKF_STATUS_REPORT"),
+    "RADIO_STATUS",
+)
+"""The messages from which the state is taken."""
+PX4_MODES: Final = {
+    1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 4: "AUTO", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED",
+}  # fmt: skip
+PX4_AUTO_MODES: Final = {
+    1: "READY", 2: "TAKEOFF", 3: "LOITER", 4: "MISSION", 5: "RTL", 6: "LAND", 8: "FOLLOW",
+    9: "PRECLAND",
+}  # fmt: skip
+COPTERS: Final = frozenset((2, 3, 4, 13, 14, 15, 29, 35))
+ROVERS: Final = frozenset((10, 11))
+
+
+class VehicleComponents:
+    """Which component of each live system is its vehicle.
+
+    Component 1 is, else the first with the heartbeat of an autopilot: so the attitude of a gimbal
+    or the position of a camera is not that of its aircraft.
+    """
+
+    def __init__(self) -> None:
+        self._components: dict[int, int] = {}
+
+    def includes(self, system_id: int, component_id: int, autopilot: int | None) -> bool:
+        """Return whether a message is a vehicle's; `autopilot` is that of a heartbeat."""
+        if not 0 < system_id < FIRST_GROUND_STATION:
+            return False
+        if component_id == AUTOPILOT:
+            self._components[system_id] = AUTOPILOT
+        elif autopilot not in (None, mavlink.MAV_AUTOPILOT_INVALID):
+            self._components.setdefault(system_id, component_id)
+        return component_id == self._components.get(system_id)
+
+
+@dataclass(slots=True)
+class GpsReport:
+    """The newest report of the first GPS receiver that has one; NaN is unknown."""
+
+    fix_type: int
+    """GPS_FIX_TYPE."""
+    satellites: float
+    hdop: float
+    separation_m: float
+    """Height of the geoid above the ellipsoid."""
+    course_deg: float
+
+
+class NewestState:
+    """The newest state of one vehicle."""
+
+    def __init__(self) -> None:
+        self.fields: dict[str, Fields] = {}
+        """The newest message of each name, as its fields by name."""
+        self.heard_us: dict[str, int] = {}
+        """When that came."""
+        self.position: Position | None = None
+        """The newest of its best source."""
+        self.position_us = -POSITION_FRESH_US
+        self._source = ""
+        self._origin: Position | None = None
+
+    def take(self, name: str, fields: Fields, now_us: int) -> bool:
+        """Take in a message; return whether it brought a new position."""
+        self.fields[name] = fields
+        self.heard_us[name] = now_us
+        if name == "GPS_GLOBAL_ORIGIN":
+            self._origin = named_position(fields)
+        message_id = MESSAGE_IDS.get(name, -1)
+        if message_id not in RANKS:
+            return False
+        known = RANKS[MESSAGE_IDS[self._source]] if self._source else len(RANKS)
+        if RANKS[message_id] > known and now_us - self.position_us < POSITION_FRESH_US:
+            return False
+        found = position_of(message_id, fields, self._origin)
+        if found is None:
+            return False
+        self.position, self.position_us, self._source = found, now_us, name
+        return True
+
+    def age_us(self, now_us: int, *names: str) -> float:
+        """Return the age of the newest of some messages; infinite if none came."""
+        heard = [self.heard_us[name] for name in names if name in self.heard_us]
+        return now_us - max(heard) if heard else math.inf
+
+    def valid_position(self, now_us: int) -> Position | None:
+        """Return the position, if it may be sent on: neither old nor disclaimed by its sender."""
+        if self.position is None or now_us - self.position_us > POSITION_OLD_US:
+            return None
+        for name in ("ESTIMATOR_STATUS", "EKF_STATUS_REPORT") if self._source in _PRESENT else ():
+            if self.age_us(now_us, name) <= QUALITY_OLD_US:
+                flags = self.fields[name]["flags"]
+                if not flags & _ABSOLUTE or flags & _CONSTANT:
+                    return None
+        return self.position
+
+    def attitude(self) -> tuple[Quat, Vec3]:
+        """Return the newest attitude, body FRD to NED, and the rates in rad/s; NaN if unknown."""
+        quaternion, angles = self.fields.get("ATTITUDE_QUATERNION"), self.fields.get("ATTITUDE")
+        late = self.heard_us.get("ATTITUDE", 0) - self.heard_us.get("ATTITUDE_QUATERNION", 0)
+        if quaternion is not None and late < ATTITUDE_FRESH_US:
+            q: Quat = (quaternion["q1"], quaternion["q2"], quaternion["q3"], quaternion["q4"])
+            return q, _rates(quaternion)
+        if angles is None:
+            return UNKNOWN_QUAT, UNKNOWN_VEC3
+        turned = (angles["roll"], angles["pitch"], angles["yaw"])
+        is_known = all(map(math.isfinite, turned))
+        return from_euler(*turned) if is_known else UNKNOWN_QUAT, _rates(angles)
+
+    def heading_deg(self) -> float:
+        """Return the heading from true north; NaN if unknown."""
+        position, hud = self.fields.get("GLOBAL_POSITION_INT"), self.fields.get("VFR_HUD")
+        if position is not None and position["hdg"] != UNKNOWN_U16:
+            return float(position["hdg"] * M_PER_CM)
+        return float(hud["heading"] % 360) if hud is not None else NAN
+
+    def true_heading_deg(self, now_us: int) -> float:
+        """Return the present heading, if its sender knows it; NaN if unknown or old."""
+        for name, field, unit_deg in (
+            ("GLOBAL_POSITION_INT", "hdg", M_PER_CM),
+            ("VFR_HUD", "heading", 1.0),
+            ("HIGH_LATENCY2", "heading", 2.0),
+        ):
+            if self.age_us(now_us, name) <= POSITION_OLD_US:
+                value = self.fields[name][field]
+                return NAN if value == UNKNOWN_U16 else value * unit_deg % 360.0
+        return NAN
+
+    def airspeed_mps(self) -> float:
+        """Return the airspeed; unknown where the field repeats the ground speed, without sensor."""
+        hud = self.fields.get("VFR_HUD")
+        unknown = hud is None or hud["airspeed"] == hud["groundspeed"]
+        return NAN if hud is None or unknown else float(hud["airspeed"])
+
+    def course_deg(self, position: Position) -> float:
+        """Return the direction of motion over ground from true north; NaN if unknown."""
+        north, east, _ = position.vel_n_mps
+        if math.isfinite(north):
+            known = math.hypot(north, east) >= LEAST_SPEED_MPS
+            return math.degrees(math.atan2(east, north)) % 360.0 if known else NAN
+        fix = self.fix()
+        return NAN if fix is None else fix.course_deg
+
+    def battery(self) -> tuple[float, float]:
+        """Return voltage in V and remaining charge in percent, each NaN if unknown."""
+        battery, system = self.fields.get("BATTERY_STATUS"), self.fields.get("SYS_STATUS")
+        cells = battery["voltages"] if battery else ()
+        volts = [mv / MV_PER_V for mv in cells if mv != UNKNOWN_U16]
+        if not volts and system and system["voltage_battery"] != UNKNOWN_U16:
+            volts = [system["voltage_battery"] / MV_PER_V]
+        sources = [source["battery_remaining"] for source in (battery, system) if source]
+        percent = next((value for value in sources if value >= 0), NAN)
+        return float(sum(volts)) if volts else NAN, float(percent)
+
+    def satellites(self) -> float:
+        """Return the number of satellites; a log without it has a fix of none."""
+        fix = self.fields.get("GPS_RAW_INT")
+        if fix is None or fix["satellites_visible"] == UNKNOWN_SATELLITES:
+            return NAN
+        counted = fix["satellites_visible"]
+        return float(counted) if counted or fix["fix_type"] < FIX_2D else NAN
+
+    def fix(self) -> GpsReport | None:
+        """Return the newest GPS report."""
+        found = self.fields.get("GPS_RAW_INT") or self.fields.get("GPS2_RAW")
+        if found is None:
+            return None
+        ellipsoid_mm, course = found.get("alt_ellipsoid", 0), found["cog"]
+        return GpsReport(
+            found["fix_type"],
+            self.satellites(),
+            NAN if found["eph"] == UNKNOWN_U16 else found["eph"] * M_PER_CM,
+            (ellipsoid_mm - found["alt"]) * M_PER_MM if ellipsoid_mm else NAN,
+            NAN if course == UNKNOWN_U16 else course * M_PER_CM,
+        )
+
+    def kind(self) -> int:
+        """Return the MAV_TYPE."""
+        beat = self.fields.get("HEARTBEAT") or self.fields.get("HIGH_LATENCY2")
+        return int(beat["type"]) if beat else mavlink.MAV_TYPE_GENERIC
+
+    def is_armed(self) -> bool:
+        """Return whether the vehicle is armed."""
+        beat = self.fields.get("HEARTBEAT")
+        return bool(beat and beat["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def mode(self) -> str:
+        """Return the flight mode in the words of its autopilot; empty if unknown."""
+        beat = self.fields.get("HEARTBEAT") or self.fields.get("HIGH_LATENCY2")
+        if beat is None:
+            return ""
+        number, autopilot = beat["custom_mode"], beat["autopilot"]
+        if autopilot == mavlink.MAV_AUTOPILOT_PX4:
+            # HIGH_LATENCY2 has the upper half of it.
+            main, sub = (number >> 16, number >> 24) if "base_mode" in beat else (number, 0)
+            return PX4_AUTO_MODES.get(sub, "") or PX4_MODES.get(main & 0xFF, "")
+        if autopilot != mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA:
+            return ""
+        words = "COPTER_MODE" if beat["type"] in COPTERS else "PLANE_MODE"
+        words = {True: "ROVER_MODE"}.get(beat["type"] in ROVERS, words)
+        entry = mavlink.enums[words].get(number)
+        return "" if entry is None else str(entry.name).removeprefix(f"{words}_")
+
+
+def _rates(fields: Fields) -> Vec3:
+    return (fields["rollspeed"], fields["pitchspeed"], fields["yawspeed"])
+
+
+class NewestVehicles:
+    """The newest states of the vehicles whose frames are fed."""
+
+    def __init__(self) -> None:
+        self.states: dict[int, NewestState] = {}
+        """By system id."""
+        self._components = VehicleComponents()
+
+    def feed(self, frame: MavFrame, now_us: int) -> NewestState | None:
+        """Take in a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
+        message_id, (system_id, component_id) = frame.message_id, frame.origin
+        if message_id not in DEFINITIONS or not 0 < system_id < FIRST_GROUND_STATION:
+            return None
+        fields = fields_of(frame.data)
+        is_beat = message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+        autopilot = fields["autopilot"] if is_beat else None
+        if not self._components.includes(system_id, component_id, autopilot):
+            return None
+        state = self.states.setdefault(system_id, NewestState())
+        state.take(MESSAGE_NAMES[message_id], fields, now_us)
+        return state

@@ -1,0 +1,259 @@
+"""NMEA sentences, read by pynmeagps and by gpsd."""
+
+import asyncio
+import json
+import os
+import pty
+import shutil
+import socket
+import subprocess
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+from pynmeagps import NMEAReader
+
+from gateway.hub.endpoint import parse_endpoint
+from gateway.outputs import extend
+from gateway.outputs.carrier import MAX_WAITING_BYTES
+from gateway.recordings.newest import POSITION_OLD_US
+from gateway.units import US_PER_S
+from tests.hub.conftest import LIMIT_S, Station
+from tests.outputs.conftest import HERE, OutputRig, at, beat, estimator, gps
+from tests.ports import free_port
+
+ABSOLUTE = mavlink.ESTIMATOR_POS_HORIZ_ABS
+
+
+def read(data: bytes) -> dict[str, Any]:
+    """Parse each sentence strictly; return them by their names."""
+    lines = data.decode("ascii").splitlines(keepends=True)
+    parsed = [NMEAReader.parse(line.encode(), msgmode=0, validate=1) for line in lines]
+    return {message.msgID: message for message in parsed}
+
+
+async def sentences(outputs: OutputRig, output: Any, station: Station) -> dict[str, Any]:
+    outputs.turn(output)
+    return read(await station.receive())
+
+
+async def udp_output(outputs: OutputRig, options: str = "") -> tuple[Any, Station]:
+    station = outputs.station()
+    return await outputs.output(f"nmea:udp:127.0.0.1:{station.port}{options}"), station
+
+
+async def test_sentences_contain_position_motion_and_heading(outputs: OutputRig) -> None:
+    output, station = await udp_output(outputs)
+    outputs.hear(beat(), at(), gps())
+    outputs.clock.us = US_PER_S // 2
+    found = await sentences(outputs, output, station)
+    assert list(found) == ["GGA", "RMC", "VTG", "HDT"]
+    gga, rmc, vtg, hdt = found.values()
+    assert (gga.lat, gga.lon) == pytest.approx(HERE[:2], abs=2e-7)
+    assert (gga.quality, gga.numSV, gga.HDOP, gga.alt, gga.sep) == (1, 11, 1.2, 488.1, 47.5)
+    assert str(gga.time) == str(rmc.time) == "12:03:04.560000", "the position's, not the present"
+    assert (str(rmc.date), rmc.status, rmc.posMode) == ("2024-06-01", "A", "A")
+    assert rmc.spd == pytest.approx(5 * 3600 / 1852, abs=0.05)
+    assert rmc.cog == vtg.cogt == pytest.approx(306.9, abs=0.05)
+    assert vtg.sogk == pytest.approx(18.0)
+    assert hdt.headingT == 90.5
+    assert output.counters.sent == 1
+
+
+@pytest.mark.parametrize(
+    ("messages", "age_us", "is_valid"),
+    [
+        ([at()], 0, True),
+        ([at()], POSITION_OLD_US, True),
+        ([at()], POSITION_OLD_US + 1, False),
+        ([at(0.0, 0.0)], 0, False),
+        ([at(95.0, 0.0)], 0, False),
+        ([gps(kind=1)], 0, False),
+        ([gps(kind=2)], 0, True),
+        ([at(), estimator(ABSOLUTE)], 0, True),
+        ([at(), estimator(0)], 0, False),
+        ([at(), estimator(ABSOLUTE | mavlink.ESTIMATOR_CONST_POS_MODE)], 0, False),
+        ([gps(), estimator(0)], 0, True),
+        ([], 0, False),
+    ],
+)
+async def test_position_is_void_unless_valid_and_new(
+    outputs: OutputRig, messages: list[Any], age_us: int, is_valid: bool
+) -> None:
+    output, station = await udp_output(outputs)
+    outputs.hear(beat(), *messages)
+    outputs.clock.us = age_us
+    found = await sentences(outputs, output, station)
+    gga, rmc = found["GGA"], found["RMC"]
+    assert (gga.quality > 0, rmc.status == "A", "VTG" in found) == (is_valid,) * 3
+    assert (gga.lat == "") == (rmc.lat == "") == (not is_valid)
+
+
+@pytest.mark.parametrize(
+    ("lat_deg", "lon_deg", "written"),
+    [
+        (59.999_999_99, -179.999_999_99, "6000.00000,N,18000.00000,W"),
+        (-0.5, 0.000_001, "0030.00000,S,00000.00006,E"),
+    ],
+)
+async def test_minutes_are_carried_and_hemispheres_are_right(
+    outputs: OutputRig, lat_deg: float, lon_deg: float, written: str
+) -> None:
+    output, station = await udp_output(outputs)
+    outputs.hear(beat(), at(lat_deg, lon_deg))
+    outputs.turn(output)
+    assert written in (await station.receive()).decode()
+
+
+@pytest.mark.parametrize(
+    ("kind", "quality"), [(0, 6), (1, 6), (2, 1), (3, 1), (4, 2), (5, 5), (6, 4), (8, 1)]
+)
+async def test_quality_follows_the_type_of_the_fix(
+    outputs: OutputRig, kind: int, quality: int
+) -> None:
+    output, station = await udp_output(outputs)
+    outputs.hear(beat(), at(), gps(kind=kind))
+    assert (await sentences(outputs, output, station))["GGA"].quality == quality
+
+
+async def test_one_vehicle_of_several_is_sent(outputs: OutputRig) -> None:
+    output, station = await udp_output(outputs)
+    for system in (9, 7):
+        outputs.hear(beat(), at(lat_deg=float(system)), system=system)
+    outputs.hear(at(lat_deg=3.0), system=7, component=154)
+    outputs.hear(at(lat_deg=1.0), system=255)
+    assert (await sentences(outputs, output, station))["GGA"].lat == 7.0
+    output.reconfigure(parse_endpoint(f"{output.endpoint.url}?vehicle=9&rate=4"))
+    assert output.interval_s == 0.25
+    assert (await sentences(outputs, output, station))["GGA"].lat == 9.0
+
+
+async def test_filters_of_the_endpoint_apply(outputs: OutputRig) -> None:
+    output, station = await udp_output(outputs, "?deny=GLOBAL_POSITION_INT&allow=GPS_RAW_INT")
+    outputs.hear(beat(), at(lat_deg=3.0), gps())
+    found = await sentences(outputs, output, station)
+    assert found["GGA"].lat == pytest.approx(HERE[0], abs=2e-7)
+    assert "HDT" not in found
+
+
+async def test_listening_port_serves_several_clients(outputs: OutputRig) -> None:
+    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
+    await outputs.until(lambda: output.carrier.port)
+    clients = [await outputs.connect(output.carrier.port) for _ in range(2)]
+    await outputs.until(lambda: len(output.carrier._peers) == 2)
+    outputs.hear(beat(), at())
+    outputs.turn(output)
+    loop = asyncio.get_running_loop()
+    for client in clients:
+        data = await asyncio.wait_for(loop.sock_recv(client, 4096), LIMIT_S)
+        assert read(data)["RMC"].status == "A"
+    clients[0].close()
+    await outputs.until(lambda: len(output.carrier._peers) == 1)
+    assert output.state == "open"
+
+
+async def test_stalled_client_loses_whole_messages(outputs: OutputRig) -> None:
+    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0")
+    await outputs.until(lambda: output.carrier.port)
+    await outputs.connect(output.carrier.port, room_bytes=2048)
+    await outputs.until(lambda: output.carrier._peers)
+    outputs.hear(beat(), at())
+    (peer,) = output.carrier._peers
+    while not output.counters.dropped:
+        outputs.turn(output)
+    assert peer.get_write_buffer_size() < MAX_WAITING_BYTES + 1024
+
+
+async def test_broken_connection_is_made_again(outputs: OutputRig) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.setblocking(False)
+        loop = asyncio.get_running_loop()
+        output = await outputs.output(f"nmea:tcp:127.0.0.1:{server.getsockname()[1]}")
+        for _ in range(2):
+            connection, _ = await asyncio.wait_for(loop.sock_accept(server), LIMIT_S)
+            await outputs.until(lambda: output.state == "open")
+            connection.close()
+            await outputs.until(lambda: output.state == "unreachable")
+            outputs.clock.us += 2 * US_PER_S
+            output.tick(outputs.clock.us)
+        output._timer.cancel()
+
+
+async def test_sentences_are_written_to_a_serial_port(outputs: OutputRig) -> None:
+    main, line = pty.openpty()
+    output = await outputs.output(f"nmea:serial:{os.ttyname(line)}:4800")
+    outputs.hear(beat(), at(), gps())
+    outputs.turn(output)
+    data = b""
+    while data.count(b"\n") < 4:
+        data += os.read(main, 4096)
+    assert read(data)["GGA"].alt == 488.1
+    for end in (main, line):
+        os.close(end)
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("nmea:ws:127.0.0.1:1", "not carried by"),
+        ("nmea:udp:127.0.0.1:0", "0 cannot be sent to"),
+        ("nmea:tcp-listen:host:1", "not an address"),
+        ("nmea:udp:h:1?rate=fast", "'fast' is not a number"),
+        ("nmea:udp:h:1?rate=1000", "is not 0.01 to 50"),
+        ("nmea:udp:h:1?rate=nan", "is not 0.01 to 50"),
+        ("nmea:udp:h:1?vehicle=255", "vehicle 255 is not 1 to 249"),
+        ("nmea:udp:h:1?callsign=x", "option"),
+    ],
+)
+def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
+    extend()
+    with pytest.raises(ValueError, match=reason):
+        parse_endpoint(url)
+
+
+@pytest.mark.io
+@pytest.mark.skipif(shutil.which("gpsd") is None, reason="needs gpsd")
+async def test_gpsd_reports_the_position(outputs: OutputRig) -> None:
+    output = await outputs.output("nmea:tcp-listen:127.0.0.1:0?rate=20")
+    await outputs.until(lambda: output.carrier.port)
+    port = free_port()
+    source = f"tcp://127.0.0.1:{output.carrier.port}"
+    daemon = subprocess.Popen(["gpsd", "-N", "-n", "-b", "-S", str(port), source])
+    try:
+        async with asyncio.timeout(LIMIT_S):
+            report = await first_fix(outputs, output, port)
+    finally:
+        daemon.kill()
+        daemon.wait()
+    assert (report["lat"], report["lon"]) == pytest.approx(HERE[:2], abs=2e-7)
+    assert report["altMSL"] == pytest.approx(488.1)
+    assert report["geoidSep"] == pytest.approx(47.5)
+    assert report["speed"] == pytest.approx(5.0, abs=0.03)
+    assert report["track"] == pytest.approx(306.9)
+
+
+async def first_fix(outputs: OutputRig, output: Any, port: int) -> Any:
+    """Return the first report of gpsd with a position and a speed."""
+    while True:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            break
+        except ConnectionRefusedError:
+            await asyncio.sleep(0.01)
+    writer.write(b'?WATCH={"enable":true,"json":true};\n')
+    reading = asyncio.get_running_loop().create_task(reader.readline())
+    try:
+        while True:
+            outputs.clock.us += US_PER_S
+            outputs.hear(beat(), at(), gps())
+            outputs.turn(output)
+            done, _ = await asyncio.wait([reading], timeout=0.05)
+            if not done:
+                continue
+            report = json.loads(reading.result())
+            if report["class"] == "TPV" and {"lat", "track", "altMSL"} <= report.keys():
+                return report
+            reading = asyncio.get_running_loop().create_task(reader.readline())
+    finally:
+        reading.cancel()
+        writer.close()
