@@ -16,6 +16,7 @@ EXTRAS: Final = {
     "formats": ("mcap", "pyarrow", "pyulog"),
     "batch": ("distributed", "fsspec"),
     "fast": ("uvloop",),
+    "mqtt": ("aiomqtt",),
 }
 """The modules of each extra of `pyproject.toml`."""
 DEBIAN_PACKAGE: Final = Path("/usr/lib/mavgate")

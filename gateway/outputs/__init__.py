@@ -14,6 +14,9 @@ from gateway.hub.transports.registry import add_endpoint_kind
 
 KINDS: Final = {
     "nmea": ("rate", "vehicle"),
+    "cot": ("rate", "vehicle", "callsign", "certificate", "key", "authority"),
+    "gdl90": ("rate", "vehicle", "callsign"),
+    "mqtt": ("rate", "vehicle", "topic", "login", "certificate", "key", "authority"),
 }
 """The options of each kind."""
 

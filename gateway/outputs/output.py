@@ -8,7 +8,7 @@ import asyncio
 import ssl
 from collections.abc import Collection, Iterable
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from gateway.clock import unix_time_us
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
@@ -42,7 +42,7 @@ class Output(Client):
         super().__post_init__()
         self.vehicles = NewestVehicles()
         self.configure()
-        self.carrier = self._make_carrier()
+        self.carrier: Any = self._make_carrier()
 
     @classmethod
     def check(cls, endpoint: Endpoint) -> None:

@@ -41,6 +41,7 @@ ATTITUDE_FRESH_US: Final = US_PER_S
 """The quaternion is preferred to the angles unless it is older than this."""
 UNKNOWN_QUAT: Final = (NAN, NAN, NAN, NAN)
 UNKNOWN_SATELLITES: Final = 255
+UNKNOWN_U32: Final = 0xFFFFFFFF
 LEAST_SPEED_MPS: Final = 0.2
 """Below it a velocity has no direction."""
 _PRESENT: Final = ("GLOBAL_POSITION_INT", "GLOBAL_POSITION_INT_COV", "LOCAL_POSITION_NED")
@@ -95,6 +96,8 @@ class GpsReport:
     separation_m: float
     """Height of the geoid above the ellipsoid."""
     course_deg: float
+    h_acc_m: float
+    v_acc_m: float
 
 
 class NewestState:
@@ -223,6 +226,7 @@ class NewestState:
             NAN if found["eph"] == UNKNOWN_U16 else found["eph"] * M_PER_CM,
             (ellipsoid_mm - found["alt"]) * M_PER_MM if ellipsoid_mm else NAN,
             NAN if course == UNKNOWN_U16 else course * M_PER_CM,
+            *(_accuracy_m(found.get(name, 0)) for name in ("h_acc", "v_acc")),
         )
 
     def kind(self) -> int:
@@ -251,6 +255,10 @@ class NewestState:
         words = {True: "ROVER_MODE"}.get(beat["type"] in ROVERS, words)
         entry = mavlink.enums[words].get(number)
         return "" if entry is None else str(entry.name).removeprefix(f"{words}_")
+
+
+def _accuracy_m(accuracy_mm: int) -> float:
+    return accuracy_mm * M_PER_MM if 0 < accuracy_mm < UNKNOWN_U32 else NAN
 
 
 def _rates(fields: Fields) -> Vec3:

@@ -1,0 +1,148 @@
+"""Cursor on Target for TAK servers, ATAK and WinTAK: one event per vehicle.
+
+    cot:udp-multicast:239.2.3.1:6969  cot:udp:HOST:PORT  cot:tcp:HOST:8087  cot:tls:HOST:8089
+
+Only vehicles with a valid position have an event; the last one becomes stale.
+
+References
+----------
+.. [1] MITRE, "Cursor on Target Message Router User's Guide", 2009: event version 2.0.
+"""
+
+import math
+import socket
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from typing import Final
+from xml.etree import ElementTree
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.endpoint import Endpoint, EndpointKind
+from gateway.outputs.output import Output
+from gateway.recordings.newest import NewestState
+from gateway.recordings.positions import Position
+from gateway.units import US_PER_S
+
+HEADER: Final = '<?xml version="1.0" encoding="UTF-8" standalone="yes"?>\n'
+UNKNOWN: Final = 9_999_999.0
+"""Of a height and of errors, by the specification."""
+UNMANNED_PLANE, UNMANNED_ROTOR = "a-f-A-M-F-Q", "a-f-A-M-H-Q"
+ROTORS: Final = frozenset(
+    (
+        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_TYPE_COAXIAL, mavlink.MAV_TYPE_HELICOPTER,
+        mavlink.MAV_TYPE_HEXAROTOR, mavlink.MAV_TYPE_OCTOROTOR, mavlink.MAV_TYPE_TRICOPTER,
+        mavlink.MAV_TYPE_DODECAROTOR, mavlink.MAV_TYPE_DECAROTOR,
+    )
+)  # fmt: skip
+TYPES: Final = {
+    **dict.fromkeys(ROTORS, UNMANNED_ROTOR),
+    mavlink.MAV_TYPE_AIRSHIP: "a-f-A-M-L",
+    mavlink.MAV_TYPE_FREE_BALLOON: "a-f-A-M-L",
+    mavlink.MAV_TYPE_GROUND_ROVER: "a-f-G-E-V",
+    mavlink.MAV_TYPE_SURFACE_BOAT: "a-f-S",
+    mavlink.MAV_TYPE_SUBMARINE: "a-f-U",
+}
+"""Friendly, by MAV_TYPE; all others are unmanned fixed-wing aircraft."""
+LEAST_STALE_S: Final = 10.0
+STALE_INTERVALS: Final = 3.0
+"""An event is stale after so many intervals without the next, but not sooner than the above."""
+MAX_CALLSIGN: Final = 64
+
+
+class CotOutput(Output):
+    """Events of all vehicles, or of the chosen one."""
+
+    carriers = (
+        EndpointKind.UDP,
+        EndpointKind.UDP_BROADCAST,
+        EndpointKind.UDP_MULTICAST,
+        EndpointKind.TCP,
+        "tls",
+    )
+
+    @classmethod
+    def check(cls, endpoint: Endpoint) -> None:
+        """Raise ValueError if the endpoint is not understood."""
+        super().check(endpoint)
+        callsign = endpoint.added.get("callsign", "x")
+        if not callsign.strip() or not callsign.isprintable() or len(callsign) > MAX_CALLSIGN:
+            raise ValueError(f"callsign {callsign!r} is not 1 to {MAX_CALLSIGN} printable letters")
+
+    def compose(self, now_us: int) -> Iterator[bytes]:
+        """Yield one event for each vehicle."""
+        stale_s = max(LEAST_STALE_S, STALE_INTERVALS * self.interval_s)
+        for system_id, state in self.heard(now_us).items():
+            if position := state.valid_position(now_us):
+                unix_us = self.position_unix_us(state, now_us)
+                callsign = self._callsign(system_id)
+                yield event_of(system_id, callsign, state, position, unix_us, stale_s)
+
+    def _callsign(self, system_id: int) -> str:
+        given = self.endpoint.added.get("callsign")
+        if given is not None and self.vehicle_id:
+            return given
+        return f"{given or 'Vehicle'} {system_id}"
+
+
+def event_of(
+    system_id: int,
+    callsign: str,
+    state: NewestState,
+    position: Position,
+    unix_us: int,
+    stale_s: float,
+) -> bytes:
+    """Return the event of a position of this civil time, as XML."""
+    report, at = state.fix(), datetime.fromtimestamp(unix_us / US_PER_S, UTC)
+    separation_m = report.separation_m if report else math.nan
+    accuracies = (report.h_acc_m, report.v_acc_m) if report else (math.nan, math.nan)
+    event = ElementTree.Element("event", version="2.0")
+    event.set("uid", f"mavgate.{socket.gethostname()}.{system_id}")
+    event.set("type", TYPES.get(state.kind(), UNMANNED_PLANE))
+    event.set("how", "m-g")
+    times = {"time": at, "start": at, "stale": at + timedelta(seconds=stale_s)}
+    event.attrib.update({name: _written(time) for name, time in times.items()})
+    point = ElementTree.SubElement(event, "point")
+    point.set("lat", f"{position.lat_deg:.7f}")
+    point.set("lon", f"{position.lon_deg:.7f}")
+    point.set("hae", _known(position.alt_amsl_m + separation_m))
+    for name, value_m in zip(("ce", "le"), accuracies, strict=True):
+        point.set(name, _known(value_m))
+    detail = ElementTree.SubElement(event, "detail")
+    ElementTree.SubElement(detail, "contact", callsign=callsign)
+    speed_mps, course_deg = position.groundspeed_mps, state.course_deg(position)
+    if math.isfinite(speed_mps):
+        track = ElementTree.SubElement(detail, "track", speed=f"{speed_mps:.2f}")
+        # A course is required; that of a vehicle at rest is not known.
+        track.set("course", f"{course_deg if math.isfinite(course_deg) else 0.0:.1f}")
+    percent = state.battery()[1]
+    if math.isfinite(percent):
+        ElementTree.SubElement(detail, "status", battery=f"{percent:.0f}")
+    ElementTree.SubElement(detail, "remarks").text = remarks_of(state, position)
+    return (HEADER + ElementTree.tostring(event, encoding="unicode") + "\n").encode()
+
+
+def remarks_of(state: NewestState, position: Position) -> str:
+    """Write mode, arming, battery and height in words."""
+    volts, percent = state.battery()
+    figures = (
+        (volts, "{:.2f} V"),
+        (percent, "{:.0f} %"),
+        (position.alt_amsl_m, "{:.0f} m AMSL"),
+        (position.alt_home_m, "{:.0f} m above home"),
+    )
+    words = [state.mode(), "armed" if state.is_armed() else "disarmed"]
+    words += [form.format(value) for value, form in figures if math.isfinite(value)]
+    return ", ".join(filter(None, words))
+
+
+def _known(value_m: float) -> str:
+    return f"{value_m if math.isfinite(value_m) else UNKNOWN:.1f}"
+
+
+def _written(at: datetime) -> str:
+    return f"{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z"
+
+
+OUTPUT: Final = CotOutput

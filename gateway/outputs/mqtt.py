@@ -1,0 +1,190 @@
+"""MQTT: the messages of all systems as JSON, each under a topic of its own.
+
+    mqtt:tcp:HOST:1883  mqtt:tls:HOST:8883
+
+`mavgate/<system>/<MESSAGE>` is `{"header": ..., "message": ...}`, as the WebSocket of the REST API
+sends it. `mavgate/status` is retained: `online`, or `offline` by the last will.
+"""
+
+import asyncio
+import ssl
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+from gateway.extras import how_to_add
+from gateway.hub.endpoint import Endpoint, EndpointKind
+from gateway.hub.limits import RateLimit
+from gateway.outputs.carrier import CONNECT_LIMIT_S, TLS, target_of
+from gateway.outputs.output import Output
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_json import json_from_frame
+from gateway.wire.mavlink_splitter import MavFrame
+
+MAX_WAITING: Final = 500
+"""Messages; while a broker is slow, further ones are dropped."""
+MAX_KINDS: Final = 4096
+"""Kinds of message whose rates are limited; more are forged."""
+GOODBYE_LIMIT_S: Final = 1.0
+DEFAULT_TOPIC: Final = "mavgate"
+
+
+class MqttOutput(Output):
+    """All messages that pass the filters, of every system and component."""
+
+    carriers = (EndpointKind.TCP, TLS)
+    default_rate_hz = 1.0
+    wanted_ids = frozenset()
+
+    def __post_init__(self) -> None:
+        """Start without limits."""
+        super().__post_init__()
+        self._limits: dict[bytes, RateLimit] = {}
+
+    @classmethod
+    def check(cls, endpoint: Endpoint) -> None:
+        """Raise ValueError if the endpoint is not understood."""
+        super().check(endpoint)
+        with suppress(ModuleNotFoundError):
+            # While the settings are read: later it would stop the telemetry for a moment.
+            import_module("aiomqtt")
+        topic = endpoint.added.get("topic", DEFAULT_TOPIC)
+        if not topic.strip("/") or not topic.isprintable() or set(topic) & set("+#$"):
+            raise ValueError(f"topic {topic!r} is empty or contains +, # or $")
+
+    def configure(self) -> None:
+        """Read the options of the endpoint."""
+        super().configure()
+        self.topic = self.endpoint.added.get("topic", DEFAULT_TOPIC)
+        self._limits = {}
+
+    def transmit(self, frame: MavFrame) -> None:
+        """Publish a message, unless one of its kind was published just before."""
+        if self.vehicle_id not in (0, frame.origin[0]) or self.state != "open":
+            return
+        if len(self._limits) >= MAX_KINDS:
+            self._limits.clear()
+        interval_us = round(self.interval_s * US_PER_S)
+        limit = self._limits.setdefault(frame.key, RateLimit(interval_us))
+        if limit.is_due(self.context.now_us()) and (found := json_from_frame(frame.data)):
+            name, data, _ = found
+            self.put((f"{self.topic}/{frame.origin[0]}/{name}", data))
+
+    def compose(self, now_us: int) -> Iterable[bytes]:  # noqa: ARG002 -- of the base class
+        """Return nothing: messages are published when they come."""
+        return ()
+
+    def put(self, message: Any) -> None:
+        """Publish one message."""
+        if self.carrier.send(message):
+            self.counters.sent += 1
+            self.counters.bytes_sent += len(message[1])
+        else:
+            self.counters.dropped += 1
+
+    def _make_carrier(self) -> Any:
+        return Broker(self.endpoint, self.become, self._tls_context)
+
+
+class Broker:
+    """A connection to a broker."""
+
+    port = 0
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        on_state: Callable[[str, Exception | None], None],
+        tls: Callable[[], ssl.SSLContext],
+    ) -> None:
+        self._kind, self._inner = target_of(endpoint.host, MqttOutput.carriers)
+        self._login = endpoint.added.get("login", "")
+        self._status = f"{endpoint.added.get('topic', DEFAULT_TOPIC)}/status"
+        self._on_state, self._tls = on_state, tls
+        self._waiting: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue(MAX_WAITING)
+        self._task: asyncio.Task[None] | None = None
+        self.client: Any = None
+        """Of the present or last connection."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it is connected, or connects."""
+        return self._task is not None
+
+    def open(self) -> None:
+        """Connect; the state is reported."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def send(self, message: tuple[str, bytes]) -> bool:
+        """Queue a topic and its text; return whether there was room."""
+        if self._waiting.full():
+            return False
+        self._waiting.put_nowait(message)
+        return True
+
+    def close(self) -> None:
+        """Disconnect."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _run(self) -> None:
+        try:
+            await self._connect()
+        except ModuleNotFoundError:
+            self._on_state("unreachable", OSError(how_to_add("this endpoint", "mqtt")))
+        except (OSError, ValueError) as error:
+            self._on_state("unreachable", error)
+        finally:
+            self._task = None
+
+    async def _connect(self) -> None:
+        # Imported here: it is an extra.
+        import aiomqtt
+
+        user, _, password = self._read_login().partition(":")
+        self.client = client = aiomqtt.Client(
+            self._inner.host,
+            self._inner.port,
+            username=user or None,
+            password=password or None,
+            tls_context=self._tls() if self._kind == TLS else None,
+            will=aiomqtt.Will(self._status, "offline", qos=1, retain=True),
+            timeout=CONNECT_LIMIT_S,
+        )
+        try:
+            async with client:
+                await client.publish(self._status, "online", qos=1, retain=True)
+                self._on_state("open", None)
+                try:
+                    async with asyncio.TaskGroup() as tasks:
+                        tasks.create_task(self._publish(client))
+                        tasks.create_task(_watch(client))
+                except asyncio.CancelledError:
+                    # The last will does not announce a regular end.
+                    last = client.publish(self._status, "offline", qos=1, retain=True)
+                    await asyncio.wait_for(last, GOODBYE_LIMIT_S)
+                    raise
+        except (aiomqtt.MqttError, ExceptionGroup) as error:
+            while not self._waiting.empty():
+                self._waiting.get_nowait()
+            cause = error.exceptions[0] if isinstance(error, ExceptionGroup) else error
+            raise ConnectionError(str(cause)) from error
+
+    async def _publish(self, client: Any) -> None:
+        while True:
+            topic, data = await self._waiting.get()
+            await client.publish(topic, data)
+
+    def _read_login(self) -> str:
+        return Path(self._login).expanduser().read_text().strip() if self._login else ""
+
+
+async def _watch(client: Any) -> None:
+    """Raise MqttError when the connection ends."""
+    async for _ in client.messages:
+        pass
+
+
+OUTPUT: Final = MqttOutput

@@ -1,0 +1,171 @@
+"""Cursor on Target events, read by takproto."""
+
+import asyncio
+import ssl
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+import takproto
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.endpoint import parse_endpoint
+from gateway.outputs import extend
+from gateway.outputs.cot import UNKNOWN
+from gateway.units import US_PER_S
+from tests.hub.conftest import LIMIT_S
+from tests.hub.test_group import GROUP, member
+from tests.hub.web.conftest import certificate as certificate
+from tests.outputs.conftest import HERE, UNIX_US, OutputRig, at, beat, gps
+
+BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)
+
+
+def read(data: bytes) -> Any:
+    """Return the event as the parser of the TAK Protocol understands it."""
+    return takproto.parse_proto(bytearray(data)).cotEvent
+
+
+async def event(outputs: OutputRig, options: str, *messages: Any) -> Any:
+    station = outputs.station()
+    output = await outputs.output(f"cot:udp:127.0.0.1:{station.port}{options}")
+    outputs.hear(*messages)
+    outputs.clock.us = US_PER_S // 2
+    outputs.turn(output)
+    return await station.receive()
+
+
+async def test_event_contains_position_motion_and_state(outputs: OutputRig) -> None:
+    data = await event(outputs, "?callsign=Fish&vehicle=1", beat(), at(), gps(), BATTERY)
+    found = read(data)
+    assert (found.type, found.how) == ("a-f-A-M-H-Q", "m-g")
+    assert (found.lat, found.lon) == pytest.approx(HERE[:2])
+    assert found.hae == pytest.approx(488.1 + 47.5, abs=0.11)
+    assert (found.ce, found.le) == (1.5, UNKNOWN)
+    assert found.sendTime == found.startTime == UNIX_US // 1000
+    assert found.staleTime - found.sendTime == 10_000
+    detail = found.detail
+    assert detail.contact.callsign == "Fish"
+    assert (detail.track.speed, detail.track.course) == (5.0, 306.9)
+    assert detail.status.battery == 80
+    assert "LOITER, armed, 12.40 V, 80 %, 488 m AMSL, 20 m above home" in detail.xmlDetail
+    assert found.uid.endswith(".1")
+
+
+@pytest.mark.parametrize(
+    ("kind", "autopilot", "mode", "expected", "words"),
+    [
+        (1, 3, 10, "a-f-A-M-F-Q", "AUTO"),
+        (2, 12, 4 << 16 | 5 << 24, "a-f-A-M-H-Q", "RTL"),
+        (2, 12, 3 << 16, "a-f-A-M-H-Q", "POSCTL"),
+        (4, 3, 0, "a-f-A-M-H-Q", "STABILIZE"),
+        (8, 0, 0, "a-f-A-M-L", ""),
+        (10, 3, 4, "a-f-G-E-V", "HOLD"),
+        (11, 3, 999, "a-f-S", ""),
+        (12, 3, 999, "a-f-U", ""),
+        (19, 0, 5, "a-f-A-M-F-Q", ""),
+    ],
+)
+async def test_type_and_mode_follow_the_heartbeat(
+    outputs: OutputRig, kind: int, autopilot: int, mode: int, expected: str, words: str
+) -> None:
+    found = read(await event(outputs, "", beat(kind, autopilot, mode, base_mode=0), at()))
+    assert found.type == expected
+    remarks = ElementTree.fromstring(found.detail.xmlDetail).text or ""
+    assert remarks.split(", ")[0] == (words or "disarmed")
+
+
+async def test_height_above_ellipsoid_is_unknown_without_its_separation(outputs: OutputRig) -> None:
+    found = read(await event(outputs, "", beat(), at()))
+    assert (found.hae, found.ce, found.le) == (UNKNOWN,) * 3
+
+
+async def test_each_vehicle_with_a_valid_position_has_an_event(outputs: OutputRig) -> None:
+    station = outputs.station()
+    output = await outputs.output(f"cot:udp:127.0.0.1:{station.port}?callsign=%3CA%26&rate=0.1")
+    for system in (1, 2, 3):
+        outputs.hear(beat(), *([at()] if system != 2 else []), system=system)
+    outputs.turn(output)
+    found = [read(await station.receive()) for _ in range(2)]
+    assert [each.detail.contact.callsign for each in found] == ["<A& 1", "<A& 3"]
+    assert found[0].staleTime - found[0].sendTime == 30_000
+    outputs.clock.us = 6 * US_PER_S
+    outputs.turn(output)
+    await outputs.quiet()
+    assert station.is_empty(), "old"
+
+
+async def test_events_are_sent_to_a_multicast_group(outputs: OutputRig) -> None:
+    listener = member(outputs)
+    port = listener.getsockname()[1]
+    output = await outputs.output(f"cot:udp-multicast:{GROUP}:{port}")
+    outputs.hear(beat(), at())
+    outputs.turn(output)
+    loop = asyncio.get_running_loop()
+    assert read(await asyncio.wait_for(loop.sock_recv(listener, 4096), LIMIT_S)).type
+
+
+@pytest.mark.parametrize("is_tls", [False, True])
+async def test_events_are_streamed_to_a_server(
+    outputs: OutputRig, certificate: Path, *, is_tls: bool
+) -> None:
+    received: asyncio.Queue[tuple[bytes, Any]] = asyncio.Queue()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        peer = writer.get_extra_info("peercert")
+        for _ in range(2):
+            received.put_nowait((await reader.readuntil(b"</event>\n"), peer))
+        writer.close()
+
+    context = None
+    if is_tls:
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH, cafile=str(certificate))
+        context.load_cert_chain(certificate)
+        context.verify_mode = ssl.CERT_REQUIRED
+    server = await asyncio.start_server(serve, "127.0.0.1", 0, ssl=context)
+    port = server.sockets[0].getsockname()[1]
+    kind = "tls" if is_tls else "tcp"
+    files = f"?authority={certificate}&certificate={certificate}" if is_tls else ""
+    output = await outputs.output(f"cot:{kind}:127.0.0.1:{port}{files}")
+    assert output.state == "open", output.reason
+    outputs.hear(beat(), at())
+    for _ in range(2):
+        outputs.turn(output)
+        data, peer = await asyncio.wait_for(received.get(), LIMIT_S)
+        assert read(data).lat == pytest.approx(HERE[0])
+        assert bool(peer) == is_tls
+    await outputs.until(lambda: not output.carrier._peers)
+    server.close()
+    await server.wait_closed()
+
+
+async def test_server_that_is_not_authentic_is_reported(
+    outputs: OutputRig, certificate: Path
+) -> None:
+    context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+    context.load_cert_chain(certificate)
+    server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0, ssl=context)
+    output = await outputs.output(f"cot:tls:127.0.0.1:{server.sockets[0].getsockname()[1]}")
+    assert output.state == "unreachable"
+    assert "certificate" in output.reason
+    server.close()
+
+
+async def test_missing_certificate_is_reported(outputs: OutputRig) -> None:
+    output = await outputs.output("cot:tls:127.0.0.1:1?certificate=/no/such.pem")
+    assert (output.state, output.reason) == ("unreachable", "No such file or directory")
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("cot:tcp-listen:127.0.0.1:1", "not carried by"),
+        ("cot:udp:h:1?callsign=", "callsign ''"),
+        ("cot:udp:h:1?callsign=%1b", "callsign"),
+    ],
+)
+def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
+    extend()
+    with pytest.raises(ValueError, match=reason):
+        parse_endpoint(url)

@@ -1,0 +1,171 @@
+"""MQTT with a real broker, mosquitto."""
+
+import asyncio
+import json
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+
+from gateway.hub.endpoint import parse_endpoint
+from gateway.outputs import extend, mqtt
+from gateway.units import US_PER_S
+from tests.hub.conftest import LIMIT_S
+from tests.hub.web.conftest import certificate as certificate
+from tests.outputs.conftest import OutputRig, at, beat
+from tests.ports import free_ports
+
+pytestmark = [
+    pytest.mark.io,
+    pytest.mark.skipif(shutil.which("mosquitto") is None, reason="needs mosquitto"),
+]
+
+
+class Mosquitto:
+    """A broker with a plain and a TLS port, and a subscriber to everything."""
+
+    def __init__(self, folder: Path, certificate: Path) -> None:
+        self.port, self.tls_port = free_ports(2)
+        self.login = folder / "login"
+        self.login.write_text("pilot:top secret\n")
+        passwords, settings = folder / "passwords", folder / "mosquitto.conf"
+        subprocess.run(
+            ["mosquitto_passwd", "-b", "-c", passwords, "pilot", "top secret"], check=True
+        )
+        own = folder / "certificate.pem"
+        own.write_bytes(certificate.read_bytes())
+        for file in (own, passwords, folder):
+            # It gives up the rights of root.
+            file.chmod(0o755)
+        for parent in folder.parents:
+            if parent.owner() == folder.owner() and parent != Path("/tmp"):
+                parent.chmod(0o755)
+        settings.write_text(
+            f"listener {self.port} 127.0.0.1\nlistener {self.tls_port} 127.0.0.1\n"
+            f"certfile {own}\nkeyfile {own}\npassword_file {passwords}\nallow_anonymous false\n"
+        )
+        self.process = subprocess.Popen(["mosquitto", "-c", settings], stderr=subprocess.DEVNULL)
+
+    async def subscriber(self) -> aiomqtt.Client:
+        while True:
+            client = aiomqtt.Client("127.0.0.1", self.port, username="pilot", password="top secret")
+            try:
+                await client.__aenter__()
+            except aiomqtt.MqttError:
+                await asyncio.sleep(0.01)
+                continue
+            await client.subscribe("#")
+            return client
+
+
+@pytest.fixture
+async def broker(tmp_path: Path, certificate: Path) -> AsyncIterator[Mosquitto]:
+    made = Mosquitto(tmp_path, certificate)
+    yield made
+    made.process.kill()
+    made.process.wait()
+
+
+async def next_of(client: aiomqtt.Client) -> tuple[str, Any, bool]:
+    """Return topic and text of the next message, and whether it was retained."""
+    async with asyncio.timeout(LIMIT_S):
+        message = await anext(aiter(client.messages))
+    data = message.payload.decode()
+    return str(message.topic), json.loads(data) if "{" in data else data, message.retain
+
+
+@pytest.mark.parametrize("is_tls", [False, True])
+async def test_messages_of_all_systems_have_topics(
+    outputs: OutputRig, broker: Mosquitto, certificate: Path, *, is_tls: bool
+) -> None:
+    client = await broker.subscriber()
+    where = f"tls:127.0.0.1:{broker.tls_port}" if is_tls else f"tcp:127.0.0.1:{broker.port}"
+    output = await outputs.output(f"mqtt:{where}?login={broker.login}&authority={certificate}")
+    assert output.state == "open", output.reason
+    assert await next_of(client) == ("mavgate/status", "online", False)
+    for seconds in (0.0, 0.5, 1.0):
+        outputs.clock.us = round(seconds * US_PER_S)
+        for system in (1, 255):
+            outputs.hear(at(), system=system)
+    for _ in range(2):
+        for system in (1, 255):
+            topic, found, _ = await next_of(client)
+            assert topic == f"mavgate/{system}/GLOBAL_POSITION_INT"
+            assert found["header"]["system_id"] == system
+            assert found["message"]["type"] == "GLOBAL_POSITION_INT"
+            assert found["message"]["lat"] == 473977420
+    assert output.counters.sent == 4
+    outputs.close()
+    assert await next_of(client) == ("mavgate/status", "offline", False)
+    await client.__aexit__(None, None, None)
+
+
+async def test_presence_is_retained_and_the_last_will_ends_it(
+    outputs: OutputRig, broker: Mosquitto
+) -> None:
+    await (await broker.subscriber()).__aexit__(None, None, None)
+    options = f"login={broker.login}&topic=field/7&deny=HEARTBEAT"
+    output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?{options}")
+    client = await broker.subscriber()
+    assert await next_of(client) == ("field/7/status", "online", True)
+    outputs.hear(beat(), at())
+    assert (await next_of(client))[0] == "field/7/1/GLOBAL_POSITION_INT"
+    # As when the gateway is killed: the socket closes without a farewell.
+    output.carrier.client._client.socket().shutdown(socket.SHUT_RDWR)
+    assert await next_of(client) == ("field/7/status", "offline", False)
+    await outputs.until(lambda: output.state == "unreachable")
+    outputs.clock.us += 2 * US_PER_S
+    output.tick(outputs.clock.us)
+    assert await next_of(client) == ("field/7/status", "online", False)
+    await client.__aexit__(None, None, None)
+
+
+async def test_wrong_password_is_reported(
+    outputs: OutputRig, broker: Mosquitto, tmp_path: Path
+) -> None:
+    await (await broker.subscriber()).__aexit__(None, None, None)
+    wrong = tmp_path / "wrong"
+    wrong.write_text("pilot:guess")
+    output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={wrong}")
+    assert output.state == "unreachable"
+    assert "Not authorized" in output.reason
+
+
+async def test_messages_are_dropped_while_the_broker_is_slow(
+    outputs: OutputRig, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mqtt, "MAX_WAITING", 3)
+    await (await broker.subscriber()).__aexit__(None, None, None)
+    output = await outputs.output(f"mqtt:tcp:127.0.0.1:{broker.port}?login={broker.login}")
+    for system in range(1, 9):
+        outputs.hear(at(), system=system)
+    assert (output.counters.sent, output.counters.dropped) == (3, 5)
+
+
+async def test_missing_extra_is_reported(
+    outputs: OutputRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "aiomqtt", None)
+    output = await outputs.output("mqtt:tcp:127.0.0.1:1")
+    assert "needs the extra mqtt" in output.reason
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("mqtt:127.0.0.1:1883", "not carried by"),
+        ("mqtt:tcp:h:1883?topic=a/%23", "topic"),
+        ("mqtt:tcp:h:1883?topic=", "topic"),
+        ("mqtt:tcp:h:1883?password=x", "option"),
+    ],
+)
+def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
+    extend()
+    with pytest.raises(ValueError, match=reason):
+        parse_endpoint(url)
