@@ -8,6 +8,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from gateway.recordings.anonymising import Anonymiser
 from gateway.recordings.files import (
     NO_RECORDING,
     TLOG,
@@ -44,7 +45,7 @@ from gateway.recordings.recorded_fusion import RecordedFusion
 from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Stamper, TlogRecord
-from gateway.recordings.tlog_editing import TlogEditor, TlogEdits
+from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_position
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 
@@ -77,6 +78,8 @@ class FlightToWrite:
         self._remarks: list[str] = []
         self.senders = Senders()
         """Those of MAVLink, once its frames are requested."""
+        self.anonymiser: Anonymiser | None = None
+        """Counts the fields that were changed, once a tlog is written."""
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
@@ -90,11 +93,14 @@ class FlightToWrite:
 
     def tlog(self) -> Iterator[bytes]:
         """Yield the MAVLink as a tlog, with the edits."""
-        editor = TlogEditor(self._edits, self._limits, self.remark)
+        sources, edits = self._open() if self.is_mavlink else [], self._edits
+        if edits.anonymity is not None:
+            self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
+            edits = replace(edits, frames=(self.anonymiser, *edits.frames))
+        editor = TlogEditor(edits, self._limits, self.remark)
         if not self.is_mavlink:
             yield from editor.apply(batched(self._sent()), self.senders)
             return
-        sources = self._open()
         yield from editor.apply(editor.joined(sources, self.options.progress), self.senders)
 
     def _open(self) -> list[TlogSource]:

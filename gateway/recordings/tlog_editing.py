@@ -12,12 +12,14 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.recordings.anonymising import Anonymity
 from gateway.recordings.files import NO_RECORDING, FlightError, Progress, TlogSource
 from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
 from gateway.recordings.reading import NOTHING_WITHIN, Limits
 from gateway.recordings.selection import FrameChoice, while_armed, within
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import Batch, encode_record
+from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 from gateway.wire.mavlink_splitter import frame_of
@@ -28,11 +30,23 @@ BoolArray = NDArray[np.bool_]
 NOTHING_LEFT: Final = "no record fits all of these options"
 
 
+def first_position(sources: Sequence[TlogSource]) -> tuple[float, float] | None:
+    """Return latitude and longitude of the first valid position of a vehicle, deg."""
+    for source in sources:
+        reader = VehicleReader(source.senders, with_attitude=False)
+        for batch in source.batches():
+            for message in reader.feed_batch(batch):
+                if message.position is not None:
+                    return message.position.lat_deg, message.position.lon_deg
+    return None
+
+
 class FrameEdit(Protocol):
     """A change of single frames."""
 
-    shift_us: int
-    """To be added to the recorded times."""
+    def shift_us(self, batch: Batch) -> int:
+        """Return what is added to the recorded times of a batch; called before the others."""
+        ...
 
     def affects(self, batch: Batch) -> BoolArray:
         """Return which records of a batch may change."""
@@ -46,10 +60,12 @@ class FrameEdit(Protocol):
 class Renumbering:
     """Other system ids, in headers and in all fields that hold one."""
 
-    shift_us = 0
-
     def __init__(self, system_ids: Mapping[int, int]) -> None:
         self._system_ids = system_ids
+
+    def shift_us(self, batch: Batch) -> int:  # noqa: ARG002
+        """Return 0: times stay."""
+        return 0
 
     def affects(self, batch: Batch) -> BoolArray:
         """Return which records may hold a system id that changes."""
@@ -77,6 +93,8 @@ class TlogEdits:
     merge: bool | None = None
     """Leave out copies of frames that several files hold; by default if the files overlap."""
     frames: tuple[FrameEdit, ...] = ()
+    anonymity: Anonymity | None = None
+    """Where and when to an anonymised recording is moved."""
 
     @property
     def are_none(self) -> bool:
@@ -153,7 +171,7 @@ class TlogEditor:
             self._remark(f"left out {counted(count, 'frame')} of {name}")
 
     def _edited(self, batch: Batch) -> bytes:
-        shift_us = sum(edit.shift_us for edit in self._edits.frames)
+        shift_us = sum(edit.shift_us(batch) for edit in self._edits.frames)
         if shift_us:
             batch = replace(batch, time_us=batch.time_us + shift_us)
         affected = [edit.affects(batch) for edit in self._edits.frames]

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -26,10 +27,11 @@ from gateway.cli.support.recording_options import (
     read_sensors,
     recorded_files,
 )
-from gateway.cli.support.terminal import console_of, refuse
+from gateway.cli.support.terminal import console_of, refuse, table_of
 from gateway.estimation.record import IntArray
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import check_output, write_new
+from gateway.recordings.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
 from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
@@ -111,6 +113,19 @@ def convert(
         list[str] | None,
         _option("--as", "OLD:NEW gives a system another id, also where it is addressed."),
     ] = None,
+    anonymise: Annotated[
+        bool,
+        _option("--anonymise", "Move coordinates and dates, replace texts and identifiers."),
+    ] = False,
+    place: Annotated[
+        str | None, _option("--place", "LAT,LON to which --anonymise moves the first position.")
+    ] = None,
+    day: Annotated[
+        str | None, _option("--day", "Day to which --anonymise moves the recording: 2020-01-31.")
+    ] = None,
+    keep_unknown: Annotated[
+        bool, _option("--keep-unknown", "With --anonymise, keep messages that are not known here.")
+    ] = False,
     force: ForceOption = False,
 ) -> None:
     """Convert, trim, join, merge and edit recordings.
@@ -124,6 +139,7 @@ def convert(
     edits = _read_edits(
         system, component, message, without, merge=merge, rename=rename,
         margin_s=margin_s if while_state else None,
+        anonymity=_read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
     of_tlogs = not fuse and (output.suffix in FROM_TLOGS or message)
@@ -151,6 +167,8 @@ def convert(
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)
+    if flight.anonymiser is not None:
+        _print_changes(flight.anonymiser)
     lacks = LACKS[output.suffix].of_tlogs if flight.is_mavlink else LACKS[output.suffix].of_tables
     if lacks and message is None:
         print_remarks([f"Dropped: {lacks}"])
@@ -166,6 +184,7 @@ def _read_edits(
     merge: bool | None,
     rename: Sequence[str] | None,
     margin_s: float | None,
+    anonymity: Anonymity | None,
 ) -> TlogEdits:
     """Read the options of a tlog that is made of tlogs; raises FlightError if one is invalid."""
     choice = FrameChoice(
@@ -175,7 +194,41 @@ def _read_edits(
         message_ids_of(without or ()),
     )
     frames = (Renumbering(_read_renames(rename)),) if rename else ()
-    return TlogEdits(choice, margin_s, merge, frames)
+    return TlogEdits(choice, margin_s, merge, frames, anonymity)
+
+
+def _read_anonymity(
+    place: str | None, day: str | None, *, keep_unknown: bool, wanted: bool
+) -> Anonymity | None:
+    if not wanted:
+        if place or day or keep_unknown:
+            refuse("--place, --day and --keep-unknown belong to --anonymise")
+        return None
+    found = Anonymity(keep_unknown=keep_unknown)
+    if day is not None:
+        try:
+            found = replace(found, day=date.fromisoformat(day))
+        except ValueError:
+            raise FlightError(f"--day {day}: write a date as 2020-01-31") from None
+    if place is not None:
+        try:
+            lat_deg, lon_deg = map(float, place.split(","))
+        except ValueError:
+            raise FlightError(f"--place {place}: write LAT,LON in degrees") from None
+        if not (abs(lat_deg) <= MAX_PLACE_DEG and abs(lon_deg) <= 180.0):
+            raise FlightError(
+                f"--place {place}: latitudes to {MAX_PLACE_DEG:g} and longitudes to 180"
+            )
+        found = replace(found, lat_deg=lat_deg, lon_deg=lon_deg)
+    return found
+
+
+def _print_changes(anonymiser: Anonymiser) -> None:
+    """Print how many fields of which message were changed."""
+    table = table_of("message", "field", "changed", left=2)
+    for (message, field), count in sorted(anonymiser.changed.items()):
+        table.add_row(message, field, str(count))
+    console_of().print(table)
 
 
 def _read_renames(texts: Sequence[str]) -> dict[int, int]:
