@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -57,7 +57,10 @@ from gateway.vehicle.requests import (
 )
 from gateway.vehicle.telemetry.announcements import Announcer
 from gateway.wire.mavlink_messages import ids_of
-from gateway.wire.mavlink_splitter import message_id_of
+from gateway.wire.mavlink_splitter import frame_of, message_id_of
+
+if TYPE_CHECKING:
+    from gateway.live.system_metrics import SystemMetrics
 
 log = logging.getLogger(__name__)
 
@@ -124,6 +127,8 @@ class Daemon:
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
         self._metrics = MetricsServer(self._metrics_text)
+        self._systems: SystemMetrics | None = None
+        """Only of a gateway that serves metrics."""
         self._notifier = ServiceNotifier()
         self._sent: Counter[int] = Counter()
         self._lag = LoopLag()
@@ -257,13 +262,18 @@ class Daemon:
         if port:
             # Here, since most gateways serve no metrics. Not at the first request either: loading
             # the library then would stop the telemetry for 0.3 s.
-            import_module("gateway.live.metrics")
+            systems = import_module("gateway.live.system_metrics")
+            self._systems = self._systems or systems.SystemMetrics()
+        else:
+            self._systems = None
         self._metrics.listen(port)
 
     def _metrics_text(self) -> Iterator[str]:
-        from gateway.live.metrics import prometheus_text
+        from gateway.live.metrics import prometheus_text, text_of
 
-        return prometheus_text(self.snapshot())
+        yield from prometheus_text(self.snapshot())
+        if self._systems is not None:
+            yield from text_of(self._systems.families(self.now_us()))
 
     def announce(self, text: str) -> None:
         """Announce an event that is not a problem to the ground stations."""
@@ -330,6 +340,8 @@ class Daemon:
     def _record_foreign(self, frames: Sequence[bytes]) -> None:
         for frame in frames:
             self._record(frame)
+            if self._systems is not None:
+                self._systems.feed(frame_of(frame), self.now_us(), is_received=True)
 
     def _record(self, frame: bytes) -> None:
         """Record a frame of another sender, unless it contains a key or a password."""
@@ -346,6 +358,9 @@ class Daemon:
         for sent in frames:
             message_id, to = sent.message_id, sent.client_id
             self._sent[message_id] += 1
+            if self._systems is not None:
+                header = sent.header or frame_of(sent.frame)
+                self._systems.feed(header, self.now_us(), is_received=False)
             if message_id not in UNRECORDED and (
                 to is None
                 or to == RECORDED_ONLY

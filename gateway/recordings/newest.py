@@ -82,6 +82,10 @@ class VehicleComponents:
             self._components[system_id] = AUTOPILOT
         elif autopilot not in (None, mavlink.MAV_AUTOPILOT_INVALID):
             self._components.setdefault(system_id, component_id)
+        return self.is_known(system_id, component_id)
+
+    def is_known(self, system_id: int, component_id: int) -> bool:
+        """Return whether a component is the vehicle of its system, as far as was heard."""
         return component_id == self._components.get(system_id)
 
 
@@ -271,7 +275,7 @@ class NewestVehicles:
     def __init__(self) -> None:
         self.states: dict[int, NewestState] = {}
         """By system id."""
-        self._components = VehicleComponents()
+        self.components = VehicleComponents()
 
     def feed(self, frame: MavFrame, now_us: int) -> NewestState | None:
         """Take in a frame of `STATE_IDS`; return the state of its vehicle, if it is of one."""
@@ -281,7 +285,7 @@ class NewestVehicles:
         fields = fields_of(frame.data)
         is_beat = message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
         autopilot = fields["autopilot"] if is_beat else None
-        if not self._components.includes(system_id, component_id, autopilot):
+        if not self.components.includes(system_id, component_id, autopilot):
             return None
         state = self.states.setdefault(system_id, NewestState())
         state.take(MESSAGE_NAMES[message_id], fields, now_us)

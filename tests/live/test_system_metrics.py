@@ -1,0 +1,98 @@
+"""Metrics of all systems, and the dashboard that shows them."""
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.live.metrics import prometheus_text, text_of
+from gateway.live.system_metrics import HEARD_US, MAX_SYSTEMS, SystemMetrics
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.mavlink import packed
+from tests.live.test_metrics import SNAPSHOT
+from tests.outputs.conftest import at, beat, gps
+
+ROOT = Path(__file__).resolve().parents[2]
+BATTERY = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_400, -1, 80, 0, 0, 0, 0, 0, 0)
+
+
+def feed(systems: SystemMetrics, *messages: Any, now_us: int = 0, **sender: Any) -> None:
+    for message in messages:
+        systems.feed(frame_of(packed(message, **sender)), now_us, is_received=True)
+
+
+def lines(systems: SystemMetrics, now_us: int = 0) -> list[str]:
+    text = "".join(text_of(systems.families(now_us)))
+    return [line for line in text.splitlines() if not line.startswith("#")]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        'mavgate_system_altitude_metres{system="9"} 488.13',
+        'mavgate_system_height_metres{system="9"} 20.0',
+        'mavgate_system_ground_speed_metres_per_second{system="9"} 5.0',
+        'mavgate_system_satellites{system="9"} 11.0',
+        'mavgate_system_battery_volts{system="9"} 12.4',
+        'mavgate_system_battery_percent{system="9"} 80.0',
+        'mavgate_system_armed{system="9"} 1.0',
+        'mavgate_system_silent_seconds{system="9"} 2.0',
+    ],
+)
+def test_values_of_a_foreign_vehicle_have_samples(line: str) -> None:
+    systems = SystemMetrics()
+    feed(systems, beat(), at(), gps(), BATTERY, system=9)
+    feed(systems, at(alt_m=1.0), system=9, component=154)
+    assert line in lines(systems, 2 * US_PER_S)
+
+
+def test_old_position_and_gone_system_have_no_samples() -> None:
+    systems = SystemMetrics()
+    feed(systems, beat(), at())
+    assert not any("altitude" in line for line in lines(systems, 6 * US_PER_S))
+    assert lines(systems, HEARD_US)
+    assert lines(systems, HEARD_US + 1) == []
+
+
+@pytest.mark.parametrize(
+    ("sequences", "frames", "lost"),
+    [
+        ([0, 1, 2], 3, 0),
+        ([250, 255, 0, 4], 4, 7),
+        ([7, 8, 8, 7, 9], 3, 0),
+        ([5, 9, 6, 10], 3, 3),
+    ],
+)
+def test_lost_frames_are_counted_by_sequence_numbers(
+    sequences: list[int], frames: int, lost: int
+) -> None:
+    systems = SystemMetrics()
+    for sequence in sequences:
+        feed(systems, beat(), sequence=sequence)
+    feed(systems, gps(), component=154, sequence=77)
+    found = lines(systems)
+    assert f'mavgate_system_frames_total{{system="1"}} {float(frames)}' in found
+    assert f'mavgate_system_frames_lost_total{{system="1"}} {float(lost)}' in found
+
+
+def test_number_of_systems_is_bounded_and_room_is_made_by_those_that_have_gone() -> None:
+    systems = SystemMetrics()
+    for system in range(1, MAX_SYSTEMS + 10):
+        feed(systems, beat(), system=system)
+    assert len([line for line in lines(systems) if "armed" in line]) == MAX_SYSTEMS
+    feed(systems, beat(), system=200, now_us=HEARD_US + 1)
+    assert 'mavgate_system_armed{system="200"} 1.0' in lines(systems, HEARD_US + 1)
+
+
+def test_dashboard_uses_metrics_that_exist() -> None:
+    systems = SystemMetrics()
+    feed(systems, beat(), at(), gps(), BATTERY)
+    known = set(re.findall(r"^(mavgate_\w+)", "\n".join(lines(systems)), re.M))
+    known |= set(re.findall(r"^(mavgate_\w+)", "".join(prometheus_text(SNAPSHOT)), re.M))
+    text = (ROOT / "config" / "grafana-dashboard.json").read_text()
+    assert json.loads(text)["panels"]
+    assert set(re.findall(r"mavgate_\w+", text)) <= known
