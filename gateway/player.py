@@ -16,6 +16,7 @@ from gateway.hub.endpoint import parse_endpoint, stays_here
 from gateway.hub.hub import Hub
 from gateway.hub.settings import HubSettings
 from gateway.live.control_socket import ControlServer, socket_path
+from gateway.live.other_gateways import identity_verb
 from gateway.live.player_edge import PlayerEdge
 from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.files import FlightError
@@ -112,7 +113,9 @@ class PlayerDaemon:
             files=files,
             on_end=self.ended.set,
         )
-        self._control = ControlServer(socket_path("play"), self.edge.verbs())
+        played = [vehicle.system_id for vehicle in self._vehicles]
+        identity = identity_verb(lambda: played, self._hub.endpoints)
+        self._control = ControlServer(socket_path("play"), identity, self.edge.verbs())
 
     async def start(self) -> None:
         """Open everything and start; raises ControlError if another player runs."""

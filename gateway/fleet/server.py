@@ -28,6 +28,7 @@ from gateway.hub.transports.base import Client
 from gateway.hub.transports.zenoh.session import RELIABLE_IDS, Payload, in_key
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
 from gateway.live.metrics_server import MetricsServer
+from gateway.live.other_gateways import identity_verb
 from gateway.units import US_PER_S
 from gateway.vehicle.telemetry.announcements import TEXT_BYTES, utf8
 from gateway.wire.mavlink_signing import WindowVerifier, key_from_passphrase
@@ -185,7 +186,10 @@ class FleetServer:
         self._task: asyncio.Task[None] | None = None
         own: Verbs = {"fleet.status": self.status, "fleet.id": self._set_id}
         recordings = RemoteRecordings(self._session)
-        self._control = ControlServer(socket_path("fleet"), own, recordings.verbs())
+        identity = identity_verb(
+            lambda: {own_id for _, own_id in self._ids.items() if own_id}, self._hub.endpoints
+        )
+        self._control = ControlServer(socket_path("fleet"), identity, own, recordings.verbs())
 
     @property
     def control_socket(self) -> Path:

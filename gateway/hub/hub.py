@@ -139,6 +139,7 @@ class Hub:
             rejects,
         )
         self.deliver = self._router.deliver
+        self.routed_vehicles = self._router.routed_vehicles
         self._ping_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._gathering: dict[float, list[Callable[[], None]]] = {}
@@ -243,7 +244,7 @@ class Hub:
 
         Returns whether there is one.
         """
-        now_us, systems = self.now_us(), self._router.routed_vehicles()
+        now_us, systems = self.now_us(), self.routed_vehicles()
         for message in messages:
             for system in systems:
                 sender = dialect.MAVLink(None, system, PROBE_COMPONENT)

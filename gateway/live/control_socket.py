@@ -360,6 +360,13 @@ def live_sockets(name: str) -> list[Path]:
     return [path for path in numbered(socket_path(name)) if path in listening]
 
 
+def all_sockets() -> list[Path]:
+    """List the sockets of all that runs here: of this user, and of the system service."""
+    services = (SERVICE_FOLDER / f"{name}.sock" for name in STARTERS)
+    own = [path for name in STARTERS for path in live_sockets(name)]
+    return [*dict.fromkeys([*own, *_listening().intersection(services)])]
+
+
 def _listening() -> set[Path]:
     """Read the listening sockets from the kernel; trying each would open a connection."""
     lines = SOCKETS.read_text(encoding="utf-8", errors="replace").splitlines()[1:]

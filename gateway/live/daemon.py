@@ -26,6 +26,7 @@ from gateway.live.control_socket import ControlError, ControlServer, socket_path
 from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, client_verbs, mark_verbs
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
+from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways
 from gateway.live.part import RecordingBudget
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
@@ -100,6 +101,8 @@ class Daemon:
         serial = settings.serial
         if self._receiver is not None:
             serial = msgspec.structs.replace(serial, port=self._receiver.path)
+        self._own_ids = set[int]() if line is None else {*aircraft}
+        """Vehicle ids of our aircraft: those that a simulation has, or that were received."""
         self._settings = settings
         self._read = read
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
@@ -161,6 +164,7 @@ class Daemon:
         return ControlServer(
             socket_path("run"),
             {"status": self.snapshot, "reload": self._reload_or_refuse},
+            identity_verb(lambda: self._own_ids | self._hub.routed_vehicles(), self._hub.endpoints),
             RecorderVerbs(self._recorder, self._has_vehicle).verbs(),
             mark_verbs(self._mark),
             SerialVerbs(self._serial, is_simulated=self._receiver is not None).verbs(),
@@ -310,6 +314,12 @@ class Daemon:
         except ControlError as error:
             log.warning("no control socket: %s", error)
         self._notifier.ready()
+        await asyncio.to_thread(log_other_gateways)
+
+    def _warn_of_conflicts(self, appeared: set[int]) -> None:
+        """Warn where another gateway sends an aircraft that has just appeared; in a thread."""
+        for text in conflicts(appeared, self._hub.endpoints()):
+            log.warning("%s", text)
 
     def _introduction(self, vehicle_id: int) -> list[bytes]:
         vehicle = self._pipeline.find(vehicle_id).vehicle
@@ -375,6 +385,9 @@ class Daemon:
         now_us = self.now_us()
         self._watch_loop(now_us)
         self._perform(self._pipeline.poll(now_us))
+        if appeared := self._pipeline.aircraft.keys() - self._own_ids:
+            self._own_ids |= appeared
+            loop.run_in_executor(None, self._warn_of_conflicts, appeared)
         for vehicle_id in self._broken_plans.keys() & self._pipeline.aircraft.keys():
             # After its first heartbeat, before which ground stations ignore its messages.
             self._announce_plans(vehicle_id, self._broken_plans.pop(vehicle_id))

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gateway.cli.support.control import ask
-from gateway.cli.support.options import CONFIG, USER_CONFIG
+from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG
 from gateway.cli.support.terminal import (
     NEGATIVE_NUMBERS,
     JsonOption,
@@ -19,6 +19,7 @@ from gateway.cli.support.terminal import (
     refuse,
     table_of,
 )
+from gateway.live.other_gateways import Gateway, other_gateways
 from gateway.printable import UNKNOWN, figure, receiver_state
 from gateway.records import RadioState, node_role
 from gateway.units import MV_PER_V, US_PER_S, counted
@@ -44,7 +45,16 @@ def status(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Show the status of the gateway: receiver, nodes, aircraft, clients."""
+    """Show the status of the gateway: receiver, nodes, aircraft, clients.
+
+    If several gateways, players or fleets run here, all are listed; `--socket` chooses one.
+    """
+    found = [] if json or SOCKET.get() else other_gateways()
+    runs = [one for one in found if one.command == "run"]
+    if len(found) > 1 or (found and not runs):
+        console_of().print(_gateways(found))
+        if len(runs) != 1:
+            return
     snapshot = ask("status")
     if json:
         print_json(snapshot["requests"] if requests else snapshot)
@@ -129,6 +139,16 @@ def mark(
 def reload() -> None:
     """Apply changed settings of the hub and of signing; other clients stay connected."""
     print(ask("reload"))
+
+
+def _gateways(found: Sequence[Gateway]) -> Table:
+    table = table_of("running", "pid", "since", "vehicles", "endpoints", "socket", left=6)
+    for one in found:
+        vehicles = ", ".join(map(str, one.systems)) or UNKNOWN
+        listed = "\n".join(one.endpoints) or UNKNOWN
+        process = UNKNOWN if one.pid is None else str(one.pid)
+        table.add_row(one.command, process, one.since, vehicles, listed, one.socket)
+    return table
 
 
 def _summary(snapshot: Record) -> str:

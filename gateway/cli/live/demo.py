@@ -21,7 +21,14 @@ from msgspec.structs import replace
 from gateway.aircraft import AircraftSettings
 from gateway.analysis.processes import begin_copy
 from gateway.cli.live.panel import launched_panel
-from gateway.cli.live.run import EndpointOption, PlainOption, serve, with_endpoints
+from gateway.cli.live.run import (
+    EndpointOption,
+    ForceOption,
+    PlainOption,
+    refuse_conflicts,
+    serve,
+    with_endpoints,
+)
 from gateway.cli.support.options import RadioName, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
 from gateway.cli.support.terminal import refuse
@@ -58,6 +65,7 @@ def demo(
         RadioName, typer.Option("--radio", help="The boards' radio, with --firmware.")
     ] = RadioName.NRF24,
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
+    force: ForceOption = False,
 ) -> None:
     """Fly the simulated tracker, over and over, until interrupted.
 
@@ -69,6 +77,9 @@ def demo(
         return with_endpoints(read_settings(), endpoint)
 
     settings = read()
+    first = settings.simulator.vehicle_id
+    count = 1 if flight is not None else settings.simulator.vehicles
+    refuse_conflicts(range(first, first + count), settings, force=force)
     # First of all, as it loads for seconds; so the simulator is imported after this.
     page = launched_panel(wanted=panel)
     load_entry_points()

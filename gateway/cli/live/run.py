@@ -5,7 +5,7 @@ import gc
 import logging
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -19,6 +19,7 @@ from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
 from gateway.extras import require
 from gateway.live.daemon import Daemon
+from gateway.live.other_gateways import conflicts
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
 from gateway.status import summary_line
@@ -35,6 +36,10 @@ LOG_INTERVAL_S: Final = 10.0
 SWITCH_S: Final = 0.0001
 
 PlainOption = Annotated[bool, typer.Option("--plain", help="Log lines instead of the live view.")]
+ForceOption = Annotated[
+    bool,
+    typer.Option("--force", help="Send, though another gateway sends the same vehicle id there."),
+]
 EndpointOption = Annotated[
     list[str] | None,
     typer.Option("--endpoint", "-e", help="Where MAVLink goes, instead of the settings'."),
@@ -81,6 +86,14 @@ def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> Ga
     except ValueError as error:
         refuse(f"--endpoint: {error}")
     return msgspec.structs.replace(settings, hub=hub)
+
+
+def refuse_conflicts(systems: Collection[int], settings: GatewaySettings, *, force: bool) -> None:
+    """End the command where another gateway sends one of its vehicle ids to the same endpoint."""
+    for text in conflicts(systems, settings.hub.endpoints):
+        if not force:
+            refuse(f"{text}; choose another id or endpoint, or --force")
+        log.warning("%s", text)
 
 
 async def serve(

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.text import Text
 
-from gateway.cli.live.run import EndpointOption, with_endpoints
+from gateway.cli.live.run import EndpointOption, ForceOption, refuse_conflicts, with_endpoints
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
@@ -29,6 +29,7 @@ from gateway.cli.support.recording_options import (
 )
 from gateway.cli.support.terminal import NEGATIVE_NUMBERS, console_of
 from gateway.config import GatewaySettings
+from gateway.live.other_gateways import log_other_gateways
 from gateway.live.player_edge import PlayerStatus
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals, on_parent_gone
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond, prepare
@@ -87,6 +88,7 @@ def play(
     ] = False,
     attached: Annotated[bool, typer.Option("--attached", hidden=True)] = False,
     endpoint: EndpointOption = None,
+    force: ForceOption = False,
 ) -> None:
     """Play recordings to the ground stations, several at once if you like.
 
@@ -109,6 +111,10 @@ def play(
             recorded = open_flights(files, replace(options, progress=advance), opened)
             flights = lay_out(recorded, system or [], with_commands=with_commands)
             prepare(flights, plan)
+        played = [system for flight in flights for system in flight.system_ids.values()]
+        refuse_conflicts(played, gateway, force=force)
+        if not attached:
+            log_other_gateways()
         print_remarks(remark for flight in recorded for remark in flight.remarks)
         names = [file.name for file in files]
         print_plan(names, flights, gateway.hub.endpoints)
