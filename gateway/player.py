@@ -5,9 +5,11 @@ The counterpart of `daemon.py` for playback: from the command line, the panel, a
 
 import asyncio
 import contextlib
-from collections.abc import Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from gateway.aircraft import Aircraft
 from gateway.clock import GatewayClock
@@ -34,6 +36,7 @@ READY_S: Final = 3.0
 """A name that takes longer to be resolved is not waited for."""
 READY_STEP_S: Final = 0.01
 RESOLVING: Final = "resolving"
+REFUSED: Final = "refused"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,16 +121,33 @@ class PlayerDaemon:
         self._control = ControlServer(socket_path("play"), identity, self.edge.verbs())
 
     async def start(self) -> None:
-        """Open everything and start; raises ControlError if another player runs."""
+        """Open everything and start.
+
+        Raises ControlError without a control socket, FlightError if no endpoint's name is known.
+        """
         await self._control.start()
+        asyncio.get_running_loop().set_default_executor(_LookUps())
         self._hub.start()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(READY_S):
-                while any(client.state == RESOLVING for client in self._hub.clients()):
+                while any(c.state == RESOLVING and not c.reason for c in self._hub.clients()):
                     await asyncio.sleep(READY_STEP_S)
+        unknown = [client for client in self._hub.clients() if client.state == RESOLVING]
+        if unknown and len(unknown) == len(self._hub.endpoints()):
+            reasons = {client.reason or "its address is not known yet" for client in unknown}
+            names = ", ".join(client.name for client in unknown)
+            raise FlightError(f"nothing can be sent to {names}: {'; '.join(sorted(reasons))}")
         self.edge.start()
         if not self._plan.paused:
             self.edge.resume()
+
+    def troubles(self) -> set[str]:
+        """Describe the clients that do not receive, such as those of a port without a listener."""
+        found = ((one.name, one.reason, one.state) for one in self._hub.clients())
+        return {
+            f"{name}: {reason or state}" for name, reason, state in found
+            if reason or state == REFUSED
+        }  # fmt: skip
 
     def close(self) -> None:
         """Close everything."""
@@ -205,6 +225,24 @@ class PlayerDaemon:
         if due_us is not None:
             wait_s = max(due_us - self._now_us(), 0) / US_PER_S
             self._timer = asyncio.get_running_loop().call_later(wait_s, self._poll)
+
+
+class _LookUps(ThreadPoolExecutor):
+    """Look names up in daemon threads: no end of the process waits for a resolver."""
+
+    def submit(self, work: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Begin a job in a thread of its own; each client has at most one."""
+        job: Future[Any] = Future()
+        job.set_running_or_notify_cancel()
+
+        def run() -> None:
+            try:
+                job.set_result(work(*args, **kwargs))
+            except OSError as error:
+                job.set_exception(error)
+
+        threading.Thread(target=run, daemon=True).start()
+        return job
 
 
 class _Numbering:

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,16 +12,19 @@ import msgspec
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+import gateway.player
 from gateway.cli.recorded.play import print_plan, steer
 from gateway.config import GatewaySettings
 from gateway.hub.hub import SENDS_AT_ONCE
 from gateway.player import PlayerDaemon, PlayPlan, endpoints_beyond
+from gateway.recordings.files import FlightError
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import Outgoing
 from gateway.wire.frame_editing import edit_frame
 from gateway.wire.mavlink_splitter import frame_of
 from tests.kit.mavlink import STATION, Sender
+from tests.ports import free_port
 from tests.recordings.flights import OPTIONS
 from tests.recordings.frames import START_US, make_tlog
 
@@ -220,6 +224,53 @@ async def test_keys_steer_the_player(tmp_path: Path, opened: ExitStack, station:
     steer(daemon, "q")
     assert daemon.ended.is_set()
     daemon.close()
+
+
+async def test_endpoint_whose_name_is_unknown_ends_the_playback(
+    tmp_path: Path, opened: ExitStack, station: Station
+) -> None:
+    daemon = make_daemon(tmp_path, opened, settings_of("udp:nowhere.invalid:14550"))
+    with pytest.raises(FlightError, match=r"nothing can be sent to udp:nowhere.invalid:14550: \w"):
+        await daemon.start()
+    daemon.close()
+    daemon = make_daemon(tmp_path, opened, settings_of("udp:nowhere.invalid:1", station.url))
+    await daemon.start()
+    await station.until(1)
+    assert len(daemon.troubles()) == 1
+    daemon.close()
+
+
+async def test_port_without_a_listener_is_named_at_once(tmp_path: Path, opened: ExitStack) -> None:
+    urls = f"udp:127.0.0.1:{free_port()}", f"tcp:127.0.0.1:{free_port()}"
+    daemon = make_daemon(tmp_path, opened, settings_of(*urls))
+    await daemon.start()
+    async with asyncio.timeout(LIMIT_S):
+        while len(daemon.troubles()) < len(urls):
+            await asyncio.sleep(0.01)
+    assert {trouble.rpartition(": ")[0] for trouble in daemon.troubles()} == {*urls}
+    daemon.close()
+
+
+def test_end_does_not_wait_for_a_name(
+    tmp_path: Path, opened: ExitStack, monkeypatch: pytest.MonkeyPatch, station: Station
+) -> None:
+    resolve, answered, given_up = socket.getaddrinfo, threading.Event(), []
+
+    def slow(host: str, *args: Any, **kwargs: Any) -> Any:
+        if host == "slow.example":
+            given_up.append(answered.wait(LIMIT_S))
+        return resolve("127.0.0.1", *args, **kwargs)
+
+    async def play() -> None:
+        daemon = make_daemon(tmp_path, opened, settings_of("udp:slow.example:1", station.url))
+        await daemon.start()
+        daemon.close()
+
+    monkeypatch.setattr(socket, "getaddrinfo", slow)
+    monkeypatch.setattr(gateway.player, "READY_S", 0.05)
+    asyncio.run(play())
+    assert given_up == [], "the look-up still waits"
+    answered.set()
 
 
 @pytest.mark.parametrize("plan", [{"paused": True}, {}], ids=["before the start", "at the end"])

@@ -4,6 +4,7 @@ Flights of all sources have the same form: the samples of a recording in the ord
 were processed, on the gateway clock.
 """
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -167,6 +168,12 @@ class Fixes:
 
     def __len__(self) -> int:
         return len(self.arrival_us)
+
+
+def max_speed_mps(flight: Flight) -> float:
+    """Return the greatest speed over ground of its usable fixes, 0 without any."""
+    speeds = (math.hypot(*fix.vel_n_mps[:2]) for fix in flight.fixes if fix.fix_ok)
+    return max((speed for speed in speeds if math.isfinite(speed)), default=0.0)
 
 
 def fixes_of(flight: Flight) -> Fixes:

@@ -4,11 +4,9 @@ import math
 import timeit
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, get_args
+from typing import TYPE_CHECKING, Final, get_args
 
 import numpy as np
-import pandas as pd
-from scipy import signal
 
 from gateway.analysis.flight import FloatArray
 from gateway.estimation.paper import PaperSettings
@@ -20,6 +18,9 @@ from gateway.estimation.vector_filter import (
     prototype_of,
 )
 from gateway.records import Vec3
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
 PAPER_RATE_HZ: Final = 1000.0
@@ -76,6 +77,8 @@ class Response:
 
 def response(kind: Kind, settings: PaperSettings, rate_hz: float) -> Response:
     """Compute the frequency response from a hundredth of the cutoff to half the sample rate."""
+    from scipy import signal
+
     *b, a1, a2 = _design(kind, settings, rate_hz)
     a = [1.0, a1, a2]
     low_hz = 0.01 * settings.accel_cutoff_hz
@@ -103,8 +106,10 @@ def _design(kind: Kind, settings: PaperSettings, rate_hz: float) -> Coefficients
     return design_lowpass(kind, settings.accel_cutoff_hz, rate_hz, settings.chebyshev_ripple_db)
 
 
-def compare(settings: PaperSettings, rate_hz: float) -> pd.DataFrame:
+def compare(settings: PaperSettings, rate_hz: float) -> "pd.DataFrame":
     """Compare the filters' properties in a table."""
+    import pandas as pd
+
     return pd.DataFrame([_properties(kind, settings, rate_hz) for kind in KINDS])
 
 
@@ -149,6 +154,8 @@ REST_ACCEL_MPS2: Final = 0.15
 
 def power_density(x: FloatArray, rate_hz: float) -> tuple[FloatArray, FloatArray]:
     """Estimate frequencies without 0 Hz and one-sided power spectral density, by Welch."""
+    from scipy import signal
+
     size = min(len(x), round(SEGMENT_S * rate_hz))
     frequency, density = signal.welch(np.nan_to_num(x), rate_hz, nperseg=size, axis=0)
     return frequency[1:], density[1:]

@@ -10,12 +10,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 import numpy as np
-import pandas as pd
-from scipy.optimize import OptimizeResult, differential_evolution
 
 from gateway.analysis.blending import Judge, judge_of, make_judge, score, thin, withhold
 from gateway.analysis.case import ESTIMATORS, setting_keys
@@ -24,6 +22,10 @@ from gateway.analysis.processes import forked
 from gateway.printable import UserError
 from gateway.recordings.fuse import FusionSettings
 from gateway.settings import fields_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from scipy.optimize import OptimizeResult
 
 SHORT: Final = {
     "alpha": "estimation.paper.alpha_accel",
@@ -204,8 +206,10 @@ WEIGHTS: Final = (0.1, 0.5, 0.9)
 """Values of alpha and of beta in Table I of the paper."""
 
 
-def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> pd.DataFrame:
+def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> "pd.DataFrame":
     """Fuse a flight with every pair of the paper's weights, as in Table I."""
+    import pandas as pd
+
     contest = make_contest(flight, fusion, [*SHORT.values()], hold_out=0, interval_s=interval_s)
     return pd.DataFrame(
         [
@@ -215,8 +219,10 @@ def blend_table(flight: Flight, fusion: FusionSettings, interval_s: float) -> pd
     )
 
 
-def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> pd.DataFrame:
+def tabulate(keys: Sequence[str], trials: Sequence[Trial], metric: Metric) -> "pd.DataFrame":
     """Return trials as a table, the best first."""
+    import pandas as pd
+
     rows = [{**dict(zip(keys, values, strict=True)), **scores} for values, scores in trials]
     table = pd.DataFrame(rows)
     column = COLUMN_OF[metric]
@@ -270,6 +276,8 @@ def optimise(
     on_generation: Callable[[float], None] = lambda _: None,
 ) -> Values:
     """Search between the least and greatest value of each axis by differential evolution."""
+    from scipy.optimize import differential_evolution
+
     bounds = []
     for axis in axes:
         numbers = [v for v in axis.values if isinstance(v, int | float)]
@@ -281,7 +289,7 @@ def optimise(
         scores = evaluate([tuple(float(v) for v in point) for point in points])
         return [math.inf if math.isnan(s) else s for s in scores]
 
-    def report_progress(intermediate_result: OptimizeResult) -> None:
+    def report_progress(intermediate_result: "OptimizeResult") -> None:
         on_generation(float(intermediate_result.fun))
 
     found = differential_evolution(

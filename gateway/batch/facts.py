@@ -140,14 +140,6 @@ class FlightFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Checksum of settings and calibration."""
 
 
-UNITS: Final = {
-    "duration": "s", "distance": "m", "highest": "m", "fastest": "m/s", "gps_lost": "s",
-    **dict.fromkeys(("lat_min", "lat_max", "lon_min", "lon_max"), "deg"),
-    "takeoff_lat": "deg", "takeoff_lon": "deg", "damaged": "bytes", "size": "bytes",
-}  # fmt: skip
-"""Of the columns that have one; `size` is that of the file."""
-
-
 class FlightTally:
     """Collect the facts of one vehicle while its recording is read."""
 

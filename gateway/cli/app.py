@@ -112,6 +112,7 @@ FORMER: Final[dict[str, dict[str, str]]] = {
 """Former names of options, by command; for one release each leads to its present name."""
 MOVED: Final = {
     "record save": "record rename",
+    "catalogue show": "info",
 }
 """Former names of commands, with those that do their work now."""
 

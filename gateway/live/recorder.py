@@ -348,17 +348,21 @@ class Recorder:
                     self._part = self._new_part(action.session, action.part)
                     actions = self._adopt(files)
         except OSError as error:
-            actions = self._session.failed(reason_of(error), now_us)
+            actions = self._session.failed(self._trouble_of(error), now_us)
         for action in actions:
             if isinstance(action, Announce):
                 self._say(action)
+
+    def _trouble_of(self, error: OSError) -> str:
+        """Return why no part could be opened, with the path that the system refused."""
+        return f"{error.filename or self.folder}: {reason_of(error)}"
 
     async def _open_part(self, action: OpenPart) -> list[SessionAction]:
         try:
             files = await done_by(self._writer, PartFiles, self.folder, action.session, action.part)
         except OSError as error:
             self._part = None
-            return self._session.failed(reason_of(error), self._clock())
+            return self._session.failed(self._trouble_of(error), self._clock())
         return self._adopt(files)
 
     def _adopt(self, files: PartFiles) -> list[SessionAction]:

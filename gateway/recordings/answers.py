@@ -7,7 +7,7 @@ parameter that a station set in flight did not exist before.
 
 | what                         | where from                                               |
 | ---------------------------- | -------------------------------------------------------- |
-| parameters                   | PARAM_VALUE of the autopilot, the newest of each name    |
+| parameters                   | PARAM_VALUE of the vehicle, the newest of each name      |
 | mission, fence, rally points | a whole download, or an upload that the vehicle accepted |
 | home, origin, version, modes | the messages of that name                                |
 
@@ -24,7 +24,7 @@ from typing import Final, Generic, TypeVar
 
 import numpy as np
 
-from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION, is_station
+from gateway.recordings.senders import AUTOPILOT, FIRST_GROUND_STATION, Senders, is_station
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.tlog import Batch, fields_of, payload_of
 from gateway.recordings.tlog_scan import IntArray
@@ -65,11 +65,12 @@ ANSWERS: Final = np.array(sorted(_ids(
 _LOOKED_AT: Final = np.array(sorted(_ASKING | _FEEDING))
 
 
-def is_command(frame: bytes, stations: Set[int]) -> bool:
+def is_command(frame: bytes, senders: Senders) -> bool:
     """Return whether a frame is a request to a vehicle, or feeds its navigation."""
-    message_id = message_id_of(frame)
+    message_id, stations = message_id_of(frame), senders.stations
     if message_id in _FEEDING:
-        return origin_of(frame)[1] != AUTOPILOT
+        system, component = origin_of(frame)
+        return component != senders.vehicle(system).component
     if message_id not in _ASKING:
         return False
     target = frame_of(frame).target[0]
@@ -84,13 +85,13 @@ def answers_of(batch: Batch, stations: Set[int]) -> IntArray:
     return np.flatnonzero(np.isin(batch.message_ids, ANSWERS) & ~is_station_s)
 
 
-def telemetry_of(batch: Batch, begin: int, stations: Set[int]) -> IntArray:
+def telemetry_of(batch: Batch, begin: int, senders: Senders) -> IntArray:
     """Find the records that are neither from a station, nor requests, nor answers to one."""
-    origins = batch.origins[begin:]
+    origins, stations = batch.origins[begin:], senders.stations
     kept = (origins >> 8 < FIRST_GROUND_STATION) & ~np.isin(origins, list(stations))
     kept &= ~np.isin(batch.message_ids[begin:], ANSWERS)
     for i in np.flatnonzero(kept & np.isin(batch.message_ids[begin:], _LOOKED_AT)).tolist():
-        kept[i] = not is_command(batch.frame(begin + i), stations)
+        kept[i] = not is_command(batch.frame(begin + i), senders)
     found: IntArray = np.flatnonzero(kept) + begin
     return found
 
@@ -169,17 +170,28 @@ class LogAnswers:
         """Parameters that a station has set, by system and name, until their value comes."""
         self._kept = 0
 
-    def note(self, batch: Batch, stations: Set[int]) -> None:
-        """Take in the next records."""
+    def note(self, batch: Batch, senders: Senders) -> None:
+        """Take in the next records, after `senders` has."""
         systems = batch.origins >> 8
+        vehicles = {each: senders.vehicle(each).component for each in np.unique(systems).tolist()}
         pairs = np.unique(systems << 32 | batch.message_ids)
         self.seen |= {(pair >> 32, pair & 0xFFFFFFFF) for pair in pairs.tolist()}
         for i in np.flatnonzero(np.isin(batch.message_ids, _READ)).tolist():
             if self._kept < MAX_KEPT:
-                self.note_frame(batch.frame(i), int(batch.time_us[i]), stations)
+                vehicle, time_us = vehicles[int(systems[i])], int(batch.time_us[i])
+                self.note_frame(batch.frame(i), time_us, senders.stations, vehicle)
 
-    def note_frame(self, frame: bytes, time_us: int, stations: Set[int] = frozenset()) -> None:
-        """Take in one frame: an answer or a part of a mission; others are ignored."""
+    def note_frame(
+        self,
+        frame: bytes,
+        time_us: int,
+        stations: Set[int] = frozenset(),
+        vehicle: int = AUTOPILOT,
+    ) -> None:
+        """Take in one frame: an answer or a part of a mission; others are ignored.
+
+        `vehicle` is the component of its system that is the vehicle.
+        """
         message_id, (system, component) = message_id_of(frame), origin_of(frame)
         self.seen.add((system, message_id))
         if message_id in _MISSION:
@@ -188,7 +200,7 @@ class LogAnswers:
             name = payload_of(frame, _SET_NAME.stop)[_SET_NAME]
             if len(self._set) < MAX_KEPT:
                 self._set.add((frame_of(frame).target[0], name))
-        elif message_id in _KEPT and component == AUTOPILOT:
+        elif message_id in _KEPT and component == vehicle:
             key = _key_of(frame)
             is_set = message_id == PARAM_VALUE_ID and (system, key) in self._set
             self._set.discard((system, key))

@@ -11,6 +11,7 @@ from typing import Final
 from gateway.recordings.anonymising import Anonymiser
 from gateway.recordings.files import (
     NO_RECORDING,
+    TABLE,
     TLOG,
     FlightError,
     TlogSource,
@@ -34,6 +35,7 @@ from gateway.recordings.reading import (
     ReadOptions,
     RecordedTable,
     aircraft_of,
+    check_vehicle,
     import_format,
     is_table,
     joined_tables,
@@ -71,6 +73,9 @@ class FlightToWrite:
         self._limits, self._smooth = limits, smooth
         self._edits = edits or TlogEdits()
         kinds = {format_of(file) for file in files}
+        if len(kinds) > 1:
+            each = ", ".join(f"{file}: {format_of(file)}" for file in files)
+            raise FlightError(f"the files differ in kind; give those of one kind ({each})")
         self.is_mavlink = kinds == {TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._as_recorded = not fuse and all(is_table(file) for file in files)
@@ -80,6 +85,8 @@ class FlightToWrite:
         """Those of MAVLink, once its frames are requested."""
         self.anonymiser: Anonymiser | None = None
         """Counts the fields that were changed, once a tlog is written."""
+        if kinds == {TABLE} and options.system_id is not None:
+            self.files = self._files_of(options.system_id)
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink: as recorded, or as the gateway would send it for the rows."""
@@ -109,6 +116,9 @@ class FlightToWrite:
         for source in sources:
             self.senders.merge(source.senders)
             self._remarks += [f"{source.path}: {text}" for text in source.remarks]
+        # A tlog may also be made of a ground station's frames.
+        if self.options.system_id not in {origin >> 8 for origin in self.senders.origins}:
+            check_vehicle(self.files, self.options.system_id, self.senders.systems())
         return sources
 
     def vehicle_messages(
@@ -134,16 +144,24 @@ class FlightToWrite:
         """Split tables by aircraft."""
         if len(self.files) == 1:
             return [self]
-        files: dict[int, list[Path]] = {}
-        quiet = replace(self.options, progress=None)
-        for file in self.files:
-            files.setdefault(open_rows(file, quiet).header.vehicle_id, []).append(file)
-        parts = []
+        files, parts = self._files_by_vehicle(), []
         for vehicle_id in sorted(files):
             part = copy(self)
             part.files = files[vehicle_id]
             parts.append(part)
         return parts
+
+    def _files_by_vehicle(self) -> dict[int, list[Path]]:
+        files: dict[int, list[Path]] = {}
+        quiet = replace(self.options, progress=None)
+        for file in self.files:
+            files.setdefault(open_rows(file, quiet).header.vehicle_id, []).append(file)
+        return files
+
+    def _files_of(self, vehicle_id: int) -> list[Path]:
+        files = self._files_by_vehicle()
+        check_vehicle(self.files, vehicle_id, files)
+        return files[vehicle_id]
 
     @property
     def remarks(self) -> list[str]:

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
@@ -61,6 +62,7 @@ class TlogFile:
             with temporary_copy(path, source.chunks(None, unpacked_limit)) as plain:
                 self._file = os.dup(plain.fileno())
         self.index = TlogIndex(source.timeline)
+        self._size = sys.maxsize
         scanner = TlogScanner()
         offset = 0
         data = b" "
@@ -69,15 +71,17 @@ class TlogFile:
             batch = source.timeline.apply(scanner.feed(data, final=not data))
             self.index.add(batch)
             if answers is not None:
-                answers.note(batch, self.index.senders.stations)
+                answers.note(batch, self.index.senders)
             offset += len(data)
             if progress is not None:
                 progress(len(data))
+        # What is recorded from here on is not indexed, and not played.
+        self._size = offset
 
     def read(self, offset: int, size: int) -> bytes:
         """Read up to `size` bytes; nothing at the end, or if the medium fails."""
         try:
-            return os.pread(self._file, size, offset)
+            return os.pread(self._file, max(0, min(size, self._size - offset)), offset)
         except OSError:
             return b""
 
@@ -158,7 +162,7 @@ class FusedTlog:
         batch = self._scanner.feed(made, final=self._ended)
         self.index.add(batch)
         if self._answers is not None:
-            self._answers.note(batch, self.index.senders.stations)
+            self._answers.note(batch, self.index.senders)
         self._size += len(made)
         return not self._ended
 

@@ -154,7 +154,7 @@ class Track:
     def _wanted(self, batch: Batch, begin: int) -> IntArray:
         if self._with_commands:
             return np.arange(begin, len(batch))
-        return telemetry_of(batch, begin, self._source.index.senders.stations)
+        return telemetry_of(batch, begin, self._source.index.senders)
 
     def _records_of(self, batches: Iterator[Batch], begin: int = 0) -> Iterator[TlogRecord]:
         """Yield the records to play; sequence numbers have no gap where answers are left out.

@@ -309,6 +309,14 @@ def _monotone(blocks: Iterator[TableBlock], path: Path, remarks: list[str]) -> I
         )
 
 
+def check_vehicle(paths: Iterable[Path], wanted: int | None, found: Iterable[int]) -> None:
+    """Raise FlightError if the vehicle that the user wants is not among those of the files."""
+    if wanted is not None and wanted not in (known := sorted(found)):
+        each = ", ".join(map(str, paths))
+        listed = ", ".join(map(str, known)) or "none"
+        raise FlightError(f"{each}: no vehicle {wanted} in this file; it has {listed}")
+
+
 def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     source = open_tlog(path)
     reader = AutopilotReader(options.system_id, source.senders)
@@ -316,11 +324,8 @@ def _open_autopilot(path: Path, options: ReadOptions) -> RecordedTable:
     blocks = chain(map(reader.feed, batches), [None])
     stream = (reader.flush() if cells is None else cells for cells in blocks)
     first = next((cells for cells in stream if len(cells)), None)
-    systems = {origin >> 8 for origin in source.senders.origins - source.senders.stations}
-    if first is None and options.system_id not in {None, *systems}:
-        listed = ", ".join(map(str, sorted(systems)))
-        raise FlightError(f"{path}: no vehicle {options.system_id} in this file; it has {listed}")
     if first is None:
+        check_vehicle([path], options.system_id, source.senders.systems())
         raise FlightError(
             f"{path}: contains no HIGHRES_IMU, RAW_IMU or SCALED_IMU of a vehicle to fuse"
         )

@@ -57,6 +57,11 @@ class RecordedSender:
     frame_origin: Position | None = None
     """Origin of LOCAL_POSITION_NED until another one is sent."""
 
+    @property
+    def component(self) -> int:
+        """Its component id."""
+        return self.origin & 0xFF
+
 
 class Senders:
     """Survey the senders of a recording, batch by batch."""

@@ -81,7 +81,7 @@ MAX_FORCE_OFF_MPS2: Final = 1.5
 REST_WINDOWS: Final = 3
 """This many still windows in a row are a rest: in fewer a slow turn cannot be detected."""
 MAX_FIELD_DRIFT_UTPS: Final = 0.2
-"""The field of a node that turns by 0.6 deg/s at mid latitudes; noise makes a third of it."""
+"""The field of a node that turns by 0.6 °/s at mid latitudes; noise makes a third of it."""
 MIN_FIELD_SAMPLES: Final = 20
 MAX_RESTS_APART_RADPS: Final = 0.02
 """Rests of one log are this much alike, unless one of them was a turn."""
@@ -222,7 +222,7 @@ def solve_mounting(level: Vec3, nose_up: Vec3) -> Matrix3:
     up = np.array(level) / np.linalg.norm(level)
     raised = np.array(nose_up) / np.linalg.norm(nose_up)
     if _angle_deg(up, raised) < MIN_TILT_DEG:
-        raise CalibrationError(f"raise the nose by more than {MIN_TILT_DEG:.0f} deg")
+        raise CalibrationError(f"raise the nose by more than {MIN_TILT_DEG:.0f}°")
     # With the nose up the specific force leans forward in the body.
     forward = raised - up * (up @ raised)
     x = forward / np.linalg.norm(forward)
@@ -352,7 +352,7 @@ def gyro_at_rest(samples: NodeSamples) -> FloatArray:
     apart = float(np.ptp(means, axis=0).max())
     if apart > MAX_RESTS_APART_RADPS:
         raise CalibrationError(
-            f"the rates of {len(spans)} apparent rests differ by {apart / RAD_PER_DEG:.1f} deg/s: "
+            f"the rates of {len(spans)} apparent rests differ by {apart / RAD_PER_DEG:.1f} °/s: "
             "the node turned steadily in some of them; calibrate from a recording on the ground"
         )
     return np.vstack([samples.gyro[span] for span in spans])

@@ -321,6 +321,12 @@ class TestTrouble:
         await until(rig, hub, lambda: hub.clients()[0].state == "unreachable")
         assert hub.clients()[0].reason.startswith(f"no router answers at {locator}")
 
+    def test_port_in_use_is_reported_in_one_line(self) -> None:
+        bound = "Can not create a new TCP listener bound to tcp/h:1: "
+        error = zenoh.ZError(f"{bound}[h:1: Address already in use (os error 98) at /x/y.rs:61.]")
+        text = "another program listens at this port; choose another one by --listen"
+        assert zenoh_session._message_of(error) == text
+
     def test_error_of_a_tls_router_mentions_certificates(self) -> None:
         error = zenoh.ZError("Unable to connect to any of [Single(tls/h:1)]!  at /x/y.rs:4.")
         text = "no router answers at tls/h:1, or a certificate does not fit"

@@ -333,7 +333,7 @@ async def test_failed_start_is_reported_and_retried(
 ) -> None:
     bench.recorder.folder.write_text("a file where the folder should be")
     bench.recorder.start()
-    assert bench.troubles == ["Recording not started: File exists"]
+    assert bench.troubles == [f"Recording not started: {bench.recorder.folder}: File exists"]
     bench.recorder.folder.unlink()
     await bench.turn(RETRY_US / 1e6)
     assert bench.recorder.status().state == "recording"

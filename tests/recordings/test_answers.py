@@ -40,7 +40,7 @@ class Day:
         batch = TlogScanner().feed(self.data, final=True)
         index, found = TlogIndex(), LogAnswers()
         index.add(batch)
-        found.note(batch, index.senders.stations)
+        found.note(batch, index.senders)
         time_us = self.now_us if at_us is None else at_us
         return VehicleAnswers(found, 3, played_as, lambda: time_us)
 
@@ -66,6 +66,15 @@ def count_of(items: int, kind: int = MISSION, target: int = 255) -> Any:
 
 def decode(frame: bytes) -> Any:
     return mavlink.MAVLink(None).decode(bytearray(frame))
+
+
+def test_answers_are_those_of_the_vehicle_whatever_its_component(day: Day) -> None:
+    autopilot = mavlink.MAVLink(None, 3, 7)
+    day.send(autopilot, mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
+    day.send(autopilot, value("ALPHA", 1.0))
+    day.send(day.vehicle, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    day.send(day.vehicle, value("COMPANION", 9.0))
+    assert [*day.answers().parameters()] == ["ALPHA"]
 
 
 def test_parameters_are_complete_and_renumbered(day: Day) -> None:

@@ -43,6 +43,18 @@ def test_parts_of_a_recording_are_one_flight(tmp_path: Path) -> None:
     assert firsts == [START_US + n * 100 * STEP_US for n in (0, 1, 2)]
 
 
+def test_recording_that_grows_is_played_as_it_was_opened(tmp_path: Path) -> None:
+    path = write(tmp_path, "a.tlog", RECORDS[:100])
+    with ExitStack() as opened:
+        (flight,) = open_flights([path], OPTIONS, opened)
+        (source,) = flight.sources
+        before = source.read(0, 1 << 20)
+        with path.open("ab") as file:
+            file.write(make_tlog(RECORDS[100:]))
+        assert source.read(0, 1 << 20) == before == make_tlog(RECORDS[:100])
+        assert source.read(len(before), 1 << 20) == b""
+
+
 def test_other_recordings_get_separate_vehicles(tmp_path: Path) -> None:
     first = write(tmp_path, "first.tlog", RECORDS[:100])
     later = write(tmp_path, "later.tlog", RECORDS[200:])

@@ -336,7 +336,7 @@ def test_rest_is_found_among_the_turns_of_a_log() -> None:
 
 def test_contradicting_rests_are_refused_without_a_magnetometer() -> None:
     log = joined(lying(8.0, mag_hz=0.0), lying(8.0, 2.8, mag_hz=0.0))
-    with pytest.raises(CalibrationError, match=r"2.8 deg/s: .*turned steadily"):
+    with pytest.raises(CalibrationError, match=r"2.8 °/s: .*turned steadily"):
         gyro_at_rest(log)
 
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from gateway.analysis.blending import PAPER_TABLE, grows, interpolate
+from gateway.analysis.blending import grows, interpolate, paper_table
 from gateway.analysis.case import (
     HOLD_OUT,
     OUTAGE_S,
@@ -312,7 +312,7 @@ def weights(case: Case) -> Section | None:
     thinned = blend_table(case.flight, case.fusion, INTERVAL_S)
     if not _is_judged(thinned) or not _is_judged(full := blend_table(case.flight, case.fusion, 0)):
         return None
-    paper = PAPER_TABLE.rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
+    paper = paper_table().rename(columns={"north_m": "paper latitude", "east_m": "paper longitude"})
     return Section(
         "Alpha and beta: Table I",
         _lead(thinned),
@@ -385,8 +385,8 @@ def _draw_heat_map(table: pd.DataFrame, width_in: float) -> Figure:
     grids = [
         ("this flight, latitude", table, "north_m"),
         ("this flight, longitude", table, "east_m"),
-        ("paper, latitude", PAPER_TABLE, "north_m"),
-        ("paper, longitude", PAPER_TABLE, "east_m"),
+        ("paper, latitude", paper_table(), "north_m"),
+        ("paper, longitude", paper_table(), "east_m"),
     ]
     values = {
         title: source.pivot_table(index="alpha", columns="beta", values=column).to_numpy()

@@ -27,7 +27,7 @@ from gateway.records import ImuRaw, LinkReport, NodeStatus, RawRecord
 from gateway.sensing import calibrating
 from gateway.sensing.calibrating import CalibrationError, NodeSamples, node_samples
 from gateway.sensing.calibration import NodeCalibration
-from gateway.units import US_PER_S
+from gateway.units import RAD_PER_DEG, US_PER_S
 from gateway.wire.link import Link
 from gateway.wire.payloads import SENSOR_IMU
 
@@ -63,11 +63,11 @@ SIDES: Final = (
 class Step(StrEnum):
     """What can be calibrated."""
 
+    MOUNTING = "mounting"
     GYRO = "gyro"
     ACCEL = "accel"
-    MAG = "mag"
-    MOUNTING = "mounting"
     LEVEL = "level"
+    MAG = "mag"
 
 
 class Capture(Protocol):
@@ -84,7 +84,7 @@ Poses = Callable[[Step], list[NodeSamples]]
 @app.command()
 def calibrate(
     steps: Annotated[
-        list[Step] | None, typer.Argument(help="Steps; by default gyro accel mag level.")
+        list[Step] | None, typer.Argument(help="Steps; by default gyro accel level mag.")
     ] = None,
     *,
     vehicle: Annotated[int, typer.Option("--vehicle", min=1, max=31, help="Its id.")] = 1,
@@ -111,7 +111,7 @@ def calibrate(
     """
     settings = read_settings()
     aircraft = load_aircraft(settings).get(vehicle, settings.default_aircraft)
-    chosen = steps or [Step.GYRO, Step.ACCEL, Step.MAG, Step.LEVEL]
+    chosen = steps or [Step.GYRO, Step.ACCEL, Step.LEVEL, Step.MAG]
     old = aircraft.calibration
     is_live = log is None and port is None and CONFIG.get() is None and is_running()
     if is_live:
@@ -208,7 +208,7 @@ def poses_from(capture: Capture) -> Poses:
         _ask("Set the aircraft level, as it flies.")
         level = [capture(POSE_S)]
         if step is Step.MOUNTING:
-            _ask("Raise the nose by 30 deg or more and hold it there.")
+            _ask("Raise the nose by 30° or more and hold it there.")
             level.append(capture(POSE_S))
         return level
 
@@ -392,12 +392,15 @@ def _show(old: NodeCalibration, new: NodeCalibration) -> None:
     for name in new.__struct_fields__:
         before, after = getattr(old, name), getattr(new, name)
         if before != after:
-            table.add_row(name, _text(before), _text(after))
+            is_rate = name.endswith("_radps")
+            shown = name.removesuffix("_radps") + ", °/s" if is_rate else name
+            scale = 1.0 / RAD_PER_DEG if is_rate else 1.0
+            table.add_row(shown, _text(before, scale), _text(after, scale))
     console.print(table if table.row_count else "nothing changed")
 
 
-def _text(value: object) -> str:
+def _text(value: object, scale: float) -> str:
     if isinstance(value, tuple):
-        inner = ", ".join(_text(item) for item in value)
+        inner = ", ".join(_text(item, scale) for item in value)
         return f"({inner})"
-    return figure(value, ".5g") if isinstance(value, float) else str(value)
+    return figure(value * scale, ".5g") if isinstance(value, float) else str(value)

@@ -1,6 +1,5 @@
 """`mavgate catalogue`: the catalogue of all recordings under a folder."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -9,7 +8,6 @@ from typer.core import TyperGroup
 
 from gateway.batch.catalogue import Row, figures_of, find_flights, geojson_of, index_folder
 from gateway.batch.executors import LocalProcesses
-from gateway.batch.facts import UNITS
 from gateway.cli.support.options import folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, JobsOption
 from gateway.cli.support.terminal import (
@@ -21,15 +19,9 @@ from gateway.cli.support.terminal import (
     table_of,
 )
 from gateway.printable import UNKNOWN, figure
-from gateway.recordings.index import RecordingError, find_recording
 from gateway.units import counted
 
 INDEX: Final = "index"
-DIGITS: Final = {
-    "duration": 1, "distance": 0, "highest": 1, "fastest": 1, "gps_lost": 1, "loss": 4,
-    **dict.fromkeys(("lat_min", "lat_max", "lon_min", "lon_max", "takeoff_lat", "takeoff_lon"), 6),
-}  # fmt: skip
-"""Decimals that are shown of a number."""
 
 
 class _IndexByDefault(TyperGroup):
@@ -103,36 +95,6 @@ def list_flights(
         print_json(geojson_of(root, where) if geojson else find_flights(root, where))
     else:
         _show_table(find_flights(root, where))
-
-
-@group.command()
-def show(
-    name: Annotated[str, typer.Argument(help="A recording's name, or a file's path.")],
-    *,
-    folder: FolderOption = None,
-    json: JsonOption = False,
-    geojson: GeojsonOption = False,
-) -> None:
-    """Show all that the catalogue knows of one recording; `last` is the newest."""
-    root = _folder(folder)
-    with suppress(RecordingError):
-        name = find_recording(root, name).name
-    quoted = name.replace("'", "''")
-    where = f"name = '{quoted}' or path = '{quoted}'"
-    rows = find_flights(root, where)
-    if not rows:
-        refuse(f"{name}: is not in the catalogue of {root}; `mavgate catalogue list` shows it")
-    if geojson or json:
-        print_json(geojson_of(root, where) if geojson else rows)
-        return
-    for number, row in enumerate(rows):
-        print(end="\n" if number else "")
-        grid = table_of("what", "value", "unit", left=3)
-        for key, value in row.items():
-            if value is not None and key != "modified":
-                text = f"{value:.{DIGITS[key]}f}" if isinstance(value, float) else str(value)
-                grid.add_row(key, text, UNITS.get(key, ""))
-        console_of().print(grid)
 
 
 def _folder(folder: Path | None) -> Path:

@@ -250,7 +250,11 @@ async def _watch(daemon: PlayerDaemon) -> None:
         closing(keyboard),
     ):
         keyboard.start()
+        named = set[str]()
         while not daemon.ended.is_set():
+            for trouble in sorted(daemon.troubles() - named):
+                console.print(trouble, style="yellow")
+            named |= daemon.troubles()
             status = daemon.edge.status()
             progress.update(
                 task,

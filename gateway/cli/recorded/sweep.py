@@ -3,15 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import msgspec
 import numpy as np
-import pandas as pd
 import typer
 
 from gateway.analysis import sweep as sweeping
-from gateway.analysis.flight import Flight
+from gateway.analysis.flight import Flight, max_speed_mps
 from gateway.analysis.sweep import (
     COLUMN_OF,
     ESTIMATOR_KEY,
@@ -28,7 +27,6 @@ from gateway.analysis.sweep import (
     with_estimator_of,
     with_values,
 )
-from gateway.batch.statistics import Choice, FloatArray, choose, group_of
 from gateway.batch.storage import is_url
 from gateway.batch.tasks import FlightResult, SweepTask
 from gateway.cli.support.batch_work import HoldOutOption, IntervalOption, SeasonWork, season_options
@@ -50,6 +48,11 @@ from gateway.printable import figure
 from gateway.recordings.fuse import FusionSettings
 from gateway.recordings.reading import ReadOptions
 from gateway.units import counted
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from gateway.batch.statistics import Choice, FloatArray
 
 app = typer.Typer()
 
@@ -122,6 +125,8 @@ def sweep(
 
 
 SHOWN: Final = 10
+AT_REST_MPS: Final = 1.0
+"""A GPS receiver at rest reports up to 0.3 m/s."""
 HEADINGS: Final = {
     "north_m": "latitude error, m",
     "east_m": "longitude error, m",
@@ -169,6 +174,12 @@ def run_sweep(
         hold_out=options.hold_out,
         interval_s=options.gps_interval_s,
     )
+    if (fastest := max_speed_mps(flight)) < AT_REST_MPS:
+        console_of(stderr=True).print(
+            f"{flight.name}: at rest throughout, at most {fastest:.1f} m/s by GPS: nothing can be "
+            "learned from it about settings of a flight",
+            style="yellow",
+        )
     _print_idle(contest, axes)
     with pool(contest, options.jobs) as run:
         if options.generations:
@@ -178,7 +189,7 @@ def run_sweep(
     results = sweeping.tabulate(contest.keys, trials, options.metric)
     _show(results, contest, options.metric)
     best = with_values(contest.fusion, contest.keys, sweeping.best_of(trials, options.metric))
-    _write(options, settings, best, results, path)
+    _write(options, settings, best, contest.keys, results, path)
 
 
 def _check_outputs(options: SweepOptions, path: Path | None = None) -> None:
@@ -192,11 +203,14 @@ def _write(
     options: SweepOptions,
     settings: GatewaySettings,
     best: FusionSettings,
-    table: pd.DataFrame,
+    keys: Sequence[str],
+    table: "pd.DataFrame",
     path: Path | None = None,
 ) -> None:
-    """Write the settings with the best values, and the table if it is wanted."""
-    merged = render(msgspec.structs.replace(settings, estimation=best.estimation))
+    """Write the settings that were varied, with the best values, and the table if it is wanted."""
+    if best.estimation.estimator != settings.estimation.estimator:
+        keys = [ESTIMATOR_KEY, *keys]
+    merged = render(msgspec.structs.replace(settings, estimation=best.estimation), keys)
     write_new(options.output, [merged.encode()], overwrite=options.overwrite, inputs=[path])
     print(options.output)
     if options.table is not None:
@@ -263,7 +277,7 @@ def _search(axes: Sequence[Axis], run: Run, generations: int, metric: Metric) ->
     return found
 
 
-def _show(results: pd.DataFrame, contest: Contest, metric: Metric) -> None:
+def _show(results: "pd.DataFrame", contest: Contest, metric: Metric) -> None:
     judged = COLUMN_OF[metric]
     others = [name for name in ("north_m", "east_m", "reference_m") if name in results]
     names = [*contest.keys, judged, *(name for name in others if name != judged)]
@@ -284,6 +298,8 @@ def run_season_sweep(
     kept: Path | None = None,
 ) -> list[FlightResult]:
     """Score every point on every flight, show what is best for all, and write it."""
+    import pandas as pd
+
     if kept is not None:
         kept.mkdir(parents=True, exist_ok=True)
     _check_outputs(options)
@@ -311,12 +327,14 @@ def run_season_sweep(
             "as others chose": choice.judged,
         }
     )
-    _write(options, settings, best, table)
+    _write(options, settings, best, keys, table)
     return results
 
 
-def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
+def _chosen(swept: Sequence[FlightResult]) -> "tuple[FloatArray, Choice]":
     """Return the errors with the settings that the flights came with, and what is best."""
+    from gateway.batch.statistics import choose, group_of
+
     # An unknown score is null in JSON.
     errors = np.array([result.figures["scores"] for result in swept], float)
     base = np.array([result.figures["base"] for result in swept], float)
@@ -328,7 +346,7 @@ def _chosen(swept: Sequence[FlightResult]) -> tuple[FloatArray, Choice]:
 
 
 def _show_choice(
-    axes: Sequence[Axis], points: Sequence[Values], choice: Choice, column: str, flights: int
+    axes: Sequence[Axis], points: Sequence[Values], choice: "Choice", column: str, flights: int
 ) -> None:
     console = console_of()
     grid_ = table_of(

@@ -82,6 +82,18 @@ def test_steps_are_guided_and_saved_with_residuals(config: Path) -> None:
     assert 0.0 < saved.accel_residual_mps2 < 0.05
 
 
+def test_steps_are_in_the_order_in_which_they_build_on_each_other(config: Path) -> None:
+    output = run(config, "--dry-run", code=1)
+    titles = [line for line in output.splitlines() if line.startswith("Step ")]
+    assert [title.rpartition(" ")[2] for title in titles] == ["gyro", "accel", "level", "mag"]
+
+
+def test_rates_are_shown_in_degrees_per_second(config: Path) -> None:
+    (line,) = (each for each in run(config, "gyro").splitlines() if "gyro_bias" in each)
+    assert "gyro_bias, °/s" in line
+    assert "(2.8" in line, "0.05 rad/s"
+
+
 def test_missing_port_is_reported_before_the_first_question(tmp_path: Path) -> None:
     command = ["calibrate", "gyro", "--port", str(tmp_path / "none")]
     result = invoke(*command, answers="\n")

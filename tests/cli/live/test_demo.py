@@ -2,6 +2,7 @@
 
 import asyncio
 import gc
+import logging
 import multiprocessing
 import os
 import signal
@@ -64,9 +65,18 @@ def test_demo_does_not_use_the_aircraft_folder_of_the_user(
 
 @pytest.mark.parametrize(("options", "mode"), [((), "manual"), (("--record",), "always")])
 def test_demo_is_recorded_only_on_request(
-    settings_of_demo: Callable[..., list[GatewaySettings]], options: tuple[str, ...], mode: str
+    settings_of_demo: Callable[..., list[GatewaySettings]],
+    caplog: pytest.LogCaptureFixture,
+    options: tuple[str, ...],
+    mode: str,
 ) -> None:
-    assert [settings.recording.mode for settings in settings_of_demo(*options)] == [mode, mode]
+    with caplog.at_level(logging.INFO):
+        found = settings_of_demo(*options)
+    assert [settings.recording.mode for settings in found] == [mode, mode]
+    state = "recording" if options else "not recording without --record"
+    assert any(
+        line.startswith(f"recording.mode is not used here: {state}") for line in caplog.messages
+    )
 
 
 SETTINGS = SimulatorSettings(corrupt_bytes=0.01)

@@ -376,6 +376,17 @@ def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, options: lis
     assert "Mark: over the wood" in texts
 
 
-def test_unknown_vehicle_is_refused_with_those_of_the_file(tlog: Path, tmp_path: Path) -> None:
-    text = run("convert", tlog, "-o", tmp_path / "x.csv", "--system", "7", code=2)
-    assert f"{tlog}: no vehicle 7 in this file; it has 1" in text
+@pytest.mark.parametrize("ending", ["csv", "tlog", "kml", "gpx", "geojson", "mcap", "parquet"])
+@pytest.mark.parametrize("source", ["tlog", "table"])
+def test_unknown_vehicle_is_refused_with_those_of_the_file(
+    request: pytest.FixtureRequest, tmp_path: Path, source: str, ending: str
+) -> None:
+    file = request.getfixturevalue(source)
+    text = run("convert", file, "-o", tmp_path / f"x.{ending}", "--system", "7", code=2)
+    assert f"{file}: no vehicle 7 in this file; it has 1" in text
+
+
+def test_files_of_different_kinds_are_refused(tlog: Path, table: Path, tmp_path: Path) -> None:
+    text = run("convert", tlog, table, "-o", tmp_path / "x.kml", code=2)
+    assert "the files differ in kind" in text
+    assert f"{tlog}: tlog" in text

@@ -1,6 +1,8 @@
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import pandas as pd
 import pytest
 
@@ -32,7 +34,22 @@ def test_best_settings_are_written_as_a_settings_file(recording: Path, tmp_path:
     estimation = load(best).estimation
     assert estimation.estimator == "paper"
     assert estimation.paper.alpha_accel == trials["estimation.paper.alpha_accel"][0]
-    assert "beta_velocity" in tomllib.loads(best.read_text())["estimation"]["paper"]
+    written = tomllib.loads(best.read_text())
+    assert written.keys() == {"estimation"}, "only what was varied, and what that needs"
+    assert written["estimation"].keys() == {"estimator", "paper"}
+    assert written["estimation"]["paper"].keys() == {"alpha_accel", "beta_velocity"}
+    assert "at rest" not in result.output
+
+
+def test_flight_at_rest_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "rest.csv"
+    resting = [
+        replace(row, gps=row.gps and msgspec.structs.replace(row.gps, vel_n_mps=(0.2, 0.1, 0.0)))
+        for row in rows(raw=False)
+    ]
+    path.write_text(encode_head(TableHeader()) + "".join(map(row_to_line, resting)))
+    result = invoke("sweep", path, "--alpha", "0.1,0.9", "-o", tmp_path / "best.toml", code=0)
+    assert "at rest throughout, at most 0.2 m/s by GPS: nothing can be learned" in result.output
 
 
 def test_search_writes_its_best_settings(recording: Path, tmp_path: Path) -> None:

@@ -122,6 +122,7 @@ TLS_FILES: Final = (
     "root_ca_certificate",
     *("connect_certificate", "connect_private_key", "listen_certificate", "listen_private_key"),
 )
+IN_USE: Final = "Address already in use"
 NO_ANSWER: Final = re.compile(r"Unable to connect to any of \[Single\((.*)\)\]!")
 SECURED: Final = ("tls/", "quic/", "wss/")
 LOCAL: Final = "unixsock-stream"
@@ -499,6 +500,8 @@ class Connection:
 def _message_of(error: Exception) -> str:
     """Return Zenoh's message without the position in its source code."""
     text = str(error).partition(" at /")[0].strip()
+    if IN_USE in text:
+        return "another program listens at this port; choose another one by --listen"
     if (found := NO_ANSWER.fullmatch(text)) is None:
         return text
     if found[1].startswith(SECURED):
