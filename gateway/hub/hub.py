@@ -139,7 +139,6 @@ class Hub:
             rejects,
         )
         self.deliver = self._router.deliver
-        self.routed_vehicles = self._router.routed_vehicles
         self._ping_us = self._alerts_us = 0
         self._timer: asyncio.TimerHandle | None = None
         self._gathering: dict[float, list[Callable[[], None]]] = {}
@@ -238,6 +237,10 @@ class Hub:
         if self._vehicles.register(frame, now_us):
             self._fanout.clear()
         self._fanout.publish(frame, sequence, now_us)
+
+    def routed_vehicles(self) -> set[int]:
+        """Return the systems of others that are routed and no ground stations."""
+        return self._router.routed_vehicles()
 
     def say(self, messages: Iterable[Any]) -> bool:
         """Send messages of this gateway as a component of each vehicle that it only routes.

@@ -76,10 +76,7 @@ def demo(
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(), endpoint)
 
-    settings = read()
-    first = settings.simulator.vehicle_id
-    count = 1 if flight is not None else settings.simulator.vehicles
-    refuse_conflicts(range(first, first + count), settings, force=force)
+    settings = _without_conflicts(read(), one=flight is not None, force=force)
     # First of all, as it loads for seconds; so the simulator is imported after this.
     page = launched_panel(wanted=panel)
     load_entry_points()
@@ -116,6 +113,13 @@ def demo(
             return daemons[0]
 
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
+
+
+def _without_conflicts(settings: GatewaySettings, *, one: bool, force: bool) -> GatewaySettings:
+    """Return the settings, unless another gateway sends the ids of the simulated aircraft too."""
+    first, count = settings.simulator.vehicle_id, 1 if one else settings.simulator.vehicles
+    refuse_conflicts(range(first, first + count), settings, force=force)
+    return settings
 
 
 def recorded_line(
