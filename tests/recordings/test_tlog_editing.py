@@ -89,7 +89,8 @@ def test_chosen_frames_are_kept_byte_for_byte(
     [
         (("--message", "ATITUDE"), "did you mean ATTITUDE"),
         (("--without", "NONE_SUCH_AT_ALL_*"), "no MAVLink message is named"),
-        (("--system", 99), "no record fits all of these options"),
+        (("--system", 99), "no vehicle 99 in this file; it has 1, 2, 7"),
+        (("--system", 1, "--message", "CAMERA_TRIGGER"), "no record fits all of these options"),
         (("--as", "1"), "write OLD:NEW"),
         (("--as", "1:256"), "write OLD:NEW"),
         (("--as", "1:3", "--as", "1:4"), "write OLD:NEW"),
