@@ -245,3 +245,38 @@ def check_instruments(page: Page) -> None:
     for selector in (".flight-display canvas", ".plot canvas >> nth=0"):
         assert page.locator(selector).evaluate(many)
     assert int(page.locator(".scene").get_attribute("data-frames") or 0) > 1
+
+
+NOTE_GAPS = """
+window.gaps = 0;
+for (const name of ['bufferData', 'bufferSubData']) {
+  const send = WebGL2RenderingContext.prototype[name];
+  WebGL2RenderingContext.prototype[name] = function (...given) {
+    const lines = given.filter((data) => data instanceof Float32Array);
+    if (lines.some((data) => data.includes(1e9))) window.gaps += 1;
+    return send.apply(this, given);
+  };
+}
+"""
+"""Counts the buffers of lines that are interrupted."""
+
+
+@pytest.mark.io
+@pytest.mark.slow
+@needs_chromium
+@pytest.mark.parametrize(("later_s", "is_interrupted"), [(0.0, False), (3600.0, True)])
+def test_path_in_3d_is_interrupted_where_the_recording_is(
+    browser: Browser, tmp_path: Path, later_s: float, is_interrupted: bool
+) -> None:
+    sent = [(k * 0.5, located(470_000_000 + 1000 * k)) for k in range(40)]
+    sent += [(20 + later_s + k * 0.5, located(470_040_000 + 1000 * k)) for k in range(40)]
+    page_of(tmp_path, sent)
+    file = tmp_path / "flight.html"
+    flight = read_flight([tmp_path / "day_01.tlog"], read_options(GatewaySettings()), "x")
+    file.write_text(render_page(flight))
+    page = browser.new_page()
+    page.add_init_script(FEW_FRAMES + NOTE_GAPS)
+    page.goto(file.as_uri())
+    page.wait_for_function("Number(document.querySelector('.scene')?.dataset.frames) > 1")
+    assert page.evaluate("window.gaps > 0") == is_interrupted
+    page.close()

@@ -8,6 +8,7 @@ import { THREE } from "nicegui-scene";
 const EARTH_M = 6378137;
 const TAIL = 6000; // points of a path
 const STEP_M = 1.5; // between them
+const GAP_M = 1e9; // farther than any point
 const AHEAD_S = 0.25; // poses are extrapolated no further
 const FRAME_MS = 30;
 const SLOWEST_MS = 400;
@@ -136,6 +137,7 @@ const LINE_SHADER = `
   varying float strength;
   void main() {
     side = position.y;
+    if (max(begin.x, end.x) >= GAP) { gl_Position = vec4(0.0, 0.0, 2.0, 1.0); return; }
     float number = float(gl_InstanceID);
     strength = number >= strong.x && number < strong.y ? 1.0 : FAINT;
     vec4 from = projectionMatrix * modelViewMatrix * vec4(begin, 1.0);
@@ -178,7 +180,7 @@ class WideLine {
     geometry.setAttribute("end", new THREE.InterleavedBufferAttribute(this.later, 3, 0));
     this.material = new THREE.ShaderMaterial({
       vertexShader: LINE_SHADER,
-      defines: { FAINT },
+      defines: { FAINT, GAP: GAP_M.toExponential() },
       fragmentShader: LINE_COLOUR,
       uniforms: { resolution: { value: new THREE.Vector2(1, 1) }, width: { value: width }, colour: { value: new THREE.Color(colour) }, opacity: { value: opacity }, strong: { value: new THREE.Vector2(0, TAIL) } },
       transparent: true, depthWrite: false, side: THREE.DoubleSide,
@@ -193,6 +195,9 @@ class WideLine {
     this.buffer.needsUpdate = this.later.needsUpdate = true;
   }
 }
+
+// Lines from and to this point are not drawn.
+const GAP = { x: GAP_M, y: GAP_M, z: GAP_M };
 
 class Path {
   constructor(scene, colour) {
@@ -235,7 +240,12 @@ class Path {
       this.read = Math.max(0, track.points.length - TAIL / 2);
     }
     if (this.read === track.points.length) return;
-    for (; this.read < track.points.length; this.read++) this.add(place(...track.points[this.read]), track.points[this.read][3]);
+    for (; this.read < track.points.length; this.read++) {
+      const point = track.points[this.read];
+      // A recorded path is interrupted where the recording is.
+      if (this.count && track.breaks?.has(this.read)) this.add(GAP, point[3]);
+      this.add(place(...point), point[3]);
+    }
     for (const line of [this.line, this.shadow]) line.show(this.count);
   }
   add(point, time_us) {
