@@ -94,8 +94,7 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
         for segment in vehicle.segments
         for _, points in groupby(segment, lambda point: point.attitude_deg is None)
     ]
-    has_heights = any(math.isfinite(point.alt_amsl_m) for point in vehicle.points)
-    mode = f"<altitudeMode>{'absolute' if has_heights else 'clampToGround'}</altitudeMode>"
+    mode = _kml_mode(vehicle.points)
     yield f"<Placemark><name>{_escaped(vehicle.name)}</name><styleUrl>{style}</styleUrl>\n"
     yield f"<gx:MultiTrack>{mode}<gx:interpolate>0</gx:interpolate>\n" if len(tracks) > 1 else ""
     for points in tracks:
@@ -110,11 +109,17 @@ def _kml_track(vehicle: VehicleTrack, style: str) -> Iterator[str]:
     yield "</Placemark>\n"
 
 
+def _kml_mode(points: Iterable[TrackPoint]) -> str:
+    """Return the mode of heights: on the ground where none is known, not at the sea's level."""
+    has_heights = any(math.isfinite(point.alt_amsl_m) for point in points)
+    return f"<altitudeMode>{'absolute' if has_heights else 'clampToGround'}</altitudeMode>"
+
+
 def _kml_marker(marker: MapMarker) -> str:
     return (
         f"<Placemark><name>{_escaped(marker.name)}</name><description>{marker.kind}</description>"
         f"<TimeStamp><when>{iso_time(marker.at.time_us)}</when></TimeStamp>"
-        "<Point><altitudeMode>absolute</altitudeMode>"
+        f"<Point>{_kml_mode([marker.at])}"
         f"<coordinates>{_kml_coordinates(marker.at, ',')}</coordinates></Point></Placemark>\n"
     )
 
@@ -164,7 +169,9 @@ def _escaped(text: str) -> str:
 
 def _gpx_position(point: TrackPoint) -> str:
     height = f"<ele>{point.alt_amsl_m:.2f}</ele>" if math.isfinite(point.alt_amsl_m) else ""
-    return f'lat="{point.lat_deg:.7f}" lon="{point.lon_deg:.7f}">{height}'
+    # Its schema ends below 180.
+    lon_deg = -180.0 if round(point.lon_deg, 7) >= 180.0 else point.lon_deg
+    return f'lat="{point.lat_deg:.7f}" lon="{lon_deg:.7f}">{height}'
 
 
 def _gpx_time(point: TrackPoint) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
@@ -98,6 +99,42 @@ def test_gpx_contains_tracks_and_waypoints() -> None:
     attitude = points[5].find("g:extensions/a:attitude", GPX)
     assert attitude is not None
     assert attitude.attrib == {"roll": "-10.0", "pitch": "5.0", "yaw": "270.0"}
+
+
+POINT_ORDER = "ele time magvar geoidheight name cmt desc src link sym type extensions"
+ORDERS = {
+    "gpx": "metadata wpt rte trk extensions", "metadata": "name desc", "wpt": POINT_ORDER,
+    "trk": "name cmt desc src link number type extensions trkseg", "trkseg": "trkpt extensions",
+    "trkpt": POINT_ORDER, "kml": "Document", "Document": "name Style Folder",
+    "Folder": "name Placemark", "TimeStamp": "when", "Point": "altitudeMode coordinates",
+    "Placemark": "name description TimeStamp styleUrl Point Track MultiTrack",
+    "MultiTrack": "altitudeMode interpolate Track", "Track": "altitudeMode when coord angles",
+}  # fmt: skip
+"""Children in the sequence of the schemas, of GPX 1.1, KML 2.2 and its extension `gx`."""
+
+
+@pytest.mark.parametrize("write", [to_kml, to_gpx])
+@pytest.mark.parametrize("alt_m", [430.25, math.nan])
+def test_elements_are_those_of_the_schema_in_its_sequence(
+    write: Callable[..., Iterator[str]], alt_m: float
+) -> None:
+    at = [replace(point, alt_amsl_m=alt_m) for point in [*POINTS, ATTITUDE]]
+    east = replace(at[-1], lon_deg=180.0, time_us=at[-1].time_us + 1)
+    markers = [MapMarker(kind, kind.name, at[0]) for kind in MarkerKind]
+    vehicles = [VehicleTrack("a", [at, [east]], markers), VehicleTrack("b", [at[:1]])]
+    root = ET.fromstring("".join(write("flight", vehicles)))
+    for element in root.iter():
+        name, text = element.tag.rpartition("}")[2], (element.text or "").strip()
+        order = ORDERS.get(name, "").split()
+        children = [child.tag.rpartition("}")[2] for child in element]
+        if name not in ("extensions", "Style", "LineStyle"):
+            assert children == sorted(children, key=order.index), name
+        assert len(element) or text or element.attrib, f"{name} is empty"
+        assert "nan" not in [*re.split("[ ,]", text), *element.attrib.values()]
+        assert -180.0 <= float(element.get("lon", 0.0)) < 180.0
+    modes = {mode.text for mode in root.iter(f"{{{KML['k']}}}altitudeMode")}
+    if write is to_kml:
+        assert modes == {"absolute" if math.isfinite(alt_m) else "clampToGround"}
 
 
 def test_map_without_points_is_valid_xml() -> None:
