@@ -13,12 +13,12 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.fleet.server import FleetServer
 from gateway.fleet.settings import FleetSettings, SiteSettings
 from gateway.hub.settings import HubSettings
-from tests.hub.conftest import LIMIT_S, Rig, Station, proven, rig
+from tests.hub.conftest import LIMIT_S, Rig, Station, rig
 from tests.kit.cli import invoke
 from tests.kit.mavlink import Sender
 from tests.ports import free_port
 
-__all__ = ["proven", "rig"]
+__all__ = ["rig"]
 
 
 class World:
