@@ -13,10 +13,11 @@ from gateway.hub.transports.base import Client, HubContext
 from gateway.hub.transports.registry import add_endpoint_kind
 
 KINDS: Final = {
-    "nmea": ("rate", "vehicle"),
+    "nmea": ("rate", "vehicle", "station"),
     "cot": ("rate", "vehicle", "callsign", "certificate", "key", "authority"),
     "gdl90": ("rate", "vehicle", "callsign"),
     "mqtt": ("rate", "vehicle", "topic", "login", "certificate", "key", "authority"),
+    "rotator": ("rate", "vehicle", "station", "protocol"),
 }
 """The options of each kind."""
 

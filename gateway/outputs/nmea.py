@@ -18,7 +18,8 @@ from typing import Final
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.hub.endpoint import EndpointKind
+from gateway.hub.endpoint import Endpoint, EndpointKind
+from gateway.outputs.antenna import Pointing, pointing_of, station_of
 from gateway.outputs.output import Output
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import FIX_2D, Position
@@ -56,6 +57,12 @@ class NmeaOutput(Output):
     )
     default_rate_hz = 1.0
 
+    @classmethod
+    def check(cls, endpoint: Endpoint) -> None:
+        """Raise ValueError if the endpoint is not understood."""
+        super().check(endpoint)
+        station_of(endpoint)
+
     def compose(self, now_us: int) -> Iterable[bytes]:
         """Return the sentences of the present moment as one datagram."""
         state = self.chosen(now_us)
@@ -63,7 +70,11 @@ class NmeaOutput(Output):
             return []
         position = state.valid_position(now_us)
         unix_us = self.unix_us() if position is None else self.position_unix_us(state, now_us)
-        sentences = map(sentence, bodies(state, position, unix_us, now_us))
+        sentences = [sentence(each) for each in bodies(state, position, unix_us, now_us)]
+        if "station" in self.endpoint.added:
+            station = station_of(self.endpoint)
+            if found := pointing_of(station, state, self.vehicles.states, now_us):
+                sentences.append(sentence(pointing_body(found)))
         return ["".join(sentences).encode("ascii")]
 
 
@@ -94,6 +105,14 @@ def bodies(
     heading = state.true_heading_deg(now_us)
     if math.isfinite(heading):
         yield f"GPHDT,{heading:.1f},T"
+
+
+def pointing_body(pointing: Pointing) -> str:
+    """Return the proprietary sentence of an antenna's direction, without checksum."""
+    return (
+        f"PMAVG,POINT,{pointing.azimuth_deg:.2f},T,{pointing.elevation_deg:.2f},"
+        f"{pointing.distance_m:.0f},M"
+    )
 
 
 def _quality(state: NewestState) -> tuple[int, str]:

@@ -1,0 +1,75 @@
+"""Antenna rotators: GS-232 and EasyComm II on a serial line, and hamlib's rotctld.
+
+    rotator:serial:DEVICE:BAUD?protocol=gs232  rotator:tcp:HOST:4533?protocol=rotctld
+
+Without a valid position the antenna stays where it is.
+
+References
+----------
+.. [1] Yaesu, "GS-232B Computer Control Interface", operating manual: the W command.
+.. [2] Hamlib, rotctld(1): the P command.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from gateway.hub.endpoint import Endpoint, EndpointKind
+from gateway.outputs.antenna import Pointing, pointing_of, station_of
+from gateway.outputs.output import Output
+from gateway.printable import unknown_choice
+
+MAX_ELEVATION_DEG: Final = 90.0
+
+
+def _gs232(azimuth_deg: float, elevation_deg: float) -> str:
+    return f"W{round(azimuth_deg) % 360:03d} {elevation_deg:03.0f}\r"
+
+
+def _easycomm(azimuth_deg: float, elevation_deg: float) -> str:
+    return f"AZ{round(azimuth_deg, 1) % 360.0:.1f} EL{elevation_deg:.1f}\n"
+
+
+def _rotctld(azimuth_deg: float, elevation_deg: float) -> str:
+    return f"P {round(azimuth_deg, 1) % 360.0:.1f} {elevation_deg:.1f}\n"
+
+
+PROTOCOLS: Final[dict[str, Callable[[float, float], str]]] = {
+    "gs232": _gs232,
+    "easycomm": _easycomm,
+    "rotctld": _rotctld,
+}
+
+
+class RotatorOutput(Output):
+    """Commands that point an antenna at one vehicle."""
+
+    carriers = (EndpointKind.SERIAL, EndpointKind.TCP, EndpointKind.UDP)
+    default_rate_hz = 1.0
+
+    @classmethod
+    def check(cls, endpoint: Endpoint) -> None:
+        """Raise ValueError if the endpoint is not understood."""
+        super().check(endpoint)
+        station_of(endpoint)
+        protocol = endpoint.added.get("protocol", "gs232")
+        if protocol not in PROTOCOLS:
+            raise ValueError(unknown_choice("protocol", protocol, sorted(PROTOCOLS)))
+
+    def compose(self, now_us: int) -> Iterable[bytes]:
+        """Return the command for the present direction, if it is known."""
+        state = self.chosen(now_us)
+        if state is None:
+            return []
+        station = station_of(self.endpoint)
+        pointing = pointing_of(station, state, self.vehicles.states, now_us)
+        protocol = self.endpoint.added.get("protocol", "gs232")
+        return [] if pointing is None else [command(protocol, pointing)]
+
+
+def command(protocol: str, pointing: Pointing) -> bytes:
+    """Return the command of a protocol; an antenna does not point below the horizon."""
+    elevation_deg = min(max(pointing.elevation_deg, 0.0), MAX_ELEVATION_DEG)
+    return PROTOCOLS[protocol](pointing.azimuth_deg, elevation_deg).encode("ascii")
+
+
+OUTPUT: Final = RotatorOutput
