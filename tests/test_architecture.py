@@ -80,7 +80,17 @@ PURE_FOLDERS = {"panel/state"}
 PURE_FILES = {"batch/facts.py"} | {
     f"recordings/{name}.py"
     for name in (
-        *("newest", "columns", "table", "tlog", "tlog_scan", "answers", "moment", "play"),
+        *(
+            "antenna",
+            "newest",
+            "columns",
+            "table",
+            "tlog",
+            "tlog_scan",
+            "answers",
+            "moment",
+            "play",
+        ),
         *("formats/csv", "formats/maps", "formats/mavlink"),
     )
 }

@@ -19,8 +19,8 @@ from typing import Final
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.hub.endpoint import Endpoint, EndpointKind
-from gateway.outputs.antenna import Pointing, pointing_of, station_of
-from gateway.outputs.output import Output
+from gateway.outputs.output import Output, station_of
+from gateway.recordings.antenna import Pointing, pointing_of
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import FIX_2D, Position
 from gateway.units import US_PER_S

@@ -14,6 +14,7 @@ from gateway.clock import unix_time_us
 from gateway.hub.endpoint import NO_MESSAGES, Endpoint, number_from
 from gateway.hub.transports.base import Client
 from gateway.outputs.carrier import Carrier, client_context, target_of
+from gateway.recordings.antenna import HOME, AntennaStation, station_from
 from gateway.recordings.newest import STATE_IDS, NewestState, NewestVehicles
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_splitter import MavFrame
@@ -144,6 +145,11 @@ def _rate_hz(endpoint: Endpoint, default_hz: float) -> float:
     if not MIN_RATE_HZ <= rate_hz <= MAX_RATE_HZ:
         raise ValueError(f"rate {text!r} is not {MIN_RATE_HZ} to {MAX_RATE_HZ} Hz")
     return rate_hz
+
+
+def station_of(endpoint: Endpoint) -> AntennaStation:
+    """Return the station of an antenna, by the option `station`; raises ValueError."""
+    return station_from(endpoint.added.get("station", HOME))
 
 
 def _vehicle_id(endpoint: Endpoint) -> int:

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from gateway.hub.endpoint import Endpoint, EndpointKind
-from gateway.outputs.antenna import Pointing, pointing_of, station_of
-from gateway.outputs.output import Output
+from gateway.outputs.output import Output, station_of
 from gateway.printable import unknown_choice
+from gateway.recordings.antenna import Pointing, pointing_of
 
 MAX_ELEVATION_DEG: Final = 90.0
 

@@ -31,6 +31,7 @@ from gateway.panel.map_tiles import MapTiles
 from gateway.panel.open_pages import OpenPages
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
+from gateway.panel.pointing_api import pointing_router
 from gateway.panel.recording_files import RecordingJobs, add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
@@ -165,6 +166,7 @@ def make_app(parts: PanelParts) -> FastAPI:
     app = FastAPI(title="mavgate", docs_url=None, redoc_url=None, openapi_url="/docs.json")
     for router in RestApi(parts.uplink).routers():
         app.include_router(router)
+    app.include_router(pointing_router(parts.fleet, parts.clock))
     telemetry = TelemetryFeed(parts.fleet, parts.clock)
 
     @app.websocket(PATH)

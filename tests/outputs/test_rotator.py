@@ -15,8 +15,8 @@ from pynmeagps import calc_checksum
 
 from gateway.hub.endpoint import parse_endpoint
 from gateway.outputs import extend
-from gateway.outputs.antenna import AntennaStation, Pointing, pointing_of
 from gateway.outputs.rotator import command
+from gateway.recordings.antenna import AntennaStation, Pointing, pointing_of
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import Position
 from tests.hub.conftest import LIMIT_S

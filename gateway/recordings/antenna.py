@@ -13,7 +13,6 @@ from typing import Final
 
 from pymap3d import geodetic2aer
 
-from gateway.hub.endpoint import Endpoint
 from gateway.recordings.newest import NewestState
 from gateway.recordings.positions import Position, named_position
 
@@ -56,12 +55,11 @@ class AntennaStation:
         return None if home is None else named_position(home)
 
 
-def station_of(endpoint: Endpoint) -> AntennaStation:
-    """Read `station=`: `home`, `system:ID`, or `LATITUDE,LONGITUDE,HEIGHT` above mean sea level.
+def station_from(text: str) -> AntennaStation:
+    """Read a station: `home`, `system:ID`, or `LATITUDE,LONGITUDE,HEIGHT` above mean sea level.
 
     Raises ValueError if it is none of them.
     """
-    text = endpoint.added.get("station", HOME)
     if text == HOME:
         return AntennaStation()
     number = text.removeprefix(SYSTEM)
