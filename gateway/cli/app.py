@@ -39,6 +39,7 @@ MODULES: Final = {
     "live.record": ("record",),
     "recorded.play": ("play", "seek", "player"),
     "recorded.convert": ("convert", "fuse"),
+    "recorded.extract": ("extract",),
     "recorded.info": ("info", "recover"),
     "recorded.batch": ("batch",),
     "recorded.catalogue": ("catalogue",),
@@ -65,7 +66,8 @@ GROUPS: Final = {
         "player": "Control the running player.",
         "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
         "page": "Make one HTML file of a flight, which opens offline in any browser.",
-        "convert": "Convert, trim and join recordings.",
+        "convert": "Convert, trim, join, merge and edit recordings.",
+        "extract": "Extract parameters, missions, texts, subtitles and geotags from a recording.",
         "recover": "Write the intact part of a damaged recording to a new file, and list what was "
         "left out.",
     },

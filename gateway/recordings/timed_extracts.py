@@ -1,0 +1,232 @@
+"""Texts, events, subtitles and geotags of a recorded vehicle, each with its time."""
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.positions import GroundDistance
+from gateway.recordings.tlog import HEARTBEAT_ID
+from gateway.recordings.vehicle_reader import VehicleMessage
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+
+SYS_STATUS_ID: Final = MESSAGE_IDS["SYS_STATUS"]
+REACHED_ID: Final = MESSAGE_IDS["MISSION_ITEM_REACHED"]
+LANDED_ID: Final = MESSAGE_IDS["EXTENDED_SYS_STATE"]
+CAMERA_FEEDBACK_ID: Final = MESSAGE_IDS["CAMERA_FEEDBACK"]
+CAPTURED_ID: Final = MESSAGE_IDS["CAMERA_IMAGE_CAPTURED"]
+WANTED: Final = (
+    HEARTBEAT_ID,
+    SYS_STATUS_ID,
+    REACHED_ID,
+    LANDED_ID,
+    CAMERA_FEEDBACK_ID,
+    CAPTURED_ID,
+)
+
+SUBTITLE_FIELDS: Final = ("mode", "height", "speed", "distance", "battery", "coordinates")
+MAX_RATE_HZ: Final = 60.0
+MAX_GAP_US: Final = 5 * US_PER_S
+"""A state that is older is not shown."""
+_MODES: Final = {
+    **dict.fromkeys((1, 19, 20, 21, 22, 23, 24, 25), "PLANE_MODE"),
+    **dict.fromkeys((2, 3, 4, 13, 14, 15, 29, 35), "COPTER_MODE"),
+    **dict.fromkeys((10, 11), "ROVER_MODE"), 12: "SUB_MODE", 5: "TRACKER_MODE",
+}  # fmt: skip
+"""Enumeration of ArduPilot's modes, by MAV_TYPE."""
+_PX4_MODES: Final = ("", "MANUAL", "ALTCTL", "POSCTL", "AUTO", "ACRO", "OFFBOARD", "STABILIZED")
+"""PX4's main modes, the third byte of the mode."""
+_PX4_AUTO: Final = ("AUTO", "READY", "TAKEOFF", "LOITER", "MISSION", "RTL", "LAND")
+"""Kinds of AUTO, the fourth byte."""
+_LANDED: Final = {1: "on the ground", 2: "in flight", 3: "taking off", 4: "landing"}
+"""MAV_LANDED_STATE."""
+
+
+def mode_name(fields: Any) -> str:
+    """Return the mode in a heartbeat, by the autopilot's names or as a number."""
+    number = int(fields["custom_mode"])
+    if fields["autopilot"] == mavlink.MAV_AUTOPILOT_PX4:
+        main, sub = number >> 16 & 0xFF, number >> 24
+        if main == 4 and sub < len(_PX4_AUTO):
+            return _PX4_AUTO[sub]
+        return _PX4_MODES[main] if 0 < main < len(_PX4_MODES) else str(number)
+    enum = _MODES.get(fields["type"])
+    if fields["autopilot"] == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA and enum is not None:
+        entry = mavlink.enums[enum].get(number)
+        return entry.name.removeprefix(f"{enum}_") if entry is not None else str(number)
+    return str(number)
+
+
+def moment_text(time_us: int) -> str:
+    """Return a time as ISO 8601 in UTC with milliseconds."""
+    moment = datetime.fromtimestamp(time_us / US_PER_S, UTC)
+    return moment.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def rows_of(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """Write rows as CSV below the names of their columns."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    for row in (columns, *rows):
+        writer.writerow(row)
+    yield text.getvalue()
+
+
+def texts(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+    """Write the texts as CSV, with their time, sender and severity."""
+    found = [
+        (moment_text(m.time_us), m.text.origin >> 8, m.text.origin & 0xFF, m.text.severity,
+         m.text.text)
+        for m in messages
+        if m.text is not None
+    ]  # fmt: skip
+    return rows_of(("time", "system", "component", "severity", "text"), found)
+
+
+def events(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+    """Write changes of mode, arming and landing, and reached items of the mission, as CSV."""
+    state: dict[tuple[int, str], object] = {}
+    found = []
+    for message in messages:
+        for kind, value in _event_values(message):
+            if kind == "reached" or state.get((message.system_id, kind)) != value:
+                state[message.system_id, kind] = value
+                found.append((moment_text(message.time_us), message.system_id, kind, value))
+    return rows_of(("time", "system", "event", "value"), found)
+
+
+def _event_values(message: VehicleMessage) -> list[tuple[str, str]]:
+    fields = message.fields
+    if message.message_id == HEARTBEAT_ID:
+        is_armed = fields["base_mode"] & mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        return [("armed", "yes" if is_armed else "no"), ("mode", mode_name(fields))]
+    if message.message_id == LANDED_ID:
+        return [("landed", _LANDED.get(fields["landed_state"], "unknown"))]
+    if message.message_id == REACHED_ID:
+        return [("reached", str(fields["seq"]))]
+    return []
+
+
+def images(messages: Iterable[VehicleMessage]) -> Iterator[str]:
+    """Write the location of each image as CSV: angles of CAMERA_FEEDBACK, names of the other."""
+    found: list[tuple[object, ...]] = []
+    for message in messages:
+        fields, at = message.fields, moment_text(message.time_us)
+        if message.message_id == CAMERA_FEEDBACK_ID:
+            found.append((
+                at, message.system_id, fields["img_idx"], "", fields["lat"] / 1e7,
+                fields["lng"] / 1e7, fields["alt_msl"], fields["alt_rel"], fields["roll"],
+                fields["pitch"], fields["yaw"],
+            ))  # fmt: skip
+        elif message.message_id == CAPTURED_ID and fields["capture_result"] == 1:
+            name = fields["file_url"].decode("utf-8", "replace")
+            found.append((
+                at, message.system_id, fields["image_index"], name, fields["lat"] / 1e7,
+                fields["lon"] / 1e7, fields["alt"] / 1e3, fields["relative_alt"] / 1e3, "", "", "",
+            ))  # fmt: skip
+    columns = ("time", "system", "image", "file", "lat_deg", "lon_deg", "alt_amsl_m",
+               "alt_home_m", "roll_deg", "pitch_deg", "yaw_deg")  # fmt: skip
+    return rows_of(columns, found)
+
+
+@dataclass(slots=True)
+class _Shown:
+    """The newest state of the vehicle for subtitles."""
+
+    mode: str = ""
+    height: str = ""
+    speed: str = ""
+    battery: str = ""
+    coordinates: str = ""
+    newest_us: int = 0
+    ground: GroundDistance = field(default_factory=GroundDistance)
+
+    @property
+    def distance(self) -> str:
+        """The distance flown."""
+        distance_m = self.ground.distance_m
+        return "" if distance_m is None else f"{distance_m:.0f} m flown"
+
+    def update(self, message: VehicleMessage) -> None:
+        """Take the next message of the vehicle."""
+        self.newest_us = message.time_us
+        fields, at = message.fields, message.position
+        if message.message_id == HEARTBEAT_ID:
+            self.mode = mode_name(fields)
+        elif message.message_id == SYS_STATUS_ID:
+            volts, percent = fields["voltage_battery"], fields["battery_remaining"]
+            self.battery = f"{volts / 1e3:.1f} V" if volts not in (0, 0xFFFF) else ""
+            self.battery += f" {percent} %" if percent >= 0 else ""
+        if at is not None:
+            self.ground.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
+            self.coordinates = f"{at.lat_deg:.6f}, {at.lon_deg:.6f}"
+            height_m = at.alt_home_m if math.isfinite(at.alt_home_m) else at.alt_amsl_m
+            self.height = f"{height_m:.1f} m" if math.isfinite(height_m) else ""
+            speed_mps = at.groundspeed_mps
+            self.speed = f"{speed_mps:.1f} m/s" if math.isfinite(speed_mps) else ""
+
+    def text(self, names: Sequence[str]) -> str:
+        """Return one line of the chosen fields that are known."""
+        return "  ".join(shown for name in names if (shown := getattr(self, name)))
+
+
+@dataclass(frozen=True, slots=True)
+class Subtitle:
+    """A text and when it is shown, in s of the video."""
+
+    begin_s: float
+    end_s: float
+    text: str
+
+
+def subtitles(
+    messages: Iterable[VehicleMessage],
+    begin_us: int,
+    names: Sequence[str] = SUBTITLE_FIELDS,
+    rate_hz: float = 5.0,
+) -> Iterator[Subtitle]:
+    """Yield the state of a vehicle at a rate; the video begins at `begin_us` of the recording."""
+    shown, step, number = _Shown(), US_PER_S / rate_hz, 0
+    for message in messages:
+        if message.text is not None:
+            continue
+        while begin_us + number * step <= message.time_us:
+            now_us = begin_us + number * step
+            if shown.newest_us and now_us - shown.newest_us > MAX_GAP_US:
+                # Nothing is known until the next message.
+                number = max(number + 1, math.ceil((message.time_us - begin_us) / step))
+                break
+            if (text := shown.text(names)) and now_us >= shown.newest_us:
+                yield Subtitle(number / rate_hz, (number + 1) / rate_hz, text)
+            number += 1
+        shown.update(message)
+
+
+def srt(found: Iterable[Subtitle]) -> Iterator[str]:
+    """Write subtitles as SubRip."""
+    for number, one in enumerate(found, 1):
+        yield f"{number}\n{_clock(one.begin_s, ',')} --> {_clock(one.end_s, ',')}\n{one.text}\n\n"
+
+
+def ass(found: Iterable[Subtitle]) -> Iterator[str]:
+    """Write subtitles as Advanced SubStation Alpha."""
+    yield "[Script Info]\nScriptType: v4.00+\n\n[V4+ Styles]\n"
+    yield "Format: Name, Fontname, Fontsize, PrimaryColour, Alignment, MarginL, MarginR, MarginV\n"
+    yield "Style: Default,Arial,16,&H00FFFFFF,2,10,10,10\n\n[Events]\n"
+    yield "Format: Layer, Start, End, Style, Text\n"
+    for one in found:
+        begin, end = (_clock(at_s, ".")[1:-1] for at_s in (one.begin_s, one.end_s))
+        yield f"Dialogue: 0,{begin},{end},Default,{one.text}\n"
+
+
+def _clock(seconds: float, point: str) -> str:
+    ms = round(seconds * 1000)
+    return (
+        f"{ms // 3_600_000:02d}:{ms // 60_000 % 60:02d}:{ms // 1000 % 60:02d}{point}{ms % 1000:03d}"
+    )

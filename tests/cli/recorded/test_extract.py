@@ -1,0 +1,249 @@
+"""`mavgate extract`: each file is read back by the program it is for, or by its rules."""
+
+import csv
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink import mavparm, mavwp
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.extracts import RecordedParameter
+from gateway.recordings.tlog import TlogRecord
+from tests.kit.cli import run
+from tests.kit.mavlink import Sender
+from tests.recordings.frames import START_US, make_tlog
+
+pytestmark = pytest.mark.io
+
+LAT, LON = 47.1234567, 8.7654321
+E7 = (round(LAT * 1e7), round(LON * 1e7))
+HOME = (471_000_000, 87_000_000)
+
+
+def item(
+    seq: int, kind: int, command: int, at: tuple[int, int], z: float, param1: float = 0
+) -> Any:
+    return mavlink.MAVLink_mission_item_int_message(
+        255, 190, seq, 3, command, 0, 1, param1, 0, 0, float("nan"), *at, z, kind
+    )
+
+
+def flight(autopilot: int = 3) -> list[Any]:
+    """Return the messages of a flight, one every 100 ms."""
+    beat = mavlink.MAVLink_heartbeat_message(2, autopilot, 128, 5, 4, 3)
+    disarmed = mavlink.MAVLink_heartbeat_message(2, autopilot, 0, 6, 4, 3)
+    found = [
+        beat,
+        mavlink.MAVLink_param_value_message(b"WPNAV_SPEED", 512.5, 9, 3, 0),
+        mavlink.MAVLink_param_value_message(b"ARMING_CHECK", 1.0, 6, 3, 1),
+        mavlink.MAVLink_param_value_message(b"ATC_RAT_RLL_P", 0.135, 9, 3, 2),
+        mavlink.MAVLink_param_value_message(b"WPNAV_SPEED", 600.0, 9, 3, 0),
+        mavlink.MAVLink_home_position_message(*HOME, 500_000, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0),
+        mavlink.MAVLink_mission_count_message(255, 190, 3, 0),
+        item(0, 0, 16, HOME, 500.0),
+        item(1, 0, 22, E7, 20.0),
+        item(2, 0, 16, (E7[0] + 1000, E7[1]), 50.0),
+        mavlink.MAVLink_mission_count_message(255, 190, 4, 1),
+        *(item(k, 1, 5001, (E7[0] + k, E7[1]), 0.0, 3.0) for k in range(3)),
+        item(3, 1, 5003, E7, 0.0, 120.0),
+        mavlink.MAVLink_mission_count_message(255, 190, 1, 2),
+        item(0, 2, 5100, E7, 30.0),
+        mavlink.MAVLink_statustext_message(6, "Höhe, 5 \"m\"".encode()),
+        mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 12_600, 0, 87, 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_camera_feedback_message(
+            START_US, 1, 0, 7, *E7, 550.0, 50.0, 1.0, 2.0, 3.0, 0.0, 0),
+        mavlink.MAVLink_camera_image_captured_message(
+            1, START_US, 1, *E7, 550_000, 50_000, [1, 0, 0, 0], 8, 1, b"DCIM/8.jpg"),
+        mavlink.MAVLink_mission_item_reached_message(2),
+    ]  # fmt: skip
+    for k in range(40):
+        at = (E7[0] + 1000 * k, E7[1])
+        found.append(
+            mavlink.MAVLink_global_position_int_message(k, *at, 550_000, 50_000, 300, 400, 0, 0)
+        )
+    return [*found, disarmed]
+
+
+@pytest.fixture
+def tlog(tmp_path: Path) -> Path:
+    return written(tmp_path, flight())
+
+
+def written(folder: Path, messages: list[Any]) -> Path:
+    sender, path = Sender(), folder / "flight.tlog"
+    frames = [sender.pack(message) for message in messages]
+    path.write_bytes(
+        make_tlog([TlogRecord(START_US + k * 100_000, frame) for k, frame in enumerate(frames)])
+    )
+    return path
+
+
+def test_parameters_are_read_by_pymavlink(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.param"
+    run("extract", tlog, "--params", out)
+    read = mavparm.MAVParmDict()
+    assert read.load(str(out))
+    assert dict(read) == pytest.approx(
+        {"WPNAV_SPEED": 600.0, "ARMING_CHECK": 1, "ATC_RAT_RLL_P": 0.135}
+    )
+    assert "ATC_RAT_RLL_P,0.135\n" in out.read_text()
+
+
+def test_parameters_of_qgroundcontrol_have_five_columns(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.params"
+    run("extract", tlog, "--params", out)
+    rows = [line.split("\t") for line in out.read_text().splitlines() if line[0] != "#"]
+    assert ["1", "1", "ARMING_CHECK", "1", "6"] in rows
+    assert all(len(row) == 5 for row in rows)
+
+
+def test_integers_that_px4_sends_bytewise_are_read_as_integers(tmp_path: Path) -> None:
+    import struct
+
+    value = struct.unpack("<f", struct.pack("<i", 123_456))[0]
+    messages = [
+        mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3),
+        mavlink.MAVLink_param_value_message(b"COM_X", value, 6, 1, 0),
+    ]
+    run("extract", written(tmp_path, messages), "--params", tmp_path / "a.param")
+    assert (tmp_path / "a.param").read_text() == "COM_X,123456\n"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(0.1, "0.1"), (1e-7, "1e-07"), (3.0, "3"), (16777217.5, "16777218")]
+)
+def test_parameter_is_written_with_the_digits_of_a_float(value: float, text: str) -> None:
+    import struct
+
+    single = struct.unpack("<f", struct.pack("<f", value))[0]
+    assert RecordedParameter("X", single, 9).text == text
+
+
+@pytest.mark.parametrize(("option", "count"), [("--mission", 3), ("--fence", 4), ("--rally", 1)])
+def test_waypoints_are_read_by_pymavlink(
+    tlog: Path, tmp_path: Path, option: str, count: int
+) -> None:
+    out = tmp_path / "flight.waypoints"
+    run("extract", tlog, option, out)
+    loader = mavwp.MAVWPLoader()
+    assert loader.load(str(out)) == count
+    last = loader.wp(count - 1)
+    assert last.x == pytest.approx(LAT, abs=2e-4)
+    assert last.y == pytest.approx(LON, abs=1e-7)
+
+
+def test_plan_follows_the_rules_of_qgroundcontrol(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.plan"
+    run("extract", tlog, "--mission", out)
+    plan = json.loads(out.read_text(), parse_constant=lambda name: pytest.fail(name))
+    assert (plan["fileType"], plan["version"]) == ("Plan", 1)
+    assert {"mission", "geoFence", "rallyPoints"} <= set(plan)
+    mission = plan["mission"]
+    assert mission["version"] == 2
+    assert mission["plannedHomePosition"] == pytest.approx([47.1, 8.7, 500.0])
+    assert [each["command"] for each in mission["items"]] == [22, 16]
+    for each in mission["items"]:
+        assert each["type"] == "SimpleItem"
+        assert len(each["params"]) == 7
+        assert each["params"][3] is None
+    (polygon,) = plan["geoFence"]["polygons"]
+    assert (len(polygon["polygon"]), polygon["inclusion"], polygon["version"]) == (3, True, 1)
+    (circle,) = plan["geoFence"]["circles"]
+    assert circle["circle"]["radius"] == 120.0
+    assert plan["rallyPoints"]["points"] == [[pytest.approx(LAT), pytest.approx(LON), 30.0]]
+
+
+def test_texts_events_and_images_are_rows_of_csv(tlog: Path, tmp_path: Path) -> None:
+    outs = [tmp_path / f"{name}.csv" for name in ("texts", "events", "images")]
+    run("extract", tlog, "--texts", outs[0], "--events", outs[1], "--images", outs[2])
+    texts, events, images = (list(csv.DictReader(out.read_text().splitlines())) for out in outs)
+    assert [row["text"] for row in texts] == ['Höhe, 5 "m"']
+    assert texts[0]["time"].endswith("Z")
+    assert [(row["event"], row["value"]) for row in events] == [
+        ("armed", "yes"), ("mode", "LOITER"), ("reached", "2"), ("armed", "no"), ("mode", "RTL"),
+    ]  # fmt: skip
+    assert [(row["image"], row["file"]) for row in images] == [("7", ""), ("8", "DCIM/8.jpg")]
+    assert float(images[1]["lat_deg"]) == pytest.approx(LAT)
+    assert float(images[1]["alt_home_m"]) == 50.0
+
+
+def parsed_srt(text: str) -> list[tuple[float, float, str]]:
+    """Read SubRip by its rules: a number, a line with two times, text, and an empty line."""
+    found = []
+    for number, block in enumerate(text.strip().split("\n\n"), 1):
+        head, times, *lines = block.split("\n")
+        assert int(head) == number
+        match = re.fullmatch(
+            r"(\d\d):(\d\d):(\d\d),(\d{3}) --> (\d\d):(\d\d):(\d\d),(\d{3})", times
+        )
+        assert match is not None
+        values = [int(one) for one in match.groups()]
+        begin, end = (h * 3600 + m * 60 + s + ms / 1000 for h, m, s, ms in (values[:4], values[4:]))
+        found.append((begin, end, "\n".join(lines)))
+    return found
+
+
+def test_subtitles_are_shown_at_their_rate_from_the_begin_of_the_video(
+    tlog: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "flight.srt"
+    run("extract", tlog, "--subtitles", out, "--offset", "2.5")
+    shown = parsed_srt(out.read_text())
+    assert [end - begin for begin, end, _ in shown] == pytest.approx([0.2] * len(shown))
+    assert shown[0][0] == 0.0
+    assert shown[-1][0] == pytest.approx(3.6, abs=0.25)
+    for word in ("LOITER", "50.0 m", "5.0 m/s", "12.6 V 87 %", "m flown", "8.765432"):
+        assert word in shown[-1][2]
+    # 1000e-7 deg in 100 ms: the field at the begin of the video is that of the recording then.
+    lat = float(shown[5][2].split("  ")[-1].split(",")[0])
+    assert lat == pytest.approx(LAT + 1e-4 * (25 + 10 - 23), abs=2.1e-4)
+
+
+def test_subtitles_of_chosen_fields_as_ass(tlog: Path, tmp_path: Path) -> None:
+    out = tmp_path / "flight.ass"
+    video = tmp_path / "DJI_20251009-085321.mp4"
+    video.touch()
+    text = run(
+        "extract",
+        tlog,
+        "--subtitles",
+        out,
+        "--fields",
+        "height,mode",
+        "--rate",
+        30,
+        "--video",
+        video,
+    )
+    assert "begins at 2025-10-09T08:53:21.000Z" in text
+    lines = [line for line in out.read_text().splitlines() if line.startswith("Dialogue")]
+    assert lines[-1].endswith("Default,50.0 m  LOITER")
+    assert re.match(r"Dialogue: 0,\d:\d\d:\d\d\.\d\d,\d:\d\d:\d\d\.\d\d,", lines[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ((), "at least one file"),
+        (("--params", "a.txt"), "must end in"),
+        (("--params", "a.param", "--system", "9"), "no vehicle 9"),
+        (("--subtitles", "a.srt", "--fields", "x"), "choose mode"),
+        (("--subtitles", "a.srt", "--offset", "x"), "--offset"),
+    ],
+)
+def test_invalid_options_are_refused(
+    tlog: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], text: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert text in run("extract", tlog, *options, code=2)
+    assert [path.name for path in tmp_path.iterdir()] == ["flight.tlog"]
+
+
+def test_recording_without_the_wanted_content_is_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, [mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)])
+    assert "no parameters" in run("extract", path, "--params", tmp_path / "a.param", code=2)
+    assert "no mission" in run("extract", path, "--mission", tmp_path / "a.plan", code=2)
+    assert not (tmp_path / "a.plan").exists()
