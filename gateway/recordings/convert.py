@@ -18,6 +18,7 @@ from gateway.recordings.files import (
     format_of,
     open_tlog,
 )
+from gateway.recordings.formats import message_csv
 from gateway.recordings.formats.maps import (
     DRAWN_IDS,
     VehicleTrack,
@@ -44,9 +45,10 @@ from gateway.recordings.reading import (
     trimmed,
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.selection import message_ids_of
 from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
-from gateway.recordings.tlog import Stamper, TlogRecord
+from gateway.recordings.tlog import Batch, Stamper, TlogRecord
 from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_position
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
@@ -105,10 +107,19 @@ class FlightToWrite:
             self.anonymiser = Anonymiser(edits.anonymity, first_position(sources))
             edits = replace(edits, frames=(self.anonymiser, *edits.frames))
         editor = TlogEditor(edits, self._limits, self.remark)
-        if not self.is_mavlink:
-            yield from editor.apply(batched(self._sent()), self.senders)
-            return
-        yield from editor.apply(editor.joined(sources, self.options.progress), self.senders)
+        yield from editor.apply(self._batches(editor, sources), self.senders)
+
+    def chosen(self) -> Iterator[Batch]:
+        """Yield the MAVLink that is kept, of all messages, not edited."""
+        choice = replace(self._edits.choice, messages=frozenset())
+        editor = TlogEditor(replace(self._edits, choice=choice), self._limits, self.remark)
+        sources = self._open() if self.is_mavlink else []
+        return editor.chosen(self._batches(editor, sources), self.senders)
+
+    def _batches(self, editor: TlogEditor, sources: list[TlogSource]) -> Iterator[Batch]:
+        if self.is_mavlink:
+            return editor.joined(sources, self.options.progress)
+        return batched(self._sent())
 
     def _open(self) -> list[TlogSource]:
         """Open the files as MAVLink; their senders are known then."""
@@ -211,6 +222,13 @@ def add_writer(ending: str, write: Write, lacks: Lacks = Lacks()) -> None:
     WRITERS[ending], LACKS[ending] = write, lacks
 
 
+def _write_csv(flight: FlightToWrite) -> Iterator[bytes]:
+    if flight.message is None:
+        return _write_table(flight)
+    (message_id,) = message_ids_of([flight.message])
+    return message_csv.write(flight.chosen(), message_id)
+
+
 def _write_table(flight: FlightToWrite) -> Iterator[bytes]:
     table = flight.table()
     yield encode_head(table.header).encode()
@@ -256,7 +274,7 @@ NOT_DRAWN: Final = (
 )
 
 add_writer(".tlog", FlightToWrite.tlog, Lacks(of_tables=NOT_FUSED))
-add_writer(".csv", _write_table, Lacks(of_tlogs=NOT_IN_TABLE))
+add_writer(".csv", _write_csv, Lacks(of_tlogs=NOT_IN_TABLE))
 add_writer(".kml", _drawn(to_kml), Lacks(*NOT_DRAWN))
 add_writer(".gpx", _drawn(to_gpx), Lacks(*NOT_DRAWN))
 add_writer(".geojson", _drawn(to_geojson), Lacks(*NOT_DRAWN))

@@ -151,13 +151,9 @@ class TlogEditor:
                 total += len(batch)
                 yield batch
 
-        chosen: Iterable[Batch] = within(all_records(), self._limits)
-        if edits.armed_margin_s is not None:
-            chosen = while_armed(chosen, senders, edits.armed_margin_s)
-        for batch in chosen:
-            wanted = edits.choice.apply(batch)
-            kept += len(wanted)
-            yield self._edited(wanted)
+        for batch in self.chosen(all_records(), senders):
+            kept += len(batch)
+            yield self._edited(batch)
         kept -= self._left_out.total()
         if not kept:
             is_cut = self._limits != (None, None) and edits.are_none
@@ -169,6 +165,13 @@ class TlogEditor:
         for message_id, count in sorted(self._left_out.items()):
             name = MESSAGE_NAMES.get(message_id, f"unknown message {message_id}")
             self._remark(f"left out {counted(count, 'frame')} of {name}")
+
+    def chosen(self, batches: Iterable[Batch], senders: Senders) -> Iterator[Batch]:
+        """Yield the records that are kept, before they are edited."""
+        cut: Iterable[Batch] = within(batches, self._limits)
+        if self._edits.armed_margin_s is not None:
+            cut = while_armed(cut, senders, self._edits.armed_margin_s)
+        return map(self._edits.choice.apply, cut)
 
     def _edited(self, batch: Batch) -> bytes:
         shift_us = sum(edit.shift_us(batch) for edit in self._edits.frames)

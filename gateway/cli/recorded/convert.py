@@ -42,7 +42,8 @@ from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()
 
-ONE_KIND: Final = ".parquet"
+OF_ONE_MESSAGE: Final = (".parquet", ".csv")
+"""Formats that can hold all messages of one type in place of the table."""
 FROM_TLOGS: Final = (".tlog", ".kml", ".gpx", ".geojson", ".mcap")
 """Formats made from a recording's tlogs, which hold all its vehicles and messages."""
 
@@ -86,8 +87,8 @@ def convert(
         list[str] | None,
         _option(
             "--message",
-            "Keep messages of this name, id or pattern (CAMERA_*); may be repeated. For Parquet: "
-            "this message instead of the table.",
+            "Keep messages of this name, id or pattern (CAMERA_*); may be repeated. For Parquet "
+            "and CSV: this message instead of the table.",
         ),
     ] = None,
     without: Annotated[
@@ -162,7 +163,7 @@ def convert(
             fuse=fuse,
             smooth=smooth,
             message=message[0] if message else None,
-            edits=edits if output.suffix == ".tlog" else None,
+            edits=edits if output.suffix in (".tlog", ".csv") else None,
         )
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
@@ -244,13 +245,17 @@ def _read_renames(texts: Sequence[str]) -> dict[int, int]:
 
 
 def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: list[int]) -> None:
-    """Refuse edits for formats other than tlogs."""
+    """Refuse edits for formats that hold no frames."""
     if output.suffix == ".tlog":
         return
-    choice = edits.choice
-    if message and (output.suffix != ONE_KIND or len(message) > 1):
-        refuse(f"--message is for .tlog, and one message for {ONE_KIND}")
-    other = replace(edits, choice=replace(choice, systems=frozenset(), messages=frozenset()))
+    if message and (
+        output.suffix not in OF_ONE_MESSAGE or len(message) > 1 or len(edits.choice.messages) > 1
+    ):
+        refuse(f"--message is for .tlog, and one message for {', '.join(OF_ONE_MESSAGE)}")
+    is_of_message = bool(message) and output.suffix == ".csv"
+    if is_of_message and not (edits.frames or edits.anonymity):
+        return
+    other = replace(edits, choice=replace(edits.choice, systems=frozenset(), messages=frozenset()))
     if other != TlogEdits() or len(system) > 1:
         refuse(f"the options under {PANEL!r} in the help are for an output that ends in .tlog")
 

@@ -1,0 +1,69 @@
+"""One MAVLink message as CSV: a row for each, with all its fields.
+
+Every message is a row of its own, also those of equal times, of other instances and of other
+senders. An array has a column for each of its elements; a text is whole.
+"""
+
+import csv
+import io
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import numpy as np
+
+from gateway.recordings.files import FlightError
+from gateway.recordings.status_texts import text_of
+from gateway.recordings.tlog import Batch, columns_of
+from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_NAMES, layout_of
+
+HEAD: Final = ("time", "system_id", "component_id")
+"""Columns before the fields; the time is civil, in UTC, with microseconds."""
+
+
+def write(batches: Iterable[Batch], message_id: int) -> Iterator[bytes]:
+    """Write all messages of one type; raises FlightError if there is none."""
+    if message_id not in DEFINITIONS:
+        raise FlightError(f"the fields of message {message_id} are not known")
+    yield _lines([(*HEAD, *_names(message_id))])
+    count = 0
+    met: set[int] = set()
+    for batch in batches:
+        met |= set(np.unique(batch.message_ids).tolist())
+        rows = np.flatnonzero(batch.message_ids == message_id)
+        if len(rows):
+            count += len(rows)
+            yield _lines(zip(*_columns(batch.chosen(batch.message_ids == message_id), message_id),
+                             strict=True))  # fmt: skip
+    if not count:
+        others = ", ".join(sorted(MESSAGE_NAMES.get(one, f"message {one}") for one in met))
+        raise FlightError(f"the flight contains no {MESSAGE_NAMES[message_id]}, but {others}")
+
+
+def _names(message_id: int) -> Iterator[str]:
+    layout = layout_of(message_id)
+    for name in DEFINITIONS[message_id].fieldnames:
+        shape = layout[name].shape
+        yield from (f"{name}[{k}]" for k in range(shape[0])) if shape else (name,)
+
+
+def _columns(batch: Batch, message_id: int) -> Iterator[list[str]]:
+    """Yield the columns of some messages of one type; floats have their shortest exact text."""
+    times = np.maximum(batch.time_us, 0).astype("datetime64[us]")
+    yield [f"{text}Z" for text in np.datetime_as_string(times).tolist()]
+    yield (batch.origins >> 8).astype(str).tolist()
+    yield (batch.origins & 0xFF).astype(str).tolist()
+    values = columns_of(batch, np.arange(len(batch)), message_id)
+    for name in DEFINITIONS[message_id].fieldnames:
+        column = values[name]
+        if column.dtype.kind == "S":
+            yield [text_of(data) for data in column.tolist()]
+        elif column.ndim > 1:
+            yield from column.T.astype(str).tolist()
+        else:
+            yield column.astype(str).tolist()
+
+
+def _lines(rows: Iterable[Iterable[str]]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()

@@ -1,0 +1,83 @@
+"""One MAVLink message as CSV: every row, every instance, arrays and texts in full."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.tlog import TlogRecord
+from tests.kit.cli import run
+from tests.kit.mavlink import Sender
+from tests.recordings.frames import START_US, make_tlog
+
+pytestmark = pytest.mark.io
+
+
+def battery(number: int) -> Any:
+    return mavlink.MAVLink_battery_status_message(
+        number, 0, 0, 2000, [4100 + number, *[65535] * 9], 0, 0, 0, 90
+    )
+
+
+def rows_of(folder: Path, name: str, *options: object) -> list[dict[str, str]]:
+    out = folder / "out.csv"
+    run("convert", folder / "a.tlog", "-o", out, "--message", name, "--force", *options)
+    return list(csv.DictReader(out.read_text().splitlines()))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    first, second = Sender(1), Sender(2)
+    text = 'Höhe, "5 m"'
+    messages = [
+        (first, battery(0)), (first, battery(1)), (second, battery(0)),
+        (first, mavlink.MAVLink_statustext_message(6, text.encode())),
+        (first, mavlink.MAVLink_attitude_message(7, 0.1, -1e-9, float("nan"), 0, 0, 0)),
+    ]  # fmt: skip
+    records = [TlogRecord(START_US, sender.pack(message)) for sender, message in messages]
+    (tmp_path / "a.tlog").write_bytes(make_tlog(records))
+    return tmp_path
+
+
+def test_messages_of_one_time_and_of_other_instances_are_rows_of_their_own(folder: Path) -> None:
+    rows = rows_of(folder, "BATTERY_STATUS")
+    assert [(row["system_id"], row["id"]) for row in rows] == [("1", "0"), ("1", "1"), ("2", "0")]
+    assert {row["time"] for row in rows} == {"2025-10-09T08:53:20.000000Z"}
+    assert [row["voltages[0]"] for row in rows] == ["4100", "4101", "4100"]
+    assert rows[0]["voltages[9]"] == "65535"
+
+
+def test_texts_are_whole_and_floats_have_their_shortest_text(folder: Path) -> None:
+    assert rows_of(folder, "STATUSTEXT")[0]["text"] == 'Höhe, "5 m"'
+    (row,) = rows_of(folder, "attitude")
+    assert (row["roll"], row["pitch"], row["yaw"], row["time_boot_ms"]) == (
+        "0.1",
+        "-1e-09",
+        "nan",
+        "7",
+    )
+
+
+def test_rows_are_chosen_by_sender(folder: Path) -> None:
+    assert len(rows_of(folder, "BATTERY_STATUS", "--system", 2)) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--message", "VFR_HUD"), "contains no VFR_HUD, but ATTITUDE, BATTERY_STATUS, STATUSTEXT"),
+        (("--message", "60001"), "not known"),
+        (("--message", "ATTITUDE*"), "one message"),
+        (("--message", "ATTITUDE", "--message", "VFR_HUD"), "one message"),
+        (("--message", "ATTITUDE", "--anonymise"), "ends in .tlog"),
+        (("--without", "ATTITUDE"), "ends in .tlog"),
+    ],
+)
+def test_csv_without_exactly_one_known_message_is_refused(
+    folder: Path, options: tuple[str, ...], text: str
+) -> None:
+    out = folder / "out.csv"
+    assert text in run("convert", folder / "a.tlog", "-o", out, *options, code=2)
+    assert not out.exists()
