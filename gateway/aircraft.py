@@ -32,6 +32,7 @@ from gateway.records import (
     NodeStatus,
     Outgoing,
     RawRecord,
+    VehicleReport,
 )
 from gateway.sensing.calibrating import corrected_by
 from gateway.sensing.calibration import NodeCalibration
@@ -142,13 +143,19 @@ class Aircraft:
         if self._fused is None:
             self.chain, self.estimator = make_fusion(self.settings, state)
 
-    def take(self, record: RawRecord | ImuCalibrated, now_us: int, out: Outputs) -> None:
+    def take(
+        self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int, out: Outputs
+    ) -> None:
         """Run one raw record through the stages, and add what results."""
         vehicle = self.vehicle
         if isinstance(record, ImuRaw):
             self._take_imu(record, self.chain.imu(record), now_us, out)
         elif isinstance(record, ImuCalibrated):
             self._take_imu(None, self.chain.imu_calibrated(record), now_us, out)
+        elif isinstance(record, VehicleReport):
+            # Not for the recording of the fusion: it takes no part in it.
+            self.perform(vehicle.on_report(record, now_us), now_us, out)
+            self.state = vehicle.telemetry.state
         else:
             # Before its effects: they may change the settings, which applies to the next record.
             out.records.append(record)
@@ -162,6 +169,7 @@ class Aircraft:
                 latency_s = latency_in_use(self.estimator)
                 if latency_s is not None:
                     self.perform(vehicle.on_latency(*latency_s, now_us), now_us, out)
+                self.state = vehicle.telemetry.state
             else:
                 self.perform(vehicle.on_node_status(record, now_us), now_us, out)
 

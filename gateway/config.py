@@ -29,6 +29,8 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.printable import UserError
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.sources.kinds import check_source
+from gateway.sources.settings import MAX_SOURCES, SourceSettings, parse_source
 from gateway.toml_file import TomlError, read_toml, read_toml_text
 from gateway.vehicle.vehicle_settings import VehicleSettings
 
@@ -79,6 +81,21 @@ class GatewaySettings(Settings, frozen=True):
             path=True,
         ),
     ] = "~/.config/mavgate/aircraft"
+
+    sources: Annotated[
+        tuple[SourceSettings, ...],
+        setting(
+            "Other sources than the receiver, each a table [[sources]] with url and vehicle: "
+            'sources = [{ url = "crsf:/dev/ttyACM0", vehicle = 2 }]. docs/sources.md lists them.'
+        ),
+    ] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse sources of an unknown kind, or with an unknown option."""
+        if len(self.sources) > MAX_SOURCES:
+            raise ValueError(f"sources: at most {MAX_SOURCES}")
+        for source in self.sources:
+            check_source(parse_source(source.url))
 
     @property
     def default_aircraft(self) -> AircraftSettings:

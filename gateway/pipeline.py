@@ -11,9 +11,11 @@ record of it is received again. Live, demo and playback differ only in the calle
 or `take` (raw records of a recording).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
+
+import msgspec
 
 from gateway.aircraft import Aircraft, AircraftSettings, FusedStates, Outputs, with_passphrase
 from gateway.records import (
@@ -24,7 +26,9 @@ from gateway.records import (
     LinkReport,
     LoggedRequest,
     RawRecord,
+    VehicleReport,
 )
+from gateway.sources.source import SourceInput
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location, StoredPlan
 from gateway.vehicle.requests import BAD_SIGNATURE, StatusText
@@ -57,6 +61,8 @@ class PipelineSettings:
     """Missions, marks and homes kept from an earlier run, by vehicle id."""
     timestamps: Mapping[int, Mapping[str, Mapping[str, int]]] = field(default_factory=dict)
     """Signing timestamps kept from an earlier run, by vehicle id; see `SigningTimestamps`."""
+    sources: Sequence[SourceInput] = ()
+    """Sources other than the receiver."""
 
 
 class Pipeline:
@@ -65,6 +71,7 @@ class Pipeline:
     def __init__(self, settings: PipelineSettings) -> None:
         self._settings = settings
         self._link = Link()
+        self.sources = settings.sources
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
         """Signs the frames of every aircraft with a passphrase where they are sent."""
@@ -88,13 +95,22 @@ class Pipeline:
             self._take(record, now_us, out)
         return out
 
-    def take(self, record: RawRecord | ImuCalibrated, now_us: int) -> Outputs:
+    def feed_source(self, source: SourceInput, data: bytes, now_us: int) -> Outputs:
+        """Process bytes of a source other than the receiver."""
+        out = Outputs()
+        for record in source.feed(data, now_us):
+            self._take(record, now_us, out)
+        return out
+
+    def take(self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int) -> Outputs:
         """Process one raw record of a recording."""
         out = Outputs()
         self._take(record, now_us, out)
         return out
 
-    def _take(self, record: RawRecord | ImuCalibrated, now_us: int, out: Outputs) -> None:
+    def _take(
+        self, record: RawRecord | ImuCalibrated | VehicleReport, now_us: int, out: Outputs
+    ) -> None:
         vehicle_id = record.node.vehicle_id
         if isinstance(record, GpsFix) and record.utc_us is not None:
             at_zero_us = self._gps_time.update(vehicle_id, record.utc_us, record.time_us)
@@ -271,13 +287,32 @@ class Pipeline:
         reporting = now_us >= self._report_due_us
         if reporting:
             self._report_due_us = now_us + REPORT_INTERVAL_US
-            self.report = self._link.report(now_us, connected=self._connected, port=self._port)
+            self.report = self._whole_report(now_us)
             self._let_go(now_us)
         for aircraft in self.aircraft.values():
             if reporting:
-                aircraft.perform(aircraft.vehicle.on_link(self.report, now_us), now_us, out)
+                report = self._report_for(aircraft.vehicle_id)
+                aircraft.perform(aircraft.vehicle.on_link(report, now_us), now_us, out)
             aircraft.perform(aircraft.vehicle.poll(now_us), now_us, out)
         return out
+
+    def _whole_report(self, now_us: int) -> LinkReport:
+        """Sum up the receiver's line and all other sources."""
+        report = self._link.report(now_us, connected=self._connected, port=self._port)
+        if not self.sources:
+            return report
+        links = tuple(link for source in self.sources for link in source.links(now_us))
+        sources = tuple(source.report() for source in self.sources)
+        return msgspec.structs.replace(report, nodes=report.nodes + links, sources=sources)
+
+    def _report_for(self, vehicle_id: int) -> LinkReport:
+        """Return the report with the state of that from which a vehicle's records come."""
+        report = self.report
+        for source in self.sources:
+            if vehicle_id in source.vehicles:
+                known = {"connected": source.connected, "port": source.url.name, "name": "Source"}
+                return msgspec.structs.replace(report, **known)
+        return report
 
     def _let_go(self, now_us: int) -> None:
         for vehicle_id, aircraft in list(self.aircraft.items()):

@@ -331,6 +331,56 @@ class RadioSignal(msgspec.Struct, frozen=True, gc=False):
     snr_db: float
 
 
+class BatteryReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
+    """A battery as an autopilot or a tracker reports it; unknown values are NaN."""
+
+    number: int = 0
+    voltage_v: float = NAN
+    current_a: float = NAN
+    used_mah: float = NAN
+    remaining_percent: float = NAN
+    cells_v: tuple[float, ...] = ()
+
+
+class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
+    """Part of a vehicle's state as its own autopilot reports it: passed on, never fused.
+
+    Each report has a few of the fields; the others are NaN, None or empty, and leave as they are
+    those that earlier reports have set.
+    """
+
+    time_us: int
+    node: NodeId
+    attitude_rad: Vec3 | None = None
+    """Roll, pitch and yaw; yaw is from true north, as far as the autopilot knows it."""
+    heading_rad: float = NAN
+    """Where nothing but the heading is known of the attitude."""
+    climb_mps: float = NAN
+    airspeed_mps: float = NAN
+    alt_home_m: float = NAN
+    """Height above home."""
+    throttle_percent: float = NAN
+    battery: BatteryReport | None = None
+    mode: str = ""
+    custom_mode: int | None = None
+    """Number of the mode as ArduPilot counts them, by which ground stations name it."""
+    armed: bool | None = None
+    vehicle_type: int | None = None
+    """A MAV_TYPE."""
+    text: tuple[int, str] | None = None
+    """MAV_SEVERITY and text of an event."""
+    link_quality_percent: float = NAN
+    signal: "RadioSignal | None" = None
+    channels_us: tuple[int, ...] = ()
+    """Pulse widths of the radio control's channels."""
+    values: tuple[tuple[str, float], ...] = ()
+    """Other measurements by name, such as temperatures."""
+
+
+SOURCE_NODE: Final = 8
+"""Node id of a vehicle's first source other than the receiver; boards have 0 to 7."""
+
+
 class NodeLink(msgspec.Struct, frozen=True, gc=False):
     """Counts of the gateway for one node since it started."""
 
@@ -368,6 +418,26 @@ class LinkReport(msgspec.Struct, frozen=True, gc=False):
     receiver: ReceiverStatus | None
     foreign: int = 0
     """Packets of other programs that the receiver passed on."""
+    name: str = "Receiver"
+    """Of that which is connected or not."""
+    sources: "tuple[SourceReport, ...]" = ()
+
+
+class SourceReport(msgspec.Struct, frozen=True, gc=False):
+    """State of a source other than the receiver."""
+
+    url: str
+    node: NodeId
+    connected: bool
+    reason: str
+    """Why it is not connected; empty if it is."""
+    bytes_received: int
+    records: int
+    faults: tuple[tuple[str, int], ...]
+    """Kind and number."""
+    newest_fault: str
+    last_time_us: int | None
+    """Of the newest record."""
 
 
 START_V2: Final = 0xFD

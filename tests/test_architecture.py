@@ -35,8 +35,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "extras": {"printable"},
     "hub": FOUNDATION | {"wire", "printable", "extras", "recordings"},
     "simulator": FOUNDATION | {"wire"},
+    "sources": FOUNDATION | {"wire", "printable", "recordings"},
     "aircraft": FOUNDATION | {"wire", "sensing", "estimation", "vehicle"},
-    "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft"},
+    "pipeline": FOUNDATION | {"wire", "vehicle", "aircraft", "sources"},
     "status": FOUNDATION | {"hub", "vehicle", "aircraft", "printable"},
     "recordings": FOUNDATION | STAGES | JOINED | {"output", "printable", "extras", "toml_file"},
     "analysis": FOUNDATION | STAGES | JOINED | {"recordings", "output", "printable"},
@@ -47,12 +48,16 @@ MAY_IMPORT: dict[str, set[str]] = {
     | EDGES,
     "panel": FOUNDATION | STAGES | {"status", "recordings", "analysis", "batch"} | EDGES,
     "fleet": FOUNDATION | STAGES | {"output", "recordings"} | EDGES,
-    "config": FOUNDATION | STAGES | JOINED | {"panel", "fleet", "output", "toml_file"} | EDGES,
+    "config": FOUNDATION
+    | STAGES
+    | JOINED
+    | {"panel", "fleet", "output", "toml_file", "sources"}
+    | EDGES,
     "flashing": FOUNDATION | {"wire", "live"},
     "live": FOUNDATION
     | STAGES
     | JOINED
-    | {"status", "config", "recordings", "output", "extras"}
+    | {"status", "config", "recordings", "output", "extras", "sources"}
     | EDGES,
     "extensions": {"printable"},
     "outputs": FOUNDATION | {"wire", "recordings", "extras"} | EDGES,
@@ -61,12 +66,12 @@ MAY_IMPORT: dict[str, set[str]] = {
     | STAGES
     | JOINED
     | {"status", "recordings", "config", "player", "analysis"}
-    | {"extensions", "extras", "panel", "fleet", "flashing", "batch", "output"}
+    | {"extensions", "extras", "panel", "fleet", "flashing", "batch", "output", "sources"}
     | EDGES,
 }
 """The law: a package may import itself and these; `gateway` itself (the version) is free to all."""
 
-PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "hub"}
+PURE = FOUNDATION - {"compiled"} | STAGES | JOINED | {"status", "hub", "sources"}
 IMPURE_PARTS = {
     "hub/forwarding.py",
     "hub/forwarding_step.py",

@@ -142,7 +142,8 @@ def to_euler(q: Quat) -> Vec3:
     """
     w, x, y, z = q
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x))))
+    # In this order NaN stays NaN.
+    pitch = math.asin(max(min(2.0 * (w * y - z * x), 1.0), -1.0))
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return (roll, pitch, yaw)
 

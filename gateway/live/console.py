@@ -176,6 +176,11 @@ def _link_line(snapshot: Snapshot) -> Text:
     line.append(f"  serial {counted(report.frames, 'frame')}, {report.frames_lost} lost")
     for kind, count in report.faults:
         line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
+    for source in report.sources:
+        state = f"{counted(source.records, 'record')}" if source.connected else source.reason
+        line.append(f"\nsource {source.url}  {state}", style="green" if source.connected else "red")
+        for kind, count in source.faults:
+            line.append(f", {counted(count, f'{kind} fault')}", style="yellow")
     if report.receiver is not None:
         line.append(f"  radio {sum(node.lost for node in report.nodes)} lost")
         line.append(f", {channel_name(report.receiver.channel)}")

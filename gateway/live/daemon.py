@@ -33,6 +33,7 @@ from gateway.live.recorder import Recorder
 from gateway.live.serial_port import NO_RECEIVER, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
+from gateway.live.source_port import SourcePort, read_map
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.printable import reason_of
 from gateway.recordings.reading import header_for
@@ -41,6 +42,8 @@ from gateway.recordings.tlog import UNRECORDED
 from gateway.records import RECORDED_ONLY, ClientInterval, FusedSample, Incoming, Outgoing
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
+from gateway.sources.kinds import make_sources
+from gateway.sources.source import SourceInput
 from gateway.status import Snapshot, status_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
@@ -108,7 +111,8 @@ class Daemon:
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
-        needed = serial.port != "auto" or not settings.hub.has_other_sources
+        others = settings.hub.has_other_sources or bool(settings.sources)
+        needed = serial.port != "auto" or not others
         self._pipeline.disconnect(serial.port if needed else NO_RECEIVER)
         self._hub = Hub(
             settings.hub,
@@ -126,6 +130,7 @@ class Daemon:
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *callbacks, self.now_us, needed=needed)
+        self._sources = [SourcePort(s, self._on_source) for s in self._pipeline.sources]
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")
@@ -141,8 +146,19 @@ class Daemon:
         self._broken_plans = dict(self._plans.broken)
         at_zero_us = unix_time_us() - self.now_us()
         default = self._settings.default_aircraft
+        try:
+            sources = make_sources(self._settings.sources, read_map)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
         return Pipeline(
-            PipelineSettings(default, aircraft, at_zero_us, plans=plans, timestamps=timestamps)
+            PipelineSettings(
+                default,
+                aircraft,
+                at_zero_us,
+                plans=plans,
+                timestamps=timestamps,
+                sources=sources,
+            )
         )
 
     def _make_recorder(self) -> Recorder:
@@ -182,6 +198,8 @@ class Daemon:
         self._recorder.start()
         self._serve_metrics()
         self._serial.start()
+        for source in self._sources:
+            source.start()
         if self._receiver is not None:
             self._receiver.start()
         self._opening = asyncio.get_running_loop().create_task(self._open_control())
@@ -228,6 +246,8 @@ class Daemon:
         if self._receiver is not None:
             self._receiver.close()
         self._serial.close()
+        for source in self._sources:
+            source.close()
         if self._timer is not None:
             self._timer.cancel()
         if self._opening is not None:
@@ -333,6 +353,9 @@ class Daemon:
             # Before the samples that waited in the kernel: they are late for the same reason.
             self._watch_loop(now_us)
         self._perform(self._pipeline.feed(data, now_us))
+
+    def _on_source(self, source: SourceInput, data: bytes) -> None:
+        self._perform(self._pipeline.feed_source(source, data, self.now_us()))
 
     def _on_frame(self, incoming: Incoming) -> None:
         frame, client_id, now_us = incoming.frame, incoming.client_id, self.now_us()

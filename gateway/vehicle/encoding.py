@@ -291,7 +291,8 @@ CAPABILITIES: Final = (
     | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_RALLY
 )
 
-MODE_NAME: Final = b"Tracking"
+MODE_NAME: Final = "Tracking"
+MAX_MODE_NAME: Final = 34
 
 AUTOPILOTS: Final[dict[str, int]] = {
     "generic": mavlink.MAV_AUTOPILOT_GENERIC,
@@ -348,22 +349,22 @@ def protocol_version() -> Any:
     return ProtocolVersion(200, 100, 200, b"", b"")
 
 
-def available_modes(autopilot: int) -> Any:
-    """Encode AVAILABLE_MODES: the one mode that a tracker has."""
+def available_modes(mode: tuple[int, str]) -> Any:
+    """Encode AVAILABLE_MODES: the one mode that a tracker has, or that is reported."""
     return mavlink.MAVLink_available_modes_message(
         number_modes=1,
         mode_index=1,
         standard_mode=mavlink.MAV_STANDARD_MODE_NON_STANDARD,
-        custom_mode=CUSTOM_MODES[autopilot],
+        custom_mode=mode[0],
         properties=mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE,
-        mode_name=MODE_NAME,
+        mode_name=mode[1].encode()[:MAX_MODE_NAME],
     )
 
 
-def current_mode(autopilot: int) -> Any:
+def current_mode(mode: tuple[int, str]) -> Any:
     """Encode CURRENT_MODE."""
     return mavlink.MAVLink_current_mode_message(
         standard_mode=mavlink.MAV_STANDARD_MODE_NON_STANDARD,
-        custom_mode=CUSTOM_MODES[autopilot],
+        custom_mode=mode[0],
         intended_custom_mode=0,
     )

@@ -15,6 +15,7 @@ from gateway.records import (
     NavState,
     NodeStatus,
     Outgoing,
+    VehicleReport,
 )
 from gateway.settings import Settings
 from gateway.units import US_PER_S
@@ -159,10 +160,8 @@ class Vehicle:
             ),
         )
         add(MAVLINK_MSG_ID_PROTOCOL_VERSION, lambda _: encoding.protocol_version())
-        add(
-            mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, lambda _: encoding.available_modes(of.autopilot)
-        )
-        add(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, lambda _: encoding.current_mode(of.autopilot))
+        add(mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, lambda _: encoding.available_modes(of.mode))
+        add(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, lambda _: encoding.current_mode(of.mode))
         add(MAVLINK_MSG_ID_COMPONENT_METADATA, self.metadata.announcement)
 
     def _route(self, commands: CommandService) -> None:
@@ -209,6 +208,20 @@ class Vehicle:
             found += self._announcements.say(StatusText(INFO, "Home set by GPS"), now_us)
         found += self.plan.on_fix(fix, now_us)
         found += self._announcements.on_fix(now_us)
+        return self._finish(found)
+
+    def on_report(self, report: VehicleReport, now_us: int) -> list[Action]:
+        """Take in what the vehicle's own autopilot reports.
+
+        Home is set again when it is armed, as by every autopilot that does not report its home.
+        """
+        was_armed = self.telemetry.armed
+        self.health.on_report(report)
+        found = self.telemetry.on_report(report)
+        if report.armed and not was_armed:
+            self.telemetry.clear_home()
+        if report.text is not None:
+            found += self._announcements.say(StatusText(*report.text), now_us)
         return self._finish(found)
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:

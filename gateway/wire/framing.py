@@ -42,8 +42,11 @@ class FaultKind(StrEnum):
 class Fault:
     """Bytes that were dropped, and why."""
 
-    kind: FaultKind
+    kind: str
+    """A `FaultKind` on the receiver's line; decoders of other sources have kinds of their own."""
     size: int
+    detail: str = ""
+    """For people; empty where the kind is all that is known."""
 
 
 def crc16(content: bytes) -> int:

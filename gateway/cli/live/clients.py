@@ -20,7 +20,7 @@ from gateway.cli.support.terminal import (
     table_of,
 )
 from gateway.live.other_gateways import Gateway, other_gateways
-from gateway.printable import UNKNOWN, figure, receiver_state
+from gateway.printable import UNKNOWN, figure, printable, receiver_state
 from gateway.records import RadioState, node_role
 from gateway.units import MV_PER_V, US_PER_S, counted
 
@@ -160,7 +160,7 @@ def _summary(snapshot: Record) -> str:
     received, lost = (sum(node[key] for node in report["nodes"]) for key in ("received", "lost"))
     serial = f"serial: {counted(report['frames'], 'frame')}, {report['frames_lost']} lost"
     radio = f"radio: {counted(received, 'payload')}, {lost} lost"
-    lines = [f"up {up}, {receiver}", f"{serial}; {radio}"]
+    lines = [f"up {up}, {receiver}", f"{serial}; {radio}", *_source_lines(snapshot)]
     if report["receiver"] is not None:
         problem = RadioState(report["receiver"]["radio"]).problem
         lines += [f"receiver: {problem}"] if problem else []
@@ -192,6 +192,24 @@ def _summary(snapshot: Record) -> str:
     if requests:
         lines.append("requests: " + ", ".join(requests) + "; see mavgate status --requests")
     return "\n".join(lines)
+
+
+def _source_lines(snapshot: Record) -> list[str]:
+    return [_source_line(each, snapshot["time_us"]) for each in snapshot["report"]["sources"]]
+
+
+def _source_line(source: Record, now_us: int) -> str:
+    """Describe a source other than the receiver."""
+    if not source["connected"]:
+        state = f"not connected: {source['reason']}"
+    elif source["last_time_us"] is None:
+        state = f"connected, {source['bytes_received']} bytes without a record"
+    else:
+        age_s = (now_us - source["last_time_us"]) / US_PER_S
+        state = f"{counted(source['records'], 'record')}, the last {max(age_s, 0.0):.1f} s ago"
+    faults = "".join(f", {count} {kind}" for kind, count in source["faults"])
+    newest = f" (last: {printable(source['newest_fault'])})" if source["newest_fault"] else ""
+    return f"source {source['url']}: {state}{faults}{newest}"
 
 
 def _requests(found: Sequence[Record], now_us: int) -> Table:

@@ -22,6 +22,7 @@ from gateway.live.daemon import Daemon
 from gateway.live.other_gateways import conflicts
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
+from gateway.sources.settings import SourceSettings
 from gateway.status import summary_line
 
 if TYPE_CHECKING:
@@ -52,6 +53,14 @@ def run_gateway(
     port: Annotated[
         str | None, typer.Option("--port", "-p", help="Receiver's port, instead of the settings'.")
     ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--source",
+            "-s",
+            help="A tracker, radio or phone, such as crsf:/dev/ttyACM0, instead of the settings'.",
+        ),
+    ] = None,
     endpoint: EndpointOption = None,
     plain: PlainOption = False,
     panel: Annotated[
@@ -61,7 +70,7 @@ def run_gateway(
     """Run the gateway on the receiver's serial port until interrupted."""
 
     def read() -> GatewaySettings:
-        settings = read_settings()
+        settings = with_sources(read_settings(), source)
         if port is not None:
             serial = msgspec.structs.replace(settings.serial, port=port)
             settings = msgspec.structs.replace(settings, serial=serial)
@@ -75,6 +84,17 @@ def run_gateway(
     load_entry_points()
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)
+
+
+def with_sources(settings: GatewaySettings, urls: list[str] | None) -> GatewaySettings:
+    """Replace the settings' sources by those of the command line."""
+    if not urls:
+        return settings
+    try:
+        sources = tuple(SourceSettings(url=url) for url in urls)
+        return msgspec.structs.replace(settings, sources=sources)
+    except ValueError as error:
+        refuse(f"--source: {error}")
 
 
 def with_endpoints(settings: GatewaySettings, endpoints: list[str] | None) -> GatewaySettings:

@@ -263,7 +263,7 @@ class Announcements(Announcer):
 
     def on_link(self, report: LinkReport, now_us: int) -> list[Answer]:
         """Announce that the receiver or a node was lost or is back."""
-        lost, back = f"Receiver lost: {report.port}", f"Receiver connected: {report.port}"
+        lost, back = f"{report.name} lost: {report.port}", f"{report.name} connected: {report.port}"
         text = status_text(not report.connected, lost, back, CRITICAL)
         findings = [Finding("link", "connected" if report.connected else "lost", text)]
         if not report.connected:

@@ -16,6 +16,7 @@ are announced when they get worse:
 | pipe   | the receiver had no room for a payload of it   | `QUIET_REPORTS` of the receiver's    |
 """
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
@@ -25,6 +26,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.records import (
     NODE_GPS,
     NODE_IMU,
+    SOURCE_NODE,
     BaroSample,
     GpsFix,
     ImuFlags,
@@ -35,12 +37,14 @@ from gateway.records import (
     NodeLink,
     NodeStatus,
     ReceiverStatus,
+    VehicleReport,
     node_role,
 )
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
 from gateway.vehicle.plan import is_3d
 from gateway.vehicle.requests import INFO, WARNING, StatusText
+from gateway.vehicle.telemetry.reported import Reported, battery_status, whole_or_unknown
 
 HYSTERESIS_V: Final = 0.1
 QUIET_REPORTS: Final = 10
@@ -51,6 +55,8 @@ MAX_REPORTS: Final = 20
 """In that time; a node reports once a second."""
 WORD: Final = 0xFFFF
 """The nodes' counters have 16 bits, and wrap."""
+BATTERY_TIMEOUT_US: Final = 10 * US_PER_S
+"""Autopilots report it every second or so, over links that lose many frames."""
 CELLS: Final = 10
 MV: Final = 1e3
 
@@ -144,6 +150,10 @@ class Health:
         self.supply_low_v = supply_low_v
         """A lower supply is announced; 0 disables this."""
         self.recording = False
+        self.reported = Reported()
+        """What the vehicle's own autopilot reports, if it has one."""
+        self.is_reported = False
+        """Whether it has reported anything."""
         self._seen_us: dict[int, int] = {}
         self._boards: dict[int, _Board] = {}
         self._imu_flags = ImuFlags(0)
@@ -188,6 +198,23 @@ class Health:
         """Note a GPS fix, good or not."""
         self._see(GPS, fix.time_us)
         self._fix = fix
+
+    def on_report(self, report: VehicleReport) -> None:
+        """Note what the vehicle's own autopilot reports."""
+        self.is_reported = True
+        if report.attitude_rad is not None:
+            self._see(AHRS, report.time_us)
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether an IMU sample was ever received."""
+        return GYRO in self._seen_us
+
+    def has_state(self, now_us: int) -> bool:
+        """Return whether that from which the state comes is alive."""
+        if self.has_imu:
+            return self.is_alive(GYRO, now_us)
+        return self.is_alive(AHRS, now_us) or self.is_alive(GPS, now_us)
 
     def _see(self, sensor: int, time_us: int) -> None:
         self._seen_us[sensor] = max(time_us, self._seen_us.get(sensor, time_us))
@@ -291,12 +318,16 @@ class Health:
             is_faulty = self._nav_flags & NavFlags.SENSOR_FAULT
             if healthy & GYRO and self._nav_flags & NavFlags.ATTITUDE_VALID and not is_faulty:
                 healthy |= AHRS
+        elif AHRS in self._seen_us:
+            present |= AHRS
+            healthy |= AHRS if self.is_alive(AHRS, now_us) else 0
         present |= LOGGING | PREARM
         # There is no fence, so none is breached; MAVProxy reports a breach without this bit.
         healthy |= GEOFENCE
         enabled = present if self.recording else present & ~LOGGING
         healthy |= LOGGING if self.recording else 0
-        needed = GYRO | ACCEL | GPS | AHRS | present & MAG
+        imu = GYRO | ACCEL | AHRS
+        needed = (imu if self.has_imu or not present & GPS else 0) | GPS | present & (MAG | AHRS)
         if healthy & needed == needed:
             healthy |= PREARM
         return present, enabled, healthy
@@ -310,12 +341,18 @@ class Health:
         """
         bus, failed, retries, overruns = self._error_counts()
         lowest = self._lowest_supply()
+        millivolts = lowest.supply_mv if lowest else encoding.UINT16_MAX
+        current = remaining = -1
+        if (battery := self.reported.battery(now_us, BATTERY_TIMEOUT_US)) is not None:
+            millivolts = encoding.uint16(battery.voltage_v * MV)
+            current = whole_or_unknown(battery.current_a * 100.0)
+            remaining = whole_or_unknown(battery.remaining_percent, 100)
         return mavlink.MAVLink_sys_status_message(
             *self.sensors(now_us),
             load=min(1000, self._load_permille),
-            voltage_battery=lowest.supply_mv if lowest else encoding.UINT16_MAX,
-            current_battery=-1,
-            battery_remaining=-1,
+            voltage_battery=millivolts,
+            current_battery=current,
+            battery_remaining=remaining,
             drop_rate_comm=round(self._drop_rate * 10_000.0),
             errors_comm=encoding.uint16(self._lost),
             errors_count1=bus,
@@ -334,12 +371,13 @@ class Health:
         if not signals:
             return None
         weakest = min(signals, key=lambda signal: signal.rssi_dbm)
-        noise_dbm = weakest.rssi_dbm - round(weakest.snr_db)
+        has_noise = math.isfinite(weakest.snr_db)
+        noise_dbm = weakest.rssi_dbm - round(weakest.snr_db if has_noise else 0.0)
         return mavlink.MAVLink_radio_status_message(
             rssi=_signed_byte(weakest.rssi_dbm),
             remrssi=encoding.UINT8_MAX,
             txbuf=100,
-            noise=_signed_byte(noise_dbm),
+            noise=_signed_byte(noise_dbm) if has_noise else encoding.UINT8_MAX,
             remnoise=encoding.UINT8_MAX,
             rxerrors=encoding.uint16(self._lost),
             fixed=0,
@@ -361,8 +399,11 @@ class Health:
         measured = (status for status in self.statuses if status.supply_mv)
         return min(measured, key=lambda status: status.supply_mv, default=None)
 
-    def lowest_battery(self) -> Any:
-        """Encode BATTERY_STATUS of the node with the lowest supply; None if none measures it."""
+    def newest_battery(self, now_us: int) -> Any:
+        """Encode BATTERY_STATUS of the vehicle's battery, or of the node with the lowest supply."""
+        battery = self.reported.battery(now_us, BATTERY_TIMEOUT_US)
+        if battery is not None:
+            return battery_status(battery)
         lowest = self._lowest_supply()
         return None if lowest is None else self.battery(lowest)
 
@@ -395,6 +436,8 @@ class Health:
 
     def node_name(self, node_id: int) -> str:
         """Name a node by its sensors, as far as it has reported them."""
+        if node_id >= SOURCE_NODE:
+            return f"Source {node_id - SOURCE_NODE + 1}"
         board = self._boards.get(node_id)
         return f"{node_role(board.status.sensors_present) if board else 'Node'} {node_id}"
 

@@ -34,14 +34,16 @@ from gateway.records import (
     NavState,
     NodeStatus,
     Vec3,
+    VehicleReport,
 )
 from gateway.units import US_PER_S
-from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES
+from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES, MODE_NAME
 from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
 from gateway.vehicle.requests import Answer, Reply
 from gateway.vehicle.telemetry import messages
-from gateway.vehicle.telemetry.health import GPS, GYRO, Health
+from gateway.vehicle.telemetry.health import GPS, Health
 from gateway.vehicle.telemetry.messages import high_latency2
+from gateway.vehicle.telemetry.reported import WITHOUT_IMU_US, battery_status, named_values
 from gateway.vehicle.telemetry.streams import (
     ADDED_MESSAGES,
     OFF,
@@ -126,7 +128,19 @@ TIMED_MESSAGES: Final = (
     mavlink.MAVLINK_MSG_ID_MISSION_CURRENT,
     mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2,
     mavlink.MAVLINK_MSG_ID_RADIO_STATUS,
+    mavlink.MAVLINK_MSG_ID_RC_CHANNELS,
 )
+
+ATTITUDE_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
+    mavlink.MAVLINK_MSG_ID_ATTITUDE,
+)
+"""Carried by the attitudes that the vehicle's own autopilot reports."""
+POSITION_MESSAGES: Final = (
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_VFR_HUD,
+)
+"""Carried by fixes where there is no IMU."""
 
 APART_US: Final = 13_000
 """Between the first of one timed message and of the next: with equal intervals, they would else be
@@ -136,6 +150,8 @@ HEARTBEAT_HZ: Final = 1.0
 
 RADIO_STATUS_HZ: Final = 1.0
 """As often as the links are counted."""
+RC_CHANNELS_HZ: Final = 5.0
+"""Only of a vehicle whose own autopilot reports its link or channels."""
 
 Builder = Callable[[int], Any]
 
@@ -162,6 +178,9 @@ class Telemetry:
         """The newest with a position, which is repeated while there is none."""
         self._mag_b_ut = UNKNOWN_VEC3
         self._updated = 0
+        self._first_us: int | None = None
+        """When the first fix came."""
+        self._announced_modes = 0
         self._batteries: dict[int, Stream] = {}
         self._unix_offset_us: int | None = None
         self.streams = {message_id: Stream(us) for message_id, us in _intervals(settings).items()}
@@ -181,12 +200,15 @@ class Telemetry:
     def _own_builders(self) -> dict[int, Builder]:
         health = self.health
         return {
-            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_state(
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._of_attitude(
                 messages.attitude_quaternion
             ),
-            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._of_state(messages.attitude),
-            mavlink.MAVLINK_MSG_ID_VFR_HUD: self._of_state(messages.vfr_hud),
-            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._of_state(messages.estimator_status),
+            mavlink.MAVLINK_MSG_ID_ATTITUDE: self._of_attitude(messages.attitude),
+            mavlink.MAVLINK_MSG_ID_VFR_HUD: self._vfr_hud,
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator_status,
+            mavlink.MAVLINK_MSG_ID_RC_CHANNELS: lambda now_us: health.reported.channels(
+                now_us, health.silent_us
+            ),
             mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: self._highres_imu,
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps_raw,
@@ -198,7 +220,7 @@ class Telemetry:
             mavlink.MAVLINK_MSG_ID_HOME_POSITION: self._home_position,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mavlink.MAVLINK_MSG_ID_HIGH_LATENCY2: self._high_latency,
-            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: lambda _: health.lowest_battery(),
+            mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: health.newest_battery,
             mavlink.MAVLINK_MSG_ID_SCALED_IMU: self._of_sample(messages.scaled_imu),
             mavlink.MAVLINK_MSG_ID_RAW_IMU: self._of_sample(messages.raw_imu),
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._of_origin(messages.local_position_ned),
@@ -239,6 +261,8 @@ class Telemetry:
     @property
     def armed(self) -> bool:
         """Whether the armed bit is set, by the setting `armed_when`."""
+        if self.health.reported.armed is not None:
+            return self.health.reported.armed
         rule = self.settings.armed_when
         flying = self.motion.landed_state == IN_AIR and rule.startswith("flying")
         recording = self.health.recording and rule.endswith("recording")
@@ -285,6 +309,45 @@ class Telemetry:
         self._state_due_us = next_us
         return found
 
+    def on_report(self, report: VehicleReport) -> list[Answer]:
+        """Take in a part of the state that the vehicle's own autopilot reports."""
+        reported, time_us = self.health.reported, report.time_us
+        reported.take(report)
+        found: list[Answer] = [Reply(message) for message in named_values(report)]
+        if report.attitude_rad is not None:
+            found += self._on_reported(time_us, ATTITUDE_MESSAGES)
+        if report.battery is not None:
+            stream = self.streams[mavlink.MAVLINK_MSG_ID_BATTERY_STATUS]
+            if report.battery.number or stream.offer(time_us):
+                found.append(Reply(battery_status(report.battery)))
+        if reported.mode_changes != self._announced_modes:
+            self._announced_modes = reported.mode_changes
+            number = reported.mode_changes & 0xFF
+            found.append(Reply(mavlink.MAVLink_available_modes_monitor_message(number)))
+            current = self.build(mavlink.MAVLINK_MSG_ID_CURRENT_MODE, time_us)
+            found += [] if current is None else [Reply(current)]
+        return found
+
+    def _on_reported(self, time_us: int, carried: tuple[int, ...]) -> list[Answer]:
+        """Take in the state of a vehicle without an IMU of ours, and return its messages."""
+        self.state = state = self.health.reported.state(time_us, self.fix, self.health.silent_us)
+        if math.isnan(self._reference_alt_m) and messages.has_position(state):
+            self._reference_alt_m = state.alt_amsl_m
+        if carried is POSITION_MESSAGES:
+            self.motion.update(state, self._ground_alt_m)
+        due = (m for m in carried if self.streams[m].offer(time_us))
+        built = (self.build(message_id, time_us) for message_id in due)
+        return [Reply(message) for message in built if message is not None]
+
+    def _position_of_fix(self, fix: GpsFix) -> list[Answer]:
+        """Let a fix be the position of a vehicle that has no IMU."""
+        if self._first_us is None:
+            self._first_us = fix.time_us
+        known = self.health.is_reported or fix.time_us - self._first_us >= WITHOUT_IMU_US
+        if self.health.has_imu or not known:
+            return []
+        return self._on_reported(fix.time_us, POSITION_MESSAGES)
+
     def on_baro(self, sample: BaroSample) -> list[Answer]:
         """Take in a barometer sample, and return its message if due."""
         self._baro = sample
@@ -309,7 +372,7 @@ class Telemetry:
             self._ground_alt_m = fix.alt_amsl_m
             if self.home is None:
                 found.append(self.set_home(Home(location_of(fix), fix.time_us)))
-        return found
+        return found + self._position_of_fix(fix)
 
     def on_node_status(self, status: NodeStatus) -> list[Answer]:
         """Return a node's supply message, if due."""
@@ -365,6 +428,31 @@ class Telemetry:
     def _of_state(self, build: Callable[[NavState], Any]) -> Builder:
         return lambda _: None if self.state is None else build(self.state)
 
+    def _of_attitude(self, build: Callable[[NavState], Any]) -> Builder:
+        """Build nothing while the attitude is not known, as of a vehicle with GPS only."""
+
+        def builder(_now_us: int) -> Any:
+            state = self.state
+            return None if state is None or math.isnan(state.q_nb[0]) else build(state)
+
+        return builder
+
+    def _estimator_status(self, _now_us: int) -> Any:
+        """Build nothing for a state that is not an estimate of ours."""
+        known = self.state is not None and self._sample is not None
+        return messages.estimator_status(self.state) if known and self.state else None
+
+    def _vfr_hud(self, now_us: int) -> Any:
+        if self.state is None:
+            return None
+        reported, timeout_us = self.health.reported, self.health.silent_us
+        return messages.vfr_hud(
+            self.state,
+            heading_rad=reported.value("heading_rad", now_us, timeout_us),
+            airspeed_mps=reported.value("airspeed_mps", now_us, timeout_us),
+            throttle_percent=reported.value("throttle_percent", now_us, timeout_us),
+        )
+
     def _of_sample(self, build: Callable[[ImuSample, Vec3], Any]) -> Builder:
         return lambda _: None if self._sample is None else build(self._sample, self._mag_b_ut)
 
@@ -418,7 +506,16 @@ class Telemetry:
     @property
     def _type(self) -> int:
         kind: int = getattr(mavlink, f"MAV_TYPE_{self.settings.type.upper()}")
-        return kind
+        reported = self.health.reported.vehicle_type
+        return kind if reported is None else reported
+
+    @property
+    def mode(self) -> tuple[int, str]:
+        """Number and name of the present mode."""
+        reported = self.health.reported
+        if reported.mode:
+            return reported.custom_mode, reported.mode
+        return CUSTOM_MODES[self.autopilot], MODE_NAME
 
     @property
     def autopilot(self) -> int:
@@ -434,14 +531,14 @@ class Telemetry:
         if self.armed:
             base_mode |= mavlink.MAV_MODE_FLAG_SAFETY_ARMED
         autopilot = self.autopilot
-        if autopilot != mavlink.MAV_AUTOPILOT_GENERIC:
+        if autopilot != mavlink.MAV_AUTOPILOT_GENERIC or self.health.reported.mode:
             # Clients name a mode of these autopilots by its number only.
             base_mode |= mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
         return mavlink.MAVLink_heartbeat_message(
             self._type,
             autopilot,
             base_mode,
-            custom_mode=CUSTOM_MODES[autopilot],
+            custom_mode=self.mode[0],
             system_status=self._system_status(now_us),
             mavlink_version=3,
         )
@@ -452,7 +549,7 @@ class Telemetry:
             status = mavlink.MAV_STATE_BOOT
         elif self.calibrating:
             status = mavlink.MAV_STATE_CALIBRATING
-        elif not self.health.is_alive(GYRO, now_us):
+        elif not self.health.has_state(now_us):
             status = mavlink.MAV_STATE_CRITICAL
         elif self.motion.landed_state == IN_AIR:
             status = mavlink.MAV_STATE_ACTIVE
@@ -464,6 +561,7 @@ def _intervals(settings: VehicleSettings) -> dict[int, int]:
     found = dict.fromkeys(REQUESTED_MESSAGES, OFF)
     found[mavlink.MAVLINK_MSG_ID_HEARTBEAT] = interval_us(HEARTBEAT_HZ)
     found[mavlink.MAVLINK_MSG_ID_RADIO_STATUS] = interval_us(RADIO_STATUS_HZ)
+    found[mavlink.MAVLINK_MSG_ID_RC_CHANNELS] = interval_us(RC_CHANNELS_HZ)
     for name, rate in msgspec.structs.asdict(settings.rates).items():
         message = f"MAVLINK_MSG_ID_{name.removesuffix('_hz').upper()}"
         found[getattr(mavlink, message)] = interval_us(rate)

@@ -157,10 +157,10 @@ def test_battery_status_is_sent_at_its_own_rate(rate_hz: float, count: int) -> N
 
 def test_requested_battery_status_is_that_of_the_lowest_supply() -> None:
     health = Health(1, 2.0)
-    assert health.lowest_battery() is None
+    assert health.newest_battery(0) is None
     health.on_node_status(WELL)
     health.on_node_status(replace(WELL, node=NodeId(1, 1), supply_mv=3100))
-    assert health.lowest_battery().id == 1
+    assert health.newest_battery(0).id == 1
 
 
 def test_sys_status_contains_the_error_counters(flying: Flying) -> None:

@@ -1,0 +1,213 @@
+"""The transports of sources: they bring bytes, and open again what was lost.
+
+| transport  | opened                                        | lost                              |
+| ---------- | --------------------------------------------- | --------------------------------- |
+| serial     | as soon as the device or USB id exists        | unplugged: tried again            |
+| udp        | at once; an address in use is tried again     | never                             |
+| tcp        | when the server accepts                       | closed by the server: tried again |
+| tcp-listen | when a client connects, one at a time         | when it leaves                    |
+| stdin      | at once                                       | at its end, for good              |
+| file       | as soon as it exists, from its beginning      | shortened: read from its beginning|
+"""
+
+import asyncio
+import logging
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+import serial
+
+from gateway.live.serial_port import PortNotFoundError, find_port, list_serial_ports, open_port
+from gateway.printable import reason_of
+from gateway.sources.source import SourceInput
+
+log = logging.getLogger(__name__)
+
+READ_SIZE: Final = 4096
+RETRY_S: Final = 1.0
+FILE_POLL_S: Final = 0.05
+DEFAULT_BAUD: Final = {"crsf": 420_000, "ltm": 9600}
+USUAL_BAUD: Final = 115_200
+
+
+def read_map(path: str) -> str:
+    """Read the map of columns that a source's option names; ValueError if it cannot be read."""
+    try:
+        return Path(path).expanduser().read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"columns={path}: {reason_of(error)}") from error
+
+
+class SourcePort:
+    """Keep one source open, and pass on its bytes.
+
+    `on_bytes` is called with the source and every chunk that arrives.
+    """
+
+    def __init__(self, source: SourceInput, on_bytes: Callable[[SourceInput, bytes], None]) -> None:
+        self._source = source
+        self._on_bytes = on_bytes
+        self._task: asyncio.Task[None] | None = None
+        self._complaint = ""
+
+    def start(self) -> None:
+        """Begin to open it; needs a running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._run())
+
+    def close(self) -> None:
+        """Close it for good."""
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _run(self) -> None:
+        url = self._source.url
+        read = {
+            "serial": self._serial,
+            "udp": self._udp,
+            "tcp": self._tcp,
+            "tcp-listen": self._tcp_listen,
+            "stdin": self._stdin,
+            "file": self._file,
+        }[url.transport]
+        while True:
+            try:
+                await read()
+            except (OSError, PortNotFoundError) as error:
+                self._lost(str(error) if isinstance(error, PortNotFoundError) else reason_of(error))
+            if url.transport == "stdin":
+                self._lost("its end was reached")
+                return
+            await asyncio.sleep(RETRY_S)
+
+    def _opened(self) -> None:
+        log.info("source %s is open", self._source.url.name)
+        self._complaint = ""
+        self._source.opened()
+
+    def _lost(self, reason: str) -> None:
+        """Note and log once why it is not open."""
+        if self._source.connected or reason != self._complaint:
+            log.warning("source %s: %s; trying again", self._source.url.name, reason)
+        self._complaint = reason
+        self._source.lost(reason)
+
+    def _take(self, data: bytes) -> None:
+        self._on_bytes(self._source, data)
+
+    async def _serial(self) -> None:
+        url, ports = self._source.url, list_serial_ports()
+        baud = int(url.options.get("baud", DEFAULT_BAUD.get(url.kind, USUAL_BAUD)))
+        port = open_port(find_port(url.address, ports), baud, ports)
+        try:
+            await self._read_file(port)
+        finally:
+            port.close()
+
+    async def _read_file(self, port: serial.Serial) -> None:
+        """Read an open port until it hangs up."""
+        loop, lost = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
+        file = port.fileno()
+
+        def read() -> None:
+            try:
+                data = os.read(file, READ_SIZE)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                data, reason = b"", reason_of(error)
+            else:
+                reason = "the device hung up"
+            if data:
+                self._take(data)
+            elif not lost.done():
+                lost.set_result(reason)
+
+        self._opened()
+        loop.add_reader(file, read)
+        try:
+            self._lost(await lost)
+        finally:
+            loop.remove_reader(file)
+
+    async def _udp(self) -> None:
+        url = self._source.url
+        transport, protocol = await asyncio.get_running_loop().create_datagram_endpoint(
+            lambda: _Datagrams(self._take), local_addr=(url.address, url.port)
+        )
+        self._opened()
+        try:
+            await protocol.closed
+        finally:
+            transport.close()
+
+    async def _tcp(self) -> None:
+        url = self._source.url
+        reader, writer = await asyncio.open_connection(url.address, url.port)
+        await self._stream(reader, writer)
+
+    async def _tcp_listen(self) -> None:
+        url = self._source.url
+        server = await asyncio.start_server(self._client, url.address, url.port)
+        self._source.lost("no client is connected")
+        async with server:
+            await server.serve_forever()
+
+    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if self._source.connected:
+            writer.close()
+            return
+        try:
+            await self._stream(reader, writer)
+        except OSError as error:
+            self._lost(reason_of(error))
+
+    async def _stream(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._opened()
+        try:
+            while data := await reader.read(READ_SIZE):
+                self._take(data)
+            self._lost("the other side closed the connection")
+        finally:
+            writer.close()
+
+    async def _stdin(self) -> None:
+        reader = asyncio.StreamReader(limit=READ_SIZE)
+        protocol = asyncio.StreamReaderProtocol(reader)
+        await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, sys.stdin)
+        self._opened()
+        while data := await reader.read(READ_SIZE):
+            self._take(data)
+
+    async def _file(self) -> None:
+        """Follow a file; one that is shorter than what was read was written again."""
+        path = self._source.url.address
+        with open(path, "rb", buffering=0) as file:  # noqa: PTH123
+            self._opened()
+            while True:
+                while data := file.read(READ_SIZE):
+                    self._take(data)
+                    await asyncio.sleep(0)
+                if os.stat(path).st_size < file.tell():  # noqa: PTH116
+                    self._lost("the file was shortened")
+                    return
+                await asyncio.sleep(FILE_POLL_S)
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    """Pass on datagrams; errors of the network are none of a receiver's."""
+
+    def __init__(self, take: Callable[[bytes], None]) -> None:
+        self._take = take
+        self.closed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def datagram_received(self, data: bytes, _address: object) -> None:
+        """Pass on a datagram, which ends its last line."""
+        self._take(data)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
+        """End the wait."""
+        if not self.closed.done():
+            self.closed.set_result(None)

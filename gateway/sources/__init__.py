@@ -1,0 +1,1 @@
+"""Sources other than the receiver: bytes of any tracker, radio or phone in, records out."""

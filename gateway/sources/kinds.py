@@ -1,0 +1,80 @@
+"""The kinds of sources by the scheme of their URLs; other packages may add some."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from gateway.printable import unknown_choice
+from gateway.records import NodeId
+from gateway.sources.lines import LinesDecoder
+from gateway.sources.settings import OPTIONS, SourceSettings, SourceUrl, nodes_of, parse_source
+from gateway.sources.source import SourceDecoder, SourceInput
+
+SourceKind = Callable[[SourceUrl, NodeId], SourceDecoder]
+"""Makes a decoder of the URL, for its options, and the node that its records are from; raises
+ValueError for an option that is wrong."""
+
+SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
+    "lines": (LinesDecoder, ()),
+}
+"""Decoder and options of each kind."""
+
+
+def add_source_kind(name: str, make: SourceKind, options: tuple[str, ...] = ()) -> None:
+    """Add a kind of source.
+
+    Parameters
+    ----------
+    name : str
+        The scheme of its URLs.
+    make : callable
+        Makes its decoder of a parsed URL and the node of its records.
+    options : tuple of str
+        The names that may follow `?`, in addition to those of every source.
+
+    Raises
+    ------
+    ValueError
+        If the name is taken.
+    """
+    if name in SOURCE_KINDS:
+        raise ValueError(f"source kind {name!r} is added twice")
+    SOURCE_KINDS[name] = (make, options)
+
+
+def check_source(url: SourceUrl) -> None:
+    """Raise ValueError for an unknown kind or option, or a number that is none."""
+    if url.kind not in SOURCE_KINDS:
+        raise ValueError(f"source {url.url!r}: {unknown_choice('kind', url.kind, SOURCE_KINDS)}")
+    _, own = SOURCE_KINDS[url.kind]
+    allowed = (*OPTIONS, *own)
+    if unknown := [name for name in url.options if name not in allowed]:
+        raise ValueError(
+            f"source {url.url!r}: unknown option {unknown[0]!r}; there are {', '.join(allowed)}"
+        )
+    for name in OPTIONS:
+        if name in url.options and not url.options[name].isdecimal():
+            raise ValueError(f"source {url.url!r}: {name} must be a whole number")
+
+
+def make_decoder(url: SourceUrl, node: NodeId) -> SourceDecoder:
+    """Make the decoder of a URL; raises ValueError as `check_source`."""
+    check_source(url)
+    make, _ = SOURCE_KINDS[url.kind]
+    return make(url, node)
+
+
+def make_sources(
+    settings: tuple[SourceSettings, ...], read: Callable[[str], str]
+) -> list[SourceInput]:
+    """Make all sources of the settings; raises ValueError as `make_decoder`.
+
+    `read` returns the text of a file, such as that of a map of columns.
+    """
+    found = []
+    for each, node in zip(settings, nodes_of(settings), strict=True):
+        url = parse_source(each.url)
+        if path := url.options.get("columns"):
+            url = replace(url, options=url.options | {"columns": read(path)})
+        found.append(SourceInput(url, node, make_decoder(url, node)))
+    return found

@@ -1,0 +1,271 @@
+"""Lines of text: JSON objects, NMEA 0183 sentences and CSV, mixed in one stream.
+
+| line begins with | is                                                                    |
+| ---------------- | --------------------------------------------------------------------- |
+| `{`              | a JSON object; its keys are those of `KEYS`                           |
+| `$` or `!`       | an NMEA 0183 sentence                                                 |
+| `#`              | a comment                                                             |
+| anything else    | CSV, by the map of columns of the option `columns`                    |
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any, Final
+
+from gateway.records import (
+    NAN,
+    BaroRaw,
+    BatteryReport,
+    GpsFixType,
+    NodeId,
+    RadioSignal,
+    Vec3,
+    VehicleReport,
+)
+from gateway.sources.nmea import NmeaReader
+from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
+from gateway.sources.settings import SourceUrl
+from gateway.sources.source import SourceRecord
+from gateway.units import STANDARD_GRAVITY_MPS2
+from gateway.wire.framing import Fault
+from gateway.wire.timesync import WRAP_MASK
+
+MAX_LINE: Final = 4096
+MAX_VEHICLE: Final = 31
+SHOWN: Final = 60
+
+DEG_PER_RAD: Final = math.degrees(1.0)
+VECTORS: Final = {
+    "accel_mps2": ("accel", 1.0),
+    "accel_g": ("accel", STANDARD_GRAVITY_MPS2),
+    "gyro_dps": ("gyro", 1.0),
+    "gyro_radps": ("gyro", DEG_PER_RAD),
+    "mag_ut": ("mag", 1.0),
+    "mag_gauss": ("mag", 100.0),
+    "vel_n_mps": ("vel", 1.0),
+    "attitude_deg": ("attitude", math.radians(1.0)),
+}
+"""Quantity and factor of each key with three numbers."""
+NUMBERS: Final = {
+    "pressure_pa": ("pressure", 1.0),
+    "pressure_hpa": ("pressure", 100.0),
+    "temperature_degc": ("temperature", 1.0),
+    "lat": ("lat", 1.0),
+    "lon": ("lon", 1.0),
+    "alt_m": ("alt", 1.0),
+    "speed_mps": ("speed", 1.0),
+    "course_deg": ("course", 1.0),
+    "climb_mps": ("climb", 1.0),
+    "satellites": ("satellites", 1.0),
+    "h_acc_m": ("h_acc", 1.0),
+    "v_acc_m": ("v_acc", 1.0),
+    "heading_deg": ("heading", math.radians(1.0)),
+    "airspeed_mps": ("airspeed", 1.0),
+    "battery_v": ("battery_v", 1.0),
+    "battery_a": ("battery_a", 1.0),
+    "battery_mah": ("battery_mah", 1.0),
+    "battery_percent": ("battery_percent", 1.0),
+    "rssi_dbm": ("rssi", 1.0),
+    "snr_db": ("snr", 1.0),
+    "link_percent": ("link", 1.0),
+    "t_ms": ("t_ms", 1.0),
+    "id": ("id", 1.0),
+}
+"""Quantity and factor of each key with a number."""
+TEXTS: Final = ("mode", "text")
+KEYS: Final = (*VECTORS, *NUMBERS, *TEXTS, "armed")
+_NOTICE: Final = 5
+"""MAV_SEVERITY_NOTICE."""
+
+
+class LineSplitter:
+    """Lines of a stream of bytes, at most `MAX_LINE` long."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[str | Fault]:
+        """Take any chunk, and return the lines that it completes."""
+        *lines, rest = (self._rest + data).split(b"\n")
+        found: list[str | Fault] = [
+            line.decode("utf-8", "replace").strip()
+            if len(line) <= MAX_LINE
+            else Fault("too long", len(line), f"a line is longer than {MAX_LINE} bytes")
+            for line in lines
+        ]
+        if len(rest) > MAX_LINE:
+            found.append(Fault("too long", len(rest), f"no line ends within {MAX_LINE} bytes"))
+            rest = b""
+        self._rest = rest
+        return found
+
+    def reset(self) -> None:
+        """Discard a line that has not ended."""
+        self._rest = b""
+
+
+class LinesDecoder:
+    """Decode lines of all three kinds."""
+
+    def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        self._node = node
+        self._splitter = LineSplitter()
+        self._nmea = NmeaReader(node)
+        self._clocks: dict[int, SampleClock] = {}
+        self._has_own_id = "id" in url.options
+        self._ends_line = url.transport == "udp"
+        """A datagram ends its last line, whether or not a line feed does."""
+
+    def reset(self) -> None:
+        """Discard a line that has not ended."""
+        self._splitter.reset()
+
+    def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Decode every line that a chunk completes."""
+        found: list[SourceRecord | Fault] = []
+        for line in self._splitter.feed(data + b"\n" if self._ends_line else data):
+            if isinstance(line, Fault):
+                found.append(line)
+            elif line:
+                found += self._line(line, arrival_us)
+        return found
+
+    def _line(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+        if line[0] == "{":
+            return self._json(line, arrival_us)
+        if line[0] in "$!":
+            return [*self._nmea.line(line, arrival_us)]
+        if line[0] == "#":
+            return []
+        return [_fault("text", line, "neither JSON, NMEA nor CSV of a map (?columns=FILE)")]
+
+    def _json(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:
+        try:
+            content = json.loads(line)
+        except (ValueError, RecursionError):
+            return [_fault("json", line, "no JSON object")]
+        values = read_keys(content)
+        unknown = [key for key in content if key not in KEYS]
+        vehicle = values.get("id")
+        node = self._node
+        if isinstance(vehicle, float) and not self._has_own_id:
+            if not (vehicle.is_integer() and 1 <= vehicle <= MAX_VEHICLE):
+                return [_fault("id", line, f"id must be 1 to {MAX_VEHICLE}")]
+            node = NodeId(int(vehicle), node.node_id)
+        clock = self._clocks.setdefault(node.vehicle_id, SampleClock())
+        stamp = values.get("t_ms")
+        if isinstance(stamp, float) and 0.0 <= stamp < 1e15:
+            time_us = clock.own(round(stamp * 1000.0), arrival_us)
+        else:
+            time_us = clock.arrival(arrival_us)
+        records = records_of(values, node, time_us)
+        faults: list[SourceRecord | Fault] = []
+        if unknown:
+            faults.append(_fault("json key", str(unknown[0]), "unknown key, not used"))
+        elif not records:
+            faults.append(_fault("json", line, "has no key with a valid value"))
+        return [*records, *faults]
+
+
+def read_keys(content: Mapping[str, Any]) -> dict[str, float | Vec3 | str | bool]:
+    """Read the known keys of an object by quantity, in SI but deg/s; leave out invalid values."""
+    found: dict[str, float | Vec3 | str | bool] = {}
+    for key, value in content.items():
+        if key in VECTORS and isinstance(value, list) and len(value) == 3:
+            quantity, factor = VECTORS[key]
+            if all(is_number(each) for each in value):
+                x, y, z = (float(each) * factor for each in value)
+                found[quantity] = (x, y, z)
+        elif key in NUMBERS and is_number(value):
+            quantity, factor = NUMBERS[key]
+            found[quantity] = float(value) * factor
+        elif (key in TEXTS and isinstance(value, str)) or (
+            key == "armed" and isinstance(value, bool)
+        ):
+            found[key] = value
+    return found
+
+
+def is_number(value: object) -> bool:
+    """Return whether a value of JSON is a finite number of a sane size."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e18
+
+
+def records_of(
+    values: Mapping[str, float | Vec3 | str | bool], node: NodeId, time_us: int
+) -> list[SourceRecord]:
+    """Make the records of the quantities of one moment."""
+    found: list[SourceRecord | None] = []
+    get: Any = values.get
+    if "pressure" in values:
+        degc = get("temperature", NAN)
+        found.append(BaroRaw(time_us, node, time_us & WRAP_MASK, get("pressure"), degc))
+    if "lat" in values and "lon" in values:
+        found.append(_fix(values, node, time_us))
+    if "accel" in values and "gyro" in values:
+        degc = get("temperature", NAN)
+        found.append(imu_raw(time_us, node, get("accel"), get("gyro"), get("mag"), degc))
+    found.append(_report(values, node, time_us))
+    return [record for record in found if record is not None]
+
+
+def _fix(values: Mapping[str, Any], node: NodeId, time_us: int) -> SourceRecord | None:
+    get = values.get
+    vel = get("vel")
+    if vel is None:
+        vel = velocity(get("speed", NAN), get("course", NAN), get("climb", NAN))
+    no_fix = (get("lat"), get("lon")) == (0.0, 0.0)
+    return fix_at(
+        time_us,
+        node,
+        values["lat"],
+        values["lon"],
+        get("alt", NAN),
+        vel_n_mps=vel,
+        satellites=round(get("satellites", 0.0)),
+        fix_type=GpsFixType.NONE if no_fix else None,
+        h_acc_m=get("h_acc", NAN),
+        v_acc_m=get("v_acc", NAN),
+    )
+
+
+REPORTED: Final = frozenset(
+    {"attitude", "heading", "airspeed", "mode", "text", "armed", "rssi", "link"}
+    | {"battery_v", "battery_a", "battery_mah", "battery_percent"}
+)
+
+
+def _report(values: Mapping[str, Any], node: NodeId, time_us: int) -> VehicleReport | None:
+    if REPORTED.isdisjoint(values):
+        return None
+    get = values.get
+    battery = None
+    if any(name.startswith("battery") for name in values):
+        battery = BatteryReport(
+            voltage_v=get("battery_v", NAN),
+            current_a=get("battery_a", NAN),
+            used_mah=get("battery_mah", NAN),
+            remaining_percent=get("battery_percent", NAN),
+        )
+    rssi = get("rssi")
+    text = get("text")
+    return VehicleReport(
+        time_us=time_us,
+        node=node,
+        attitude_rad=get("attitude"),
+        heading_rad=get("heading", NAN),
+        airspeed_mps=get("airspeed", NAN),
+        battery=battery,
+        mode=get("mode", ""),
+        armed=get("armed"),
+        text=None if text is None else (_NOTICE, text),
+        link_quality_percent=get("link", NAN),
+        signal=None if rssi is None else RadioSignal(round(rssi), get("snr", NAN)),
+    )
+
+
+def _fault(kind: str, line: str, why: str) -> Fault:
+    return Fault(kind, len(line), f"{line[:SHOWN]!r}: {why}")

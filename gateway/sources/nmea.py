@@ -1,0 +1,169 @@
+"""NMEA 0183 sentences of any talker to fixes: GGA, RMC, VTG, GSA, GST and HDT.
+
+A receiver spreads one fix over several sentences of the same time of day, in an order of its own.
+A fix is complete with GGA and RMC of one time, or with the only one that a receiver sends.
+The others add to the next fix what they hold.
+"""
+
+import math
+import re
+from datetime import UTC, datetime
+from functools import reduce
+from operator import xor
+from typing import Final
+
+from gateway.records import NAN, GpsFix, GpsFixType, NodeId, VehicleReport
+from gateway.sources.sampling import fix_at, velocity
+from gateway.units import US_PER_S
+from gateway.wire.framing import Fault
+
+SENTENCE: Final = re.compile(r"[$!](\w{2})(\w{3})((?:,[^*]*)?)(?:\*([0-9A-Fa-f]{2}))?")
+KNOTS_MPS: Final = 1852.0 / 3600.0
+KMH_MPS: Final = 1.0 / 3.6
+DEG_MIN: Final = re.compile(r"(\d{1,3})(\d\d(?:\.\d*)?)")
+UERE_M: Final = 4.0
+"""Error of a range, m, by which a dilution becomes an accuracy where GST gives none."""
+MAX_AGE_US: Final = 3 * US_PER_S
+"""How long VTG, GSA and GST count for later fixes."""
+FIX_TYPES: Final = {"1": GpsFixType.NONE, "2": GpsFixType.FIX_2D, "3": GpsFixType.FIX_3D}
+IGNORED: Final = frozenset({"GSV", "GLL", "TXT", "ZDA", "GNS", "GBS", "GRS", "DTM", "VLW"})
+
+
+def checksum(text: str) -> int:
+    """Return the checksum of the characters between `$` and `*`."""
+    return reduce(xor, text.encode("latin-1", "replace"), 0)
+
+
+class NmeaReader:
+    """Collect sentences of one receiver into fixes."""
+
+    def __init__(self, node: NodeId) -> None:
+        self._node = node
+        self._epoch: dict[str, list[str]] = {}
+        """GGA and RMC of the time that is being collected."""
+        self._time = ""
+        self._both = False
+        """Whether the last time had GGA and RMC."""
+        self._done = False
+        self._extra: dict[str, tuple[int, list[str]]] = {}
+        """Arrival and fields of the newest VTG, GSA and GST."""
+
+    def line(self, line: str, arrival_us: int) -> list[GpsFix | VehicleReport | Fault]:
+        """Take one sentence."""
+        found = SENTENCE.fullmatch(line)
+        if found is None:
+            return [_fault("nmea", line, "no NMEA sentence")]
+        _, kind, fields, check = found.groups()
+        if check is not None and int(check, 16) != checksum(line[1:].partition("*")[0]):
+            return [_fault("nmea checksum", line, "wrong checksum")]
+        try:
+            return self._sentence(kind, fields.split(",")[1:], arrival_us)
+        except (ValueError, IndexError):
+            return [_fault("nmea", line, f"{kind} has a field that cannot be read")]
+
+    def _sentence(
+        self, kind: str, fields: list[str], arrival_us: int
+    ) -> list[GpsFix | VehicleReport | Fault]:
+        if kind in ("GGA", "RMC"):
+            fix = self._collect(kind, fields, arrival_us)
+            return [] if fix is None else [fix]
+        if kind in ("VTG", "GSA", "GST"):
+            self._extra[kind] = (arrival_us, fields)
+            return []
+        if kind == "HDT" and fields[0]:
+            heading = math.radians(float(fields[0]))
+            return [VehicleReport(time_us=arrival_us, node=self._node, heading_rad=heading)]
+        if kind in IGNORED or kind == "HDT":
+            return []
+        return [_fault("nmea unknown", kind, "sentence is not used")]
+
+    def _collect(self, kind: str, fields: list[str], arrival_us: int) -> GpsFix | None:
+        if fields[0] != self._time or kind in self._epoch:
+            self._both = len(self._epoch) > 1
+            self._epoch, self._time, self._done = {}, fields[0], False
+        self._epoch[kind] = fields
+        if self._done or (self._both and len(self._epoch) < 2):
+            return None
+        self._done = True
+        return self._fix(arrival_us)
+
+    def _newest(self, kind: str, arrival_us: int) -> list[str]:
+        since_us, fields = self._extra.get(kind, (-MAX_AGE_US - 1, []))
+        return fields if arrival_us - since_us <= MAX_AGE_US else []
+
+    def _fix(self, arrival_us: int) -> GpsFix | None:
+        gga, rmc = self._epoch.get("GGA", []), self._epoch.get("RMC", [])
+        at = gga[1:] if gga else rmc[2:]
+        lat, lon = _degrees(at[0], at[1]), _degrees(at[2], at[3])
+        gsa = self._newest("GSA", arrival_us)
+        hdop = _number(gga[7]) if gga else NAN
+        pdop = _number(gsa[14]) if len(gsa) > 14 else NAN
+        h_acc, v_acc = self._accuracies(hdop, pdop, arrival_us)
+        valid = gga[5] not in ("", "0") if gga else rmc[1] == "A"
+        if rmc and rmc[1] == "V":
+            valid = False
+        fix_type = FIX_TYPES.get(gsa[1]) if len(gsa) > 1 and valid else None
+        return fix_at(
+            arrival_us,
+            self._node,
+            lat if valid else 0.0,
+            lon if valid else 0.0,
+            _number(gga[8]) if gga else NAN,
+            vel_n_mps=velocity(*self._motion(rmc, arrival_us), climb_mps=NAN),
+            satellites=int(gga[6] or 0) if gga else 0,
+            fix_type=fix_type if valid else GpsFixType.NONE,
+            h_acc_m=h_acc,
+            v_acc_m=v_acc,
+            pdop=pdop,
+            utc_us=_utc_us(rmc) if rmc and valid else None,
+        )
+
+    def _motion(self, rmc: list[str], arrival_us: int) -> tuple[float, float]:
+        """Return speed over ground in m/s and course in degrees."""
+        if rmc:
+            return _number(rmc[6]) * KNOTS_MPS, _number(rmc[7])
+        vtg = self._newest("VTG", arrival_us)
+        return (_number(vtg[6]) * KMH_MPS, _number(vtg[0])) if len(vtg) > 6 else (NAN, NAN)
+
+    def _accuracies(self, hdop: float, pdop: float, arrival_us: int) -> tuple[float, float]:
+        gst = self._newest("GST", arrival_us)
+        if len(gst) > 7:
+            lat_m, lon_m, alt_m = (_number(gst[k]) for k in (5, 6, 7))
+            if lat_m == lat_m and lon_m == lon_m:
+                return math.hypot(lat_m, lon_m), alt_m
+        v_sq = pdop * pdop - hdop * hdop
+        return hdop * UERE_M, math.sqrt(v_sq) * UERE_M if v_sq > 0.0 else NAN
+
+
+def _fault(kind: str, line: str, why: str) -> Fault:
+    return Fault(kind, len(line), f"{line[:60]!r}: {why}")
+
+
+def _number(text: str) -> float:
+    if not text:
+        return NAN
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
+
+
+def _degrees(text: str, side: str) -> float:
+    """Read degrees and minutes, such as 4807.038 and N; NaN if empty."""
+    if not text:
+        return NAN
+    found = DEG_MIN.fullmatch(text)
+    if found is None or side not in ("N", "S", "E", "W"):
+        raise ValueError(text)
+    value = int(found[1]) + float(found[2]) / 60.0
+    return -value if side in ("S", "W") else value
+
+
+def _utc_us(rmc: list[str]) -> int | None:
+    time, date = rmc[0], rmc[8]
+    if len(time) < 6 or len(date) != 6:
+        return None
+    day, month, year = (int(date[k : k + 2]) for k in (0, 2, 4))
+    hour, minute = int(time[:2]), int(time[2:4])
+    whole_us = datetime(2000 + year, month, day, hour, minute, tzinfo=UTC).timestamp() * US_PER_S
+    return round(whole_us + _number(time[4:]) * US_PER_S)

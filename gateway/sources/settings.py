@@ -1,0 +1,118 @@
+"""The URL of a source: its kind, the transport that brings its bytes, and options.
+
+    KIND:/dev/ttyACM0            serial port; ?baud=420000
+    KIND:usb:1a86:7523           serial port by its USB id, as [serial] port
+    KIND:udp:HOST:PORT           datagrams to this address
+    KIND:tcp:HOST:PORT           connect, and reconnect when it breaks
+    KIND:tcp-listen:HOST:PORT    serve one client at a time
+    KIND:stdin                   standard input
+    KIND:file:PATH               a file that grows
+
+`KIND-udp:HOST:PORT` is the same as `KIND:udp:HOST:PORT`, and so are the others. A listening address
+beyond loopback is opened only if it is written, as in every endpoint.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Final
+from urllib.parse import parse_qsl
+
+from gateway.records import SOURCE_NODE, NodeId
+from gateway.settings import Settings, setting
+
+TRANSPORTS: Final = ("serial", "udp", "tcp", "tcp-listen", "stdin", "file")
+NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen"})
+MAX_SOURCES: Final = 16
+MAX_PORT: Final = 65535
+OPTIONS: Final = ("baud", "id")
+"""Of every kind."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceUrl:
+    """One parsed URL."""
+
+    url: str
+    kind: str
+    transport: str
+    address: str
+    """Device, path, or host of a network."""
+    port: int
+    options: dict[str, str]
+
+    @property
+    def name(self) -> str:
+        """The URL without its options, which may be secret."""
+        return self.url.partition("?")[0]
+
+
+def parse_source(url: str) -> SourceUrl:
+    """Parse a URL; raises ValueError with the reason."""
+    location, _, query = url.partition("?")
+    head, colon, address = location.partition(":")
+    kind, transport = head, ""
+    for each in TRANSPORTS:
+        if head.endswith(f"-{each}"):
+            # The longest, which is the last: tcp-listen ends in no other.
+            kind, transport = head.removesuffix(f"-{each}"), each
+    if not transport:
+        transport, address = _transport_of(address)
+    if not kind or not (colon or transport == "stdin"):
+        raise ValueError(f"source {url!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
+    options = dict(parse_qsl(query, keep_blank_values=True))
+    port = 0
+    if transport in NETWORK:
+        address, port = _host_and_port(url, address)
+    elif transport != "stdin" and not address:
+        raise ValueError(f"source {url!r}: names no device or file")
+    return SourceUrl(url, kind, transport, address, port, options)
+
+
+def _transport_of(address: str) -> tuple[str, str]:
+    """Split the rest of a URL into transport and address; a device needs no transport."""
+    word, _, rest = address.partition(":")
+    if word in TRANSPORTS:
+        return word, rest
+    return ("stdin", "") if address == "-" else ("serial", address)
+
+
+def _host_and_port(url: str, address: str) -> tuple[str, int]:
+    host, _, port = address.rpartition(":")
+    if not (port.isdecimal() and 0 <= int(port) <= MAX_PORT and host):
+        raise ValueError(f"source {url!r}: needs HOST:PORT, such as 127.0.0.1:5600")
+    return host.strip("[]"), int(port)
+
+
+class SourceSettings(Settings, frozen=True):
+    """A tracker, radio or phone that is a vehicle, next to those of the receiver."""
+
+    url: Annotated[
+        str,
+        setting(
+            "Kind and place, such as crsf:/dev/ttyACM0, lines:udp:0.0.0.0:5600 or "
+            "lines:file:/tmp/log; docs/sources.md lists the kinds and their options."
+        ),
+    ]
+    vehicle: Annotated[
+        int,
+        setting(
+            "Vehicle id, which is its MAVLink system id; 0 for its place in the list. Several "
+            "sources may belong to one vehicle.",
+            ge=0,
+            le=31,
+        ),
+    ] = 0
+
+    def __post_init__(self) -> None:
+        """Refuse a wrong URL when the settings are read."""
+        parse_source(self.url)
+
+
+def nodes_of(sources: tuple[SourceSettings, ...]) -> list[NodeId]:
+    """Return the node of each source: the vehicles' nodes of sources are counted from 8."""
+    found: list[NodeId] = []
+    for place, source in enumerate(sources, 1):
+        wanted = parse_source(source.url).options.get("id", "")
+        vehicle_id = int(wanted) if wanted.isdecimal() else source.vehicle or place
+        before = sum(node.vehicle_id == vehicle_id for node in found)
+        found.append(NodeId(vehicle_id, SOURCE_NODE + before))
+    return found

@@ -1,0 +1,142 @@
+"""A source's bytes to records, with the counts of all that was dropped.
+
+Theory of operation. A kind of source is a decoder and nothing else: `feed` takes any chunk of bytes
+and the time of their arrival, and returns the records and faults in it. Two kinds of records come:
+samples of sensors (`ImuRaw`, `BaroRaw`, `GpsFix`), which are calibrated and fused like those of
+boards, and reports of an autopilot (`VehicleReport`), which are passed on with their own time. A
+`GpsFix` of a vehicle without an IMU is its position as well.
+"""
+
+from collections import Counter, deque
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+from gateway.records import (
+    BaroRaw,
+    GpsFix,
+    ImuRaw,
+    NodeId,
+    NodeLink,
+    RadioSignal,
+    SourceReport,
+    VehicleReport,
+)
+from gateway.sources.settings import SourceUrl
+from gateway.units import US_PER_S
+from gateway.wire.framing import Fault
+
+SourceRecord = ImuRaw | BaroRaw | GpsFix | VehicleReport
+
+MAX_ARRIVALS: Final = 2048
+"""For the rate; more than any source sends in a second."""
+MAX_KINDS: Final = 32
+"""Kinds of faults that are counted by name."""
+MAX_DETAIL: Final = 200
+
+
+class SourceDecoder(Protocol):
+    """The decoder of one kind of source."""
+
+    def feed(self, data: bytes, arrival_us: int) -> list[SourceRecord | Fault]:
+        """Take any chunk, and return the records and faults that it completes; never raise."""
+        ...
+
+    def reset(self) -> None:
+        """Discard a part of a frame or line, as the transport was opened again."""
+        ...
+
+
+@dataclass(slots=True)
+class _Node:
+    """What came from one vehicle of a source."""
+
+    last_us: int
+    received: int = 0
+    signal: RadioSignal | None = None
+    arrivals_us: deque[int] = field(default_factory=lambda: deque(maxlen=MAX_ARRIVALS))
+
+
+class SourceInput:
+    """One source: its decoder, and the counts of its records and faults."""
+
+    def __init__(self, url: SourceUrl, node: NodeId, decoder: SourceDecoder) -> None:
+        self.url = url
+        self.node = node
+        self.connected = False
+        self.reason = "not opened yet"
+        self.decoder = decoder
+        self._bytes = self._records = 0
+        self._faults: Counter[str] = Counter()
+        self._newest_fault = ""
+        self._nodes: dict[NodeId, _Node] = {}
+
+    def feed(self, data: bytes, now_us: int) -> list[SourceRecord]:
+        """Decode bytes that arrived now, and count what cannot be used."""
+        self._bytes += len(data)
+        records: list[SourceRecord] = []
+        for event in self.decoder.feed(data, now_us):
+            if isinstance(event, Fault):
+                self._count(event)
+                continue
+            self._records += 1
+            node = self._nodes.setdefault(event.node, _Node(now_us))
+            node.received += 1
+            node.last_us = now_us
+            node.arrivals_us.append(now_us)
+            if isinstance(event, VehicleReport) and event.signal is not None:
+                node.signal = event.signal
+            records.append(event)
+        return records
+
+    @property
+    def vehicles(self) -> frozenset[int]:
+        """The vehicles that records came from."""
+        return frozenset(node.vehicle_id for node in self._nodes)
+
+    def _count(self, fault: Fault) -> None:
+        known = fault.kind in self._faults or len(self._faults) < MAX_KINDS
+        self._faults[fault.kind if known else "other"] += 1
+        self._newest_fault = (fault.detail or fault.kind)[:MAX_DETAIL]
+
+    def opened(self) -> None:
+        """Note that the transport was opened, and discard what was received in part."""
+        self.decoder.reset()
+        self.connected, self.reason = True, ""
+
+    def lost(self, reason: str) -> None:
+        """Note that the transport is gone."""
+        self.connected, self.reason = False, reason
+
+    def report(self) -> SourceReport:
+        """Return the state for people."""
+        return SourceReport(
+            self.url.name,
+            self.node,
+            self.connected,
+            self.reason,
+            self._bytes,
+            self._records,
+            tuple(sorted(self._faults.items())),
+            self._newest_fault,
+            max((node.last_us for node in self._nodes.values()), default=None),
+        )
+
+    def links(self, now_us: int) -> list[NodeLink]:
+        """Return the counts as those of nodes, one for each vehicle; faults are the first's."""
+        faults = [sum(self._faults.values())]
+        return [
+            NodeLink(
+                node=key,
+                pipe=0,
+                received=node.received,
+                lost=faults.pop() if faults else 0,
+                duplicates=0,
+                reordered=0,
+                restarts=0,
+                rate_hz=float(sum(us > now_us - US_PER_S for us in node.arrivals_us)),
+                last_time_us=node.last_us,
+                clock_skew_ppm=0.0,
+                signal=node.signal,
+            )
+            for key, node in self._nodes.items()
+        ]

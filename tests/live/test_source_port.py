@@ -1,0 +1,124 @@
+"""The transports of sources: each brings bytes, and opens again what was lost."""
+
+import asyncio
+import os
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gateway.live import source_port
+from gateway.live.source_port import SourcePort
+from gateway.records import NodeId
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
+from gateway.sources.source import SourceInput
+
+pytestmark = pytest.mark.io
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(source_port, "RETRY_S", 0.01)
+    monkeypatch.setattr(source_port, "FILE_POLL_S", 0.01)
+
+
+class Opened:
+    """A source that is open, and the bytes that it has brought."""
+
+    def __init__(self, url: str) -> None:
+        parsed, node = parse_source(url), NodeId(1, 8)
+        self.source = SourceInput(parsed, node, make_decoder(parsed, node))
+        self.data = b""
+        self._port = SourcePort(self.source, self._take)
+
+    def _take(self, _source: SourceInput, data: bytes) -> None:
+        self.data += data
+
+    async def __aenter__(self) -> "Opened":
+        self._port.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._port.close()
+        await asyncio.sleep(0)
+
+
+async def until(condition: Callable[[], object]) -> None:
+    async with asyncio.timeout(30.0):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+async def test_datagrams_are_read() -> None:
+    port = free_port()
+    async with Opened(f"lines:udp:127.0.0.1:{port}") as opened:
+        await until(lambda: opened.source.connected)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.sendto(b"abc", ("127.0.0.1", port))
+        await until(lambda: opened.data == b"abc")
+
+
+async def test_file_is_followed_from_its_beginning_and_again_after_it_is_replaced(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "log"
+    async with Opened(f"lines:file:{path}") as opened:
+        await until(lambda: "No such file" in opened.source.reason)
+        path.write_bytes(b"one\n")
+        await until(lambda: opened.data == b"one\n")
+        with path.open("ab") as file:
+            file.write(b"two\n")
+        await until(lambda: opened.data == b"one\ntwo\n")
+        path.write_bytes(b"3\n")
+        await until(lambda: opened.data == b"one\ntwo\n3\n")
+
+
+async def test_serial_device_is_opened_again_after_it_was_unplugged(tmp_path: Path) -> None:
+    link = tmp_path / "tty"
+    async with Opened(f"lines:{link}") as opened:
+        await until(lambda: "No such file" in opened.source.reason)
+        for word in (b"one", b"two"):
+            opened.data = b""
+            master, slave = os.openpty()
+            link.symlink_to(os.ttyname(slave))
+            await until(lambda: opened.source.connected)
+            os.write(master, word)
+            await until(lambda w=word: opened.data == w)
+            link.unlink()
+            os.close(slave)
+            os.close(master)
+            await until(lambda: not opened.source.connected)
+
+
+async def test_server_is_connected_again_after_it_has_closed() -> None:
+    async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"x")
+        await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    async with server, Opened(f"lines:tcp:127.0.0.1:{port}") as opened:
+        await until(lambda: opened.data.startswith(b"xx"))
+
+
+async def test_listening_source_serves_one_client_at_a_time() -> None:
+    port = free_port()
+    async with Opened(f"lines:tcp-listen:127.0.0.1:{port}") as opened:
+        await until(lambda: opened.source.reason == "no client is connected")
+        _, first = await asyncio.open_connection("127.0.0.1", port)
+        first.write(b"1")
+        await until(lambda: opened.data == b"1")
+        reader, second = await asyncio.open_connection("127.0.0.1", port)
+        assert await reader.read() == b"", "closed at once"
+        second.close()
+        first.close()
+        await until(lambda: not opened.source.connected)

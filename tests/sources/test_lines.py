@@ -1,0 +1,197 @@
+"""Lines of text: JSON, NMEA 0183, and faults; any chunking gives the same records."""
+
+import json
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import pytest
+from pynmeagps import GET, NMEAMessage
+
+from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuRaw, NodeId, VehicleReport
+from gateway.sensing.calibration import NodeCalibration
+from gateway.sensing.chain import SensorChain
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
+from gateway.wire.framing import Fault
+
+NODE = NodeId(3, 8)
+
+
+def decode(text: str | bytes, url: str = "lines:stdin", arrival_us: int = 1_000_000) -> list[Any]:
+    data = text.encode() if isinstance(text, str) else text
+    return make_decoder(parse_source(url), NODE).feed(data, arrival_us)
+
+
+def json_line(**content: object) -> str:
+    return json.dumps(content) + "\n"
+
+
+def nmea(kind: str, *fields: str, talker: str = "GN") -> str:
+    """Write a sentence by an independent implementation."""
+    return NMEAMessage(talker, kind, GET, payload=[*fields]).serialize().decode()
+
+
+GGA = ("101530.20", "4807.038", "N", "01131.000", "E", "1", "09", "0.9", "545.4", "M", "46.9", "M")
+RMC = ("101530.20", "A", "4807.038", "N", "01131.000", "E", "22.4", "084.4", "230326")
+
+
+def gga(talker: str = "GN", *, time: str = GGA[0]) -> str:
+    return nmea("GGA", time, *GGA[1:], "", "", talker=talker)
+
+
+def rmc(talker: str = "GN", *, time: str = RMC[0]) -> str:
+    return nmea("RMC", time, *RMC[1:], "", "", "A", talker=talker)
+
+
+def of_kind(found: Iterable[Any], kind: type) -> list[Any]:
+    return [each for each in found if isinstance(each, kind)]
+
+
+def test_imu_in_si_keeps_its_values_through_counts_and_mounting() -> None:
+    line = json_line(accel_mps2=[0.5, -1.25, 9.8], gyro_dps=[10, -20, 300], mag_ut=[21, -3.5, -44])
+    (raw,) = decode(line)
+    assert isinstance(raw, ImuRaw)
+    sample = SensorChain(NodeCalibration()).imu(raw)
+    assert sample.accel_b_mps2 == pytest.approx((0.5, 1.25, -9.8), abs=0.0004)
+    assert sample.gyro_b_radps == pytest.approx(
+        [math.radians(rate) for rate in (10, 20, -300)], abs=math.radians(0.005)
+    )
+    assert sample.mag_b_ut == pytest.approx((21, 3.5, 44), abs=0.006)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "same"),
+    [
+        ("accel_g", [0, 0, 1], {"accel_mps2": [0, 0, 9.80665]}),
+        ("gyro_radps", [math.pi, 0, 0], {"gyro_dps": [180.0, 0, 0]}),
+        ("mag_gauss", [0.2, 0, 0.4], {"mag_ut": [20, 0, 40]}),
+    ],
+)
+def test_other_units_give_the_same_record(key: str, value: list[float], same: dict) -> None:
+    rest = {"accel_mps2": [0, 0, 9.8], "gyro_dps": [1, 2, 3], "mag_ut": [20, 0, 40]}
+    other = {k: v for k, v in rest.items() if k.split("_")[0] != key.split("_")[0]}
+    assert decode(json_line(**other, **{key: value})) == decode(json_line(**other, **same))
+
+
+def test_position_battery_and_link_become_records() -> None:
+    line = json_line(
+        lat=-33.5, lon=151.25, alt_m=12.5, speed_mps=5, course_deg=90, satellites=11, h_acc_m=1.5,
+        pressure_hpa=1001.5, battery_v=11.1, rssi_dbm=-80, mode="AUTO", armed=True,
+    )  # fmt: skip
+    baro, fix, report = decode(line)
+    assert (baro.pressure_pa, baro.node) == (100_150.0, NODE)
+    assert (fix.lat_dege7, fix.lon_dege7, fix.satellites) == (-335_000_000, 1_512_500_000, 11)
+    assert fix.vel_n_mps[:2] == pytest.approx((0.0, 5.0), abs=1e-9)
+    assert math.isnan(fix.vel_n_mps[2]), "the climb is not reported"
+    assert report.battery.voltage_v == 11.1
+    assert math.isnan(report.battery.current_a)
+    assert (report.mode, report.armed, report.signal.rssi_dbm) == ("AUTO", True, -80)
+
+
+def test_own_clock_is_followed_and_arrival_is_used_without_one() -> None:
+    decoder = make_decoder(parse_source("lines:stdin"), NODE)
+    stamped = [
+        decoder.feed(json_line(t_ms=t, pressure_hpa=1000).encode(), 5_000_000 + t * 1000 + late)[0]
+        for t, late in ((0, 0), (10, 9000), (20, 0))
+    ]
+    assert [record.time_us for record in stamped] == [5_000_000, 5_010_000, 5_020_000]
+    lines = json_line(pressure_hpa=1000) * 3
+    times = [record.time_us for record in decode(lines, arrival_us=7_000_000)]
+    assert times[0] == 7_000_000
+    assert times == sorted(set(times)), "samples of one chunk have different times"
+
+
+def test_id_selects_the_vehicle_unless_the_url_does() -> None:
+    line = json_line(id=7, pressure_hpa=1000)
+    assert decode(line)[0].node == NodeId(7, 8)
+    assert decode(line, "lines:stdin?id=3")[0].node == NODE
+    assert decode(json_line(id=99, pressure_hpa=1000))[0].kind == "id"
+
+
+@pytest.mark.parametrize("talker", ["GP", "GN", "GL", "GA"])
+@pytest.mark.parametrize("rmc_first", [False, True])
+def test_gga_and_rmc_of_one_time_are_one_fix(talker: str, rmc_first: bool) -> None:
+    times = [f"10153{n}.00" for n in range(4)]
+    pairs = [[gga(talker, time=t), rmc(talker, time=t)] for t in times]
+    text = "".join(line for pair in pairs for line in (pair[::-1] if rmc_first else pair))
+    fixes = of_kind(decode(text), GpsFix)[2:]
+    assert len(fixes) == 2, "after the first time, which shows that both are sent"
+    fix = fixes[-1]
+    assert fix.lat_dege7 == round((48 + 7.038 / 60) * 1e7)
+    assert (fix.alt_amsl_m, fix.satellites, fix.fix_type) == (545.4, 9, GpsFixType.FIX_3D)
+    speed = 22.4 * 1852 / 3600
+    assert math.hypot(*fix.vel_n_mps[:2]) == pytest.approx(speed)
+    assert fix.vel_n_mps[1] > fix.vel_n_mps[0] > 0.0
+    assert fix.utc_us == 1_774_260_933_000_000
+
+
+def test_accuracies_come_from_gst_or_else_from_the_dilution() -> None:
+    gst = nmea("GST", "101530.20", "5", "", "", "", "3.0", "4.0", "6.0")
+    (fix,) = of_kind(decode(gst + gga()), GpsFix)
+    assert (fix.h_acc_m, fix.v_acc_m) == (5.0, 6.0)
+    gsa = nmea("GSA", "A", "2", *([""] * 12), "2.0", "0.9", "1.7")
+    (fix,) = of_kind(decode(gsa + gga()), GpsFix)
+    assert fix.fix_type is GpsFixType.FIX_2D
+    assert fix.h_acc_m == pytest.approx(3.6)
+
+
+def test_sentences_without_a_fix_report_that_there_is_none() -> None:
+    empty = nmea("GGA", "101530.20", "", "", "", "", "0", "00", "99.9", "", "M", "", "M", "", "")
+    (fix,) = decode(empty)
+    assert (fix.fix_ok, fix.fix_type) == (False, GpsFixType.NONE)
+
+
+def test_true_heading_is_reported_without_an_attitude() -> None:
+    (report,) = decode(nmea("HDT", "271.5", "T", talker="HE"))
+    assert isinstance(report, VehicleReport)
+    assert report.heading_rad == pytest.approx(math.radians(271.5))
+    assert report.attitude_rad is None
+
+
+@pytest.mark.parametrize(
+    ("line", "kind", "why"),
+    [
+        ("hello", "text", "neither JSON"),
+        ('{"lat": 1', "json", "no JSON object"),
+        ("[" * 3000, "text", "neither"),
+        ('{"lat":' + "[" * 3000, "json", "no JSON object"),
+        ('{"speed": 3}', "json key", "speed"),
+        ('{"lat": NaN, "lon": 4}', "json", "valid value"),
+        ('{"lat": 91, "lon": 4}', "json", "valid value"),
+        ('{"pressure_hpa": "1000"}', "json", "valid value"),
+        ('{"pressure_hpa": 1' + "0" * 400 + "}", "json", "valid value"),
+        ("$GPGGA,101530.20,4807.038*00", "nmea checksum", "checksum"),
+        ("$GPGGA,x,y", "nmea", "cannot be read"),
+        ("$PUBX,00", "nmea", "no NMEA sentence"),
+        ("x" * 5000, "too long", "longer"),
+    ],
+)
+def test_line_that_cannot_be_used_is_an_explained_fault(line: str, kind: str, why: str) -> None:
+    good = json_line(pressure_hpa=1000)
+    fault, record = decode(f"{line}\n{good}")
+    assert isinstance(fault, Fault)
+    assert fault.kind == kind
+    assert why in fault.detail
+    assert isinstance(record, BaroRaw), "and the next line is read"
+
+
+def test_endless_line_is_dropped_with_a_bound() -> None:
+    decoder = make_decoder(parse_source("lines:stdin"), NODE)
+    for _ in range(100):
+        decoder.feed(b"x" * 1000, 0)
+    assert len(decoder._splitter._rest) <= 4096  # type: ignore[attr-defined]
+
+
+def test_any_chunking_gives_the_same_records() -> None:
+    text = (gga() + rmc() + json_line(pressure_hpa=1000, t_ms=5) + "junk\n# note\n").encode()
+    whole = decode(text)
+    decoder = make_decoder(parse_source("lines:stdin"), NODE)
+    single = [e for k in range(len(text)) for e in decoder.feed(text[k : k + 1], 1_000_000)]
+    assert [repr(e) for e in single] == [repr(e) for e in whole]
+
+
+def test_datagram_needs_no_line_feed() -> None:
+    line = json_line(pressure_hpa=1000).strip()
+    assert decode(line) == []
+    assert len(decode(line, "lines:udp:127.0.0.1:5600")) == 1
