@@ -360,6 +360,8 @@ class VehicleReport(msgspec.Struct, frozen=True, gc=False, kw_only=True):
     alt_home_m: float = NAN
     """Height above home."""
     throttle_percent: float = NAN
+    home: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees, height in m AMSL."""
     battery: BatteryReport | None = None
     mode: str = ""
     custom_mode: int | None = None

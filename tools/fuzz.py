@@ -54,6 +54,10 @@ from gateway.recordings.tlog import HEARTBEAT_ID, TlogScanner, encode_record
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.records import BaroRaw, Incoming, NodeId
 from gateway.settings import Field, Settings, fields_of
+from gateway.simulator.source_bytes import crsf_frame
+from gateway.sources.kinds import SOURCE_KINDS, make_sources
+from gateway.sources.lines import KEYS as LINE_KEYS
+from gateway.sources.settings import SourceSettings
 from gateway.vehicle.plan import Location
 from gateway.wire import payloads
 from gateway.wire.framing import encode_frame
@@ -446,10 +450,36 @@ def command(file: tuple[str, bytes], words: tuple[str, ...]) -> None:
     assert result.exit_code == 0 or result.output.strip()
 
 
+SOURCE_NUMBER: Final = (
+    st.floats() | st.integers(-(2**70), 2**70) | st.lists(st.floats(), max_size=4) | st.text()
+)
+SOURCE_TEXT: Final = st.one_of(
+    st.dictionaries(
+        st.sampled_from(LINE_KEYS), SOURCE_NUMBER | st.text(max_size=9) | st.booleans()
+    ).map(lambda content: json.dumps(content).encode() + b"\n"),
+    st.builds(crsf_frame, st.integers(0, 0x80), st.binary(min_size=1, max_size=60)),
+    st.tuples(
+        st.sampled_from(["GGA", "RMC", "VTG", "GSA", "GST", "HDT"]),
+        st.lists(st.sampled_from(["", "1", "A", "N", "9999.9", "inf", "nan", "-1", "230326"])),
+    ).map(lambda parts: f"$GP{parts[0]},{','.join(parts[1])}\n".encode()),
+)
+"""Pieces that a decoder reads further than noise."""
+
+
+@given(st.sampled_from([*SOURCE_KINDS]), st.lists(st.binary(max_size=80) | SOURCE_TEXT, max_size=8))
+def source(kind: str, chunks: list[bytes]) -> None:
+    """Any bytes of any source: records, faults, and frames of a vehicle."""
+    (found,) = make_sources((SourceSettings(url=f"{kind}:stdin"),), str)
+    pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[found]))
+    for number, chunk in enumerate(chunks):
+        pipeline.feed_source(found, chunk, number * 400_000)
+        pipeline.poll(number * 400_000)
+
+
 TARGETS: Final[dict[str, Any]] = {
     target.__name__: target
     for target in (
-        *(splitter, whole_frames, receiver, vehicle, control),
+        *(splitter, whole_frames, receiver, source, vehicle, control),
         *(settings_file, table, tlog, vehicles, command),
     )
 }

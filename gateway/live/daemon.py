@@ -43,6 +43,7 @@ from gateway.records import RECORDED_ONLY, ClientInterval, FusedSample, Incoming
 from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.timed_frame import TimedFrame
 from gateway.sources.kinds import make_sources
+from gateway.sources.settings import SourceSettings
 from gateway.sources.source import SourceInput
 from gateway.status import Snapshot, status_of
 from gateway.units import US_PER_S
@@ -88,6 +89,8 @@ class Daemon:
         Reads the settings again, or raises ConfigError.
     line : iterator of TimedFrame, optional
         Frames of a simulated receiver, instead of the serial port.
+    simulated_kind : str
+        Kind of source whose bytes they are, if they are not the receiver's.
     """
 
     _timer: asyncio.TimerHandle | None = None
@@ -98,12 +101,15 @@ class Daemon:
         aircraft: Mapping[int, AircraftSettings],
         read: Callable[[], GatewaySettings],
         line: Iterator[TimedFrame] | None = None,
+        simulated_kind: str = "",
     ) -> None:
         self.now_us = GatewayClock()
         self._receiver = None if line is None else PtyPort(line)
         serial = settings.serial
         if self._receiver is not None:
-            serial = msgspec.structs.replace(serial, port=self._receiver.path)
+            path = self._receiver.path
+            serial = msgspec.structs.replace(serial, port=NO_RECEIVER if simulated_kind else path)
+            settings = _with_simulated(settings, simulated_kind, path)
         self._own_ids = set[int]() if line is None else {*aircraft}
         """Vehicle ids of our aircraft: those that a simulation has, or that were received."""
         self._settings = settings
@@ -504,6 +510,13 @@ class Daemon:
         out = Outputs()
         aircraft.perform(actions, self.now_us(), out)
         self._perform(out)
+
+
+def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewaySettings:
+    """Let a simulated source, if there is one, take the place of the settings' sources."""
+    vehicle_id = settings.simulator.vehicle_id
+    found = (SourceSettings(url=f"{kind}:{path}", vehicle=vehicle_id),) if kind else ()
+    return msgspec.structs.replace(settings, sources=found)
 
 
 def _report_saved(saving: Future[Path]) -> None:

@@ -6,7 +6,9 @@ from typing import Final
 
 from gateway.printable import unknown_choice
 from gateway.records import NodeId
+from gateway.sources.crsf import CrsfDecoder
 from gateway.sources.lines import LinesDecoder
+from gateway.sources.ltm import LtmDecoder
 from gateway.sources.settings import OPTIONS, SourceSettings, SourceUrl, nodes_of, parse_source
 from gateway.sources.source import SourceDecoder, SourceInput
 
@@ -16,6 +18,8 @@ ValueError for an option that is wrong."""
 
 SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
     "lines": (LinesDecoder, ()),
+    "crsf": (CrsfDecoder, ("pitch", "type")),
+    "ltm": (LtmDecoder, ("type",)),
 }
 """Decoder and options of each kind."""
 

@@ -1,5 +1,6 @@
 """One aircraft as a MAVLink system: records in, frames out; requests in, answers out."""
 
+import math
 from collections.abc import Iterable, Mapping
 from typing import Final
 
@@ -25,7 +26,7 @@ from gateway.vehicle.encoding import (
     MAVLINK_MSG_ID_PROTOCOL_VERSION,
     Encoder,
 )
-from gateway.vehicle.plan import Location, StoredPlan
+from gateway.vehicle.plan import Home, Location, StoredPlan, distance_and_bearing
 from gateway.vehicle.requests import (
     INFO,
     NOTICE,
@@ -71,6 +72,9 @@ from gateway.wire.mavlink_signing import (
 )
 
 OWN_SECTION: Final = "vehicle"
+HOME_STEP_M: Final = 20.0
+HOME_STEP_SHARE: Final = 0.06
+"""Of the distance: an autopilot's radio may send the direction of home in steps of 3 degrees."""
 REFUSALS_AT_ONCE: Final = 3
 REFUSAL_INTERVAL_US: Final = 20 * US_PER_S
 """A refusal is announced to all at most this often: enough as a warning, without a flood."""
@@ -213,16 +217,33 @@ class Vehicle:
     def on_report(self, report: VehicleReport, now_us: int) -> list[Action]:
         """Take in what the vehicle's own autopilot reports.
 
-        Home is set again when it is armed, as by every autopilot that does not report its home.
+        Home is set by the first fix after arming, unless the autopilot reports it. A reported one
+        is coarse: only a change that is greater than its steps moves home.
         """
         was_armed = self.telemetry.armed
         self.health.on_report(report)
         found = self.telemetry.on_report(report)
         if report.armed and not was_armed:
             self.telemetry.clear_home()
+        if report.home is not None:
+            found += self._on_home(Location(*report.home), report.time_us)
         if report.text is not None:
             found += self._announcements.say(StatusText(*report.text), now_us)
         return self._finish(found)
+
+    def _on_home(self, home: Location, time_us: int) -> list[Answer]:
+        """Take over the home that the vehicle's own autopilot reports, if it is another."""
+        telemetry = self.telemetry
+        state, known = telemetry.state, telemetry.home
+        if known is not None:
+            away_m = 0.0
+            if state is not None and math.isfinite(state.lat_deg + state.lon_deg):
+                here = Location(state.lat_deg, state.lon_deg, 0.0)
+                away_m, _ = distance_and_bearing(here, home)
+            moved_m, _ = distance_and_bearing(known.location, home)
+            if moved_m <= HOME_STEP_M + HOME_STEP_SHARE * away_m:
+                return []
+        return [telemetry.set_home(Home(home, time_us))]
 
     def on_latency(self, used_s: float, set_s: float, now_us: int) -> list[Action]:
         """Take in the GPS latency that the estimator uses, and the one that is set, s."""

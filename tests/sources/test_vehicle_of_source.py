@@ -257,3 +257,15 @@ def test_sources_are_vehicles_by_their_place_unless_a_vehicle_is_set() -> None:
         SourceSettings(url="lines:file:/b?id=7"),
     )
     assert nodes_of(settings) == [NodeId(1, 8), NodeId(7, 8), NodeId(7, 9)]
+
+
+def test_reported_home_and_height_are_used_and_small_steps_are_not() -> None:
+    flight = Flight()
+    flight.take(fix(0, 48.0))
+    for lat in (48.01, 48.0101):
+        report = VehicleReport(time_us=0, node=NODE, home=(lat, 11.0, 480.0), alt_home_m=33.0)
+        flight.take(report)
+        flight.take(fix(flight.now_us, 48.0))
+        flight.wait(1.1)
+    assert flight.newest("HOME_POSITION").latitude == 480100000
+    assert flight.newest("GLOBAL_POSITION_INT").relative_alt == 33000

@@ -297,11 +297,14 @@ def test_software_version_is_encoded_in_four_bytes(text: str, number: int) -> No
     assert encoding.software_version(text) == number
 
 
+MODE = (0, "Tracking")
+
+
 def test_modes_are_decoded_by_the_development_dialect() -> None:
     parser = development.MAVLink(None)
     modes, mode = (
         parser.decode(bytearray(Encoder(1).encode(message).frame))
-        for message in (encoding.available_modes(0), encoding.current_mode(0))
+        for message in (encoding.available_modes(MODE), encoding.current_mode(MODE))
     )
     assert (modes.number_modes, modes.mode_index, modes.mode_name) == (1, 1, "Tracking")
     assert mode.custom_mode == 0

@@ -9,6 +9,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Generator, Iterator
+from enum import StrEnum
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -41,6 +42,14 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.simulator.simulator_settings import SimulatorSettings
 from gateway.simulator.timed_frame import TimedFrame
 
+
+class SourceName(StrEnum):
+    """The kinds of sources that are simulated."""
+
+    CRSF = "crsf"
+    LINES = "lines"
+
+
 NOT_RECORDED: Final = "not recording without --record or `mavgate record start`"
 
 log = logging.getLogger(__name__)
@@ -64,6 +73,10 @@ def demo(
     radio: Annotated[
         RadioName, typer.Option("--radio", help="The boards' radio, with --firmware.")
     ] = RadioName.NRF24,
+    source: Annotated[
+        SourceName | None,
+        typer.Option("--source", help="Fly it through the bytes of another kind of tracker."),
+    ] = None,
     panel: Annotated[bool, typer.Option("--panel/--no-panel", help="Start the panel too.")] = True,
     force: ForceOption = False,
 ) -> None:
@@ -94,9 +107,7 @@ def demo(
             line = made_ahead(firmware_line(settings.simulator, unix_time_us(), radio.value))
             aircraft = calibrated_aircraft(settings)
         else:
-            from gateway.simulator.receiver import simulate
-
-            line = made_ahead(simulate(settings.simulator, unix_time_us()).frames())
+            line = made_ahead(simulated_line(settings.simulator, source))
             aircraft = calibrated_aircraft(settings)
     except (BenchError, ValueError) as error:
         refuse(str(error))
@@ -109,7 +120,8 @@ def demo(
 
         def daemon() -> Daemon:
             log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
-            daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line))
+            kind = "" if source is None else source.value
+            daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line, kind))
             return daemons[0]
 
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
@@ -120,6 +132,16 @@ def _without_conflicts(settings: GatewaySettings, *, one: bool, force: bool) -> 
     first, count = settings.simulator.vehicle_id, 1 if one else settings.simulator.vehicles
     refuse_conflicts(range(first, first + count), settings, force=force)
     return settings
+
+
+def simulated_line(settings: SimulatorSettings, source: SourceName | None) -> Iterator[TimedFrame]:
+    """Fly the simulated aircraft, by the receiver's frames or a source's bytes."""
+    from gateway.simulator.receiver import simulate
+    from gateway.simulator.source_bytes import SOURCE_BYTES
+
+    if source is not None:
+        return SOURCE_BYTES[source.value](settings, unix_time_us())
+    return simulate(settings, unix_time_us()).frames()
 
 
 def recorded_line(

@@ -7,6 +7,7 @@ the settings is not known any more: its message is not sent, or has the value fo
 import math
 from typing import Any, Final
 
+from msgspec.structs import asdict, replace
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.geometry.quaternion import from_euler
@@ -28,6 +29,8 @@ UNKNOWN_QUAT: Final[Quat] = (NAN, NAN, NAN, NAN)
 WITHOUT_IMU_US: Final = 3 * US_PER_S
 """A vehicle that has sent no IMU sample for so long has none: its fixes are its position."""
 MAX_CELLS: Final = 14
+JOINED_US: Final = 10 * US_PER_S
+"""How old the rest of a battery's report may be."""
 CHANNELS: Final = 18
 MAX_BATTERIES: Final = 8
 MAX_MODES: Final = 64
@@ -62,7 +65,7 @@ class Reported:
             if number == number:
                 self._newest[name] = (report.time_us, number)
         if report.battery is not None and 0 <= report.battery.number < MAX_BATTERIES:
-            self.batteries[report.battery.number] = (report.time_us, report.battery)
+            self.batteries[report.battery.number] = (report.time_us, self._joined(report))
         if report.armed is not None:
             self.armed = report.armed
         if report.vehicle_type is not None:
@@ -72,6 +75,15 @@ class Reported:
             self.mode = report.mode
         if report.mode:
             self.custom_mode = self._number_of(report)
+
+    def _joined(self, report: VehicleReport) -> BatteryReport:
+        """Join a battery with what another report holds of it: cells come apart from the rest."""
+        fresh = report.battery or BatteryReport()
+        known = self.battery(report.time_us, JOINED_US, fresh.number)
+        if known is None:
+            return fresh
+        fields = asdict(fresh).items()
+        return replace(known, **{name: v for name, v in fields if v == v and v != ()})
 
     def _number_of(self, report: VehicleReport) -> int:
         """Return the number of a mode: ArduPilot's, or one in the order in which others came."""

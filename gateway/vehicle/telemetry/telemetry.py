@@ -472,10 +472,14 @@ class Telemetry:
         origin = self._origin
         return origin and messages.gps_global_origin(origin.location, origin.set_time_us)
 
-    def _global_position(self, _now_us: int) -> Any:
+    def _global_position(self, now_us: int) -> Any:
         if self.state is None or not messages.has_position(self.state):
             return None
-        return messages.global_position_int(self.state, self._reference_alt_m)
+        reference_m = self._reference_alt_m
+        height_m = self.health.reported.value("alt_home_m", now_us, self.health.silent_us)
+        if height_m is not None:
+            reference_m = self.state.alt_amsl_m - height_m
+        return messages.global_position_int(self.state, reference_m)
 
     def _highres_imu(self, _now_us: int) -> Any:
         if self._sample is None:

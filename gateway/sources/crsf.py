@@ -1,0 +1,411 @@
+"""CRSF: telemetry of ExpressLRS and Crossfire links, as EdgeTX mirrors it or a receiver sends it.
+
+Theory of operation. A frame is address, length, type, payload and a CRC-8 of type and payload; any
+address is accepted, since each hop writes its own. There is no escape: where a CRC fails, the
+decoder moves on by one byte, so that it finds the next frame behind any damage and between bytes of
+other protocols. Bytes that belong to no frame are one fault until the next frame.
+
+Scales are those that flight controllers send and EdgeTX shows; they differ from the published
+specification where that states 10 uV for a tenth of a volt, and 0.01 km/h for a tenth of a km/h.
+
+ArduPilot's own frames (0x80) contain packets of FrSky's passthrough protocol. The mode, the arming
+and the type of the vehicle are taken from them where they come, and else from the text of the
+flight mode. Betaflight and INAV count the pitch positive with the nose down, in the specification
+it is positive with the nose up.
+
+References
+----------
+.. [1] Team BlackSheep, "CRSF protocol", github.com/tbs-fpv/tbs-crsf-spec.
+"""
+
+import math
+import struct
+from collections.abc import Callable
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from fastcrc.crc8 import dvb_s2
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import (
+    NAN,
+    BatteryReport,
+    GpsFix,
+    GpsFixType,
+    NodeId,
+    RadioSignal,
+    VehicleReport,
+)
+from gateway.sources.flight_modes import FIXED_WING, QUADROTOR, ardupilot_mode, mode_of_text
+from gateway.sources.sampling import fix_at, velocity
+from gateway.sources.settings import SourceUrl
+from gateway.units import M_PER_CM, RAD_PER_DEG, US_PER_S
+from gateway.wire.framing import Fault
+
+MIN_LENGTH, MAX_LENGTH = 2, 62
+"""Of type, payload and CRC."""
+HEAD: Final = 2
+MAX_NOISE: Final = 64
+"""Bytes without a frame that are one fault."""
+EXTENDED: Final = 0x28
+"""From this type on a payload begins with destination and origin."""
+KMH10_MPS: Final = 1.0 / 36.0
+SPEED_RANGE, SPEED_LINEAR = 0.026, 100.0
+"""Of the packed vertical speed, cm/s: (exp(|n| * 0.026) - 1) * 100."""
+EXTRA_AGE_US: Final = 2 * US_PER_S
+"""How long the extended frame and the time belong to later fixes."""
+PERCENT: Final = 100
+UNUSED: Final = frozenset(
+    {0x0B, 0x10, 0x15, 0x17, 0x18, 0x22, 0x28, 0x2B, 0x2C, 0x2D, 0x2E, 0x32, 0x34, 0x3A, 0x3C}
+    | {0x78, 0x7A, 0x7B, 0x7C, 0x7D, 0x7E, 0xAA, 0xAC}
+)
+"""Known types without telemetry of the vehicle: heartbeat, parameters, commands, MSP."""
+
+ADDRESSES: Final = frozenset(
+    {0x00, 0x0E, 0x10, 0x12, 0x13, 0x14, 0x80, 0xC0, 0xC2, 0xC4, 0xC8, 0xCC, 0xCE, 0xEA, 0xEB}
+    | {0xEC, 0xED, 0xEE, 0xEF}
+)
+"""Those of the specification."""
+SIZES: Final = {
+    0x02: (15, 15), 0x03: (9, 9), 0x06: (20, 20), 0x07: (2, 4), 0x08: (8, 8), 0x09: (2, 4),
+    0x0A: (2, 2), 0x0C: (4, 58), 0x0D: (3, 41), 0x0E: (3, 59), 0x14: (10, 10), 0x16: (22, 22),
+    0x1C: (5, 5), 0x1D: (6, 6), 0x1E: (6, 6), 0x1F: (9, 9), 0x21: (1, 32), 0x29: (16, 60),
+    0x7F: (3, 60), 0x80: (3, 60),
+}  # fmt: skip
+"""Least and greatest payload of the types that are read. Behind an address that is not of the
+specification only these are frames: eight bits of CRC fit one noise in 256, and a wrong length
+would hold back the frames behind it."""
+Parts = dict[str, Any]
+
+
+class CrsfDecoder:
+    """Decode a stream of CRSF."""
+
+    def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        self._node = node
+        self._rest = b""
+        self._noise = 0
+        self._nose_down = url.options.get("pitch") == "down"
+        self._fixed_sign = "pitch" in url.options
+        wanted = url.options.get("type")
+        kind = None if wanted is None else getattr(mavlink, f"MAV_TYPE_{wanted.upper()}", None)
+        if wanted is not None and kind is None:
+            raise ValueError(f"source {url.url!r}: no MAV_TYPE {wanted!r}")
+        self._type: int | None = kind
+        self._type_is_set = kind is not None
+        self._has_passthrough = False
+        self._velocity: tuple[int, tuple[Any, ...]] | None = None
+        self._utc: tuple[int, int] | None = None
+        self._fix: GpsFix | None = None
+        self._readers: dict[int, Callable[[bytes, int], Any]] = {
+            0x02: self._gps,
+            0x03: self._gps_time,
+            0x06: self._gps_extended,
+            0x1E: self._attitude,
+            0x21: self._flight_mode,
+            0x29: self._device,
+            0x7F: self._ardupilot,
+            0x80: self._ardupilot,
+            **_STATELESS,
+        }
+        self._passthrough: dict[int, Callable[[int, int], Parts]] = {
+            0x5001: self._status,
+            0x5003: _passthrough_battery(0),
+            0x5004: self._home,
+            0x5007: self._parameter,
+            0x5008: _passthrough_battery(1),
+        }
+
+    def reset(self) -> None:
+        """Discard a part of a frame."""
+        self._rest, self._noise = b"", 0
+
+    def feed(self, data: bytes, arrival_us: int) -> list[Any]:
+        """Decode every frame that a chunk completes."""
+        found: list[Any] = []
+        data = self._rest + data
+        at = 0
+        while len(data) - at > HEAD:
+            length = data[at + 1]
+            end = at + HEAD + length
+            least, most = SIZES.get(data[at + HEAD], (0, -1))
+            if data[at] in ADDRESSES:
+                least, most = 0, MAX_LENGTH - MIN_LENGTH
+            if not least <= length - MIN_LENGTH <= most:
+                at += 1
+                self._noise += 1
+                continue
+            if end > len(data):
+                break
+            if dvb_s2(data[at + HEAD : end - 1]) != data[end - 1]:
+                at += 1
+                self._noise += 1
+                continue
+            found += self._end_noise()
+            found += self._frame(data[at + HEAD], data[at + HEAD + 1 : end - 1], arrival_us)
+            at = end
+        self._rest = data[at:]
+        if self._noise >= MAX_NOISE:
+            found += self._end_noise()
+        return found
+
+    def _end_noise(self) -> list[Fault]:
+        dropped, self._noise = self._noise, 0
+        why = f"{dropped} bytes belong to no frame with a right CRC"
+        return [Fault("crc", dropped, why)] if dropped else []
+
+    def _frame(self, kind: int, payload: bytes, arrival_us: int) -> list[Any]:
+        read = self._readers.get(kind)
+        if read is None:
+            unknown = Fault("unknown type", len(payload), f"type {kind:#x} is not known")
+            return [] if kind in UNUSED else [unknown]
+        try:
+            found = read(payload, arrival_us)
+        except (struct.error, IndexError, ValueError, OverflowError):
+            why = f"type {kind:#x} with {len(payload)} bytes"
+            return [Fault("payload", len(payload), why)]
+        if not isinstance(found, dict):
+            return [] if found is None else [found]
+        if not found:
+            return []
+        return [VehicleReport(time_us=arrival_us, node=self._node, **found)]
+
+    def _gps(self, payload: bytes, arrival_us: int) -> GpsFix | None:
+        lat, lon, speed, course, height, satellites = struct.unpack_from(">iiHHHB", payload)
+        vel = velocity(speed * KMH10_MPS, course / 100.0)
+        fix_type = None if (lat, lon) != (0, 0) else GpsFixType.NONE
+        h_acc = v_acc = speed_acc = NAN
+        if self._velocity is not None and arrival_us - self._velocity[0] <= EXTRA_AGE_US:
+            kind, north, east, up, speed_cm, _, _, h_cm, v_cm = self._velocity[1]
+            vel = (north * M_PER_CM, east * M_PER_CM, -up * M_PER_CM)
+            h_acc, v_acc, speed_acc = h_cm * M_PER_CM, v_cm * M_PER_CM, speed_cm * M_PER_CM
+            known = {2: GpsFixType.FIX_2D}.get(kind, GpsFixType.FIX_3D)
+            fix_type = known if kind > 1 else GpsFixType.NONE
+        utc_us = None
+        if self._utc is not None and arrival_us - self._utc[0] <= EXTRA_AGE_US:
+            utc_us = self._utc[1] + arrival_us - self._utc[0]
+        self._fix = fix_at(
+            arrival_us,
+            self._node,
+            lat * 1e-7,
+            lon * 1e-7,
+            height - 1000.0,
+            vel_n_mps=vel,
+            satellites=satellites,
+            fix_type=fix_type,
+            h_acc_m=h_acc,
+            v_acc_m=v_acc,
+            speed_acc_mps=speed_acc,
+            utc_us=utc_us,
+        )
+        if self._fix is None:
+            raise ValueError("coordinates")
+        return self._fix
+
+    def _gps_time(self, payload: bytes, arrival_us: int) -> None:
+        year, month, day, hour, minute, second, ms = struct.unpack_from(">hBBBBBH", payload)
+        civil = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+        self._utc = (arrival_us, round(civil.timestamp() * US_PER_S) + ms * 1000)
+
+    def _gps_extended(self, payload: bytes, arrival_us: int) -> None:
+        self._velocity = (arrival_us, struct.unpack_from(">Bhhhhhhhh", payload))
+
+    def _attitude(self, payload: bytes, _arrival_us: int) -> Parts:
+        pitch, roll, yaw = (angle * 1e-4 for angle in struct.unpack_from(">hhh", payload))
+        return {"attitude_rad": (roll, -pitch if self._nose_down else pitch, yaw)}
+
+    def _flight_mode(self, payload: bytes, _arrival_us: int) -> Parts:
+        if self._has_passthrough:
+            return {}
+        text = payload.partition(b"\0")[0].decode("ascii", "replace").strip()
+        mode = mode_of_text(text)
+        if mode.nose_down and not self._fixed_sign:
+            self._nose_down = True
+        if not self._type_is_set and mode.vehicle_type is not None and self._type != FIXED_WING:
+            # One mode of an aeroplane decides; the others have the same names on a copter.
+            self._type = mode.vehicle_type
+        kind = self._type
+        number = mode.plane if kind == FIXED_WING else mode.copter
+        armed = {} if mode.armed is None else {"armed": mode.armed}
+        return {"mode": mode.name, "custom_mode": number, "vehicle_type": kind, **armed}
+
+    def _device(self, payload: bytes, _arrival_us: int) -> Parts:
+        """Betaflight and INAV write their names into the device information."""
+        name = payload[2:].partition(b"\0")[0].lower()
+        if name.startswith((b"betaflight", b"inav", b"emuflight")):
+            self._nose_down = self._nose_down if self._fixed_sign else True
+            if name.startswith(b"betaflight") and not self._type_is_set:
+                self._type = QUADROTOR
+        return {}
+
+    def _ardupilot(self, payload: bytes, arrival_us: int) -> Parts:
+        """Read texts, and packets of FrSky's passthrough, one or several."""
+        kind, body = payload[0], payload[1:]
+        if kind == 0xF1:
+            text = body[1:].partition(b"\0")[0].decode("utf-8", "replace")
+            return {"text": (body[0] & 7, text)} if text else {}
+        found: Parts = {}
+        packets = body[1 : 1 + 6 * body[0]] if kind == 0xF2 else body[:6]
+        for number, value in struct.iter_unpack("<HI", packets[: len(packets) // 6 * 6]):
+            if (read := self._passthrough.get(number)) is not None:
+                found |= read(value, arrival_us)
+        return found
+
+    def _status(self, value: int, _arrival_us: int) -> Parts:
+        self._has_passthrough = True
+        number = (value & 0x1F) - 1
+        found: Parts = {"armed": bool(value >> 8 & 1)}
+        if number >= 0:
+            name = ardupilot_mode(self._type, number)
+            found |= {"mode": name, "custom_mode": number, "vehicle_type": self._type}
+        return found | {"throttle_percent": (value >> 19 & 0x3F) / 0.63}
+
+    def _parameter(self, value: int, _arrival_us: int) -> Parts:
+        if value >> 24 == 1 and not self._type_is_set:
+            self._type = value & 0xFF
+        return {}
+
+    def _home(self, value: int, arrival_us: int) -> Parts:
+        """Distance and direction of home from the vehicle, and the height above it."""
+        distance_m = _number(value & 0xFFF, 2)
+        height_m = 0.1 * _number(value >> 12 & 0xFFF, 2) * (-1.0 if value >> 24 & 1 else 1.0)
+        found: Parts = {"alt_home_m": height_m}
+        fix = self._fix
+        if fix is not None and fix.fix_ok and arrival_us - fix.time_us <= EXTRA_AGE_US:
+            bearing = (value >> 25 & 0x7F) * 3.0 * RAD_PER_DEG
+            lat_deg, lon_deg = fix.lat_dege7 * 1e-7, fix.lon_dege7 * 1e-7
+            per_m = math.degrees(1.0 / 6_371_000.0)
+            shrink = max(math.cos(math.radians(lat_deg)), 1e-3)
+            home_lat = lat_deg + distance_m * math.cos(bearing) * per_m
+            home_lon = lon_deg + distance_m * math.sin(bearing) * per_m / shrink
+            found["home"] = (home_lat, home_lon, fix.alt_amsl_m - height_m)
+        return found
+
+
+def _number(bits: int, width: int) -> float:
+    """Read a number of the passthrough protocol: the power of ten in its lowest bits."""
+    mantissa: float = (bits >> width) * 10.0 ** (bits & (1 << width) - 1)
+    return mantissa
+
+
+def _passthrough_battery(number: int) -> Callable[[int, int], Parts]:
+    def read(value: int, _arrival_us: int) -> Parts:
+        battery = BatteryReport(
+            number=number,
+            voltage_v=(value & 0x1FF) * 0.1,
+            current_a=0.1 * _number(value >> 9 & 0xFF, 1),
+            used_mah=float(value >> 17),
+        )
+        return {"battery": battery}
+
+    return read
+
+
+def _mavlink_fc(payload: bytes, _arrival_us: int) -> Parts:
+    _, base_mode, number, _, kind = struct.unpack_from(">hBIBB", payload)
+    armed = bool(base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+    name = ardupilot_mode(kind, number)
+    return {"mode": name, "custom_mode": number, "armed": armed, "vehicle_type": kind}
+
+
+def _vario(payload: bytes, _arrival_us: int) -> Parts:
+    (climb,) = struct.unpack_from(">h", payload)
+    return {"climb_mps": climb * M_PER_CM}
+
+
+def _battery(payload: bytes, _arrival_us: int) -> Parts:
+    voltage, current = struct.unpack_from(">HH", payload)
+    remaining = payload[7]
+    battery = BatteryReport(
+        voltage_v=voltage * 0.1,
+        current_a=current * 0.1,
+        used_mah=float(int.from_bytes(payload[4:7], "big")),
+        remaining_percent=float(remaining) if remaining <= PERCENT else NAN,
+    )
+    return {"battery": battery}
+
+
+def _barometer(payload: bytes, _arrival_us: int) -> Parts:
+    (packed,) = struct.unpack_from(">H", payload)
+    height_m = float(packed & 0x7FFF) if packed & 0x8000 else (packed - 10_000) * 0.1
+    found: Parts = {"alt_home_m": height_m}
+    if len(payload) == 3:
+        (speed,) = struct.unpack_from(">b", payload, 2)
+        size = (math.exp(abs(speed) * SPEED_RANGE) - 1.0) * SPEED_LINEAR
+        found["climb_mps"] = math.copysign(size, speed) * M_PER_CM
+    elif len(payload) > 3:
+        (speed,) = struct.unpack_from(">h", payload, 2)
+        found["climb_mps"] = speed * M_PER_CM
+    return found
+
+
+def _airspeed(payload: bytes, _arrival_us: int) -> Parts:
+    (speed,) = struct.unpack_from(">H", payload)
+    return {"airspeed_mps": speed * KMH10_MPS}
+
+
+def _rpm(payload: bytes, _arrival_us: int) -> Parts:
+    source, found = payload[0], []
+    for number, at in enumerate(range(1, len(payload) - 2, 3)):
+        value = int.from_bytes(payload[at : at + 3], "big", signed=True)
+        found.append((f"rpm{source}.{number}", float(value)))
+    return {"values": tuple(found)}
+
+
+def _temperatures(payload: bytes, _arrival_us: int) -> Parts:
+    source = payload[0]
+    deci = struct.unpack(f">{len(payload) // 2}h", payload[1 : 1 + len(payload) // 2 * 2])
+    return {"values": tuple((f"temp{source}.{k}", value * 0.1) for k, value in enumerate(deci))}
+
+
+def _cells(payload: bytes, _arrival_us: int) -> Parts:
+    source, count = payload[0], (len(payload) - 1) // 2
+    volts = tuple(mv * 1e-3 for mv in struct.unpack_from(f">{count}H", payload, 1))
+    if source >= 128:
+        return {"values": tuple((f"volt{source}.{k}"[:10], v) for k, v in enumerate(volts))}
+    battery = BatteryReport(number=source, voltage_v=sum(volts), cells_v=volts)
+    return {"battery": battery}
+
+
+def _link(payload: bytes, _arrival_us: int) -> Parts:
+    """Read the signal of the downlink, by which telemetry comes, and the quality of the uplink."""
+    first, second, quality, snr, antenna, _, _, down, _, down_snr = struct.unpack_from(
+        ">BBBbBBBBBb", payload
+    )
+    up = second if antenna == 1 else first
+    signal = RadioSignal(-down, float(down_snr)) if down else RadioSignal(-up, float(snr))
+    return {"signal": signal, "link_quality_percent": float(quality)}
+
+
+def _link_of_receiver(payload: bytes, _arrival_us: int) -> Parts:
+    return {"link_quality_percent": float(payload[2])}
+
+
+def _link_of_transmitter(payload: bytes, _arrival_us: int) -> Parts:
+    (snr,) = struct.unpack_from(">b", payload, 3)
+    return {"signal": RadioSignal(-payload[0], float(snr))}
+
+
+def _channels(payload: bytes, _arrival_us: int) -> Parts:
+    if len(payload) < 22:
+        raise ValueError("channels")
+    bits = int.from_bytes(payload[:22], "little")
+    ticks = [bits >> 11 * k & 0x7FF for k in range(16)]
+    return {"channels_us": tuple(round((tick - 992) * 5 / 8 + 1500) for tick in ticks)}
+
+
+_STATELESS: Final[dict[int, Callable[[bytes, int], Parts]]] = {
+    0x07: _vario,
+    0x08: _battery,
+    0x09: _barometer,
+    0x0A: _airspeed,
+    0x0C: _rpm,
+    0x0D: _temperatures,
+    0x0E: _cells,
+    0x14: _link,
+    0x16: _channels,
+    0x1C: _link_of_receiver,
+    0x1D: _link_of_transmitter,
+    0x1F: _mavlink_fc,
+}
+"""Readers of frames that depend on no other frame."""

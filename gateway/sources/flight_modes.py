@@ -1,0 +1,77 @@
+"""Names of flight modes to ArduPilot's numbers, by which ground stations name a mode.
+
+Flight controllers report the mode as a few letters: Betaflight, INAV and ArduPilot each have their
+own. A mark behind them (`*`, `!`, `?`) means that the vehicle is not armed.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+FIXED_WING: Final[int] = mavlink.MAV_TYPE_FIXED_WING
+QUADROTOR: Final[int] = mavlink.MAV_TYPE_QUADROTOR
+
+NUMBERS: Final[dict[str, tuple[int | None, int | None]]] = {
+    "ACRO": (1, 4), "AIR": (1, 4), "ANGL": (0, 5), "HOR": (0, 2), "STAB": (0, 2),
+    "ALTH": (2, 6), "AH": (2, 6), "A H": (2, 6), "POSH": (16, 12), "HOLD": (16, 12),
+    "LOIT": (5, 12), "RTH": (6, 11), "RTL": (6, 11), "WP": (3, 10), "AUTO": (3, 10),
+    "GUID": (4, 15), "CIRC": (7, 1), "LAND": (9, None), "MANU": (1, 0), "CRS": (None, 7),
+    "3CRS": (None, 7), "CRUZ": (None, 7), "CRSH": (None, 7), "CRUI": (None, 7), "FBWA": (None, 5),
+    "FBWB": (None, 6), "LNCH": (None, 13), "BRAK": (17, None), "DRIF": (11, None),
+    "SPRT": (13, None), "TRAN": (None, 8), "QSTB": (None, 17), "QHOV": (None, 18),
+    "QLOT": (None, 19), "QLND": (None, 20), "QRTL": (None, 21),
+}  # fmt: skip
+"""Of a copter and of an aeroplane, by the letters."""
+OF_BETAFLIGHT: Final = frozenset({"ANGL", "HOR", "AIR", "RTH", "WAIT", "OK", "!ERR", "3CRS", "WP"})
+"""Written by Betaflight and INAV, never by ArduPilot."""
+NOT_ARMED: Final = frozenset({"OK", "WAIT", "!ERR"})
+FAILSAFE: Final = "!FS!"
+MARKS: Final = "*!?"
+
+
+@dataclass(frozen=True, slots=True)
+class TextMode:
+    """A mode as its text describes it."""
+
+    name: str
+    copter: int | None
+    plane: int | None
+    armed: bool | None
+    """None where the text does not show it."""
+    vehicle_type: int | None
+    nose_down: bool
+    """Whether its autopilot counts the pitch positive with the nose down."""
+
+
+def mode_of_text(text: str) -> TextMode:
+    """Read the letters of a mode and the mark behind them."""
+    whole = text in NOT_ARMED or text == FAILSAFE
+    name = text if whole else text.rstrip(MARKS).strip()
+    armed: bool | None = text not in NOT_ARMED and name == text
+    if text == FAILSAFE:
+        armed = None
+    copter, plane = NUMBERS.get(name, (None, None))
+    kind = None
+    if (copter, plane) != (None, None):
+        kind = FIXED_WING if copter is None else QUADROTOR
+    return TextMode(name or "unknown", copter, plane, armed, kind, name in OF_BETAFLIGHT)
+
+
+VTOL_TYPES: Final = range(19, 26)
+"""The MAV_TYPEs of aircraft that take off vertically, which fly with the modes of aeroplanes."""
+_CLASSES: Final = (
+    ("PLANE_MODE", {FIXED_WING, *VTOL_TYPES}),
+    ("ROVER_MODE", {mavlink.MAV_TYPE_GROUND_ROVER, mavlink.MAV_TYPE_SURFACE_BOAT}),
+    ("SUB_MODE", {mavlink.MAV_TYPE_SUBMARINE}),
+    ("TRACKER_MODE", {mavlink.MAV_TYPE_ANTENNA_TRACKER}),
+)
+
+
+def ardupilot_mode(vehicle_type: int | None, number: int) -> str:
+    """Name a mode of ArduPilot; of a type that is not known yet, by its number."""
+    if vehicle_type is None:
+        return f"MODE {number}"
+    kind = next((name for name, types in _CLASSES if vehicle_type in types), "COPTER_MODE")
+    entry = mavlink.enums.get(kind, {}).get(number)
+    return f"MODE {number}" if entry is None else str(entry.name).removeprefix(f"{kind}_")

@@ -1,0 +1,120 @@
+"""LTM, the Lightweight Telemetry of INAV and of older radios: frames `$T`, type, payload, XOR.
+
+Heights are above home. The frame `O` has the home; without its height, home is at 0 m.
+"""
+
+import struct
+from functools import reduce
+from operator import xor
+from typing import Any, Final
+
+from gateway.records import BatteryReport, GpsFixType, NodeId, VehicleReport
+from gateway.sources.flight_modes import FIXED_WING, QUADROTOR
+from gateway.sources.sampling import fix_at, velocity
+from gateway.sources.settings import SourceUrl
+from gateway.units import M_PER_CM, RAD_PER_DEG
+from gateway.wire.framing import Fault
+
+START: Final = b"$T"
+SIZES: Final = {b"G": 14, b"A": 6, b"S": 7, b"O": 14, b"N": 6, b"X": 6}
+"""Bytes of payload by type."""
+MAX_NOISE: Final = 64
+FIX_TYPES: Final = (GpsFixType.NONE, GpsFixType.NONE, GpsFixType.FIX_2D, GpsFixType.FIX_3D)
+MODES: Final[tuple[tuple[str, int | None, int | None], ...]] = (
+    ("MANUAL", None, 0), ("RATE", 1, 4), ("ANGLE", 0, 5), ("HORIZON", 0, 2), ("ACRO", 1, 4),
+    ("STABILIZED1", 0, 2), ("STABILIZED2", 0, 2), ("STABILIZED3", 0, 2), ("ALTHOLD", 2, 6),
+    ("GPSHOLD", 16, 12), ("WAYPOINTS", 3, 10), ("HEADFREE", 0, None), ("CIRCLE", 7, 1),
+    ("RTH", 6, 11), ("FOLLOWME", 23, None), ("LAND", 9, None), ("FLYBYWIREA", None, 5),
+    ("FLYBYWIREB", None, 6), ("CRUISE", None, 7), ("UNKNOWN", None, None),
+    ("LAUNCH", None, 13), ("AUTOTUNE", 15, 8),
+)  # fmt: skip
+"""Name, and ArduPilot's number of it on a copter and on an aeroplane."""
+
+
+class LtmDecoder:
+    """Decode a stream of LTM."""
+
+    def __init__(self, url: SourceUrl, node: NodeId) -> None:
+        self._node = node
+        self._rest = b""
+        self._home_alt_m = 0.0
+        self._course_deg = 0.0
+        self._type = FIXED_WING if url.options.get("type") == "fixed_wing" else QUADROTOR
+
+    def reset(self) -> None:
+        """Discard a part of a frame."""
+        self._rest = b""
+
+    def feed(self, data: bytes, arrival_us: int) -> list[Any]:
+        """Decode every frame that a chunk completes."""
+        found: list[Any] = []
+        data = self._rest + data
+        at = dropped = 0
+        while len(data) - at > len(START):
+            size = SIZES.get(data[at + 2 : at + 3])
+            if not data.startswith(START, at) or size is None:
+                at, dropped = at + 1, dropped + 1
+                continue
+            end = at + 4 + size
+            if end > len(data):
+                break
+            payload = data[at + 3 : end - 1]
+            if reduce(xor, payload, 0) != data[end - 1]:
+                at, dropped = at + 1, dropped + 1
+                continue
+            found += self._frame(data[at + 2 : at + 3], payload, arrival_us)
+            at = end
+        self._rest = data[at:]
+        if dropped:
+            why = f"{dropped} bytes belong to no frame with a right checksum"
+            found.append(Fault("checksum", dropped, why))
+        return found
+
+    def _frame(self, kind: bytes, payload: bytes, time_us: int) -> list[Any]:
+        parts: dict[str, Any] = {}
+        if kind == b"G":
+            return self._gps(payload, time_us)
+        if kind == b"A":
+            pitch, roll, heading = struct.unpack("<hhh", payload)
+            self._course_deg = float(heading % 360)
+            roll_rad, pitch_rad, yaw_rad = (v * RAD_PER_DEG for v in (roll, pitch, heading))
+            parts = {"attitude_rad": (roll_rad, pitch_rad, yaw_rad)}
+        elif kind == b"S":
+            parts = self._state(payload)
+        elif kind == b"O":
+            lat, lon, alt_cm, _, fix = struct.unpack("<iiiBB", payload)
+            self._home_alt_m = alt_cm * M_PER_CM
+            if fix:
+                parts = {"home": (lat * 1e-7, lon * 1e-7, self._home_alt_m)}
+        return [VehicleReport(time_us=time_us, node=self._node, **parts)] if parts else []
+
+    def _gps(self, payload: bytes, time_us: int) -> list[Any]:
+        """Read a fix; its course is not sent, and the heading is taken for it."""
+        lat, lon, speed, alt_cm, state = struct.unpack("<iiBiB", payload)
+        height_m = alt_cm * M_PER_CM
+        fix = fix_at(
+            time_us,
+            self._node,
+            lat * 1e-7,
+            lon * 1e-7,
+            self._home_alt_m + height_m,
+            vel_n_mps=velocity(float(speed), self._course_deg),
+            satellites=state >> 2,
+            fix_type=FIX_TYPES[state & 3],
+        )
+        if fix is None:
+            return [Fault("payload", len(payload), "G has coordinates that are none")]
+        return [VehicleReport(time_us=time_us, node=self._node, alt_home_m=height_m), fix]
+
+    def _state(self, payload: bytes) -> dict[str, Any]:
+        millivolts, used_mah, rssi, airspeed, flags = struct.unpack("<HHBBB", payload)
+        name, copter, plane = MODES[min(flags >> 2, len(MODES) - 1)]
+        parts: dict[str, Any] = {
+            "battery": BatteryReport(voltage_v=millivolts * 1e-3, used_mah=float(used_mah)),
+            "armed": bool(flags & 1),
+            "mode": name,
+            "custom_mode": plane if self._type == FIXED_WING else copter,
+            "vehicle_type": self._type,
+            "link_quality_percent": rssi / 2.54,
+        }
+        return parts | ({"airspeed_mps": float(airspeed)} if airspeed else {})

@@ -1,0 +1,293 @@
+"""CRSF: frames of an independent writer, the scales of flight controllers, damage and noise."""
+
+import math
+import struct
+from typing import Any
+
+import pytest
+from crsf_parser.handling import crsf_build_frame
+from crsf_parser.payloads import PacketsTypes
+from fastcrc.crc8 import dvb_s2
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import GpsFix, GpsFixType, NodeId, VehicleReport
+from gateway.sources.kinds import make_decoder
+from gateway.sources.settings import parse_source
+from gateway.wire.framing import Fault
+
+NODE = NodeId(2, 8)
+
+
+def decoder(options: str = "") -> Any:
+    return make_decoder(parse_source(f"crsf:/dev/ttyACM0{options}"), NODE)
+
+
+def frame(kind: int, payload: bytes, address: int = 0xEA) -> bytes:
+    body = bytes([kind]) + payload
+    return bytes([address, len(body) + 1]) + body + bytes([dvb_s2(body)])
+
+
+def one(kind: int, payload: bytes, options: str = "") -> Any:
+    (record,) = decoder(options).feed(frame(kind, payload), 5_000_000)
+    return record
+
+
+ATTITUDE = struct.pack(">hhh", 1745, -3491, 31416)
+
+
+def test_battery_of_another_implementation_is_read() -> None:
+    data = crsf_build_frame(
+        PacketsTypes.BATTERY_SENSOR,
+        {"voltage": 168, "current": 123, "capacity": 70_000, "remaining": 81},
+    )
+    (report,) = decoder().feed(data, 0)
+    battery = report.battery
+    assert (battery.voltage_v, battery.current_a) == pytest.approx((16.8, 12.3))
+    assert (battery.used_mah, battery.remaining_percent) == (70_000.0, 81.0)
+
+
+def test_link_statistics_of_another_implementation_are_read() -> None:
+    values = {
+        "uplink_rssi_ant_1": 70, "uplink_rssi_ant_2": 65, "uplink_link_quality": 98,
+        "uplink_snr": 9, "diversity_active_antenna": 1, "rf_mode": 2, "uplink_tx_power": 3,
+        "downlink_rssi": 88, "downlink_link_quality": 100, "downlink_snr": -7,
+    }  # fmt: skip
+    (report,) = decoder().feed(crsf_build_frame(PacketsTypes.LINK_STATISTICS, values), 0)
+    assert (report.signal.rssi_dbm, report.signal.snr_db) == (-88, -7.0)
+    assert report.link_quality_percent == 98.0
+    (report,) = decoder().feed(
+        crsf_build_frame(PacketsTypes.LINK_STATISTICS, values | {"downlink_rssi": 0}), 0
+    )
+    assert (report.signal.rssi_dbm, report.signal.snr_db) == (-65, 9.0), "of the active antenna"
+
+
+def test_channels_of_another_implementation_are_read() -> None:
+    ticks = [172, 992, 1811, *[992] * 12, 191]
+    # This writer takes the last channel first.
+    data = crsf_build_frame(PacketsTypes.RC_CHANNELS_PACKED, {"channels": ticks[::-1]})
+    (report,) = decoder().feed(data, 0)
+    assert report.channels_us[:3] == (988, 1500, 2012)
+    assert report.channels_us[15] == 999
+
+
+def test_attitude_has_the_order_and_scale_of_the_specification() -> None:
+    report = one(0x1E, ATTITUDE)
+    assert report.attitude_rad == pytest.approx((-0.3491, 0.1745, 3.1416))
+    assert report.time_us == 5_000_000
+
+
+@pytest.mark.parametrize(
+    ("before", "options", "pitch"),
+    [
+        (b"", "", 0.1745),
+        (frame(0x21, b"ANGL\0"), "", -0.1745),
+        (frame(0x21, b"STAB\0"), "", 0.1745),
+        (frame(0x29, b"\xea\xc8Betaflight 4.5\0"), "", -0.1745),
+        (frame(0x21, b"ANGL\0"), "?pitch=up", 0.1745),
+        (b"", "?pitch=down", -0.1745),
+    ],
+)
+def test_pitch_sign_is_that_of_the_autopilot(before: bytes, options: str, pitch: float) -> None:
+    found = decoder(options).feed(before + frame(0x1E, ATTITUDE), 0)
+    assert found[-1].attitude_rad[1] == pytest.approx(pitch)
+
+
+GPS = struct.pack(">iiHHHB", 481173000, -115167000, 414, 27050, 1545, 11)
+GPS_EXTENDED = struct.pack(">BhhhhhhhhBBB", 3, 250, -130, 40, 30, 100, 590, 180, 250, 0, 9, 14)
+
+
+def test_gps_frame_is_a_fix() -> None:
+    fix = one(0x02, GPS)
+    assert (fix.lat_dege7, fix.lon_dege7, fix.alt_amsl_m) == (481173000, -115167000, 545.0)
+    assert (fix.satellites, fix.fix_type, fix.fix_ok) == (11, GpsFixType.FIX_3D, True)
+    speed = 41.4 / 3.6
+    assert fix.vel_n_mps[1] == pytest.approx(speed * math.sin(math.radians(270.5)))
+
+
+def test_extended_gps_and_time_belong_to_the_next_fix() -> None:
+    time = struct.pack(">hBBBBBH", 2026, 3, 23, 10, 15, 33, 250)
+    data = frame(0x03, time) + frame(0x06, GPS_EXTENDED) + frame(0x02, GPS)
+    (fix,) = decoder().feed(data, 7_000_000)
+    assert fix.vel_n_mps == pytest.approx((2.5, -1.3, -0.4))
+    assert (fix.h_acc_m, fix.v_acc_m, fix.speed_acc_mps) == pytest.approx((1.8, 2.5, 0.3))
+    assert fix.utc_us == 1_774_260_933_250_000
+
+
+def test_gps_without_a_position_is_no_fix() -> None:
+    fix = one(0x02, struct.pack(">iiHHHB", 0, 0, 0, 0, 1000, 3))
+    assert (fix.fix_ok, fix.satellites) == (False, 3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload", "field", "value"),
+    [
+        (0x07, struct.pack(">h", -250), "climb_mps", -2.5),
+        (0x09, struct.pack(">Hb", 10_000, 0), "alt_home_m", 0.0),
+        (0x09, struct.pack(">Hb", 0, 0), "alt_home_m", -1000.0),
+        (0x09, struct.pack(">Hb", 0x7FFF, 0), "alt_home_m", 2276.7),
+        (0x09, struct.pack(">H", 0x8000 | 5000), "alt_home_m", 5000.0),
+        (0x09, struct.pack(">Hb", 0, 127), "climb_mps", math.exp(127 * 0.026) - 1),
+        (0x09, struct.pack(">Hb", 0, -10), "climb_mps", 1 - math.exp(0.26)),
+        (0x0A, struct.pack(">H", 720), "airspeed_mps", 20.0),
+        (0x1C, bytes([80, 60, 93, 5, 20]), "link_quality_percent", 93.0),
+    ],
+)
+def test_scale_and_sign_of_a_number(kind: int, payload: bytes, field: str, value: float) -> None:
+    assert getattr(one(kind, payload), field) == pytest.approx(value)
+
+
+def test_rpm_temperatures_and_cells_are_read() -> None:
+    assert one(0x0C, bytes([0]) + (1200).to_bytes(3, "big") + b"\xff\xff\x38").values == (
+        ("rpm0.0", 1200.0),
+        ("rpm0.1", -200.0),
+    )
+    assert one(0x0D, b"\x01" + struct.pack(">hh", 250, -50)).values == (
+        ("temp1.0", 25.0),
+        ("temp1.1", -5.0),
+    )
+    battery = one(0x0E, b"\x00" + struct.pack(">HHH", 3850, 3840, 3830)).battery
+    assert battery.cells_v == pytest.approx((3.85, 3.84, 3.83))
+    assert battery.voltage_v == pytest.approx(11.52)
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "number", "armed", "kind"),
+    [
+        (b"ANGL", "ANGL", 0, True, mavlink.MAV_TYPE_QUADROTOR),
+        (b"ANGL*", "ANGL", 0, False, mavlink.MAV_TYPE_QUADROTOR),
+        (b"ACRO!", "ACRO", 1, False, mavlink.MAV_TYPE_QUADROTOR),
+        (b"RTH?", "RTH", 6, False, mavlink.MAV_TYPE_QUADROTOR),
+        (b"3CRS", "3CRS", 7, True, mavlink.MAV_TYPE_FIXED_WING),
+        (b"WAIT", "WAIT", None, False, None),
+        (b"!ERR", "!ERR", None, False, None),
+        (b"!FS!", "!FS!", None, None, None),
+        (b"FBWA", "FBWA", 5, True, mavlink.MAV_TYPE_FIXED_WING),
+        (b"XYZ", "XYZ", None, True, None),
+    ],
+)
+def test_mode_and_arming_are_read_from_the_text(
+    text: bytes, mode: str, number: int | None, armed: bool | None, kind: int | None
+) -> None:
+    report = one(0x21, text + b"\0")
+    found = (report.mode, report.custom_mode, report.armed, report.vehicle_type)
+    assert found == (mode, number, armed, kind)
+
+
+def test_aeroplane_remains_one_in_modes_that_copters_have_too() -> None:
+    stream = decoder()
+    for text in (b"CRS", b"ANGL"):
+        (report,) = stream.feed(frame(0x21, text + b"\0"), 0)
+    assert (report.vehicle_type, report.custom_mode) == (mavlink.MAV_TYPE_FIXED_WING, 5)
+    assert one(0x21, b"ANGL\0", "?type=fixed_wing").custom_mode == 5
+
+
+def passthrough(*packets: tuple[int, int]) -> bytes:
+    packed = b"".join(struct.pack("<HI", *packet) for packet in packets)
+    if len(packets) == 1:
+        return frame(0x80, b"\xf0" + packed)
+    return frame(0x80, bytes([0xF2, len(packets)]) + packed)
+
+
+def test_ardupilot_frames_have_mode_type_arming_batteries_and_text() -> None:
+    stream = decoder()
+    parameter = (1 << 24) | mavlink.MAV_TYPE_FIXED_WING
+    status = (10 + 1) | 1 << 8 | 63 << 19
+    (report,) = stream.feed(passthrough((0x5007, parameter), (0x5001, status)), 0)
+    assert (report.mode, report.custom_mode, report.armed) == ("AUTO", 10, True)
+    assert report.vehicle_type == mavlink.MAV_TYPE_FIXED_WING
+    assert report.throttle_percent == pytest.approx(100.0)
+    assert stream.feed(frame(0x21, b"MANU\0"), 0) == [], "the text is coarser"
+    # 12.6 V; 25 A as 25 * 10 tenths; 1500 mAh.
+    battery = 126 | (25 << 1 | 1) << 9 | 1500 << 17
+    (report,) = stream.feed(passthrough((0x5008, battery)), 0)
+    assert (report.battery.number, report.battery.voltage_v) == (1, pytest.approx(12.6))
+    assert (report.battery.current_a, report.battery.used_mah) == (pytest.approx(25.0), 1500.0)
+    (report,) = stream.feed(frame(0x80, b"\xf1\x04PreArm: Compass not healthy\0"), 0)
+    assert report.text == (4, "PreArm: Compass not healthy")
+
+
+def test_home_of_ardupilot_is_found_from_distance_and_direction() -> None:
+    stream = decoder()
+    stream.feed(frame(0x02, GPS), 0)
+    # 1200 m as 120 * 10, height 45 m as 45 * 10 dm, direction 90 degrees.
+    home = (120 << 2 | 1) | (45 << 2 | 1) << 12 | 30 << 25
+    (report,) = stream.feed(passthrough((0x5004, home)), 0)
+    lat, lon, alt = report.home
+    assert (lat, alt) == (pytest.approx(48.1173, abs=1e-6), pytest.approx(500.0))
+    metres = (lon + 11.5167) * 111_195 * math.cos(math.radians(48.1173))
+    assert metres == pytest.approx(1200.0, rel=1e-3)
+    assert report.alt_home_m == pytest.approx(45.0)
+
+
+FLIGHT = frame(0x1E, ATTITUDE) + frame(0x02, GPS) + frame(0x21, b"ACRO*\0") + frame(0x07, b"\0\1")
+
+
+@pytest.mark.parametrize("address", [0xC8, 0xEA, 0xEE, 0xEC, 0x00, 0x7F])
+def test_any_address_is_accepted(address: int) -> None:
+    assert len(decoder().feed(frame(0x1E, ATTITUDE, address), 0)) == 1
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 7, 1000])
+def test_any_chunking_gives_the_same_records(size: int) -> None:
+    stream, found = decoder(), []
+    for at in range(0, len(FLIGHT), size):
+        found += stream.feed(FLIGHT[at : at + size], 0)
+    assert [type(each) for each in found] == [VehicleReport, GpsFix, VehicleReport, VehicleReport]
+
+
+@pytest.mark.parametrize("noise", [b"$TA", b"\x7e\x98\x10" * 9, b"\xff" * 40, b"$GPGGA,1,2*00\r\n"])
+def test_frames_are_found_between_bytes_of_other_protocols(noise: bytes) -> None:
+    stream = decoder()
+    found = [e for _ in range(10) for e in stream.feed(noise + FLIGHT, 0)]
+    found += stream.feed(bytes(70), 0)
+    records = [each for each in found if not isinstance(each, Fault)]
+    assert len(records) == 40
+    dropped = sum(each.size for each in found if isinstance(each, Fault))
+    assert dropped >= 10 * len(noise)
+
+
+def test_damaged_frame_is_one_fault_and_the_next_frame_is_read() -> None:
+    damaged = bytearray(FLIGHT)
+    damaged[4] ^= 0x40
+    fault, *records = decoder().feed(bytes(damaged), 0)
+    assert (fault.kind, fault.size) == ("crc", len(frame(0x1E, ATTITUDE)))
+    assert len(records) == 3
+
+
+def test_unknown_type_and_short_payload_are_counted() -> None:
+    unknown, short = decoder().feed(frame(0x60, b"abc") + frame(0x02, b"abc"), 0)
+    assert (unknown.kind, short.kind) == ("unknown type", "payload")
+    assert decoder().feed(frame(0x3A, b"\xea\xee\x10\x00\x00"), 0) == [], "known and not used"
+
+
+def ltm(kind: bytes, payload: bytes) -> bytes:
+    check = 0
+    for byte in payload:
+        check ^= byte
+    return b"$T" + kind + payload + bytes([check])
+
+
+def test_ltm_is_read_behind_the_same_interface() -> None:
+    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
+    data = ltm(b"O", struct.pack("<iiiBB", 481000000, 115000000, 50_000, 1, 1))
+    data += ltm(b"A", struct.pack("<hhh", -5, 20, 270))
+    data += ltm(b"G", struct.pack("<iiBiB", 481100000, 115100000, 17, 12_300, 11 << 2 | 3))
+    data += ltm(b"S", struct.pack("<HHBBB", 15_900, 420, 127, 18, 2 << 2 | 1))
+    found = [e for k in range(len(data)) for e in stream.feed(data[k : k + 1], 9)]
+    home, attitude, height, fix, state = found
+    assert home.home == pytest.approx((48.1, 11.5, 500.0))
+    assert attitude.attitude_rad == pytest.approx([math.radians(v) for v in (20, -5, 270)])
+    assert height.alt_home_m == 123.0
+    assert (fix.alt_amsl_m, fix.satellites) == (623.0, 11)
+    assert fix.vel_n_mps[:2] == pytest.approx((0.0, -17.0), abs=1e-9)
+    assert (state.mode, state.armed, state.battery.voltage_v) == ("ANGLE", True, 15.9)
+    assert state.link_quality_percent == 50.0
+    assert state.airspeed_mps == 18.0
+
+
+def test_ltm_noise_is_counted_and_the_next_frame_is_read() -> None:
+    stream = make_decoder(parse_source("ltm:/dev/ttyUSB0"), NODE)
+    good = ltm(b"A", struct.pack("<hhh", 0, 0, 90))
+    report, fault = stream.feed(b"$TA123456x" + good, 0)
+    assert isinstance(fault, Fault)
+    assert report.attitude_rad is not None
