@@ -142,8 +142,7 @@ def vfr_hud(
     Without an airspeed its field carries the ground speed, as ArduPilot's does without such a
     sensor, because clients print it as an integer, where NaN fails. Throttle is 0 where none is
     reported. The heading is the yaw of ATTITUDE; without an attitude it is the heading alone where
-    that is reported, or else the course over ground. What is not known at all is 0: this message
-    has no other value for it.
+    that is reported, or else the course over ground, or 0.
     """
     north, east, down = state.vel_n_mps
     speed = math.hypot(north, east)
@@ -151,11 +150,9 @@ def vfr_hud(
     if math.isnan(yaw):
         yaw = math.atan2(east, north) if heading_rad is None else heading_rad
     heading = encoding.compass_deg(yaw) if math.isfinite(yaw) else 0
-    speed = speed if math.isfinite(speed) else 0.0
-    climb = -down if math.isfinite(down) else 0.0
     airspeed = speed if airspeed_mps is None else airspeed_mps
     throttle = 0 if throttle_percent is None else encoding.uint16(throttle_percent, 0)
-    return VFR_HUD(airspeed, speed, heading, throttle, state.alt_amsl_m, climb)
+    return VFR_HUD(airspeed, speed, heading, throttle, state.alt_amsl_m, -down)
 
 
 def highres_imu(sample: ImuSample, mag_b_ut: Vec3, baro: BaroSample | None, updated: int) -> Any:
