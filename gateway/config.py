@@ -29,7 +29,6 @@ from gateway.panel.panel_settings import PanelSettings
 from gateway.printable import UserError
 from gateway.settings import Field, Settings, fields_of, setting
 from gateway.simulator.simulator_settings import SimulatorSettings
-from gateway.sources.kinds import check_source
 from gateway.sources.settings import MAX_SOURCES, SourceSettings, parse_source
 from gateway.toml_file import TomlError, read_toml, read_toml_text
 from gateway.vehicle.vehicle_settings import VehicleSettings
@@ -94,6 +93,11 @@ class GatewaySettings(Settings, frozen=True):
         """Refuse sources of an unknown kind, or with an unknown option."""
         if len(self.sources) > MAX_SOURCES:
             raise ValueError(f"sources: at most {MAX_SOURCES}")
+        if not self.sources:
+            return
+        # Here, as the decoders load what small commands should not wait for.
+        from gateway.sources.kinds import check_source
+
         for source in self.sources:
             check_source(parse_source(source.url))
 

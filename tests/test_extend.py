@@ -4,6 +4,7 @@ import asyncio
 import importlib
 import re
 import socket
+import struct
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -29,6 +30,8 @@ from gateway.recordings.reading import READERS, ReadOptions, header_for
 from gateway.recordings.table import encode_head
 from gateway.records import ImuRaw, Incoming, NavState
 from gateway.simulator.simulator_settings import SimulatorSettings
+from gateway.sources.kinds import SOURCE_KINDS, make_sources
+from gateway.sources.settings import SourceSettings
 from gateway.vehicle.telemetry.streams import ADDED_MESSAGES
 from gateway.wire.mavlink_splitter import message_id_of
 from tools.simulated_flight import fly
@@ -43,6 +46,7 @@ REGISTRIES: tuple[dict, ...] = (
     CLIENTS,
     ADDED_KINDS,
     ADDED_VIEWS,
+    SOURCE_KINDS,
 )
 
 Install = Callable[[str, str], ModuleType]
@@ -103,6 +107,24 @@ def test_added_message_is_sent_at_its_rate(install: Install) -> None:
     message = mavlink.MAVLink(None).parse_char(frames[-1])
     assert message.name == "load"
     assert message.value == pytest.approx(1.0, abs=0.1)
+
+
+def test_added_source_kind_is_a_vehicle(install: Install) -> None:
+    install("beacon", example("A source"))
+    load_extensions()
+    (source,) = make_sources((SourceSettings(url="beacon:stdin", vehicle=4),), str)
+    payload = struct.pack("<iih", 481000000, 115000000, 512)
+    frame = b"B" + payload + bytes([sum(payload) % 256])
+    pipeline = Pipeline(PipelineSettings(AircraftSettings(), sources=[source]))
+    frames = []
+    for number in range(20):
+        data = b"?" + frame if number == 7 else frame
+        frames += pipeline.feed_source(source, data, number * 500_000).frames
+    wanted = mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT
+    (*_, newest) = [sent.frame for sent in frames if sent.message_id == wanted]
+    message = mavlink.MAVLink(None).parse_char(newest)
+    assert (message.get_srcSystem(), message.lat, message.alt) == (4, 481000000, 512_000)
+    assert source.report().faults == (("checksum", 1),)
 
 
 async def test_added_endpoint_kind_sends_and_receives(install: Install, tmp_path: Path) -> None:

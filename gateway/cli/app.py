@@ -34,6 +34,7 @@ MODULES: Final = {
     "live.flash": ("ports", "flash"),
     "live.doctor": ("check-config", "doctor"),
     "live.map": ("map",),
+    "live.source": ("source",),
     "recorded.report": ("report", "page"),
     "recorded.sweep": ("sweep",),
     "live.record": ("record",),
@@ -93,6 +94,7 @@ GROUPS: Final = {
         "doctor": "Check this machine and suggest fixes: rights, ports, latency, kernels, time, "
         "disk.",
         "map": "Fetch an area of a map for the panel, for use without a network.",
+        "source": "Test a tracker that is to be a vehicle.",
     },
 }
 """The headings of the list, and the summary of each command below it."""

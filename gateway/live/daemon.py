@@ -515,7 +515,9 @@ class Daemon:
 def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewaySettings:
     """Let a simulated source, if there is one, take the place of the settings' sources."""
     vehicle_id = settings.simulator.vehicle_id
-    found = (SourceSettings(url=f"{kind}:{path}", vehicle=vehicle_id),) if kind else ()
+    # It is an aeroplane, which the names of most modes do not show.
+    url = f"{kind}:{path}" + ("?type=fixed_wing" if kind == "crsf" else "")
+    found = (SourceSettings(url=url, vehicle=vehicle_id),) if kind else ()
     return msgspec.structs.replace(settings, sources=found)
 
 

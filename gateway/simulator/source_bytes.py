@@ -82,7 +82,7 @@ def _link(truth: Truth, k: int) -> bytes:
 
 def _mode(truth: Truth, k: int) -> bytes:
     flying = float(truth.airspeed_mps[k]) > FLYING_MPS
-    return crsf_frame(0x21, b"CRUI\0" if flying else b"FBWA*\0")
+    return crsf_frame(0x21, b"AUTO\0" if flying else b"STAB*\0")
 
 
 def _battery(truth: Truth, k: int) -> bytes:

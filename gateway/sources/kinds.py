@@ -17,7 +17,7 @@ SourceKind = Callable[[SourceUrl, NodeId], SourceDecoder]
 ValueError for an option that is wrong."""
 
 SOURCE_KINDS: Final[dict[str, tuple[SourceKind, tuple[str, ...]]]] = {
-    "lines": (LinesDecoder, ()),
+    "lines": (LinesDecoder, ("columns", "names")),
     "crsf": (CrsfDecoder, ("pitch", "type")),
     "ltm": (LtmDecoder, ("type",)),
 }

@@ -23,6 +23,7 @@ from gateway.records import (
     Vec3,
     VehicleReport,
 )
+from gateway.sources.csv_lines import CsvLines, read_column_map
 from gateway.sources.nmea import NmeaReader
 from gateway.sources.sampling import SampleClock, fix_at, imu_raw, velocity
 from gateway.sources.settings import SourceUrl
@@ -112,6 +113,11 @@ class LinesDecoder:
         self._node = node
         self._splitter = LineSplitter()
         self._nmea = NmeaReader(node)
+        column_map = url.options.get("columns")
+        self._csv = None
+        if column_map is not None:
+            names = url.options.get("names", "")
+            self._csv = CsvLines(read_column_map(column_map), names, node)
         self._clocks: dict[int, SampleClock] = {}
         self._has_own_id = "id" in url.options
         self._ends_line = url.transport == "udp"
@@ -138,6 +144,8 @@ class LinesDecoder:
             return [*self._nmea.line(line, arrival_us)]
         if line[0] == "#":
             return []
+        if self._csv is not None:
+            return self._csv.line(line, arrival_us)
         return [_fault("text", line, "neither JSON, NMEA nor CSV of a map (?columns=FILE)")]
 
     def _json(self, line: str, arrival_us: int) -> list[SourceRecord | Fault]:

@@ -11,11 +11,83 @@ from pynmeagps import GET, NMEAMessage
 from gateway.records import BaroRaw, GpsFix, GpsFixType, ImuRaw, NodeId, VehicleReport
 from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
-from gateway.sources.kinds import make_decoder
-from gateway.sources.settings import parse_source
+from gateway.sources.kinds import make_decoder, make_sources
+from gateway.sources.settings import SourceSettings, parse_source
+from gateway.sources.trial import SourceTrial, describe
 from gateway.wire.framing import Fault
 
 NODE = NodeId(3, 8)
+
+
+MAP = """[columns]
+time_us = { column = "t", scale = 1000.0 }
+accel_x_b_mps2 = "ax"
+accel_y_b_mps2 = "ay"
+accel_z_b_mps2 = "az"
+gyro_x_b_radps = "gx"
+gyro_y_b_radps = "gy"
+gyro_z_b_radps = "gz"
+gps_lat_dege7 = { column = "lat", scale = 1e7 }
+gps_lon_dege7 = { column = "lon", scale = 1e7 }
+baro_pressure_pa = { column = "hpa", scale = 100.0 }
+"""
+HEADER = "t,ax,ay,az,gx,gy,gz,lat,lon,hpa\n"
+
+
+def decode_csv(text: str, names: str = "") -> list[Any]:
+    (source,) = make_sources(
+        (SourceSettings(url=f"lines:stdin?columns=MAP{names}"),), lambda _: MAP
+    )
+    return source.decoder.feed(text.encode(), 1_000_000)
+
+
+def test_csv_is_read_by_the_map_of_columns_of_files() -> None:
+    values = "10,0.5,-1.25,9.8,0,0,0.5,48.5,11.5,1001.5\n20,0.5,-1.25,9.8,0,0,0.5,,,\n"
+    found = decode_csv(HEADER + values)
+    assert [type(each) for each in found] == [BaroRaw, GpsFix, ImuRaw, ImuRaw]
+    baro, fix, first, second = found
+    assert (baro.pressure_pa, fix.lat_dege7) == (pytest.approx(100_150.0), 485000000)
+    assert second.time_us > first.time_us
+    sample = SensorChain(NodeCalibration()).imu(first)
+    assert sample.accel_b_mps2 == pytest.approx((0.5, 1.25, -9.8), abs=0.0004)
+    assert sample.gyro_b_radps[2] == pytest.approx(-0.5, abs=0.0001)
+    without = decode_csv(values, "&names=t,ax,ay,az,gx,gy,gz,lat,lon,hpa")
+    assert [repr(each) for each in without] == [repr(each) for each in found]
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("1,2,3\n", "before the line with the names"),
+        (HEADER + "x,1,1,1,1,1,1,1,1,1\n", "not a number"),
+        (HEADER + "5\n", "no value of the map"),
+    ],
+)
+def test_csv_that_cannot_be_used_is_an_explained_fault(text: str, why: str) -> None:
+    (fault,) = decode_csv(text)
+    assert fault.kind == "csv"
+    assert why in fault.detail
+
+
+def test_wrong_map_is_refused_when_the_source_is_made() -> None:
+    with pytest.raises(ValueError, match="map of columns"):
+        make_sources((SourceSettings(url="lines:stdin?columns=MAP"),), lambda _: "[columns]\nx = 1")
+
+
+def test_trial_names_rates_what_is_missing_and_a_map() -> None:
+    trial, text = SourceTrial(), "time,acc_x,acc_y,acc_z\n1,2,3,4\n" + json_line(speed=1)
+    trial.look_at(text)
+    shown = []
+    for event in decode(text + gga()):
+        trial.take(event)
+        shown.append(describe(event))
+    assert shown[-1] == "GPS fix 48.117300 11.516667 545.4 m, 9 satellites"
+    assert shown[0].startswith("not used (text): 'time,acc_x,acc_y,acc_z'")
+    summary = trial.summary(2.0)
+    assert "fault text: 2, 1.0 a second" in summary
+    assert "attitude: no; it needs accel_mps2 and gyro_dps in one object" in summary
+    assert "position: yes" in summary
+    assert 'accel_y_b_mps2 = { column = "acc_y", scale = 1 }' in summary
 
 
 def decode(text: str | bytes, url: str = "lines:stdin", arrival_us: int = 1_000_000) -> list[Any]:

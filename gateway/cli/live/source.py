@@ -1,0 +1,55 @@
+"""`mavgate source test`: what a tracker sends, in words."""
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from gateway.cli.support.terminal import refuse
+from gateway.clock import GatewayClock
+from gateway.live.source_port import SourcePort, read_map
+from gateway.printable import printable
+from gateway.sources.kinds import make_sources
+from gateway.sources.settings import SourceSettings
+from gateway.sources.source import SourceInput
+from gateway.sources.trial import SourceTrial, describe
+
+app = typer.Typer()
+group = typer.Typer(help="Test a tracker that is to be a vehicle.")
+app.add_typer(group, name="source")
+
+SHOWN = 5
+"""Records of a kind that are shown; the rest is counted."""
+
+
+@group.command("test")
+def try_source(
+    url: Annotated[str, typer.Argument(help="Such as lines:/dev/ttyUSB0 or crsf:/dev/ttyACM0.")],
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, max=3600)] = 10.0,
+) -> None:
+    """Show what a tracker sends, its rates, and what is missing for attitude and position."""
+    try:
+        (source,) = make_sources((SourceSettings(url=url),), read_map)
+    except ValueError as error:
+        refuse(str(error))
+    trial = asyncio.run(_listen(source, seconds))
+    if not source.report().connected and not trial.counts:
+        print(f"not connected: {source.reason}")
+    for line in trial.summary(seconds):
+        print(line)
+
+
+async def _listen(source: SourceInput, seconds: float) -> SourceTrial:
+    trial, clock = SourceTrial(), GatewayClock()
+
+    def take(found: SourceInput, data: bytes) -> None:
+        trial.look_at(data.decode("utf-8", "replace"))
+        for event in found.decoder.feed(data, clock()):
+            if trial.take(event) <= SHOWN:
+                print(printable(describe(event)))
+
+    port = SourcePort(source, take)
+    port.start()
+    await asyncio.sleep(seconds)
+    port.close()
+    return trial

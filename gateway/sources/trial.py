@@ -1,0 +1,128 @@
+"""A trial of a source: each record and fault in words, rates, and what a vehicle would lack."""
+
+import math
+import re
+from collections import Counter
+from typing import Final
+
+from gateway.records import BaroRaw, GpsFix, ImuFlags, ImuRaw, VehicleReport
+from gateway.sources.sampling import COUNTS_PER_DPS, COUNTS_PER_MPS2, COUNTS_PER_UT
+from gateway.sources.source import SourceRecord
+from gateway.wire.framing import Fault
+
+GUESSES: Final = (
+    (r"^(t|time|timestamp|millis|t_?ms)$", "time_us"),
+    *((rf"^(a|acc|accel\w*)_?{axis}\b", f"accel_{axis}_b_mps2") for axis in "xyz"),
+    *((rf"^(g|gyr|gyro\w*)_?{axis}\b", f"gyro_{axis}_b_radps") for axis in "xyz"),
+    *((rf"^(m|mag\w*)_?{axis}\b", f"mag_{axis}_b_ut") for axis in "xyz"),
+    (r"^(p|press\w*|baro\w*)\b", "baro_pressure_pa"),
+    (r"^(lat|latitude)\b", "gps_lat_dege7"),
+    (r"^(lon|lng|longitude)\b", "gps_lon_dege7"),
+    (r"^(alt|altitude)\b", "gps_alt_amsl_m"),
+    (r"^(speed|gspeed|groundspeed)\b", "gps_speed_mps"),
+    (r"^(course|heading|cog)\b", "gps_course_deg"),
+)
+"""Names that people give their columns, and ours."""
+DEGE7: Final = frozenset({"gps_lat_dege7", "gps_lon_dege7"})
+LEAST_NAMES: Final = 3
+
+
+def describe(event: SourceRecord | Fault) -> str:
+    """Describe a record or a fault in one line."""
+    match event:
+        case Fault():
+            return f"not used ({event.kind}): {event.detail}"
+        case ImuRaw():
+            accel = _vector(event.accel_raw, COUNTS_PER_MPS2)
+            gyro = _vector(event.gyro_raw, COUNTS_PER_DPS)
+            has_mag = event.flags & ImuFlags.MAG_NEW
+            mag = f", compass {_vector(event.mag_raw, COUNTS_PER_UT)} uT" if has_mag else ""
+            return f"accelerometer {accel} m/s2, gyroscope {gyro} deg/s{mag}"
+        case BaroRaw():
+            return f"barometer {event.pressure_pa / 100.0:.2f} hPa"
+        case GpsFix():
+            place = f"{event.lat_dege7 * 1e-7:.6f} {event.lon_dege7 * 1e-7:.6f}"
+            fix = f"fix {place} {event.alt_amsl_m:.1f} m" if event.fix_ok else "no fix"
+            return f"GPS {fix}, {event.satellites} satellites"
+        case VehicleReport():
+            return f"state {', '.join(_fields(event))}"
+
+
+def _vector(counts: tuple[int, int, int], per_unit: float) -> str:
+    return " ".join(f"{count / per_unit:.2f}" for count in counts)
+
+
+def _fields(report: VehicleReport) -> list[str]:
+    """Name the fields that a report has, with their values."""
+    found = []
+    for name in report.__struct_fields__[2:]:
+        value = getattr(report, name)
+        if value in (None, "", ()) or value != value:
+            continue
+        if name == "attitude_rad":
+            angles = (f"{math.degrees(angle):.1f}" for angle in value)
+            found.append(f"roll, pitch, yaw {' '.join(angles)} deg")
+        elif name == "battery":
+            found.append(f"battery {value.voltage_v:.2f} V")
+        else:
+            found.append(f"{name} {value}")
+    return found
+
+
+class SourceTrial:
+    """Count what a source brings, and sum it up."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+        """By the kind of record, and of fault."""
+        self._has_mag = self._has_fix = self._has_height = self._has_attitude = False
+        self._header = ""
+
+    def take(self, event: SourceRecord | Fault) -> int:
+        """Count a record or a fault; return how many of its kind there were."""
+        kind = f"fault {event.kind}" if isinstance(event, Fault) else type(event).__name__
+        self.counts[kind] += 1
+        if isinstance(event, ImuRaw):
+            self._has_mag |= bool(event.flags & ImuFlags.MAG_NEW)
+        elif isinstance(event, GpsFix):
+            self._has_fix |= event.fix_ok
+            self._has_height |= event.fix_ok and math.isfinite(event.alt_amsl_m)
+        elif isinstance(event, VehicleReport):
+            self._has_attitude |= event.attitude_rad is not None
+        return self.counts[kind]
+
+    def look_at(self, text: str) -> None:
+        """Keep the first line that may hold names of columns, for a suggestion."""
+        for line in text.splitlines():
+            names = re.findall(r"[A-Za-z]\w*", line)
+            if not self._header and len(names) >= LEAST_NAMES and suggested_map(line):
+                self._header = line
+
+    def summary(self, seconds: float) -> list[str]:
+        """Sum up: rates, what is missing, and the map that would read CSV."""
+        lines = [f"{kind}: {n}, {n / seconds:.1f} a second" for kind, n in self.counts.items()]
+        attitude = "yes" if self._has_attitude or self.counts["ImuRaw"] else "no"
+        why = "" if attitude == "yes" else "; it needs accel_mps2 and gyro_dps in one object"
+        lines.append(f"attitude: {attitude}{why}")
+        if self.counts["ImuRaw"] and not self._has_mag:
+            lines.append("heading: only in flight, by GPS; it needs mag_ut")
+        place = "yes" if self._has_height else "no"
+        missing = (
+            "a height (alt_m or GGA)" if self._has_fix else "a fix: lat, lon and alt_m, or NMEA"
+        )
+        lines.append(f"position: {place}" + ("" if self._has_height else f"; it needs {missing}"))
+        if self._header and not self.counts["ImuRaw"]:
+            lines += ["a map for ?columns=FILE; check its units:", *suggested_map(self._header)]
+        return lines
+
+
+def suggested_map(header: str) -> list[str]:
+    """Suggest a map of the columns that a line of names has; empty if it has none."""
+    cells = [cell.strip(' "') for cell in re.split(r"[,;\t]", header)]
+    found = {}
+    for cell in cells:
+        ours = next((name for pattern, name in GUESSES if re.match(pattern, cell.lower())), None)
+        if ours is not None and ours not in found:
+            scale = 1e7 if ours in DEGE7 else 1000.0 if ours == "time_us" else 1.0
+            found[ours] = f'{ours} = {{ column = "{cell}", scale = {scale:g} }}'
+    return ["[columns]", *found.values()] if "time_us" in found and len(found) > 1 else []
