@@ -102,6 +102,11 @@ class GatewaySettings(Settings, frozen=True):
             check_source(parse_source(source.url))
 
     @property
+    def has_other_sources(self) -> bool:
+        """Whether data may come from more than the receiver."""
+        return self.hub.has_other_sources or bool(self.sources)
+
+    @property
     def default_aircraft(self) -> AircraftSettings:
         """The settings of an aircraft without its own file."""
         return AircraftSettings(vehicle=self.vehicle, estimation=self.estimation)

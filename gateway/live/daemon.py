@@ -105,11 +105,9 @@ class Daemon:
     ) -> None:
         self.now_us = GatewayClock()
         self._receiver = None if line is None else PtyPort(line)
-        serial = settings.serial
         if self._receiver is not None:
-            path = self._receiver.path
-            serial = msgspec.structs.replace(serial, port=NO_RECEIVER if simulated_kind else path)
-            settings = _with_simulated(settings, simulated_kind, path)
+            settings = _with_simulated(settings, simulated_kind, self._receiver.path)
+        serial = settings.serial
         self._own_ids = set[int]() if line is None else {*aircraft}
         """Vehicle ids of our aircraft: those that a simulation has, or that were received."""
         self._settings = settings
@@ -117,8 +115,7 @@ class Daemon:
         self._plans = PlanFiles(aircraft_folder(settings), self._announce_plans)
         self._timestamps = TimestampFile(aircraft_folder(settings))
         self._pipeline = self._make_pipeline(aircraft)
-        others = settings.hub.has_other_sources or bool(settings.sources)
-        needed = serial.port != "auto" or not others
+        needed = serial.port != "auto" or not settings.has_other_sources
         self._pipeline.disconnect(serial.port if needed else NO_RECEIVER)
         self._hub = Hub(
             settings.hub,
@@ -241,6 +238,8 @@ class Daemon:
         self._perform(self._pipeline.sign_by(passphrase, own, self.now_us()))
         self._serve_metrics()
         self._notifier.ready()
+        if self._receiver is not None:
+            settings = msgspec.structs.replace(settings, serial=now.serial, sources=now.sources)
         later = "; others need a new start" if settings != now else ""
         status = f"settings of the hub and of signing applied{later}"
         log.info(status)
@@ -513,12 +512,12 @@ class Daemon:
 
 
 def _with_simulated(settings: GatewaySettings, kind: str, path: str) -> GatewaySettings:
-    """Let a simulated source, if there is one, take the place of the settings' sources."""
-    vehicle_id = settings.simulator.vehicle_id
+    """Let a simulated receiver, or a simulated source, take the place of those of the settings."""
     # It is an aeroplane, which the names of most modes do not show.
     url = f"{kind}:{path}" + ("?type=fixed_wing" if kind == "crsf" else "")
-    found = (SourceSettings(url=url, vehicle=vehicle_id),) if kind else ()
-    return msgspec.structs.replace(settings, sources=found)
+    found = (SourceSettings(url=url, vehicle=settings.simulator.vehicle_id),) if kind else ()
+    serial = msgspec.structs.replace(settings.serial, port=NO_RECEIVER if kind else path)
+    return msgspec.structs.replace(settings, sources=found, serial=serial)
 
 
 def _report_saved(saving: Future[Path]) -> None:
