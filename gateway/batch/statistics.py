@@ -296,7 +296,7 @@ def write_season_page(
             "Errors by aircraft and estimator",
             "Each flight was fused without every fifth fix, which then judged: the figures are the "
             f"root mean square errors of the flights, horizontal. {why_leads(judged)}".strip(),
-            [_picture(judged)] if judged else [],
+            [_picture(judged)] if any(result.figures[HELD] for result in judged) else [],
             [ReportTable("errors", errors_by_group(judged), "Errors at withheld fixes.")],
         )
     ]

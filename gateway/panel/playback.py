@@ -26,7 +26,7 @@ from gateway.recordings.index import RecordingError, find_recording, parts_toget
 from gateway.recordings.positions import TrackPoint
 from gateway.recordings.reading import recorded_frames
 from gateway.recordings.senders import FIRST_GROUND_STATION, Senders
-from gateway.recordings.table import TableHeader, TableReader
+from gateway.recordings.table import TableReader
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S
 
@@ -107,13 +107,12 @@ def _of_tables(parts: Sequence[Path]) -> RecordedAircraft:
         reader = TableReader()
         for chunk in read_chunks(part, None):
             for event in reader.feed(chunk):
-                if isinstance(event, TableHeader):
-                    vehicle_id = event.vehicle_id
-                elif isinstance(event, TableRow):
+                if isinstance(event, TableRow):
                     begin_us = event.time_us if begin_us is None else begin_us
                     if event.state is not None:
                         at = (event.state.lat_deg, event.state.lon_deg, event.state.alt_amsl_m)
                         _note_height(TrackPoint(event.time_us, *at), points)
+        vehicle_id = reader.vehicle_id
     return RecordedAircraft(vehicle_id, FUSED_AGAIN, _profile(points, begin_us or 0))
 
 

@@ -6,7 +6,15 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gateway.batch.statistics import choose, errors_by_group, folds_of, lead_of, versus, why_leads
+from gateway.batch.statistics import (
+    choose,
+    errors_by_group,
+    folds_of,
+    lead_of,
+    versus,
+    why_leads,
+    write_season_page,
+)
 from gateway.batch.tasks import FlightResult
 from gateway.config import load
 from tests.kit.cli import invoke
@@ -92,6 +100,12 @@ def test_errors_are_summed_up_by_aircraft_and_estimator() -> None:
         ["2", "eskf", 1, 8.0, 8.0],
         ["2", "paper", 1, 1.0, 1.0],
     ]
+
+
+def test_page_of_flights_too_short_to_be_judged_has_no_picture(tmp_path: Path) -> None:
+    page = write_season_page([flight("a_01_v1.csv", 1)], tmp_path, None).read_text()
+    assert "a_01_v1.csv" in page
+    assert "Share of the flights" not in page
 
 
 def season_of(eskf_m: float, paper_m: float, drifts_m: dict[str, float]) -> list[FlightResult]:

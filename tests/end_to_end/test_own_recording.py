@@ -14,6 +14,10 @@ from mcap.reader import make_reader
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import all as mavlink
 
+from gateway.clock import GatewayClock
+from gateway.panel.playback import FUSED_AGAIN, RECORDED, Playback
+from gateway.panel.state.fleet import FleetState
+from gateway.panel.uplink import ControlClient, Uplink
 from tests.end_to_end.processes import Gateway
 from tests.end_to_end.station import Station
 from tests.kit.cli import invoke
@@ -202,6 +206,51 @@ def test_batch_command_describes_the_folder(folder: Path, tmp_path: Path) -> Non
     done = invoke("batch", "info", folder, "-o", tmp_path / "info", "--jobs", 1, code=0)
     assert "_01.tlog" in done.output
     assert any(path.is_file() for path in (tmp_path / "info").rglob("*"))
+
+
+def test_tables_are_fused_again_and_recovered(folder: Path, tlog: Path, tmp_path: Path) -> None:
+    (table,) = folder.glob("*_01_v1.csv")
+    invoke("fuse", table, "-o", tmp_path / "fused.csv", code=0)
+    assert "nav_q_w" in (tmp_path / "fused.csv").read_text()
+    for file in (tlog, table):
+        kept = tmp_path / f"kept{file.suffix}"
+        assert "nothing was damaged" in invoke("recover", file, "-o", kept, code=0).output
+        assert kept.read_bytes() == file.read_bytes()
+
+
+def test_sweep_of_the_seconds_before_the_take_off_teaches_nothing(
+    folder: Path, tmp_path: Path
+) -> None:
+    *_, table = sorted(folder.glob("*_v1.csv"))
+    vary = ["--vary", "gps_latency_s=0,0.4", "--jobs", "1"]
+    done = invoke("sweep", table, *vary, "-o", tmp_path / "best.toml")
+    assert f"{table.name}: at rest throughout" in done.output
+
+
+def test_folder_is_fused_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
+    invoke("batch", "fuse", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert all(table.name in page for table in folder.glob("*_01_v?.csv"))
+
+
+async def test_recording_is_played_in_the_panel(folder: Path, tlog: Path) -> None:
+    fleet = FleetState()
+    uplink = Uplink(None, fleet, ControlClient(None), GatewayClock())
+    playback = Playback(uplink, fleet, "page")
+    try:
+        uplink.start()
+        await playback.open(folder, tlog.name.removesuffix("_01.tlog"), fused_again=True)
+        origins = sorted((one.recorded_id, one.origin) for one in playback.aircraft.values())
+        assert origins == [(1, FUSED_AGAIN), (1, RECORDED), (2, FUSED_AGAIN), (2, RECORDED)]
+        await playback.order("seek", to="2")
+        assert playback.status is not None
+        assert playback.status["duration_s"] > RECORDED_S
+    finally:
+        player = playback._child
+        playback.close()
+        uplink.close()
+        if player is not None:
+            await player.communicate()
 
 
 def test_page_and_report_are_made(folder: Path, tlog: Path, tmp_path: Path) -> None:
