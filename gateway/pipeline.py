@@ -38,6 +38,7 @@ from gateway.wire.mavlink_signing import (
     KeptTimestamps,
     SigningClock,
     SigningTimestamps,
+    key_from_passphrase,
 )
 from gateway.wire.timesync import GpsTime
 
@@ -75,6 +76,7 @@ class Pipeline:
         self._signing_clock = SigningClock(settings.unix_us_at_zero)
         self.signer = FrameSigner(self._signing_clock)
         """Signs the frames of every aircraft with a passphrase where they are sent."""
+        self._set_shared_key(settings.default.vehicle.signing_passphrase)
         self._timestamps = {
             key: SigningTimestamps(kept) for key, kept in settings.timestamps.items()
         }
@@ -152,6 +154,10 @@ class Pipeline:
         else:
             self.signer.keys[aircraft.vehicle_id] = key
 
+    def _set_shared_key(self, passphrase: str) -> None:
+        """Let the signer renew signatures of other systems that have the common passphrase."""
+        self.signer.shared_key = key_from_passphrase(passphrase) if passphrase else b""
+
     def find(self, vehicle_id: int) -> Aircraft:
         """Return an aircraft that was ever received; raises KeyError for another."""
         found = self.aircraft.get(vehicle_id)
@@ -183,6 +189,7 @@ class Pipeline:
         }
         default = with_passphrase(known.default, common)
         self._settings = replace(known, default=default, aircraft=aircraft)
+        self._set_shared_key(common)
         out = Outputs()
         for each in self._ever():
             each.sign_by(own.get(each.vehicle_id, common), now_us, out)

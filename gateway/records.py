@@ -451,6 +451,8 @@ EVERYBODY: Final = (0, 0)
 HEARTBEAT_TYPE_OFFSET: Final = 4
 _TYPE_GCS: Final = bytes((6,))
 """MAV_TYPE_GCS."""
+_NO_AUTOPILOT: Final = bytes((8,))
+"""MAV_AUTOPILOT_INVALID."""
 TXBUF_OFFSET: Final = 6
 """Of RADIO_STATUS, behind its two counters and the two signal strengths."""
 
@@ -480,6 +482,12 @@ class MavFrame(msgspec.Struct, frozen=True, gc=False):
     def is_station_heartbeat(self) -> bool:
         """Whether this HEARTBEAT reports that its sender is a ground station."""
         return self.payload[HEARTBEAT_TYPE_OFFSET : HEARTBEAT_TYPE_OFFSET + 1] == _TYPE_GCS
+
+    @property
+    def is_autopilot_heartbeat(self) -> bool:
+        """Whether this HEARTBEAT is an autopilot's, and not a station's or a companion's."""
+        autopilot = self.payload[HEARTBEAT_TYPE_OFFSET + 1 : HEARTBEAT_TYPE_OFFSET + 2]
+        return not self.is_station_heartbeat and autopilot != _NO_AUTOPILOT
 
     @property
     def free_percent(self) -> int:

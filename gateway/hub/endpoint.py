@@ -44,6 +44,13 @@ from enum import StrEnum
 from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
+from gateway.hub.systems import (
+    FILTER_OPTIONS,
+    NO_FILTER,
+    SystemFilter,
+    new_ids_from,
+    system_filter_from,
+)
 from gateway.printable import unknown_choice
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS
@@ -166,6 +173,7 @@ TLS_KINDS: Final = frozenset({EndpointKind.WSS, EndpointKind.WSS_LISTEN})
 """Kinds that use TLS."""
 COMMON_OPTIONS: Final = frozenset(
     {"name", "allow", "deny", "rate", "pack", "wait", "budget", "trusted", "monitor", "mavlink"}
+    | {*FILTER_OPTIONS, "as"}
 )
 OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.WS: frozenset({"path"}),
@@ -225,6 +233,10 @@ class Endpoint:
     allow: frozenset[int] = frozenset()
     """Only these messages pass; empty lets all pass."""
     deny: frozenset[int] = frozenset()
+    systems: SystemFilter = NO_FILTER
+    """Systems and components that pass, in both directions."""
+    new_ids: dict[int, int] = field(default_factory=dict)
+    """Ids of systems here by those of the link; see `SystemTranslation`."""
     interval_us: dict[int, int] = field(default_factory=dict)
     """Least time between two frames of a message, by message id."""
     pack_bytes: int = 0
@@ -272,7 +284,8 @@ def parse_endpoint(url: str) -> Endpoint:
 
     Options are `name`, `allow`, `deny` (message names or numbers, separated by commas), `rate`
     (`NAME:hertz`, separated by commas), `pack` (bytes), `wait` (milliseconds), `budget` (bytes a
-    second), `trusted` and `monitor` (yes or no), `mavlink` (1 or 2), and of some kinds `origins`
+    second), `trusted` and `monitor` (yes or no), `mavlink` (1 or 2), `systems`, `not-systems`,
+    `components` (ids, separated by commas), `as` (see `new_ids_from`), and of some kinds `origins`
     (separated by commas), `path`, `site`, `keys` and `config`.
 
     Raises ValueError if anything in it is not understood; the text says what is allowed.
@@ -297,6 +310,8 @@ def parse_endpoint(url: str) -> Endpoint:
             name=name_from(options.get("name", f"{kind}:{rest}")),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
+            systems=system_filter_from(*(options.get(key, "") for key in FILTER_OPTIONS)),
+            new_ids=new_ids_from(options.get("as", "")),
             interval_us=intervals_from(options.get("rate", "")),
             pack_bytes=number_from(options.get("pack", "0"), "pack", 0, MAX_PACK_BYTES),
             pack_wait_s=number_from(options.get("wait", "0"), "wait", 0, MAX_WAIT_MS) / MS_PER_S,

@@ -73,8 +73,18 @@ class _Subscription:
     limits: dict[bytes, RateLimit] = field(default_factory=dict)
 
     def carries(self, frame: MavFrame) -> bool:
-        """Return whether the client's version of MAVLink has the message."""
+        """Return whether the client gets a system, and its version of MAVLink has the message."""
+        endpoint, renumbering = self.client.endpoint, self.client.renumbering
+        if endpoint.systems and not endpoint.systems.has(frame.origin):
+            return False
+        if renumbering is not None and not renumbering.has_room_for(frame.origin[0]):
+            return False
         return not self.client.is_mavlink1 or base_size(frame.message_id) is not None
+
+    def lets_out(self, frame: MavFrame) -> bool:
+        """Return whether the client's filter lets a frame pass that is not only telemetry."""
+        systems = self.client.endpoint.systems
+        return not systems or systems.lets_out(frame)
 
     def gap_of(self, origin: Origin) -> _Gap:
         gap = self.gaps.get(origin)
@@ -268,11 +278,13 @@ class Fanout:
     def deliver(self, frame: MavFrame, client_ids: Collection[int], source_id: int) -> None:
         """Forward a frame to some clients, past their filters, unchanged."""
         for client_id in client_ids:
-            if subscription := self._subscriptions.get(client_id):
+            subscription = self._subscriptions.get(client_id)
+            if subscription and subscription.lets_out(frame):
                 subscription.answered += len(frame.data)
                 subscription.client.send(frame)
         for monitor in self._monitors:
-            if monitor.client_id not in client_ids and monitor.client_id != source_id:
+            passes = self._subscriptions[monitor.client_id].lets_out(frame)
+            if passes and monitor.client_id not in client_ids and monitor.client_id != source_id:
                 monitor.send(frame)
 
     def make_route(
@@ -281,14 +293,20 @@ class Fanout:
         source: Client,
         path: SystemPath,
         rejects: Callable[[MavFrame, int], bool] | None,
+        reaches: Callable[[int], bool] = lambda _: True,
     ) -> Route:
-        """Make the route of broadcasts like this one from a client; see `Route`."""
+        """Make the route of broadcasts like this one from a client; see `Route`.
+
+        `reaches` returns whether they may be sent to a client.
+        """
         if max(len(source.routes), len(self.others)) >= MAX_ROUTES:
             self.clear()
         targets: list[tuple[Client, RateLimit | None]] = []
         for subscription in self._subscriptions.values():
             interval_us = subscription.interval_us(frame, is_ours=False)
-            if subscription.client is not source and interval_us != NO_MESSAGES:
+            if subscription.client is source or not reaches(subscription.client.client_id):
+                continue
+            if interval_us != NO_MESSAGES:
                 limit = subscription.limit_of(frame.key, interval_us)
                 targets.append((subscription.client, limit))
         key = tuple((client.client_id, id(limit)) for client, limit in targets)
@@ -301,7 +319,8 @@ class Fanout:
     def keep_route(self, route: Route, source: Client, key: bytes) -> None:
         """Forward all such frames of a client by a route from now on, without looking at them."""
         source.routes[key] = route
-        route.enter(self.forwarding, key)
+        if source.renumbering is None:
+            route.enter(self.forwarding, key)
 
     def finish_run(self, now_us: int) -> None:
         """Do for a run of frames what the compiled step has left."""

@@ -317,8 +317,10 @@ class Hub:
     def clients(self) -> tuple[ClientStats, ...]:
         """Return the present figures of every client, in the order of their ids."""
         self._fanout.settle()
+        notes = self._router.clash_notes(self.now_us())
         return tuple(
-            self._clients[key].stats(self._router.origins(key)) for key in sorted(self._clients)
+            self._clients[key].stats(self._router.origins(key), notes.get(key, ""))
+            for key in sorted(self._clients)
         )
 
     def listeners(self) -> tuple[ListenerStats, ...]:

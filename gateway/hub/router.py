@@ -26,11 +26,13 @@ from gateway.hub.routing_table import (
     SystemPath,
 )
 from gateway.hub.stats import HubCounters
+from gateway.hub.systems import commands
 from gateway.hub.transports.base import Client, HubContext, OnForeign
 from gateway.records import Incoming
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import TARGET_OFFSETS
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from gateway.wire.system_ids import LAST_ID
 
 UNADDRESSED_REQUESTS: Final = frozenset({HEARTBEAT_ID, dialect.MAVLINK_MSG_ID_TIMESYNC})
 """Messages without a target that our vehicles handle, whoever sends them."""
@@ -123,11 +125,15 @@ class Router:
         if self._vehicles.is_own(origin, now_us) or origin == self._round_trip.origin:
             self.counters.looped += 1
             return
+        round_trip_us = self._round_trip.read(frame, now_us)
+        measures = round_trip_us is not None or is_of_gateway(frame)
+        if client.endpoint.systems and not (measures or self._lets_in(client, frame, now_us)):
+            self.counters.unroutable += 1
+            return
         table = self._table if client.trusted else self._untrusted
         path = table.register(client.client_id, origin, now_us)
         if path is not None and frame.message_id == HEARTBEAT_ID:
             path.is_station = frame.is_station_heartbeat
-        round_trip_us = self._round_trip.read(frame, now_us)
         if round_trip_us is not None:
             client.round_trip_us = round_trip_us
             client.prove()
@@ -143,6 +149,45 @@ class Router:
         else:
             self._route_broadcast(client, path, frame, table.is_station(origin), now_us)
 
+    def _lets_in(self, client: Client, frame: MavFrame, now_us: int) -> bool:
+        """Return whether the filter of an endpoint lets a frame of it pass."""
+        tables, own = (self._table, self._untrusted), self._vehicles.systems(now_us)
+        from_station = any(table.is_station(frame.origin) for table in tables)
+        if frame.message_id == HEARTBEAT_ID:
+            from_station = frame.is_station_heartbeat
+        others = self._clients.keys() - {client.client_id}
+        return client.endpoint.systems.lets_in(
+            frame,
+            from_station=from_station,
+            is_vehicle=lambda system: (
+                system in own or any(system in self._table.vehicles(key) for key in others)
+            ),
+        )
+
+    def _reaches(self, client: Client, frame: MavFrame, other_id: int) -> bool:
+        """Return whether a broadcast may be sent to another client, by the filter of its own."""
+        allowed = client.endpoint.systems
+        if not allowed or not commands(frame.message_id):
+            return True
+        return all(map(allowed.has_system, self._table.vehicles(other_id)))
+
+    def clash_notes(self, now_us: int) -> dict[int, str]:
+        """Return by client how to distinguish its vehicle from another with the same id."""
+        notes: dict[int, str] = {}
+        origins = (each for key in self._clients for each in self._table.origins(key))
+        taken = {system for system, _ in origins} | {*self._vehicles.systems(now_us)}
+        for client_id, (system, first_id) in self._table.clashes(now_us).items():
+            client, first = self._clients[client_id], self._clients[first_id]
+            free = min({*range(1, LAST_ID)} - taken, default=LAST_ID)
+            taken.add(free)
+            text = f"system {system} is another vehicle than that of {first.name}"
+            if client.endpoint is first.endpoint:
+                notes[client_id] = f"{text}; let one connect to a port of its own with ?as={free}"
+            else:
+                joined = "&" if "?" in client.endpoint.url else "?"
+                notes[client_id] = f"{text}; write {client.endpoint.url}{joined}as={free}"
+        return notes
+
     def _is_rejected(self, client: Client, path: SystemPath, frame: MavFrame, now_us: int) -> bool:
         """Return whether a frame is a copy, or late; only one with several paths can be."""
         client_id = client.client_id
@@ -153,6 +198,7 @@ class Router:
             return False
         late_us = round(self._context.settings.late_after_s * US_PER_S)
         first = self._duplicates.check(frame, client_id, path, now_us, late_us)
+        path.note_boot(frame, now_us)
         if first == NEW:
             return False
         if first == LATE:
@@ -200,22 +246,31 @@ class Router:
     ) -> None:
         message_id = frame.message_id
         telemetry = message_id not in TARGET_OFFSETS and message_id not in UNADDRESSED_REQUESTS
-        if from_station or not telemetry:
+        own = self._vehicles.systems(now_us)
+        allowed = client.endpoint.systems
+        if allowed and commands(frame.message_id) and not all(map(allowed.has_system, own)):
+            self.counters.unroutable += 1
+        elif from_station or not telemetry:
             self._ask(client, frame, forwarded=client.trusted)
         if not client.trusted:
             return
         if from_station:
             self._count(frame)
             clients = self._table.clients_with_vehicles(client.client_id)
+            clients = [key for key in clients if self._reaches(client, frame, key)]
             self._fanout.deliver(frame, clients, client.client_id)
             return
         source_id, key = client.client_id, frame.key
         route = self._fanout.others.get((source_id, key))
         if route is None:
+            if path is not None and telemetry and not path.is_vehicle:
+                path.is_vehicle = True
+                self._fanout.clear()
             path = path or SystemPath(now_us, now_us)
             is_shared = self._table.is_shared(frame.origin, now_us)
             rejects = partial(self._is_rejected, client, path) if is_shared else None
-            route = self._fanout.make_route(frame, client, path, rejects)
+            reaches = partial(self._reaches, client, frame)
+            route = self._fanout.make_route(frame, client, path, rejects, reaches)
             if telemetry and (self._rejects is None or not client.may_return):
                 self._fanout.keep_route(route, client, key)
             else:

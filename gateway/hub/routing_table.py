@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 from gateway.units import US_PER_S
-from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_messages import MESSAGE_IDS, MESSAGE_NAMES, NO_TARGET, offset_of
 from gateway.wire.mavlink_splitter import MavFrame
 
 Origin = tuple[int, int]
@@ -45,6 +45,20 @@ NEIGHBOURS: Final = 8
 NEW: Final = -1
 LATE: Final = 0
 """Results of `DuplicateFilter.check`; client ids are positive."""
+
+US_PER_MS: Final = 1000
+BOOT_TIME_BYTES: Final = 4
+BOOT_TIME_OFFSETS: Final = {
+    message_id: offset
+    for message_id in MESSAGE_NAMES
+    if (offset := offset_of(message_id, "time_boot_ms")) != NO_TARGET
+}
+"""Where messages contain the time since the start of their sender, in ms."""
+REPORTED_US: Final = 3 * US_PER_S
+"""Most vehicles send such messages several times a second."""
+SAME_START_US: Final = 5 * US_PER_S
+"""Difference of start times that no delay of a link explains; two vehicles are seldom switched on
+at the same moment."""
 
 Note = TypeVar("Note")
 
@@ -99,6 +113,12 @@ class SystemPath:
     """Delay relative to the fastest path, measured by the newest copy."""
     copied_us: int = 0
     """When the newest copy was received."""
+    is_vehicle: bool = False
+    """Whether telemetry was received on this path."""
+    booted_us: int | None = None
+    """When the system started, by the newest frame with its time since then."""
+    booted_heard_us: int = 0
+    """When that frame was received."""
 
     def count(self, frames: int, client_id: int, heard_us: int) -> None:
         """Register frames whose sequence numbers are in the stream already."""
@@ -106,6 +126,27 @@ class SystemPath:
         self.stream.count += frames
         if heard_us >= self.stream.newest_us:
             self.stream.newest_us, self.stream.leader = heard_us, client_id
+
+    def note_boot(self, frame: MavFrame, now_us: int) -> None:
+        """Compute when the system started, if a frame contains its time since then."""
+        offset = BOOT_TIME_OFFSETS.get(frame.message_id)
+        if offset is not None:
+            time_ms = int.from_bytes(frame.payload[offset : offset + BOOT_TIME_BYTES], "little")
+            self.booted_us, self.booted_heard_us = now_us - time_ms * US_PER_MS, now_us
+
+    def is_another_vehicle(self, other: "SystemPath", now_us: int) -> bool:
+        """Return whether another path of the same id leads to another vehicle.
+
+        Both bring frames, none of them a copy, and the two have not started at the same time.
+        """
+        if self.booted_us is None or other.booted_us is None:
+            return False
+        both = (self, other)
+        return (
+            all(now_us - path.booted_heard_us <= REPORTED_US for path in both)
+            and all(not path.copied_us or now_us - path.copied_us > MEMORY_US for path in both)
+            and abs(self.booted_us - other.booted_us) > SAME_START_US
+        )
 
     def is_fresh(self, now_us: int) -> bool:
         """Return whether a frame was received recently."""
@@ -169,6 +210,26 @@ class RoutingTable:
             for client_id, paths in self._of_client.items()
             if client_id != source_id and not all(path.is_station for path in paths.values())
         ]
+
+    def vehicles(self, client_id: int) -> set[int]:
+        """Return the systems of a client that have sent telemetry and are no ground stations."""
+        paths = self._of_client.get(client_id, {})
+        return {
+            origin[0] for origin, path in paths.items() if path.is_vehicle and not path.is_station
+        }
+
+    def clashes(self, now_us: int) -> dict[int, tuple[int, int]]:
+        """Return the clients with a system whose id another vehicle has too.
+
+        Each has the system, and the client that brought that id first.
+        """
+        found: dict[int, tuple[int, int]] = {}
+        for origin, paths in self._to.items():
+            first, *others = paths
+            for client_id in others:
+                if paths[client_id].is_another_vehicle(paths[first], now_us):
+                    found[client_id] = origin[0], first
+        return found
 
     def remove(self, client_id: int) -> None:
         """Remove all paths of a client."""

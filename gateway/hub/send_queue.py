@@ -249,13 +249,19 @@ class SendQueue:
     """A queue in front of one slow link: at most `max_bytes` wait, in addition to bulk.
 
     The newest frame is always accepted. Our own frames are numbered and signed as they leave; one
-    that was overtaken is signed again, since its timestamp is too early.
+    that was overtaken is signed again, since its timestamp is too early. `system_here` returns the
+    id at the gateway of a sender that has another one on the link.
     """
 
     def __init__(
-        self, max_bytes: int, is_own: Callable[[Origin], bool], signer: FrameSigner
+        self,
+        max_bytes: int,
+        is_own: Callable[[Origin], bool],
+        signer: FrameSigner,
+        system_here: Callable[[int], int] | None = None,
     ) -> None:
         self.max_bytes = max_bytes
+        self._system_here = system_here
         self.max_bulk_bytes = max(max_bytes, BULK_BYTES)
         self._numbering = Numbering(is_own)
         self._signer = signer
@@ -343,7 +349,8 @@ class SendQueue:
         if step is None:
             return frame.data
         sequence = self._numbering.leave(frame, step)
-        return self._signer.sequence_and_sign(frame, sequence, now_us).data
+        system = self._system_here(frame.origin[0]) if self._system_here else None
+        return self._signer.sequence_and_sign(frame, sequence, now_us, system).data
 
 
 class Packer:

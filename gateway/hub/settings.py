@@ -22,7 +22,8 @@ class HubSettings(Settings, frozen=True):
             "ws-listen:HOST:PORT (56781 is usual), wss:HOST:PORT, wss-listen:HOST:PORT, "
             "zenoh:tcp/HOST:7447?site=NAME, "
             "serial:DEVICE:BAUD, or outputs that are not MAVLink, such as nmea:udp:HOST:10110; "
-            "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no."
+            "with options such as ?name=tablet&deny=RAW_IMU&rate=ATTITUDE:5&pack=1100&trusted=no. "
+            "?systems=1 passes only system 1, ?as=2 gives the vehicle of a link the id 2."
         ),
     ] = ENDPOINTS
     max_clients: Annotated[

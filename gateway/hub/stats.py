@@ -57,6 +57,10 @@ class ClientStats:
     """Why nothing is sent: the operating system's error; empty if frames are sent."""
     unheard: int = 0
     """Frames sent to a port on which nobody listened; they do not count as loss."""
+    refused: int = 0
+    """Frames that could not be renumbered."""
+    note: str = ""
+    """A problem of the systems behind it that the settings solve, such as two with one id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -155,6 +159,8 @@ class ClientAlerts:
     def __init__(self) -> None:
         self._away_since_us: dict[Key, int] = {}
         self._away_reported: set[Key] = set()
+        self._notes: dict[int, tuple[str, int | None]] = {}
+        """The note of each client, and since when it waits to be announced."""
         self._dropped: dict[int, int] = {}
         """Drops at the last look, of clients that were open then."""
         self._slow_until_us: dict[int, int] = {}
@@ -176,7 +182,7 @@ class ClientAlerts:
             state = ALERT_STATES.get(client.state, "")
             trouble = client.reason or state if state else ""
             found = self._away(client.client_id, client.name, trouble, now_us)
-            found += self._slow(client, now_us)
+            found += self._slow(client, now_us) + self._noted(client, now_us)
             if client.endpoint in ports:
                 found = [
                     ClientAlert(is_problem, line)
@@ -199,6 +205,15 @@ class ClientAlerts:
         self._away_reported.add(key)
         return [ClientAlert(True, f"{name}: {trouble}")]
 
+    def _noted(self, client: ClientStats, now_us: int) -> list[ClientAlert]:
+        text, since_us = self._notes.get(client.client_id, ("", None))
+        if client.note != text:
+            self._notes[client.client_id] = client.note, now_us if client.note else None
+        elif since_us is not None and now_us - since_us >= ALERT_AFTER_US:
+            self._notes[client.client_id] = text, None
+            return [ClientAlert(True, f"{client.name}: {text}")]
+        return []
+
     def _slow(self, client: ClientStats, now_us: int) -> list[ClientAlert]:
         key = client.client_id
         before = self._dropped.pop(key, client.dropped)
@@ -215,9 +230,9 @@ class ClientAlerts:
         )
 
     def _keep_only(self, clients: set[int], listeners: set[str]) -> None:
-        for known in (self._dropped, self._slow_until_us):
+        for known in (self._notes, self._dropped, self._slow_until_us):
             for client_id in known.keys() - clients:
-                del known[client_id]
+                known.pop(client_id)
         there = clients | listeners
         for key in self._away_since_us.keys() - there:
             del self._away_since_us[key]

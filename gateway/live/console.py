@@ -323,7 +323,8 @@ def _ports(snapshot: Snapshot) -> list[Text]:
 
 def _troubles(snapshot: Snapshot) -> list[Text]:
     found: list[ListenerStats | ClientStats] = [*snapshot.listeners, *snapshot.clients]
-    return [Text(f"{one.name}: {one.reason}", style="red") for one in found if one.reason]
+    notes = [Text(f"{one.name}: {one.note}", style="red") for one in snapshot.clients if one.note]
+    return [Text(f"{one.name}: {one.reason}", style="red") for one in found if one.reason] + notes
 
 
 def _client_cells(client: ClientStats) -> tuple[str, ...]:

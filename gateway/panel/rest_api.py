@@ -15,7 +15,7 @@ import asyncio
 import json
 import time
 from collections import Counter, deque
-from collections.abc import AsyncIterator, Callable, Iterator, Set
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Set
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -30,6 +30,7 @@ from starlette.responses import FileResponse, StreamingResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from gateway import __version__
+from gateway.hub.systems import FILTER_OPTIONS, NO_FILTER, SystemFilter, system_filter_from
 from gateway.panel.access import ROLE, WS_POLICY_VIOLATION, Role
 from gateway.panel.uplink import Uplink
 from gateway.wire.mavlink_json import CLASSES, BadMessageError, from_json, template, to_json
@@ -111,14 +112,14 @@ class MessageBook:
         """Return whether anything came from a component."""
         return (system_id, component_id) in self._heard
 
-    def look_up(self, path: str) -> Any:
+    def look_up(self, path: str, systems: SystemFilter = NO_FILTER) -> Any:
         """Return the value at a path such as `vehicles/1/components/1/messages/ATTITUDE`.
 
-        It is a JSON pointer without its first slash; empty is the whole tree. Entries are encoded
-        by `plain_entry`. Raises KeyError if there is none.
+        It is a JSON pointer without its first slash; empty is the whole tree, of the systems that
+        pass. Entries are encoded by `plain_entry`. Raises KeyError if there is none.
         """
         parts = path.split("/") if path else []
-        node: Any = self._tree(parts)
+        node: Any = self._tree(parts, systems)
         for part in parts:
             if isinstance(node, _Entry):
                 node = node.as_json()
@@ -130,10 +131,12 @@ class MessageBook:
                 raise KeyError(part)
         return node.as_json() if isinstance(node, _Entry) else node
 
-    def _tree(self, parts: list[str]) -> dict[str, Any]:
+    def _tree(self, parts: list[str], systems: SystemFilter) -> dict[str, Any]:
         """Build as much of the tree as a path needs."""
         vehicles: dict[str, Any] = {}
         for (system_id, component_id, name), entry in self._chosen(parts):
+            if not systems.has((system_id, component_id)):
+                continue
             vehicle = vehicles.setdefault(str(system_id), {"id": system_id, "components": {}})
             component = vehicle["components"].setdefault(
                 str(component_id), {"id": component_id, "messages": {}}
@@ -166,10 +169,11 @@ EVERYTHING: Final = ".*"
 
 
 class Subscriber:
-    """A client that receives some kinds of message."""
+    """A client that receives some kinds of message of some systems."""
 
-    def __init__(self, names: Set[str]) -> None:
+    def __init__(self, names: Set[str], systems: SystemFilter = NO_FILTER) -> None:
         self.names = names
+        self.systems = systems
         self.dropped = 0
         self._waiting: deque[str | bytes] = deque()
         self._bytes = 0
@@ -201,9 +205,9 @@ class MessageStream:
         self._subscribers: list[Subscriber] = []
 
     @contextmanager
-    def subscribe(self, names: Set[str]) -> Iterator[Subscriber]:
-        """Receive some kinds of message for a while."""
-        subscriber = Subscriber(names)
+    def subscribe(self, names: Set[str], systems: SystemFilter = NO_FILTER) -> Iterator[Subscriber]:
+        """Receive some kinds of message of some systems for a while."""
+        subscriber = Subscriber(names, systems)
         self._subscribers.append(subscriber)
         try:
             yield subscriber
@@ -212,7 +216,12 @@ class MessageStream:
 
     def send(self, message: Any) -> None:
         """Pass on one decoded message."""
-        subscribers = [each for each in self._subscribers if message.msgname in each.names]
+        origin = message.get_srcSystem(), message.get_srcComponent()
+        subscribers = [
+            each
+            for each in self._subscribers
+            if message.msgname in each.names and each.systems.has(origin)
+        ]
         if not subscribers:
             return
         text = pretty(with_header(message))
@@ -310,16 +319,22 @@ class RestApi:
         }
         return _json({"version": API_VERSION, "service": service})
 
-    async def read_all(self) -> Response:
-        """Return the newest message of each kind of every system and component."""
-        return await self.read("")
+    async def read_all(self, request: Request) -> Response:
+        """Return the newest message of each kind of every system and component.
 
-    async def read(self, path: str) -> Response:
+        `?systems=1,2`, `not-systems=` and `components=` select some.
+        """
+        return await self.read(request, "")
+
+    async def read(self, request: Request, path: str) -> Response:
         """Return a part of that: `vehicles/1/components/1/messages/ATTITUDE/message/roll`."""
         try:
-            return StreamingResponse(encode_in_pieces(self._book.look_up(path)), media_type=JSON)
+            found = self._book.look_up(path, _systems_of(request.query_params))
+            return StreamingResponse(encode_in_pieces(found), media_type=JSON)
         except KeyError:
             return Response(NOTHING, media_type=JSON)
+        except ValueError as error:
+            return Response(str(error), HTTPStatus.BAD_REQUEST, media_type="text/plain")
 
     async def helper(self, name: str | None = None) -> Response:
         """Return an empty message of a name, to be filled in and sent."""
@@ -341,7 +356,8 @@ class RestApi:
         if request.scope[ROLE] is not Role.OPERATOR:
             return Response(NOT_ALLOWED, HTTPStatus.FORBIDDEN)
         try:
-            self._send(_read_json5((await request.body()).decode()))
+            systems = _systems_of(request.query_params)
+            self._send(_read_json5((await request.body()).decode()), systems)
         except UnicodeDecodeError as error:
             return _refused(f"Failed to parse input as UTF-8 string: {error}")
         except ValueError as error:
@@ -349,15 +365,19 @@ class RestApi:
         return Response("Ok.", media_type=JSON)
 
     async def follow(self, socket: WebSocket) -> None:
-        """Send messages with names that match a regular expression; accept messages to send."""
+        """Send messages with names that match a regular expression; accept messages to send.
+
+        `systems`, `not-systems` and `components` select, both of those sent and those accepted.
+        """
         await socket.accept()
         try:
             names = names_matching(socket.query_params.get("filter", EVERYTHING))
+            systems = _systems_of(socket.query_params)
         except ValueError as error:
             await socket.send_text(pretty({"error": str(error)}))
             await socket.close(WS_INVALID)
             return
-        with self._stream.subscribe(names) as subscriber:
+        with self._stream.subscribe(names, systems) as subscriber:
             sending = asyncio.create_task(_send_all(socket, subscriber))
             try:
                 await self._read_all(socket, subscriber)
@@ -385,19 +405,27 @@ class RestApi:
                     await socket.close(WS_POLICY_VIOLATION, NOT_ALLOWED)
                     return
                 text = given.get("text")
-                subscriber.push(given["bytes"] if text is None else self._answer(text))
+                subscriber.push(
+                    given["bytes"] if text is None else self._answer(text, subscriber.systems)
+                )
 
-    def _answer(self, text: str) -> str:
+    def _answer(self, text: str, systems: SystemFilter) -> str:
         try:
-            return f"Ok({self._send(_read_json(text))})"
+            return f"Ok({self._send(_read_json(text), systems)})"
         except ValueError as error:
             return f"Could not convert input message. {error}"
 
-    def _send(self, given: Any) -> int:
-        """Send a message and return its size; raises BadMessageError if it is invalid."""
+    def _send(self, given: Any, systems: SystemFilter) -> int:
+        """Send a message and return its size; raises BadMessageError if it is invalid.
+
+        One that addresses a system that does not pass, or all systems, is invalid too.
+        """
         if not isinstance(given, dict):
             raise BadMessageError("it is an object with 'header' and 'message'")
         message = from_json(given.get("message"))
+        target = _target(message)
+        if systems and not systems.lets_send(message.get_msgId(), target):
+            raise BadMessageError(f"systems= or components= excludes its target {target}")
         system_id, component_id = _sender(given.get("header"))
         if self._book.has_heard(system_id, component_id):
             # Ids of a known system must not be used: the gateway would take that for a loop.
@@ -449,6 +477,16 @@ def _refused(text: str, detail: str = "") -> Response:
     if detail:
         answer.headers["x-error-detail"] = quote(detail, safe=" '\":;,./()[]{}<>|=+*&-_")
     return answer
+
+
+def _target(message: Any) -> tuple[int, int]:
+    """Return the addressed system and component; 0 is all."""
+    target = getattr(message, "target_system", getattr(message, "target", 0))
+    return target, getattr(message, "target_component", 0)
+
+
+def _systems_of(query: Mapping[str, str]) -> SystemFilter:
+    return system_filter_from(*(query.get(key, "") for key in FILTER_OPTIONS))
 
 
 def _sender(header: Any) -> tuple[int, int]:

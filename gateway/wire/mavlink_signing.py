@@ -79,6 +79,11 @@ def is_genuine(key: bytes, data: bytes) -> bool:
     return hmac.compare_digest(_hash(key, data[:-HASH_BYTES]), data[-HASH_BYTES:])
 
 
+def renewed(key: bytes, data: bytes) -> Sign:
+    """Return the signer of a changed frame, with the link and timestamp of the former one."""
+    return partial(signature, key, data[-SIGNATURE_SIZE], timestamp_of(data))
+
+
 def timestamp_of(data: bytes) -> int:
     """Return the timestamp of a signed frame."""
     return int.from_bytes(data[_TIMESTAMP], "little")
@@ -116,17 +121,29 @@ class FrameSigner:
     def __init__(self, clock: SigningClock | None = None) -> None:
         self.keys: dict[int, bytes] = {}
         """Signing keys by system id; set by the stage that owns the vehicles."""
+        self.shared_key = b""
+        """Key of the settings, also without a vehicle of the gateway; empty for none."""
         self._clock = clock
         self._newest = 0
         """Each timestamp is later than the one before."""
 
-    def sequence_and_sign(self, frame: MavFrame, sequence: int, now_us: int) -> MavFrame:
+    def renewal(self, frame: MavFrame) -> Sign | None:
+        """Return the signer of a changed frame, by the key of its signature; None without it."""
+        for key in {self.shared_key, *self.keys.values()} - {b""}:
+            if is_genuine(key, frame.data):
+                return renewed(key, frame.data)
+        return None
+
+    def sequence_and_sign(
+        self, frame: MavFrame, sequence: int, now_us: int, system: int | None = None
+    ) -> MavFrame:
         """Return a frame with this sequence number, signed again if its system has a key.
 
-        A frame of an unknown message, or signed by somebody else, is returned as it is; one of
-        version 1 is numbered and never signed.
+        `system` is the one that has the key; by default the sender. A frame of an unknown message,
+        or signed by somebody else, is returned as it is; one of version 1 is numbered and never
+        signed.
         """
-        key = self.keys.get(frame.origin[0]) if self.keys else None
+        key = self.keys.get(frame.origin[0] if system is None else system) if self.keys else None
         if key is None or self._clock is None:
             if frame.sequence == sequence:
                 return frame
@@ -273,6 +290,5 @@ class WindowVerifier:
         return is_genuine(self._key, frame.data)
 
     def renewal(self, frame: MavFrame) -> Sign:
-        """Return the signer of a changed frame, with the link and timestamp of the former one."""
-        data = frame.data
-        return partial(signature, self._key, data[-SIGNATURE_SIZE], timestamp_of(data))
+        """Return the signer of a changed frame; see `renewed`."""
+        return renewed(self._key, frame.data)

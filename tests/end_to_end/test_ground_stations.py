@@ -283,6 +283,37 @@ async def test_mavsdk_uploads_downloads_and_clears_a_mission(gateway: Gateway) -
         assert await answered(missions.download_mission) == []
 
 
+def test_mavproxy_sees_two_vehicles_with_id_1_as_1_and_2(tmp_path: Path) -> None:
+    """Two gateways fly a vehicle 1 each, and a third joins them without one of its own."""
+    folders = [tmp_path / name for name in ("first", "second", "router")]
+    for folder in folders:
+        folder.mkdir()
+    flying = [Gateway(folder, "demo", config=CONFIG) for folder in folders[:2]]
+    first, second = (gateway.listen_port for gateway in flying)
+    urls = f'"tcp:127.0.0.1:{first}", "tcp:127.0.0.1:{second}?as=2", "udp:127.0.0.1:{{port}}"'
+    router = Gateway(folders[2], "run", config=f"[hub]\nendpoints = [{urls}]")
+    mavproxy = MavProxy(router.port, tmp_path)
+    try:
+        mavproxy.until(r"Detected vehicle 1:1")
+        mavproxy.until(r"Detected vehicle 2:1")
+        mavproxy.type("vehicle 2")
+        # Refused until the parameters are loaded.
+        words = ("param set PAPER_ACC_CUTOFF 12.5", "param show PAPER_ACC_CUTOFF")
+        mavproxy.until(r"PAPER_ACC_CUTOFF\s+12\.5", asking="\n".join(words))
+        values = []
+        request = mavlink.MAVLink_param_request_read_message(1, 1, b"PAPER_ACC_CUTOFF", -1)
+        for gateway in flying:
+            station = Station.connect(socket.SOCK_DGRAM, gateway.listen_port, 2)
+            values += [each.param_value for each in station.ask(request, "PARAM_VALUE")]
+            station.close()
+        assert values[0] != values[1] == 12.5
+    finally:
+        mavproxy.process.kill()
+        mavproxy.process.communicate(timeout=START_LIMIT_S)
+        for gateway in (router, *flying):
+            gateway.end()
+
+
 def test_mavproxy_loads_parameters_and_uploads_a_mission(gateway: Gateway, tmp_path: Path) -> None:
     """Load the parameters, set one, upload waypoints and see the way to them."""
     (tmp_path / "way.txt").write_text(WAYPOINTS)

@@ -63,6 +63,12 @@ AWAY = client(state="unreachable")
             id="drops before and after a pause",
         ),
         pytest.param(
+            [*((n * S, client(note="two with id 1")) for n in range(20)), (20 * S, client()),
+             (21 * S, client(note="short"))],
+            ["tablet: two with id 1"],
+            id="note",
+        ),
+        pytest.param(
             [(0, client(state="unreachable", dropped=10)), (S, client(dropped=20)),
              (2 * S, client(dropped=20))],
             [],

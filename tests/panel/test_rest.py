@@ -10,6 +10,7 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import httpx
 import pytest
@@ -285,6 +286,36 @@ class TestFollowing:
             assert str(await stream.recv()).startswith("Could not convert input message. ")
             await stream.send(b"\1\2")
             assert await stream.recv() == b"\1\2"
+
+    async def test_filter_by_system_applies_to_both_directions(self, world: World) -> None:
+        url = f"ws://{world.url}/v1/ws/mavlink?filter=ATTITUDE&systems="
+        async with websockets.connect(url + "2") as other, websockets.connect(url + "1") as stream:
+            await self.until_followed(world, stream)
+            await stream.send(json.dumps(COMMAND))
+            while not (answer := str(await stream.recv())).startswith("Ok("):
+                assert "ATTITUDE" in answer
+            assert (await world.until_commanded()).target_system == 1
+            for target, command in ((1, COMMAND), (0, COMMAND)):
+                message = command["message"] | {"target_system": target}
+                await other.send(json.dumps(command | {"message": message}))
+                # The first text that is received: no attitude of system 1 was sent before.
+                assert "excludes its target" in str(await other.recv())
+            assert len(world.commands()) == 1
+
+    async def test_answers_and_requests_are_filtered_by_system(self, world: World) -> None:
+        world.attitude(0.5)
+        await world.until_json(f"{ATTITUDE}/message/roll", 0.5)
+        for query, found in (
+            ("systems=1", True),
+            ("not-systems=1", False),
+            ("components=9", False),
+        ):
+            tree = (await world.client.get(f"/v1/mavlink?{query}")).json()
+            assert ("1" in tree["vehicles"]) == found
+        wrong = await world.client.get("/v1/mavlink?systems=x")
+        assert (wrong.status_code, "is not an id" in wrong.text) == (400, True)
+        refused = await world.client.post("/v1/mavlink?systems=2", json=COMMAND)
+        assert "excludes its target" in unquote(refused.headers["x-error-detail"])
 
     async def test_messages_of_cockpit_are_sent_and_answered(self, world: World) -> None:
         header = {"system_id": 255, "component_id": 240, "sequence": 0}

@@ -268,8 +268,8 @@ def _print_clients(console: Console, snapshot: Record) -> None:
     console.print()
     console.print(_clients(snapshot["clients"], snapshot["time_us"]))
     for client in snapshot["clients"]:
-        if client["reason"]:
-            console.print(f"{client['name']}: {client['reason']}", style="yellow")
+        for text in filter(None, (client["reason"], client["note"])):
+            console.print(f"{client['name']}: {text}", style="yellow", soft_wrap=True)
 
 
 def _listeners(listeners: Sequence[Record]) -> Table:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -22,6 +23,7 @@ from gateway.hub.routing_table import Origin, SystemPath
 from gateway.hub.send_queue import RADIO_STATUS
 from gateway.hub.settings import HubSettings
 from gateway.hub.stats import ClientCounters, ClientStats, ListenerStats
+from gateway.hub.systems import SystemTranslation
 from gateway.printable import reason_of
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import CRC_EXTRA
@@ -262,6 +264,8 @@ class Client:
     """Whether it is certain that it receives; False only of peers whose address may be forged."""
     may_return: ClassVar[bool] = True
     """Whether each frame from here may be one that was sent elsewhere and has returned."""
+    renumbering: SystemTranslation | None = field(default=None, init=False)
+    """Other system ids on its link, if its endpoint has the option `as`."""
     _version1_since_us: int | None = None
     """When it began to send MAVLink 1."""
     _sends_version2: bool = False
@@ -275,6 +279,7 @@ class Client:
         self.name = self.name or self.endpoint.name
         self.since_us = self.context.now_us()
         self.words = new_client_words(self.client_id)
+        self._renumber()
 
     def become(self, state: str, error: Exception | None = None) -> None:
         """Set the state and its reason."""
@@ -288,7 +293,22 @@ class Client:
     @property
     def send(self) -> Callable[[MavFrame], None]:
         """The function that sends a frame in the version of MAVLink that the client needs."""
+        if self.renumbering is not None:
+            return self._transmit_renumbered
         return self._transmit_version1 if self.is_mavlink1 else self.transmit
+
+    def _transmit_renumbered(self, frame: MavFrame) -> None:
+        assert self.renumbering is not None
+        changed = self.renumbering.to_link(frame)
+        if changed is not None:
+            (self._transmit_version1 if self.is_mavlink1 else self.transmit)(changed)
+
+    def _renumber(self) -> None:
+        """Begin to translate the system ids of its link, or end it."""
+        self.renumbering = None
+        if new_ids := self.endpoint.new_ids:
+            on_change = partial(self.context.reconfigure, self)
+            self.renumbering = SystemTranslation(new_ids, self.context.signer.renewal, on_change)
 
     def _transmit_version1(self, frame: MavFrame) -> None:
         data = to_mavlink1(frame.data)
@@ -315,6 +335,8 @@ class Client:
             self.name = endpoint.name_of(self.remote)
         self.endpoint = endpoint
         self.trusted = _is_trusted(endpoint, self.host)
+        if endpoint.new_ids != before.new_ids:
+            self._renumber()
         self.context.reconfigure(self)
 
     def prove(self) -> None:
@@ -344,6 +366,11 @@ class Client:
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
         return False
+
+    @property
+    def is_unchanged(self) -> bool:
+        """Whether it gets frames byte for byte as others do."""
+        return self.renumbering is None and not self.is_mavlink1
 
     @property
     def is_mavlink1(self) -> bool:
@@ -402,6 +429,11 @@ class Client:
         """Route one frame: by the cache if its route is known."""
         self.counters.received += 1
         self.heard_us = now_us
+        if self.renumbering is not None:
+            changed = self.renumbering.from_link(frame, now_us)
+            if changed is None:
+                return
+            frame = changed
         route = self.routes.get(frame.key)
         if route is not None:
             route.forward(frame, now_us)
@@ -473,8 +505,9 @@ class Client:
         bucket.refill(self.context.now_us())
         return 0 if self.trusted else bucket.wait_us()
 
-    def stats(self, systems: tuple[Origin, ...]) -> ClientStats:
-        """Return the client's present figures; the hub passes the systems behind it."""
+    def stats(self, systems: tuple[Origin, ...], note: str = "") -> ClientStats:
+        """Return the client's present figures; the hub passes the systems behind it and a note."""
+        renumbering = self.renumbering
         counters = {name: getattr(self.counters, name) for name in ClientCounters.__slots__}
         return ClientStats(
             client_id=self.client_id,
@@ -489,6 +522,8 @@ class Client:
             since_us=self.since_us,
             heard_us=self.heard_us,
             round_trip_us=self.round_trip_us,
+            refused=renumbering.refused if renumbering else 0,
+            note=note or (renumbering.reason if renumbering else ""),
             **counters,
         )
 

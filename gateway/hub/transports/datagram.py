@@ -67,7 +67,7 @@ class DatagramClient(Client):
     @property
     def is_direct(self) -> bool:
         """Whether a frame may be passed to `write` directly."""
-        return self._packer is None and not self.is_mavlink1
+        return self._packer is None and self.is_unchanged
 
     @property
     def queued(self) -> int:

@@ -13,6 +13,7 @@ from typing import Any, Final
 from gateway.compiled.messages import STREAM
 from gateway.hub import forwarding_step as kernel
 from gateway.hub.endpoint import host_and_port
+from gateway.hub.routing_table import Origin
 from gateway.hub.send_queue import SendQueue
 from gateway.hub.transports.base import Client, Listener, Peer, new_socket
 from gateway.units import US_PER_S
@@ -99,9 +100,16 @@ class QueuedClient(Client):
     def __post_init__(self) -> None:
         """Start with an empty queue."""
         super().__post_init__()
-        self._queue = SendQueue(self.queue_bytes, self.context.is_own, self.context.signer)
+        signer = self.context.signer
+        self._queue = SendQueue(self.queue_bytes, self._is_own, signer, self._system_here)
         self._splitter = MavlinkSplitter()
         self._step = self.context.forwarding.step(self.words, reads=False)
+
+    def _system_here(self, system: int) -> int:
+        return system if self.renumbering is None else self.renumbering.here(system)
+
+    def _is_own(self, origin: Origin) -> bool:
+        return self.context.is_own((self._system_here(origin[0]), origin[1]))
 
     def take(self, data: bytes, now_us: int) -> None:
         """Process a chunk of the stream: frames with compiled routes by the step."""
@@ -158,7 +166,7 @@ class StreamClient(QueuedClient):
     @property
     def is_direct(self) -> bool:
         """Whether frames are sent as they are, unless others wait."""
-        return not self.is_mavlink1
+        return self.is_unchanged
 
     def send_rest(self, frames: Iterable[bytes], _number: int = 0, part: int = 0) -> None:
         """Send frames that will be counted as sent; the first was sent up to `part`."""

@@ -1,0 +1,310 @@
+"""Options of endpoints that select systems and renumber them, in both directions."""
+
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.hub.endpoint import parse_endpoint
+from gateway.hub.systems import WAITS, SystemTranslation
+from gateway.wire.mavlink_signing import FrameSigner
+from gateway.wire.mavlink_splitter import frame_of
+from tests.kit.mavlink import KEY, STATION, packed
+
+V1, V2 = 1, 2
+OTHER_KEY = bytes(range(32))
+
+
+def command(system: int, component: int = 1) -> Any:
+    return mavlink.MAVLink_command_long_message(system, component, 400, 0, 1, 0, 0, 0, 0, 0, 7)
+
+
+def attitude(time_ms: int = 5) -> Any:
+    return mavlink.MAVLink_attitude_message(time_ms, 0.5, 0, 0, 0, 0, 0.25)
+
+
+def heartbeat(kind: int = mavlink.MAV_TYPE_FIXED_WING, autopilot: int = 3) -> Any:
+    return mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
+
+
+def read(data: bytes, key: bytes | None = None) -> Any:
+    """Read a frame back; pymavlink raises if the checksum or the signature is wrong."""
+    link = mavlink.MAVLink(None, 255, 0)
+    if key is not None:
+        link.signing.secret_key, link.signing.timestamp = key, 1
+    return link.decode(bytearray(data))
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ("systems=0", "systems 0 is not an id from 1 to 255"),
+        ("systems=1,x", "systems 'x' is not an id from 1 to 255"),
+        ("not-systems=256", "not-systems 256 is not an id"),
+        ("systems=1,2&not-systems=2", "system 2 is in both"),
+        ("components=-1", "components '-1' is not an id"),
+        ("as=1:11,2:11", "an id is given twice"),
+        ("as=1:11,1:12", "an id is given twice"),
+        ("as=11,2:12", "write as=11 for one vehicle"),
+        ("as=1:", "as '' is not an id"),
+    ],
+)
+def test_wrong_option_is_refused(options: str, text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        parse_endpoint(f"udp:h:1?{options}")
+
+
+@pytest.mark.parametrize("version", [V1, V2])
+@pytest.mark.parametrize(
+    ("options", "message", "sender", "passes"),
+    [
+        ("systems=1", command(1), (255, STATION), True),
+        ("systems=1", command(2), (255, STATION), False),
+        ("systems=1", attitude(), (1, 1), True),
+        ("systems=1", command(255, STATION), (1, 1), True),
+        ("systems=1", command(255, STATION), (2, 1), False),
+        ("systems=1", heartbeat(mavlink.MAV_TYPE_GCS, 8), (255, STATION), True),
+        ("systems=1", command(0, 0), (255, STATION), False),
+        ("not-systems=2", command(1), (255, STATION), True),
+        ("not-systems=2", command(2), (255, STATION), False),
+        ("not-systems=2", command(255, STATION), (2, 1), False),
+        ("components=1", command(3, 1), (255, STATION), True),
+        ("components=1", command(3, 154), (255, STATION), False),
+        ("components=1", command(3, 0), (255, STATION), False),
+        ("components=1", mavlink.MAVLink_set_mode_message(3, 1, 0), (255, STATION), True),
+        ("components=1", command(255, STATION), (3, 154), False),
+    ],
+)
+def test_filter_lets_frames_pass_in_both_directions(
+    options: str, message: Any, sender: tuple[int, int], passes: bool, version: int
+) -> None:
+    """Systems 1 to 9 are vehicles somewhere else, and 255 is a known station."""
+    wanted = parse_endpoint(f"udp:h:1?{options}").systems
+    frame = frame_of(packed(message, *sender, version=version))
+    assert wanted.lets_out(frame) == passes
+    if frame.target != (0, 0) or frame.message_id == 0:
+        received = wanted.lets_in(
+            frame, from_station=sender[1] == STATION, is_vehicle=lambda system: system < 10
+        )
+        assert received == passes
+
+
+def translation(text: str, *keys: bytes) -> SystemTranslation:
+    signer = FrameSigner()
+    signer.keys = dict(enumerate(keys, 50))
+    return SystemTranslation(
+        parse_endpoint(f"udp:h:1?as={text}").new_ids, signer.renewal, lambda: None
+    )
+
+
+@pytest.mark.parametrize("version", [V1, V2])
+@pytest.mark.parametrize("text", ["1:11,2:12", "11"])
+def test_ids_change_in_both_directions(text: str, version: int) -> None:
+    ids = translation(text)
+    ids.from_link(frame_of(packed(heartbeat(), 1)), 0)
+    received = ids.from_link(frame_of(packed(attitude(), 1, version=version)), 0)
+    assert received
+    assert (read(received.data).get_srcSystem(), read(received.data).roll) == (11, 0.5)
+    sent = ids.to_link(frame_of(packed(command(11), 255, version=version)))
+    assert sent
+    got = read(sent.data)
+    assert (got.get_srcSystem(), got.target_system, got.param7) == (255, 1, 7)
+
+
+def test_fields_with_a_system_id_change_too() -> None:
+    message = mavlink.MAVLink_command_long_message(
+        11, 1, mavlink.MAV_CMD_DO_FOLLOW, 0, 12, 0, 0, 0, 0, 0, 0
+    )
+    sent = translation("1:11,2:12").to_link(frame_of(packed(message, 255)))
+    assert sent
+    got = read(sent.data)
+    assert (got.target_system, got.param1) == (1, 2)
+
+
+@pytest.mark.parametrize("key", [KEY, OTHER_KEY])
+def test_signed_frame_is_signed_again_with_its_own_time(key: bytes) -> None:
+    signed = packed(attitude(), 1, signing=(key, 3, 123_456))
+    changed = translation("1:11", OTHER_KEY, KEY).from_link(frame_of(signed), 0)
+    assert changed
+    assert read(changed.data, key).get_srcSystem() == 11
+    assert changed.data[-13:-6] == signed[-13:-6]
+
+
+def test_signed_frame_without_key_is_refused_with_the_reason() -> None:
+    ids = translation("1:11", OTHER_KEY)
+    assert ids.from_link(frame_of(packed(attitude(), 1, signing=(KEY, 3, 9))), 0) is None
+    assert (ids.refused, "need their signing_passphrase" in ids.reason) == (1, True)
+
+
+def test_system_with_the_new_id_of_another_is_refused_and_not_sent() -> None:
+    ids = translation("1:11")
+    assert ids.from_link(frame_of(packed(attitude(), 11)), 0) is None
+    assert "system 11 of this link has the id of another one" in ids.reason
+    # Vehicle 1 of this side would look like the link's own.
+    assert ids.to_link(frame_of(packed(attitude(), 1))) is None
+
+
+def test_ids_may_be_exchanged() -> None:
+    ids = translation("1:2,2:1")
+    for before, after in ((1, 2), (2, 1)):
+        found = ids.from_link(frame_of(packed(attitude(), before)), 0)
+        back = ids.to_link(frame_of(packed(attitude(), after)))
+        assert found
+        assert back
+        assert (found.origin[0], back.origin[0]) == (after, before)
+
+
+def test_one_vehicle_is_found_by_the_heartbeat_of_its_autopilot() -> None:
+    ids = translation("11")
+    station = frame_of(packed(heartbeat(mavlink.MAV_TYPE_GCS, 8), 255, STATION))
+    assert ids.from_link(frame_of(packed(attitude(), 1)), 0) is None
+    assert ids.reason == WAITS
+    assert ids.from_link(station, 0) == station
+    found = ids.from_link(frame_of(packed(heartbeat(), 1)), 0)
+    assert found
+    assert found.origin == (11, 1)
+    assert ids.reason == ""
+    # Another autopilot replaces it after an outage.
+    second = frame_of(packed(heartbeat(), 7))
+    assert ids.from_link(second, 1) == second
+    replaced = ids.from_link(second, 20_000_000)
+    assert replaced
+    assert replaced.origin == (11, 1)
+
+
+@pytest.mark.io
+class TestHub:
+    """Frames between sockets: two links with vehicles, and a station."""
+
+    async def open(self, rig: Any, *options: str, station: str = "") -> Any:
+        first, second, seat = (rig.station() for _ in range(3))
+        urls = [
+            f"udp:127.0.0.1:{each.port}?{text}"
+            for each, text in zip((first, second, seat), (*options, station), strict=True)
+        ]
+        hub = await rig.open(*urls)
+        for client, each in zip(hub._clients.values(), (first, second, seat), strict=True):
+            each.target = client._socket.getsockname()
+        return hub, first, second, seat
+
+    async def say(self, rig: Any, *frames: tuple[Any, Any, int, int]) -> None:
+        for station, message, system, component in frames:
+            station.send(packed(message, system, component))
+            await rig.quiet_some()
+        await rig.quiet()
+
+    def origins(self, station: Any) -> list[tuple[int, int]]:
+        frames = [frame_of(data) for data in station.received()]
+        return [(frame.origin[0], frame.message_id) for frame in frames]
+
+    async def test_two_vehicles_with_id_1_become_1_and_2(self, rig: Any) -> None:
+        _, first, second, seat = await self.open(rig, "", "as=2")
+        gcs = heartbeat(mavlink.MAV_TYPE_GCS, 8)
+        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 1, 1))
+        await self.say(rig, (first, attitude(), 1, 1), (second, attitude(), 1, 1))
+        assert self.origins(seat) == [(1, 0), (2, 0), (1, 30), (2, 30)]
+        assert self.origins(second) == [(1, 0)]  # Before its own id was known.
+        first.received()
+        await self.say(rig, (seat, gcs, 255, STATION), (seat, command(2), 255, STATION))
+        assert self.origins(first) == [(255, 0)]
+        assert self.origins(second) == [(255, 0), (255, 76)]
+        await self.say(rig, (second, mavlink.MAVLink_command_ack_message(400, 0), 1, 1))
+        assert self.origins(seat) == [(2, 77)]
+
+    async def test_station_behind_one_system_cannot_command_another(self, rig: Any) -> None:
+        hub, first, second, seat = await self.open(rig, "", "", station="systems=1")
+        gcs = heartbeat(mavlink.MAV_TYPE_GCS, 8)
+        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 2, 1))
+        await self.say(rig, (first, attitude(), 1, 1), (second, attitude(), 2, 1))
+        assert self.origins(seat) == [(1, 0), (1, 30)]
+        first.received(), second.received()
+        await self.say(rig, (seat, gcs, 255, STATION))
+        assert (self.origins(first), self.origins(second)) == ([(255, 0)], [(255, 0)])
+        # Directly, by a command to all, as the vehicle 1, and as a station with its id.
+        gcs_2 = (seat, gcs, 2, STATION)
+        for sender in ((255, STATION), (1, 1), (2, STATION), (9, 1)):
+            await self.say(rig, gcs_2, (seat, command(2), *sender), (seat, command(0, 0), *sender))
+        assert [each for each in self.origins(second) if each[1] == 76] == []
+        assert hub.counters().unroutable >= 4
+        await self.say(rig, (seat, command(1), 255, STATION))
+        assert (255, 76) in self.origins(first)
+
+    async def test_command_to_all_does_not_reach_an_excluded_vehicle_of_ours(
+        self, rig: Any
+    ) -> None:
+        hub, _, _, seat = await self.open(rig, "", "", station="systems=3")
+        hub.send(rig.out(rig.vehicle.heartbeat()))
+        await self.say(rig, (seat, heartbeat(mavlink.MAV_TYPE_GCS, 8), 255, STATION))
+        before = len(rig.incoming)
+        await self.say(rig, (seat, command(0, 0), 255, STATION), (seat, command(1), 255, STATION))
+        assert len(rig.incoming) == before
+        assert self.origins(seat) == []
+
+    async def test_own_frames_leave_no_gap_behind_a_filter_and_are_renumbered(
+        self, rig: Any
+    ) -> None:
+        hub, first, second, _ = await self.open(rig, "not-systems=1", "as=1:21")
+        for _ in range(2):
+            hub.send(rig.out(rig.vehicle.attitude()))
+        await rig.quiet()
+        assert self.origins(first) == []
+        # 21 is the vehicle of the link that has the id 1 there: ours would look like it.
+        assert self.origins(second) == []
+
+    @pytest.mark.parametrize("kind", ["udp", "tcp"])
+    async def test_own_signed_frames_are_renumbered_in_order(self, rig: Any, kind: str) -> None:
+        from gateway.wire.mavlink_signing import EPOCH_2015_US, SigningClock
+
+        signer = FrameSigner(SigningClock(EPOCH_2015_US))
+        signer.keys[1] = KEY
+        hub = rig.hub(f"{kind}-listen:127.0.0.1:0?as=21:1&pack=0", signer=signer)
+        if kind == "udp":
+            client = await rig.call(hub)
+        else:
+            sock = await rig.connect(hub.listening_ports()[0])
+            await rig.until(lambda: len(hub.clients()) == 1)
+        for _ in range(3):
+            hub.send(rig.out(rig.vehicle.attitude()))
+        await rig.quiet()
+        frames = client.received() if kind == "udp" else [sock.recv(4096)]
+        link = mavlink.MAVLink(None, 255, 0)
+        link.signing.secret_key, link.signing.timestamp = KEY, 1
+        got = link.parse_buffer(b"".join(frames))
+        assert [each.get_srcSystem() for each in got] == [21, 21, 21]
+        assert [each.get_seq() for each in got] == [got[0].get_seq() + k for k in range(3)]
+
+    async def test_clash_of_ids_is_reported_with_the_option_that_solves_it(self, rig: Any) -> None:
+        hub, first, second, _ = await self.open(rig, "", "name=radio")
+        for number in range(30):
+            rig.clock.us += 100_000
+            await self.say(rig, (first, attitude(60_000 + 100 * number), 1, 1))
+            await self.say(rig, (second, attitude(500_000 + 100 * number), 1, 1))
+        notes = [client.note for client in hub.clients()]
+        url = f"udp:127.0.0.1:{second.port}?name=radio&as=2"
+        assert notes[0] == notes[2] == ""
+        assert notes[1].endswith(f"; write {url}")
+        hub.apply(type(hub.settings)(endpoints=(*hub.settings.endpoints[::2], url)))
+        rig.clock.us += 40_000_000
+        await self.say(rig, (first, attitude(), 1, 1), (second, heartbeat(), 1, 1))
+        assert [client.note for client in hub.clients()] == ["", "", ""]
+
+    async def test_two_links_to_one_vehicle_are_no_clash(self, rig: Any) -> None:
+        hub, first, second, _ = await self.open(rig, "", "")
+        for number in range(30):
+            rig.clock.us += 100_000
+            for each in (first, second):
+                # Each port of an autopilot has frames and sequence numbers of its own.
+                await self.say(rig, (each, attitude(60_000 + 100 * number + (each is first)), 1, 1))
+        assert [client.note for client in hub.clients()] == ["", "", ""]
+
+    async def test_clients_without_options_keep_their_compiled_routes(self, rig: Any) -> None:
+        hub, first, second, _ = await self.open(rig, "", "as=2", station="systems=1")
+        await self.say(rig, (first, heartbeat(), 1, 1), (second, heartbeat(), 1, 1))
+        await self.say(rig, *[(each, attitude(), 1, 1) for each in (first, second)] * 2)
+        clients = list(hub._clients.values())
+        compiled = [
+            any(route._words is not None for route in client.routes.values()) for client in clients
+        ]
+        if hub.forwarding.is_compiled:
+            assert compiled == [True, False, False]
+        assert [client.is_direct for client in clients] == [True, False, True]
