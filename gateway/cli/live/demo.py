@@ -30,7 +30,7 @@ from gateway.cli.live.run import (
     serve,
     with_endpoints,
 )
-from gateway.cli.support.options import RadioName, folder_of, read_options, read_settings
+from gateway.cli.support.options import CONFIG, RadioName, folder_of, read_options, read_settings
 from gateway.cli.support.recording_options import ColumnsOption, files_of, progress_of
 from gateway.cli.support.terminal import refuse
 from gateway.clock import unix_time_us
@@ -85,9 +85,11 @@ def demo(
     The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
     that is flown instead restarts at its end, with a message.
     """
+    # Taken here: a reload reads in another thread, which does not have the context's value.
+    file = CONFIG.get()
 
     def read() -> GatewaySettings:
-        return with_endpoints(read_settings(), endpoint)
+        return with_endpoints(read_settings(file), endpoint)
 
     settings = _without_conflicts(read(), one=flight is not None, force=force)
     # First of all, as it loads for seconds; so the simulator is imported after this.

@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from gateway.cli.live.panel import PanelProcess, launched_panel
-from gateway.cli.support.options import read_settings
+from gateway.cli.support.options import CONFIG, read_settings
 from gateway.cli.support.terminal import refuse
 from gateway.compiled.entry_point import load_entry_points
 from gateway.config import ConfigError, GatewaySettings, load_aircraft
@@ -68,9 +68,11 @@ def run_gateway(
     ] = False,
 ) -> None:
     """Run the gateway on the receiver's serial port until interrupted."""
+    # Taken here: a reload reads in another thread, which does not have the context's value.
+    file = CONFIG.get()
 
     def read() -> GatewaySettings:
-        settings = with_sources(read_settings(), source)
+        settings = with_sources(read_settings(file), source)
         if port is not None:
             serial = msgspec.structs.replace(settings.serial, port=port)
             settings = msgspec.structs.replace(settings, serial=serial)
