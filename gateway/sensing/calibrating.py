@@ -204,7 +204,9 @@ def solve_magnetometer(field: FloatArray, strength_ut: float | None = None) -> S
         raise MoreNeeded(f"{found} where {MIN_MAG_SAMPLES} are needed")
     centre, _ = _sphere(field)
     radius = float(np.linalg.norm(field - centre, axis=1).mean())
-    _check_spread(field, radius, "turn the aircraft about all its axes, upside down too")
+    # At rest the fit's radius is that of the noise, which is as wide as itself.
+    least_ut = max(radius, FIELD_UT[0])
+    _check_spread(field, least_ut, "turn the aircraft about all its axes, upside down too")
     advice = f"{IRON_ADVICE}, and turn it further"
     if not FIELD_UT[0] <= radius <= FIELD_UT[1]:
         text = f"the fit gave {radius:.0f} uT, which is not the Earth's field"

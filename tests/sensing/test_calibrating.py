@@ -19,6 +19,7 @@ from gateway.sensing.calibrating import (
     STILL_ACCEL_MPS2,
     STILL_GYRO_RADPS,
     CalibrationError,
+    MoreNeeded,
     NodeSamples,
     calibrate_accelerometer,
     calibrate_gyro,
@@ -159,6 +160,12 @@ def test_implausible_accelerometer_error_is_refused(poses: np.ndarray, reason: s
 def test_field_outside_the_range_of_the_earth_is_refused(field: np.ndarray, reason: str) -> None:
     with pytest.raises(CalibrationError, match=f"{reason}.*steel"):
         solve_magnetometer(field)
+
+
+def test_compass_at_rest_is_to_be_turned(rng: np.random.Generator) -> None:
+    noise = np.array([22.0, 5.0, 40.0]) + rng.normal(0.0, 0.5, (300, 3))
+    with pytest.raises(MoreNeeded, match="turn the aircraft about all its axes"):
+        solve_magnetometer(noise)
 
 
 BIAS = np.array([0.2, -0.1, 0.3])
