@@ -3,6 +3,7 @@
 const OLD_S = 1.5;
 const EVERY_MS = 200;
 const rad = Math.PI / 180;
+const EARTH_M = 6371000;
 
 export default {
   template: `
@@ -46,6 +47,15 @@ function items_of(state) {
     const bearing = Math.round(bearing_deg ?? mavgate.bearing_deg(here, to)) % 360;
     return [item(name, text, `${unit} ${bearing}°`, "position_s")];
   };
+  // Where an antenna at home points: the Earth's curvature lowers the line of sight by half the arc.
+  const sight = (home) => {
+    const rise_m = state.alt_amsl_m - home?.alt_amsl_m;
+    if (!Number.isFinite(rise_m) || !Number.isFinite(here[0]) || home.alt_amsl_m === null || state.alt_amsl_m === null) return [];
+    const from = [home.lat_deg, home.lon_deg];
+    const distance_m = mavgate.distance_m(from, here);
+    const elevation = (Math.atan2(rise_m, distance_m) - distance_m / 2 / EARTH_M) / rad;
+    return [item("From home", `${Math.round(mavgate.bearing_deg(from, here)) % 360}°`, `${elevation.toFixed(1)}° up`, "position_s")];
+  };
   return [
     item("Roll", angle(angles[0]), "°", "attitude_s"),
     item("Pitch", angle(angles[1]), "°", "attitude_s"),
@@ -55,6 +65,7 @@ function items_of(state) {
     quantity("Above home", "altitude", state.alt_home_m, "position_s"),
     quantity("Above sea", "altitude", state.alt_amsl_m, "position_s"),
     ...way("To home", state.home, null, null),
+    ...sight(state.home),
     ...way("To mark", state.mark, state.mark_distance_m, state.mark_bearing_deg),
     position("Latitude, longitude", ...here),
     ...(state.mark ? [position("Mark at", state.mark.lat_deg, state.mark.lon_deg)] : []),
