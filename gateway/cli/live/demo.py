@@ -116,14 +116,13 @@ def demo(
     # Settings that a ground station stores in the demo must not become the real aircraft's.
     with tempfile.TemporaryDirectory(prefix="mavgate-demo-") as folder:
 
-        def apart(settings: GatewaySettings) -> GatewaySettings:
+        def own(settings: GatewaySettings) -> GatewaySettings:
             recording = replace(settings.recording, mode="always" if record else "manual")
             return replace(settings, aircraft_folder=folder, recording=recording)
 
         def daemon() -> Daemon:
             log.info("recording.mode is not used here: %s", "recording" if record else NOT_RECORDED)
-            kind = "" if source is None else source.value
-            daemons.append(Daemon(apart(settings), aircraft, lambda: apart(read()), line, kind))
+            daemons.append(Daemon(own(settings), aircraft, lambda: own(read()), line, source or ""))
             return daemons[0]
 
         run_event_loop(serve(daemon, plain=plain, panel=page), settings.hub.event_loop)
