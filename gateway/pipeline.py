@@ -43,6 +43,8 @@ from gateway.wire.mavlink_signing import (
 from gateway.wire.timesync import GpsTime
 
 REPORT_INTERVAL_US: Final = US_PER_S
+RADIOHEAD_HEADER: Final = 4
+"""Bytes: to, from, id and flags."""
 GONE_US: Final = 600 * US_PER_S
 """Timeout after which an aircraft disappears; longer than a change of batteries."""
 
@@ -95,7 +97,26 @@ class Pipeline:
         out = Outputs()
         for record in self._link.feed(data, now_us):
             self._take(record, now_us, out)
+        if self._link.packets:
+            self._take_packets(now_us, out)
         return out
+
+    @property
+    def ported(self) -> list[SourceInput]:
+        """The sources that have a transport of their own."""
+        return [source for source in self.sources if source.url.transport != "receiver"]
+
+    def _take_packets(self, now_us: int, out: Outputs) -> None:
+        """Pass packets of other programs, without their RadioHead header, to their sources."""
+        taken = [*self._link.packets]
+        self._link.packets.clear()
+        for source in self.sources:
+            if source.url.transport != "receiver":
+                continue
+            for packet in taken:
+                content = packet.packet[RADIOHEAD_HEADER:]
+                for record in source.feed(content, now_us, packet.signal):
+                    self._take(record, now_us, out)
 
     def feed_source(self, source: SourceInput, data: bytes, now_us: int) -> Outputs:
         """Process bytes of a source other than the receiver."""
@@ -210,11 +231,17 @@ class Pipeline:
         """Note that the source was opened; partly received data is dropped."""
         self._link.reopened()
         self._connected, self._port = True, port
+        for source in self.sources:
+            if source.url.transport == "receiver":
+                source.opened()
         self._report_due_us = 0
 
     def disconnect(self, port: str) -> None:
         """Note that the source is gone."""
         self._connected, self._port = False, port
+        for source in self.sources:
+            if source.url.transport == "receiver":
+                source.lost("the receiver is not connected")
         self._report_due_us = 0
 
     def handle(self, incoming: Incoming, now_us: int) -> Outputs:

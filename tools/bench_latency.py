@@ -5,11 +5,12 @@
 Several aircraft send all that their nodes send: IMU and barometer samples, fixes with their
 quality, the nodes' and the receiver's own reports. A frame with an IMU sample is written to a
 pseudo-terminal and the ATTITUDE_QUATERNION that it becomes is awaited on a UDP port, at several
-rates. Programs take turns in short rounds, so that other load on the machine meets them alike: the
-median round counts. The baseline is a program that reads the same line and sends a datagram of the
-same size for every frame, without decoding, fusing or encoding anything; `--forwarder` names
-another such program, in any language. The greatest latency at the highest rate is the longest
-pause, the machine's own included: the baseline has those too.
+rates; of one aircraft the samples are lines of JSON. Programs take turns in short rounds, so that
+other load on the machine meets them alike: the median round counts. The baseline is a program that
+reads the same line and sends a datagram of the same size for every frame, without decoding, fusing
+or encoding anything; `--forwarder` names another such program, in any language. The greatest
+latency at the highest rate is the longest pause, the machine's own included: the baseline has those
+too.
 """
 
 import argparse
@@ -53,6 +54,8 @@ START_LIMIT_S = 120.0
 CLOCK_TICKS = os.sysconf("SC_CLK_TCK")
 GATEWAY = "mavgate"
 WITH_UVLOOP = "mavgate, uvloop"
+OF_LINES = "mavgate, JSON lines"
+"""One aircraft that prints as many samples as the boards send, each as a line of JSON."""
 
 BASELINE = """
 import os, socket, sys
@@ -151,6 +154,20 @@ def quality_payload(itow_ms: int) -> payloads.GpsQualityPayload:
     return payloads.GpsQualityPayload(itow_ms, 150, 220, 30, 900, 140, 2500, utc)
 
 
+def line_moments(rate_hz: int) -> Iterator[Moment]:
+    """Yield lines of JSON without end, each with a sample of an IMU and every tenth a field."""
+    for number in itertools.count():
+        turn = math.sin(number / 500)
+        sample: dict[str, object] = {
+            "t_ms": number * 1000 / rate_hz,
+            "accel_mps2": [0.02 * turn, 0.01, 9.81],
+            "gyro_dps": [0.1, -0.2, 3 * turn],
+        }
+        if number % 10 == 0:
+            sample["mag_ut"] = [21.5, -3.25, -44.0]
+        yield Moment(1, json.dumps(sample).encode() + b"\n", [])
+
+
 def frames(rate_hz: int) -> Iterator[bytes]:
     """Yield the IMU frames of one aircraft without end."""
     return (moment.sample for moment in Nodes().moments(rate_hz, 1))
@@ -166,7 +183,7 @@ class Line:
     """A pseudo-terminal with a program at its other end, and the UDP port of its answers."""
 
     def __init__(self, name: str, command: list[str], moments: Iterator[Moment]) -> None:
-        self._is_gateway = name in (GATEWAY, WITH_UVLOOP)
+        self._is_gateway = name in (GATEWAY, WITH_UVLOOP, OF_LINES)
         self._moments = moments
         self._waiting: dict[int, deque[float | None]] = {}
         """Times of the frames not answered yet, by system; None for those that are not measured."""
@@ -252,7 +269,8 @@ def measure(
     name: str, command: list[str], rate_hz: int, options: argparse.Namespace
 ) -> dict[str, float]:
     """Run a program on a line of its own and measure it."""
-    line = Line(name, command, Nodes().moments(rate_hz, options.vehicles))
+    of_nodes = Nodes().moments(rate_hz, options.vehicles)
+    line = Line(name, command, line_moments(rate_hz) if name == OF_LINES else of_nodes)
     try:
         line.await_answer(rate_hz)
         line.exchange(rate_hz, WARM_UP_S)
@@ -280,6 +298,9 @@ def programs(folder: Path, options: argparse.Namespace) -> dict[str, list[str]]:
         gateway = f"-m gateway.cli run --plain --config {config} --port {{line}}"
         endpoint = ["--endpoint", "udp:127.0.0.1:{port}"]
         commands[name] = [sys.executable, *gateway.split(), *endpoint]
+    config = folder / "asyncio.toml"
+    gateway = f"-m gateway.cli run --plain --config {config} --source lines:{{line}}"
+    commands[OF_LINES] = [sys.executable, *gateway.split(), "--endpoint", "udp:127.0.0.1:{port}"]
     return commands | {command.split()[0]: shlex.split(command) for command in options.forwarder}
 
 

@@ -133,7 +133,7 @@ class Daemon:
         self._budget = RecordingBudget()
         callbacks = (self._on_bytes, self._pipeline.connect, self._pipeline.disconnect)
         self._serial = SerialPort(serial, *callbacks, self.now_us, needed=needed)
-        self._sources = [SourcePort(s, self._on_source) for s in self._pipeline.sources]
+        self._sources = [SourcePort(s, self._on_source) for s in self._pipeline.ported]
         self._control = self._make_control()
         self._opening: asyncio.Task[None] | None = None
         self._files = begin_worker("settings")

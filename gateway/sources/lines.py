@@ -120,8 +120,8 @@ class LinesDecoder:
             self._csv = CsvLines(read_column_map(column_map), names, node)
         self._clocks: dict[int, SampleClock] = {}
         self._has_own_id = "id" in url.options
-        self._ends_line = url.transport == "udp"
-        """A datagram ends its last line, whether or not a line feed does."""
+        self._ends_line = url.transport in ("udp", "receiver")
+        """A datagram or packet ends its last line, whether or not a line feed does."""
 
     def reset(self) -> None:
         """Discard a line that has not ended."""

@@ -5,6 +5,7 @@
     KIND:udp:HOST:PORT           datagrams to this address
     KIND:tcp:HOST:PORT           connect, and reconnect when it breaks
     KIND:tcp-listen:HOST:PORT    serve one client at a time
+    KIND:receiver                packets of other programs that our receiver passes on
     KIND:stdin                   standard input
     KIND:file:PATH               a file that grows
 
@@ -19,7 +20,9 @@ from urllib.parse import parse_qsl
 from gateway.records import SOURCE_NODE, NodeId
 from gateway.settings import Settings, setting
 
-TRANSPORTS: Final = ("serial", "udp", "tcp", "tcp-listen", "stdin", "file")
+TRANSPORTS: Final = ("serial", "udp", "tcp", "tcp-listen", "receiver", "stdin", "file")
+PLAIN: Final = frozenset({"receiver", "stdin"})
+"""Transports without an address."""
 NETWORK: Final = frozenset({"udp", "tcp", "tcp-listen"})
 MAX_SOURCES: Final = 16
 MAX_PORT: Final = 65535
@@ -56,13 +59,13 @@ def parse_source(url: str) -> SourceUrl:
             kind, transport = head.removesuffix(f"-{each}"), each
     if not transport:
         transport, address = _transport_of(address)
-    if not kind or not (colon or transport == "stdin"):
+    if not kind or not (colon or transport in PLAIN):
         raise ValueError(f"source {url!r}: write KIND:WHERE, such as lines:/dev/ttyUSB0")
     options = dict(parse_qsl(query, keep_blank_values=True))
     port = 0
     if transport in NETWORK:
         address, port = _host_and_port(url, address)
-    elif transport != "stdin" and not address:
+    elif transport not in PLAIN and not address:
         raise ValueError(f"source {url!r}: names no device or file")
     return SourceUrl(url, kind, transport, address, port, options)
 

@@ -70,8 +70,10 @@ class SourceInput:
         self._newest_fault = ""
         self._nodes: dict[NodeId, _Node] = {}
 
-    def feed(self, data: bytes, now_us: int) -> list[SourceRecord]:
-        """Decode bytes that arrived now, and count what cannot be used."""
+    def feed(
+        self, data: bytes, now_us: int, signal: RadioSignal | None = None
+    ) -> list[SourceRecord]:
+        """Decode bytes that arrived now, with a signal if known; count what cannot be used."""
         self._bytes += len(data)
         records: list[SourceRecord] = []
         for event in self.decoder.feed(data, now_us):
@@ -85,6 +87,8 @@ class SourceInput:
             node.arrivals_us.append(now_us)
             if isinstance(event, VehicleReport) and event.signal is not None:
                 node.signal = event.signal
+            elif signal is not None:
+                node.signal = signal
             records.append(event)
         return records
 

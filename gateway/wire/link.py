@@ -46,6 +46,8 @@ RATE_SPAN_US: Final = US_PER_S
 FIRST_YEAR: Final = 2024
 """An earlier date is false: the receiver has lost count of the weeks, which start again every 1024,
 or reports the date of its firmware until it has received that of the satellites."""
+MAX_PACKETS: Final = 64
+"""More than a chunk of the line has, or than a slow radio sends in a second."""
 MAX_ARRIVALS: Final = 2048
 """Twice what a node at the radio's best rate sends in `RATE_SPAN_US`."""
 
@@ -150,6 +152,8 @@ class Link:
         self._frames = 0
         self._frames_lost = 0
         self._foreign = 0
+        self.packets: deque[payloads.ForeignFrame] = deque(maxlen=MAX_PACKETS)
+        """Packets of other programs that the caller has not taken yet."""
         self._next_frame_seq: int | None = None
 
     def feed(self, data: bytes, arrival_us: int) -> list[RawRecord]:
@@ -176,6 +180,7 @@ class Link:
                 self._receiver_status = _receiver_status(frame, received_us)
             elif isinstance(frame, payloads.ForeignFrame):
                 self._foreign += 1
+                self.packets.append(frame)
             elif (node := self._nodes.get(frame.header.node)) is None:
                 records += self._receive_new_node(frame, received_us, arrival_us)
             elif (record := _receive(node, frame, received_us, arrival_us)) is not None:

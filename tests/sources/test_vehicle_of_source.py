@@ -9,11 +9,13 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.aircraft import AircraftSettings
 from gateway.pipeline import Pipeline, PipelineSettings
-from gateway.records import BatteryReport, GpsFix, NodeId, VehicleReport
+from gateway.records import BatteryReport, GpsFix, NodeId, RadioSignal, VehicleReport
 from gateway.sources.kinds import make_sources
 from gateway.sources.sampling import fix_at, imu_raw
 from gateway.sources.settings import SourceSettings, nodes_of, parse_source
 from gateway.units import US_PER_S
+from gateway.wire.framing import encode_frame
+from gateway.wire.payloads import ForeignFrame, encode_foreign
 
 NODE = NodeId(1, 8)
 
@@ -203,6 +205,20 @@ def test_signal_of_a_source_is_its_radio_status() -> None:
     flight.line(rssi_dbm=-71)
     flight.wait(2.5)
     assert flight.newest("RADIO_STATUS").noise == 255
+
+
+def test_packets_of_radiohead_through_the_receiver_are_lines() -> None:
+    flight = Flight("lines:receiver?id=5")
+    flight.pipeline.connect("/dev/ttyUSB0")
+    for number in range(4):
+        packet = b"\xff\x01\x00\x00" + b'{"pressure_hpa": 990}'
+        frame = ForeignFrame(number, number * 500_000, RadioSignal(-104, 5.0), packet)
+        flight.now_us += 500_000
+        flight._keep(flight.pipeline.feed(encode_frame(encode_foreign(frame)), flight.now_us))
+    flight.wait(2.0)
+    assert flight.newest("SCALED_PRESSURE").press_abs == 990.0
+    assert flight.newest("SCALED_PRESSURE").get_srcSystem() == 5
+    assert flight.newest("RADIO_STATUS").rssi - 256 == -104
 
 
 def test_faults_are_counted_with_the_newest_explained() -> None:

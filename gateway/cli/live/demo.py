@@ -105,11 +105,10 @@ def demo(
     try:
         if flight is not None:
             line, aircraft = recorded_line(settings, flight, columns, report)
-        elif firmware:
-            line = made_ahead(firmware_line(settings.simulator, unix_time_us(), radio.value))
-            aircraft = calibrated_aircraft(settings)
         else:
-            line = made_ahead(simulated_line(settings.simulator, source))
+            one = settings.simulator
+            boards = firmware_line(one, unix_time_us(), radio.value) if firmware else None
+            line = made_ahead(boards or simulated_line(one, source))
             aircraft = calibrated_aircraft(settings)
     except (BenchError, ValueError) as error:
         refuse(str(error))
