@@ -41,6 +41,7 @@ MODULES: Final = {
     "recorded.play": ("play", "seek", "player"),
     "recorded.convert": ("convert", "fuse"),
     "recorded.extract": ("extract",),
+    "recorded.diff": ("diff",),
     "recorded.info": ("info", "recover"),
     "recorded.batch": ("batch",),
     "recorded.catalogue": ("catalogue",),
@@ -68,6 +69,7 @@ GROUPS: Final = {
         "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
         "page": "Make one HTML file of a flight, which opens offline in any browser.",
         "convert": "Convert, trim, join, merge and edit recordings.",
+        "diff": "Compare recordings or parameter files: parameters, missions, figures, texts.",
         "extract": "Extract parameters, missions, texts, subtitles and geotags from a recording.",
         "recover": "Write the intact part of a damaged recording to a new file, and list what was "
         "left out.",

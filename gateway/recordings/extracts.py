@@ -122,6 +122,11 @@ class RecordedPlan:
             )
         return None
 
+    def fields(self, message_id: int) -> dict[str, Any] | None:
+        """Return the fields of the newest message of one type among the answers."""
+        frames = self._answers.frames(message_id)
+        return fields_of(frames[0]) if frames else None
+
     def _is_bytewise(self) -> bool:
         """Return whether integers are sent as their own bytes in place of a float."""
         for frame in self._answers.frames(AUTOPILOT_VERSION_ID):

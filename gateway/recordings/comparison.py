@@ -1,0 +1,254 @@
+"""Two recordings or parameter files, compared: parameters, missions, figures, texts."""
+
+import html
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gateway.recordings.answers import AUTOPILOT_VERSION_ID, LogAnswers
+from gateway.recordings.extracts import FENCE, MISSION, RALLY, PlanItem, RecordedPlan
+from gateway.recordings.files import FlightError, Progress, open_tlog
+from gateway.recordings.positions import GroundDistance
+from gateway.recordings.tlog import Batch
+from gateway.recordings.tlog_scan import TIME_SIZE
+from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
+from gateway.units import US_PER_S
+from gateway.wire.mavlink_messages import MESSAGE_IDS
+from gateway.wire.mavlink_splitter import SEQUENCE_V1, SEQUENCE_V2, START_V2
+
+MAX_PARAM_FILE: Final = 4 << 20
+"""Bytes; a vehicle has some 1,500 parameters of 30 bytes."""
+MAX_TEXTS: Final = 10_000
+"""Different texts of a recording that are compared."""
+ERROR: Final = 3
+"""MAV_SEVERITY of an error; smaller ones are worse."""
+KINDS: Final = {MISSION: "mission", FENCE: "fence", RALLY: "rally points"}
+VIBRATION: Final = ("vibration_x", "vibration_y", "vibration_z")
+_IDS: Final = {name: MESSAGE_IDS[name] for name in ("BATTERY_STATUS", "VIBRATION", "GPS_RAW_INT")}
+UNKNOWN_U8: Final = 0xFF
+
+
+@dataclass(slots=True)
+class Contents:
+    """What is compared of one side; a parameter file has parameters only."""
+
+    name: str
+    parameters: dict[str, str] = field(default_factory=dict)
+    plans: dict[str, list[str]] = field(default_factory=dict)
+    """Items by kind, as text."""
+    figures: dict[str, str] = field(default_factory=dict)
+    texts: set[str] = field(default_factory=set)
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """The differences: by name, the value on each side; empty where there is none."""
+
+    names: tuple[str, str]
+    parameters: dict[str, tuple[str, str]]
+    plans: dict[str, tuple[str, str]]
+    figures: dict[str, tuple[str, str]]
+    """All of them, also equal ones."""
+    texts: dict[str, tuple[str, str]]
+    """Texts that only one side has."""
+
+
+def compare(first: Contents, second: Contents) -> Comparison:
+    """Compare two sides; sections that one side cannot have are left out."""
+    plans: dict[str, tuple[str, str]] = {}
+    for kind in first.plans.keys() & second.plans.keys():
+        items = (dict(enumerate(side.plans[kind])) for side in (first, second))
+        numbered = ({f"{kind} {number}": text for number, text in one.items()} for one in items)
+        plans |= _differences(*numbered)
+    are_flights = bool(first.figures and second.figures)
+    figures = {
+        name: (first.figures.get(name, ""), second.figures.get(name, ""))
+        for name in (first.figures | second.figures if are_flights else ())
+    }
+    only = (first.texts - second.texts, second.texts - first.texts)
+    texts = {text: (text, "") for text in sorted(only[0])}
+    texts |= {text: ("", text) for text in sorted(only[1])}
+    return Comparison(
+        (first.name, second.name),
+        _differences(first.parameters, second.parameters),
+        plans,
+        figures,
+        texts if are_flights else {},
+    )
+
+
+def _differences(first: Mapping[str, str], second: Mapping[str, str]) -> dict[str, tuple[str, str]]:
+    return {
+        name: pair
+        for name in sorted(first.keys() | second.keys())
+        if (pair := (first.get(name, ""), second.get(name, "")))[0] != pair[1]
+    }
+
+
+def read_param_file(path: Path) -> Contents:
+    """Read a parameter file of Mission Planner, MAVProxy or QGroundControl.
+
+    Raises FlightError if it holds none, OSError if it cannot be read.
+    """
+    with path.open("rb") as file:
+        lines = file.read(MAX_PARAM_FILE).decode("utf-8", "replace").splitlines()
+    found = Contents(str(path))
+    for line in lines:
+        cells = line.split("#")[0].replace(",", " ").split()
+        name, text = cells[2:4] if len(cells) == len(QGC_CELLS) else (*cells[:2], "", "")[:2]
+        try:
+            value = float(text)
+        except ValueError:
+            continue
+        found.parameters[name] = single_text(value)
+    if not found.parameters:
+        raise FlightError(f"{path}: holds no parameters")
+    return found
+
+
+QGC_CELLS: Final = ("vehicle", "component", "name", "value", "type")
+
+
+def single_text(value: float) -> str:
+    """Return a value with the digits of a single-precision float."""
+    return f"{float(np.float32(value)):.7g}"
+
+
+class FlownFigures:
+    """Collect the figures of a flight, message by message."""
+
+    def __init__(self) -> None:
+        self.texts: set[str] = set()
+        self.errors = 0
+        self.distance = GroundDistance()
+        self.used_mah: dict[int, tuple[int, int]] = {}
+        """First and last charge used, by battery."""
+        self.greatest_vibration_mps2 = 0.0
+        self.fewest_satellites: int | None = None
+        self.lost = self.received = 0
+        self._sequence: int | None = None
+
+    def add_batch(self, batch: Batch, origin: int) -> None:
+        """Count the frames of the vehicle that are missing between others."""
+        data, rows = np.frombuffer(batch.data, np.uint8), batch.origins == origin
+        starts = batch.starts[rows] + TIME_SIZE
+        at = np.where(data[starts] == START_V2, SEQUENCE_V2, SEQUENCE_V1)
+        numbers = data[starts + at].astype(np.int64)
+        if not len(numbers):
+            return
+        before = int(numbers[0]) - 1 if self._sequence is None else self._sequence
+        gaps = (np.diff(numbers, prepend=before) - 1) & 0xFF
+        # A large step is a restart, or a frame that came twice.
+        self.lost += int(gaps[gaps < 128].sum())
+        self.received += len(numbers)
+        self._sequence = int(numbers[-1])
+
+    def add(self, message: VehicleMessage) -> None:
+        """Take the next message of the vehicle."""
+        fields, at = message.fields, message.position
+        if message.text is not None:
+            self.errors += message.text.severity <= ERROR
+            if len(self.texts) < MAX_TEXTS:
+                self.texts.add(message.text.text)
+        if at is not None:
+            self.distance.update(message.time_us, at.lat_deg, at.lon_deg, message.boot_us)
+        if message.message_id == _IDS["BATTERY_STATUS"] and fields["current_consumed"] >= 0:
+            used = fields["current_consumed"]
+            first, _ = self.used_mah.get(fields["id"], (used, used))
+            self.used_mah[fields["id"]] = (first, used)
+        elif message.message_id == _IDS["VIBRATION"]:
+            worst = max(fields[axis] for axis in VIBRATION)
+            self.greatest_vibration_mps2 = max(self.greatest_vibration_mps2, worst)
+        elif message.message_id == _IDS["GPS_RAW_INT"]:
+            count = fields["satellites_visible"]
+            if count != UNKNOWN_U8:
+                known = self.fewest_satellites
+                self.fewest_satellites = count if known is None else min(known, count)
+
+    def figures(self, duration_s: float) -> dict[str, str]:
+        """Return the figures as text, those that are known."""
+        found = {"duration": f"{duration_s:.1f} s"}
+        if self.distance.distance_m is not None:
+            found["distance"] = f"{self.distance.distance_m:.0f} m"
+        for number, (first, last) in sorted(self.used_mah.items()):
+            found[f"charge used, battery {number}"] = f"{last - first} mAh"
+        if self.greatest_vibration_mps2:
+            found["greatest vibration"] = f"{self.greatest_vibration_mps2:.1f} m/s2"
+        if self.fewest_satellites is not None:
+            found["fewest satellites"] = str(self.fewest_satellites)
+        share = self.lost / max(self.lost + self.received, 1)
+        found["lost frames"] = f"{self.lost} ({share:.2%})"
+        found["errors"] = str(self.errors)
+        return found
+
+
+def read_recording(path: Path, system_id: int | None, progress: Progress) -> Contents:
+    """Read what is compared of a tlog; raises FlightError if it has no vehicle."""
+    source = open_tlog(path)
+    systems = source.senders.systems()
+    if not systems or (system_id is not None and system_id not in systems):
+        raise FlightError(f"{path}: no vehicle{f' {system_id}' if system_id else ''} in it")
+    chosen = system_id or systems[0]
+    sender = source.senders.vehicle(chosen)
+    answers, facts = LogAnswers(), FlownFigures()
+    reader = VehicleReader(source.senders, _IDS.values(), chosen, with_attitude=False)
+    first_us = last_us = 0
+    for batch in source.batches(progress):
+        if len(batch):
+            first_us, last_us = first_us or int(batch.time_us[0]), int(batch.time_us[-1])
+        answers.note(batch, source.senders)
+        facts.add_batch(batch, sender.origin)
+        for message in reader.feed_batch(batch):
+            facts.add(message)
+    for message in reader.flush():
+        facts.add(message)
+    plan = RecordedPlan(answers, sender)
+    return Contents(
+        str(path),
+        {each.name: single_text(each.value) for each in plan.parameters()},
+        {name: [_item_text(item) for item in plan.items(kind)] for kind, name in KINDS.items()},
+        {**_versions(plan), **facts.figures((last_us - first_us) / US_PER_S)},
+        facts.texts,
+    )
+
+
+def _item_text(item: PlanItem) -> str:
+    numbers = " ".join(f"{value:.7f}".rstrip("0").rstrip(".") for value in item.params)
+    return f"command {item.command}, frame {item.frame}: {numbers}"
+
+
+def _versions(plan: RecordedPlan) -> dict[str, str]:
+    fields: Mapping[str, Any] | None = plan.fields(AUTOPILOT_VERSION_ID)
+    if fields is None:
+        return {}
+    version = fields["flight_sw_version"]
+    return {
+        "firmware": f"{version >> 24}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}",
+        "hardware": f"{fields['vendor_id']}:{fields['product_id']}, {fields['board_version']}",
+    }
+
+
+SECTIONS: Final = {"parameters": "parameter", "plans": "item", "figures": "figure", "texts": "text"}
+"""Sections of a comparison, and the heading of their first column."""
+
+
+def as_html(found: Comparison) -> Iterator[str]:
+    """Write a comparison as one page that needs nothing else."""
+    title = html.escape(" and ".join(found.names))
+    yield f'<!doctype html><meta charset="utf-8"><title>{title}</title>'
+    yield "<style>body{font-family:sans-serif}td,th{text-align:left;padding:2px 12px}</style>"
+    for section, heading in SECTIONS.items():
+        yield f"<h2>{section.capitalize()}</h2>"
+        yield from _html_table((heading, *found.names), getattr(found, section))
+
+
+def _html_table(heads: Iterable[str], rows: Mapping[str, tuple[str, str]]) -> Iterator[str]:
+    yield "<table><tr>" + "".join(f"<th>{html.escape(head)}</th>" for head in heads) + "</tr>\n"
+    for name, pair in rows.items():
+        yield (
+            "<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in (name, *pair)) + "</tr>\n"
+        )
+    yield "</table>\n"

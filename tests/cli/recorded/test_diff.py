@@ -1,0 +1,113 @@
+"""`mavgate diff`: recordings and parameter files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.tlog import TlogRecord
+from tests.kit.cli import run
+from tests.kit.mavlink import Sender
+from tests.recordings.frames import START_US, make_tlog
+
+pytestmark = pytest.mark.io
+
+
+def written(path: Path, messages: list[Any], lost: int = 0) -> Path:
+    sender = Sender()
+    frames = [sender.pack(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))]
+    for _ in range(lost):
+        sender.heartbeat()
+    frames += [sender.pack(message) for message in messages]
+    records = [TlogRecord(START_US + k * 500_000, frame) for k, frame in enumerate(frames)]
+    path.write_bytes(make_tlog(records))
+    return path
+
+
+def param(name: bytes, value: float) -> Any:
+    return mavlink.MAVLink_param_value_message(name, value, 9, 2, 0)
+
+
+def mission(alt: float) -> list[Any]:
+    item = mavlink.MAVLink_mission_item_int_message(
+        255, 190, 0, 3, 16, 0, 1, 0, 0, 0, 0, 471_000_000, 85_000_000, alt, 0
+    )
+    return [mavlink.MAVLink_mission_count_message(255, 190, 1, 0), item]
+
+
+@pytest.fixture
+def flights(tmp_path: Path) -> tuple[Path, Path]:
+    def version(patch: int) -> Any:
+        number = 4 << 24 | 5 << 16 | patch << 8
+        hashes = [[0] * 8] * 3
+        return mavlink.MAVLink_autopilot_version_message(0, number, 0, 0, 9, *hashes, 1, 2, 0)
+
+    text = mavlink.MAVLink_statustext_message
+    battery = [
+        mavlink.MAVLink_battery_status_message(0, 0, 0, 0, [1] * 10, 0, used, 0, 90)
+        for used in (100, 350)
+    ]
+    one = [
+        param(b"A", 0.1),
+        param(b"B", 2),
+        *mission(50),
+        version(1),
+        text(3, b"Bad gyro"),
+        *battery,
+    ]
+    two = [param(b"A", 0.2), param(b"C", 3), *mission(60), version(2), text(6, b"Ready")]
+    return written(tmp_path / "a.tlog", one), written(tmp_path / "b.tlog", two, lost=3)
+
+
+def test_recordings_are_compared_by_section(flights: tuple[Path, Path]) -> None:
+    found = json.loads(run("diff", *flights, "--json"))
+    assert found["parameters"] == {"A": ["0.1", "0.2"], "B": ["2", ""], "C": ["", "3"]}
+    ((name, (before, after)),) = found["plans"].items()
+    assert (name, before[-2:], after[-2:]) == ("mission 0", "50", "60")
+    figures = found["figures"]
+    assert figures["firmware"] == ["4.5.1", "4.5.2"]
+    assert figures["lost frames"] == ["0 (0.00%)", "3 (30.00%)"]
+    assert figures["errors"] == ["1", "0"]
+    assert figures["charge used, battery 0"] == ["250 mAh", ""]
+    assert found["texts"] == {"Bad gyro": ["Bad gyro", ""], "Ready": ["", "Ready"]}
+
+
+def test_equal_recordings_have_no_differences(flights: tuple[Path, Path], tmp_path: Path) -> None:
+    copy = tmp_path / "copy.tlog"
+    copy.write_bytes(flights[0].read_bytes())
+    assert "no differences" in run("diff", flights[0], copy)
+
+
+@pytest.mark.parametrize(
+    "content", ["A,0.1\nB,5\n", "A 0.1\nB 5\n", "# x\n1\t1\tA\t0.1\t9\n1\t1\tB\t5\t9\n"]
+)
+def test_recording_is_compared_with_a_parameter_file(
+    flights: tuple[Path, Path], tmp_path: Path, content: str
+) -> None:
+    path = tmp_path / "x.param"
+    path.write_text(content)
+    found = json.loads(run("diff", flights[0], path, "--json"))
+    assert found["parameters"] == {"B": ["2", "5"]}
+    assert found["figures"] == found["texts"] == {}
+
+
+def test_page_escapes_texts_and_is_not_overwritten(
+    flights: tuple[Path, Path], tmp_path: Path
+) -> None:
+    other = written(tmp_path / "c.tlog", [mavlink.MAVLink_statustext_message(6, b"<script>")])
+    page = tmp_path / "diff.html"
+    run("diff", flights[0], other, "--html", page)
+    assert "&lt;script&gt;" in page.read_text()
+    assert "<script>" not in page.read_text()
+    assert "--force" in run("diff", *flights, "--html", page, code=2)
+
+
+def test_files_without_parameters_or_vehicle_are_refused(
+    flights: tuple[Path, Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "x.param"
+    path.write_bytes(b"nothing\xff\n")
+    assert "holds no parameters" in run("diff", flights[0], path, code=2)
+    assert "no vehicle 9" in run("diff", *flights, "--system", 9, code=2)
