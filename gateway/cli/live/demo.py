@@ -85,8 +85,7 @@ def demo(
     The simulated receiver sends the real protocol on a pseudo-terminal, at true rates. A recording
     that is flown instead restarts at its end, with a message.
     """
-    # Taken here: a reload reads in another thread, which does not have the context's value.
-    file = CONFIG.get()
+    file = CONFIG.get()  # A reload reads in another thread, without the context's value.
 
     def read() -> GatewaySettings:
         return with_endpoints(read_settings(file), endpoint)
