@@ -19,7 +19,7 @@ WORDS: Final = {
     r"believe|believes|believed|doubt|doubts|doubted": "accept, reject, inflate the variance",
     r"unsure|less sure|surely": "standard deviation, uncertain",
     r"anew": "again, repeatedly",
-    r"beside": "next to, in addition to",
+    r"(?<!--)beside": "next to, in addition to",
     r"(?<!hard )(?<!soft )(?<!hard-)(?<!soft-)iron(?! and soft)": "hard iron, soft iron",
     r"roughness": "vibration noise",
     r"purse|wish|wishes": "token bucket, requested interval",

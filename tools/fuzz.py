@@ -36,7 +36,9 @@ from gateway.config import ConfigError, GatewaySettings, load
 from gateway.live.control_socket import ControlServer, Verbs
 from gateway.live.control_verbs import mark_verbs
 from gateway.pipeline import Pipeline, PipelineSettings
+from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.columns import COLUMNS, TableRow
+from gateway.recordings.files import FlightError
 from gateway.recordings.formats.maps import (
     DRAWN_IDS,
     to_geojson,
@@ -47,6 +49,7 @@ from gateway.recordings.formats.maps import (
 from gateway.recordings.formats.ulog import TOPICS
 from gateway.recordings.moment import parse_moment
 from gateway.recordings.positions import ORIGIN_ID, POSITION_SOURCES
+from gateway.recordings.reading import ReadOptions, has_record, open_record
 from gateway.recordings.senders import ATTITUDE_ID, ATTITUDE_QUATERNION_ID, Senders
 from gateway.recordings.status_texts import STATUSTEXT_ID
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
@@ -476,11 +479,31 @@ def source(kind: str, chunks: list[bytes]) -> None:
         pipeline.poll(number * 400_000)
 
 
+@given(
+    st.tuples(st.just("ulg"), damaged(ulog_messages()).map(lambda log: ULOG_HEAD + log))
+    | st.tuples(st.just("bin"), damaged(dataflash_messages()))
+)
+def record(file: tuple[str, bytes]) -> None:
+    """Any log of an autopilot: frames whose times grow, or an error in words."""
+    ending, data = file
+    path = _folder() / f"record.{ending}"
+    path.write_bytes(data)
+    current = PipelineSettings(AircraftSettings())
+    if not has_record(path):
+        return
+    try:
+        log = open_record(path, ReadOptions(current))
+    except FlightError:
+        return
+    frames = list(RecordTranslator(log).frames())
+    assert all(a.time_us < b.time_us for a, b in itertools.pairwise(frames))
+
+
 TARGETS: Final[dict[str, Any]] = {
     target.__name__: target
     for target in (
         *(splitter, whole_frames, receiver, source, vehicle, control),
-        *(settings_file, table, tlog, vehicles, command),
+        *(settings_file, table, tlog, vehicles, record, command),
     )
 }
 """By name."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.recordings.anonymising import Anonymiser
+from gateway.recordings.autopilot_record import AutopilotLog, RecordTranslator
 from gateway.recordings.files import (
     NO_RECORDING,
     TABLE,
@@ -36,10 +37,13 @@ from gateway.recordings.reading import (
     ReadOptions,
     RecordedTable,
     aircraft_of,
+    beside_id,
     check_vehicle,
+    estimates_of,
     import_format,
     is_table,
     joined_tables,
+    open_record,
     open_rows,
     recorded_frames,
     trimmed,
@@ -68,6 +72,7 @@ class FlightToWrite:
         title: str = "flight",
         fuse: bool = False,
         smooth: bool = False,
+        both: bool = False,
         message: str | None = None,
         edits: TlogEdits | None = None,
     ) -> None:
@@ -80,8 +85,10 @@ class FlightToWrite:
             raise FlightError(f"the files differ in kind; give those of one kind ({each})")
         self.is_mavlink = kinds == {TLOG}
         """Whether the frames are the recorded ones, and the rows are derived from them."""
+        self._estimates = estimates_of(files, fuse=fuse, both=both)
         self._as_recorded = not fuse and all(is_table(file) for file in files)
         self._sources: list[RecordedFusion | RecordedTable] = []
+        self._logs: list[AutopilotLog] = []
         self._remarks: list[str] = []
         self.senders = Senders()
         """Those of MAVLink, once its frames are requested."""
@@ -177,7 +184,15 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user, complete once all is written."""
-        return [*self._remarks, *(remark for source in self._sources for remark in source.remarks)]
+        sources = [*self._logs, *self._sources]
+        return [*self._remarks, *(remark for source in sources for remark in source.remarks)]
+
+    def lacks(self, ending: str) -> str:
+        """Return the content that a format cannot hold, once all is written; empty for none."""
+        if self._logs:
+            return "; ".join(filter(None, (log.lacks for log in self._logs)))
+        lacks = LACKS[ending]
+        return lacks.of_tlogs if self.is_mavlink else lacks.of_tables
 
     def remark(self, text: str) -> None:
         """Add a remark for the user."""
@@ -190,8 +205,21 @@ class FlightToWrite:
         return fusion
 
     def _sent(self) -> Iterator[TlogRecord]:
-        """Yield the frames that the gateway would send for all aircraft, stamped as in one file."""
-        streams = [part.fused().frames() for part in self.by_aircraft()]
+        """Yield the frames that the gateway would send for all aircraft, stamped as in one file.
+
+        Of logs of autopilots, those of their records, or both.
+        """
+        streams: list[Iterator[TlogRecord]] = []
+        if self._estimates != "fused":
+            for file in self.files:
+                log = open_record(file, self.options)
+                streams.append(RecordTranslator(log).frames())
+                self._logs.append(log)
+        if self._estimates == "both":
+            second = beside_id(self._logs[0].vehicle_id)
+            self.options = replace(self.options, system_id=second, progress=None)
+        if self._estimates != "own":
+            streams += [part.fused().frames() for part in self.by_aircraft()]
         stamper = Stamper(0)
         for record in heapq.merge(*streams, key=lambda record: record.time_us):
             yield TlogRecord(stamper.stamp(record.time_us), record.frame)

@@ -73,6 +73,8 @@ Progress = Callable[[int], None]
 
 Position = Literal["causal", "interpolated"]
 SettingsChoice = Literal["recorded", "current"]
+Estimates = Literal["own", "fused", "both"]
+"""Of an autopilot's log: its own estimates, those of mavgate, or both as two vehicles."""
 
 NO_RECORDING: Final = (
     "unknown file format; readable: tlog, raw MAVLink, CSV, ULog, DataFlash, MCAP, Parquet"

@@ -6,16 +6,18 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Final
 
 from gateway.recordings.answers import LogAnswers
+from gateway.recordings.autopilot_record import RecordTranslator
 from gateway.recordings.files import (
     MAX_UNPACKED,
     NO_RECORDING,
     TLOG,
+    Estimates,
     FlightError,
     Layout,
     Progress,
@@ -27,7 +29,7 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.reading import ReadOptions, beside_id, estimates_of, open_record
 from gateway.recordings.recorded_fusion import RecordedFusion, end_of
 from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
@@ -206,9 +208,17 @@ class PlayedFlight:
 
 
 def open_flights(
-    files: Sequence[Path], options: ReadOptions, opened: ExitStack
+    files: Sequence[Path],
+    options: ReadOptions,
+    opened: ExitStack,
+    *,
+    fuse: bool = False,
+    both: bool = False,
 ) -> list[OpenFlight]:
-    """Index the tlogs, and begin to fuse other files; the parts of a recording together.
+    """Index the tlogs, and begin to read or fuse other files; the parts of a recording together.
+
+    Of an autopilot's own log its estimates are played; with `fuse` those of mavgate, and with
+    `both` these and those.
 
     Raises FlightError if there is nothing to play in one of them; OSError if one cannot be
     read.
@@ -223,18 +233,40 @@ def open_flights(
                 flight.sources.append(tlog)
                 flight.remarks += [f"{file}: {remark}" for remark in tlog.remarks]
         else:
-            fusion = RecordedFusion(parts, options)
-            for frame in fusion.introduction():
-                flight.answers.note_frame(frame, 0)
-            fused = FusedTlog(fusion.frames(), end_of(parts[-1], options), flight.answers)
-            opened.callback(fused.close)
-            flight.sources.append(fused)
-            flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
+            _open_made(flight, parts, options, opened, estimates_of(parts, fuse=fuse, both=both))
         for source, file in zip(flight.sources, parts, strict=False):
             if not source.index.count:
                 raise FlightError(f"{file}: {NO_RECORDING}")
         flights.append(flight)
     return flights
+
+
+def _open_made(
+    flight: OpenFlight,
+    parts: Sequence[Path],
+    options: ReadOptions,
+    opened: ExitStack,
+    estimates: Estimates,
+) -> None:
+    """Begin to generate the frames of a flight that has none."""
+
+    def add(frames: Iterator[TlogRecord], last_us: int | None = None) -> None:
+        made = FusedTlog(frames, last_us, flight.answers)
+        opened.callback(made.close)
+        flight.sources.append(made)
+
+    if estimates != "fused":
+        for part in parts:
+            log = open_record(part, options)
+            add(RecordTranslator(log).frames())
+            flight.remarks += log.remarks
+            options = replace(options, system_id=beside_id(log.vehicle_id), progress=None)
+    if estimates != "own":
+        fusion = RecordedFusion(parts, options)
+        for frame in fusion.introduction():
+            flight.answers.note_frame(frame, 0)
+        add(fusion.frames(), end_of(parts[-1], options))
+        flight.remarks += [f"{parts[0]}: {remark}" for remark in fusion.remarks]
 
 
 def lay_out(

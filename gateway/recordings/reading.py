@@ -22,6 +22,7 @@ from gateway import __version__
 from gateway.aircraft import AircraftSettings, migrate_sections
 from gateway.extras import how_to_add
 from gateway.pipeline import PipelineSettings
+from gateway.recordings.autopilot_record import AutopilotLog
 from gateway.recordings.columns import TIMES, BoolArray, TableRow
 from gateway.recordings.files import (
     CSV,
@@ -30,6 +31,7 @@ from gateway.recordings.files import (
     PARQUET,
     TABLE,
     TLOG,
+    Estimates,
     FlightError,
     Position,
     Progress,
@@ -44,6 +46,7 @@ from gateway.recordings.files import (
 from gateway.recordings.formats.csv import ColumnMap, CsvReader
 from gateway.recordings.formats.mavlink import AutopilotReader
 from gateway.recordings.moment import Moment, time_us_of
+from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.table import (
     BLOCK_ROWS,
     HEAD_LINES,
@@ -144,6 +147,36 @@ def _add_packaged(name: str, module: str) -> None:
         return table
 
     READERS[name] = read
+
+
+RECORDS: Final = {"DataFlash": "dataflash_record", "ULog": "ulog_record"}
+"""Module that reads the record of an autopilot, by the name of the format."""
+
+
+def has_record(path: Path) -> bool:
+    """Return whether a file is the log of an autopilot, with its own estimates."""
+    return format_of(path) in RECORDS
+
+
+def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
+    """Open an autopilot's own log to be played; raises FlightError and OSError as `open_rows`."""
+    kind = format_of(path)
+    record: AutopilotLog = import_format(RECORDS[kind], kind).open_record(path, options)
+    return record
+
+
+def estimates_of(files: Iterable[Path], *, fuse: bool, both: bool) -> Estimates:
+    """Return which estimates of these files are sent; FlightError for `both` without a log."""
+    if not all(has_record(file) for file in files):
+        if both:
+            raise FlightError("--beside is for logs of autopilots, DataFlash and ULog")
+        return "fused"
+    return "both" if both else "fused" if fuse else "own"
+
+
+def beside_id(vehicle_id: int) -> int:
+    """Return the system id of the second vehicle, with the states of mavgate."""
+    return vehicle_id % (FIRST_GROUND_STATION - 1) + 1
 
 
 def is_table(path: Path) -> bool:

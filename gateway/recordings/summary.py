@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -333,16 +334,20 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
 def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
     # They import every stage, which a summary of a recording of our own does not need.
-    from gateway.recordings.reading import is_table, open_rows, shifted
+    from gateway.recordings.reading import has_record, is_table, open_record, open_rows, shifted
 
     recorded, table = open_rows(file, options), TableSummary()
     own = is_table(file)
     zero_us = 0 if own else recorded.header.unix_us_at_zero or 0
     for block in recorded.blocks:
         table.add(shifted(block, zero_us), recorded.header)
+    remarks = list(recorded.remarks)
+    if has_record(file):
+        with suppress(FlightError):
+            remarks += filter(None, [open_record(file, replace(options, progress=None)).lacks])
     return replace(
         table.result(file.stat().st_size),
         kind=kind,
         header=recorded.header if own else None,
-        remarks=tuple(recorded.remarks),
+        remarks=tuple(remarks),
     )

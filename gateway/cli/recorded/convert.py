@@ -12,6 +12,7 @@ import typer
 from gateway.aircraft import DEPRECATED
 from gateway.cli.support.options import CONFIG, output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
+    BesideOption,
     ColumnsOption,
     Files,
     ForceOption,
@@ -32,7 +33,7 @@ from gateway.estimation.record import IntArray
 from gateway.estimation.select import ESTIMATORS
 from gateway.output import check_output, write_new
 from gateway.recordings.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
-from gateway.recordings.convert import LACKS, WRITERS, FlightToWrite
+from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
 from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, message_ids_of
@@ -68,8 +69,9 @@ def convert(
     sensor: SensorOption = None,
     fuse: Annotated[
         bool,
-        typer.Option("--fuse", help="Fuse a table again instead of using its recorded states."),
+        typer.Option("--fuse", help="Fuse again instead of using the recorded states."),
     ] = False,
+    both: BesideOption = False,
     smooth: SmoothOption = False,
     fuse_with: FuseWithOption = "recorded",
     position: PositionOption = "causal",
@@ -133,7 +135,8 @@ def convert(
 
     Convert between tlogs and tables, or to a track for a map, MCAP for Foxglove, or Parquet. Logs
     of other autopilots (tlog, ULog, DataFlash) become tables that can be fused, and so does a CSV
-    of another program, by its column map.
+    of another program, by its column map. A tlog of a DataFlash log or ULog holds the estimates
+    and messages of its autopilot; with --fuse mavgate's, with --beside both.
     """
     if smooth and not fuse:
         refuse("--smooth smooths what --fuse fuses: give both")
@@ -162,6 +165,7 @@ def convert(
             title=output.stem,
             fuse=fuse,
             smooth=smooth,
+            both=both,
             message=message[0] if message else None,
             edits=edits if output.suffix in (".tlog", ".csv") else None,
         )
@@ -170,8 +174,7 @@ def convert(
     print_remarks(flight.remarks)
     if flight.anonymiser is not None:
         _print_changes(flight.anonymiser)
-    lacks = LACKS[output.suffix].of_tlogs if flight.is_mavlink else LACKS[output.suffix].of_tables
-    if lacks and message is None:
+    if (lacks := flight.lacks(output.suffix)) and message is None:
         print_remarks([f"Dropped: {lacks}"])
     console_of().print(f"{output}: {size / 1e6:.3f} MB")
 

@@ -16,6 +16,7 @@ from gateway.cli.live.run import EndpointOption, ForceOption, refuse_conflicts, 
 from gateway.cli.support.control import ask
 from gateway.cli.support.options import read_options, read_settings
 from gateway.cli.support.recording_options import (
+    BesideOption,
     ColumnsOption,
     Files,
     FromOption,
@@ -73,6 +74,11 @@ def play(
             help="System id for each recording's first vehicle; its others get the next ids.",
         ),
     ] = None,
+    fuse: Annotated[
+        bool,
+        typer.Option("--fuse", help="Of an autopilot's log: mavgate's states, not its own."),
+    ] = False,
+    both: BesideOption = False,
     fuse_with: FuseWithOption = "recorded",
     position: PositionOption = "causal",
     columns: ColumnsOption = None,
@@ -94,8 +100,9 @@ def play(
 
     Messages of the vehicles of a tlog are sent byte for byte, and requests are answered from the
     recording. A table is fused again while it plays, so what was recorded and what other settings
-    make of it can be compared on one map. The parts of a recording are one flight. `mavgate seek`
-    and `mavgate player` control it meanwhile.
+    make of it can be compared on one map. An autopilot's own log is played with its own estimates,
+    parameters and mission, unless --fuse or --beside is given. The parts of a recording are one
+    flight. `mavgate seek` and `mavgate player` control it meanwhile.
     """
     gateway = with_endpoints(read_settings(), endpoint)
     if with_commands and not yes:
@@ -108,7 +115,9 @@ def play(
         files = recorded_files(files, "tlogs")
         options = read_options(gateway, columns, choice=fuse_with, position=position)
         with progress_of(files) as advance:
-            recorded = open_flights(files, replace(options, progress=advance), opened)
+            recorded = open_flights(
+                files, replace(options, progress=advance), opened, fuse=fuse, both=both
+            )
             flights = lay_out(recorded, system or [], with_commands=with_commands)
             prepare(flights, plan)
         played = [system for flight in flights for system in flight.system_ids.values()]

@@ -33,6 +33,13 @@ SmoothOption = Annotated[
         "an hour of flight takes 120 MB of memory.",
     ),
 ]
+BesideOption = Annotated[
+    bool,
+    typer.Option(
+        "--beside",
+        help="Of an autopilot's log: its own estimates and mavgate's, as two vehicles.",
+    ),
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite the output.")]
 FromOption = Annotated[
     str | None, typer.Option("--from", help="Begin: 80, 1:20 or 2026-06-11T14:25:30Z.")

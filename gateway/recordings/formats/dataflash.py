@@ -10,12 +10,12 @@ import contextlib
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from itertools import chain, islice
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from msgspec.structs import replace
 from pymavlink.DFReader import DFReader_binary, DFReader_text
@@ -93,7 +93,7 @@ def in_era(gps_us: int) -> int:
     return gps_us + lost * ROLLOVER_US
 
 
-def _own_us(name: str, message: Message) -> int:
+def own_us_of(name: str, message: Message) -> int:
     """Return a message's time on the autopilot's clock."""
     time_us = getattr(message, "TimeUS", None)
     if time_us is not None:
@@ -101,10 +101,13 @@ def _own_us(name: str, message: Message) -> int:
     return 1000 * int(message.T if KINDS.get(name) == "GPS" else message.TimeMS)
 
 
-class ArdupilotReader:
-    """Turn the messages of one log into records."""
+Item = TypeVar("Item")
 
-    def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
+
+class LogClock(Generic[Item]):
+    """The times of one log, which grow from 0: damaged ones are left out, a leap is followed."""
+
+    def __init__(self) -> None:
         self.dropped = 0
         """Messages with an impossible time."""
         self.leaps = 0
@@ -116,12 +119,78 @@ class ArdupilotReader:
         self.is_beyond_leaps = False
         """Whether a date is later than the leap seconds are known."""
         self.zero_us: int | None = None
-        """The autopilot's time at the records' zero."""
-        self._vehicle_id = vehicle_id
+        """The autopilot's time at zero."""
         self._newest_us = 0
+        self._held: list[tuple[int, Item]] = []
+        """Items whose times agree with each other, but not with those before."""
+
+    def feed(self, own_us: int | None, item: Item) -> list[tuple[int, Item]]:
+        """Take the next item with its time on the autopilot's clock; return those that are timed.
+
+        One without a time is as old as the one before.
+        """
+        if own_us is None:
+            return [(self._newest_us, item)]
+        if self.zero_us is None:
+            self.zero_us = own_us
+        if -LATE_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
+            self._drop_held()
+            return [self._timed(own_us, item)]
+        if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
+            self._drop_held()
+        self._held.append((own_us, item))
+        return self._follow() if len(self._held) == AGREEING else []
+
+    def flush(self) -> list[tuple[int, Item]]:
+        """Return the items that still wait at the end of the log."""
+        held = self._follow() if len(self._held) >= LEAST_AGREEING else []
+        self._drop_held()
+        return held
+
+    def utc_us(self, message: Message) -> int | None:
+        """Return the civil time of a fix, in µs since 1970; None if the receiver has no week."""
+        week = getattr(message, "GWk", 0) or getattr(message, "Week", 0)
+        if not week or message.Status < FIX_2D:
+            return None
+        counted_us = week * WEEK_US + week_ms_of(message) * 1000
+        utc_us = unix_us_of_gps(in_era(counted_us))
+        self.is_rolled_over |= counted_us < FIRST_LOG_US
+        self.is_beyond_leaps |= utc_us > LEAPS_KNOWN_UNTIL_US
+        return utc_us
+
+    def _timed(self, own_us: int, item: Item) -> tuple[int, Item]:
+        """Return an item with its time on the records' clock, which never goes back."""
+        self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
+        return self._newest_us, item
+
+    def _drop_held(self) -> None:
+        self.dropped += len(self._held)
+        self._held.clear()
+
+    def _follow(self) -> list[tuple[int, Item]]:
+        """Follow the clock to the times of the held items."""
+        held, self._held = self._held, []
+        step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
+        self.leaps += step_us > 0
+        self.restarts += step_us < 0
+        # A log that begins again goes on from where it was.
+        self.zero_us = (self.zero_us or 0) + min(step_us, 0)
+        return [self._timed(*one) for one in held]
+
+
+def week_ms_of(message: Message) -> int:
+    """Return a fix's time of the week, which before 3.3 is in TimeMS."""
+    week_ms = getattr(message, "GMS", None)
+    return int(message.TimeMS if week_ms is None else week_ms)
+
+
+class ArdupilotReader:
+    """Turn the messages of one log into records."""
+
+    def __init__(self, vehicle_id: int, sensors: Mapping[str, int] = MappingProxyType({})) -> None:
+        self.clock: LogClock[tuple[str, Message]] = LogClock()
+        self._vehicle_id = vehicle_id
         self._sensors = {**sensors, "GPA": sensors.get("GPS", 0)}
-        self._held: list[tuple[int, str, Message]] = []
-        """Messages whose times agree with each other, but not with those before."""
         self._mag: Vec3 | None = None
         self._fix: GpsFix | None = None
         """The newest fix, which waits for its accuracies."""
@@ -145,47 +214,24 @@ class ArdupilotReader:
         kind = KINDS.get(name, name)
         if kind not in self._handlers or sensor_of(name, message) != self._sensors.get(kind, 0):
             return []
-        own_us = _own_us(name, message)
-        if self.zero_us is None:
-            self.zero_us = own_us
-        if -LATE_US <= own_us - self.zero_us - self._newest_us <= AHEAD_US:
-            self._drop_held()
-            return self._take(own_us, kind, message)
-        if self._held and abs(own_us - self._held[-1][0]) > LATE_US:
-            self._drop_held()
-        self._held.append((own_us, kind, message))
-        return self._follow() if len(self._held) == AGREEING else []
+        return self._take(self.clock.feed(own_us_of(name, message), (kind, message)))
 
     def flush(self) -> list[Imported]:
         """Return the records that still wait at the end of the log."""
-        held = self._follow() if len(self._held) >= LEAST_AGREEING else []
-        self._drop_held()
-        return [*held, *self._flush_fix()]
+        return [*self._take(self.clock.flush()), *self._flush_fix()]
 
-    def _take(self, own_us: int, kind: str, message: Message) -> list[Imported]:
-        """Handle a message at its time on the records' clock, which never goes back."""
-        self._newest_us = max(self._newest_us, own_us - (self.zero_us or 0))
-        waited = [] if kind == "GPA" else self._flush_fix()
-        return [*waited, *self._handlers[kind](message, self._newest_us)]
+    def _take(self, timed: Iterable[tuple[int, tuple[str, Message]]]) -> list[Imported]:
+        """Handle messages at their times."""
+        found: list[Imported] = []
+        for time_us, (kind, message) in timed:
+            found += [] if kind == "GPA" else self._flush_fix()
+            found += self._handlers[kind](message, time_us)
+        return found
 
     def _flush_fix(self) -> list[Imported]:
         """Return the fix that waits for its accuracies, if one does."""
         fix, self._fix = self._fix, None
         return [] if fix is None else [fix]
-
-    def _drop_held(self) -> None:
-        self.dropped += len(self._held)
-        self._held.clear()
-
-    def _follow(self) -> list[Imported]:
-        """Follow the clock to the times of the held messages, and handle these."""
-        held, self._held = self._held, []
-        step_us = held[0][0] - (self.zero_us or 0) - self._newest_us
-        self.leaps += step_us > 0
-        self.restarts += step_us < 0
-        # A log that begins again goes on from where it was.
-        self.zero_us = (self.zero_us or 0) + min(step_us, 0)
-        return [record for one in held for record in self._take(*one)]
 
     def _imu(self, m: Message, time_us: int) -> list[Imported]:
         mag, self._mag = self._mag, None
@@ -215,20 +261,11 @@ class ArdupilotReader:
         has_fix = fix_type is not GpsFixType.NONE
         course_rad = math.radians(m.GCrs)
         level = (m.Spd * math.cos(course_rad), m.Spd * math.sin(course_rad))
-        utc_us = None
-        # Before 3.3 TimeMS is the time of the week.
-        week, week_ms = getattr(m, "GWk", 0) or getattr(m, "Week", 0), getattr(m, "GMS", None)
-        week_ms = m.TimeMS if week_ms is None else week_ms
-        if week and has_fix:
-            counted_us = week * WEEK_US + week_ms * 1000
-            utc_us = unix_us_of_gps(in_era(counted_us))
-            self.is_rolled_over |= counted_us < FIRST_LOG_US
-            self.is_beyond_leaps |= utc_us > LEAPS_KNOWN_UNTIL_US
         self._fix = GpsFix(
             time_us=time_us,
             node=NodeId(self._vehicle_id, 1),
             node_time_us=time_us,
-            itow_ms=week_ms,
+            itow_ms=week_ms_of(m),
             fix_type=fix_type,
             fix_ok=has_fix,
             satellites=m.NSats,
@@ -242,7 +279,7 @@ class ArdupilotReader:
             speed_acc_mps=NAN,
             course_acc_deg=NAN,
             pdop=NAN,
-            utc_us=utc_us,
+            utc_us=self.clock.utc_us(m),
         )
         return []
 
@@ -289,7 +326,7 @@ _AS_TEXT: Final = bytes(range(128)) + b"?" * 128
 _SKIPPED: Final = re.compile(r"Skipped (\d+) bad bytes")
 
 
-class _PrintedDamage(io.TextIOBase):
+class PrintedDamage(io.TextIOBase):
     """Count the damage that pymavlink prints to the terminal."""
 
     def __init__(self) -> None:
@@ -298,6 +335,7 @@ class _PrintedDamage(io.TextIOBase):
         self.was_printed = False
 
     def write(self, text: str) -> int:
+        """Count what is reported as skipped."""
         self.was_printed = True
         self.bytes += sum(map(int, _SKIPPED.findall(text)))
         return len(text)
@@ -310,39 +348,52 @@ class _PrintedDamage(io.TextIOBase):
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a DataFlash log as a flight; raises FlightError if there is none in it."""
-    damage = _PrintedDamage()
-    log = _open(path, options, damage)
-    named = (log.params.get(name) for name in SYSTEM_IDS)
-    known = next((int(value) for value in named if value is not None), 1)
-    vehicle_id = options.system_id or (known if 1 <= known <= 255 else 1)
-    sensors = _sensors_of(log, damage) | dict(options.sensors)
+    damage = PrintedDamage()
+    log = open_log(path, options, damage)
+    vehicle_id = options.system_id or system_id_of(log.params)
+    sensors = sensors_of(log, damage) | dict(options.sensors)
     reader = ArdupilotReader(vehicle_id, sensors)
     remarks = [f"{path}: uses {kind} {number + 1}" for kind, number in sensors.items() if number]
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
         with contextlib.closing(log):
-            for record in _records(log, damage, reader):
+            for record in items_of(log, damage, reader):
                 yield from builder.add(record)
             yield from builder.flush()
-            remarks.extend(f"{path}: {remark}" for remark in _remarks(log, damage, reader))
+            remarks.extend(f"{path}: {remark}" for remark in remarks_of(log, damage, reader.clock))
 
     stream = rows()
     first = next((row for row in stream if row.imu is not None), None)
     if first is None:
         raise FlightError(f"{path}: {_why_empty(log, damage, reader)}")
-    # By the first week and time of GPS, to which pymavlink applies the leap seconds of today; 0
-    # without one.
-    clock, zero_us = log.clock, None
-    if clock.timebase:
-        zero_us = round((clock.timebase - clock._gpsTimeToTime(0, 0)) * US_PER_S)  # noqa: SLF001
-        zero_us = unix_us_of_gps(in_era(zero_us + (reader.zero_us or 0)))
+    zero_us = unix_us_at(log, reader.clock.zero_us or 0)
     table = table_of_rows(chain([first], stream), options, vehicle_id, zero_us)
     table.remarks = remarks
     return table
 
 
-def _why_empty(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> str:
+def system_id_of(parameters: Mapping[str, float]) -> int:
+    """Return the system id among parameters; 1 if there is no valid one."""
+    named = (parameters.get(name) for name in SYSTEM_IDS)
+    known = next((int(value) for value in named if value is not None), 1)
+    return known if 1 <= known <= 255 else 1
+
+
+def unix_us_at(log: Any, own_us: int) -> int | None:
+    """Return the civil time at a time of the autopilot's clock; None without one of GPS.
+
+    It is that of the first week and time of GPS, to which pymavlink applies the leap seconds of
+    today.
+    """
+    clock = log.clock
+    if not clock.timebase:
+        return None
+    zero_us = round((clock.timebase - clock._gpsTimeToTime(0, 0)) * US_PER_S)  # noqa: SLF001
+    return unix_us_of_gps(in_era(zero_us + own_us))
+
+
+def _why_empty(log: Any, damage: PrintedDamage, reader: ArdupilotReader) -> str:
     """Return why a log gave no IMU samples."""
     formats = {known.name: {*known.columns} for known in log.formats.values()}
     if not formats.keys() - {"FMT"}:
@@ -355,12 +406,12 @@ def _why_empty(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> str
                 f"its {name} messages cannot be decoded: they have no {', '.join(sorted(lacking))}"
                 ", as in a log of sdlog2, PX4's logger before ULog, which is not read"
             )
-    if damage.messages or reader.dropped:
+    if damage.messages or reader.clock.dropped:
         return "none of its IMU messages can be decoded"
     return "contains no IMU messages, so there is nothing to fuse"
 
 
-def _sensors_of(log: Any, damage: _PrintedDamage) -> dict[str, int]:
+def sensors_of(log: Any, damage: PrintedDamage) -> dict[str, int]:
     """Find the first sensor of each kind that has data; a GPS that has a fix."""
     found: dict[str, int] = {}
     for kind, columns in SENSORS.items():
@@ -377,19 +428,19 @@ def _sensors_of(log: Any, damage: _PrintedDamage) -> dict[str, int]:
     return found
 
 
-def _each(log: Any, damage: _PrintedDamage, names: set[str]) -> Iterator[Any]:
+def _each(log: Any, damage: PrintedDamage, names: set[str]) -> Iterator[Any]:
     """Yield the messages of these names up to the first damage, and go back to the begin."""
     log.type_list = None
     try:
         while message := damage.counting(lambda: log.recv_match(type=names, strict=True)):
             yield message
-    except Exception:  # noqa: BLE001 - as for `_open`
+    except Exception:  # noqa: BLE001 - as for `open_log`
         return
     finally:
         log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
 
 
-def _open(path: Path, options: ReadOptions, damage: _PrintedDamage) -> Any:
+def open_log(path: Path, options: ReadOptions, damage: PrintedDamage) -> Any:
     """Open a temporary copy of a log, unpacked.
 
     pymavlink maps a log into the memory, where one that shrinks would end the process.
@@ -415,7 +466,24 @@ def _open(path: Path, options: ReadOptions, damage: _PrintedDamage) -> Any:
         return log
 
 
-def _records(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Iterator[Imported]:
+class MessageReader(Protocol[Item]):
+    """Takes the messages of a log one by one."""
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the messages that are used."""
+        ...
+
+    def feed(self, name: str, message: Message) -> list[Item]:
+        """Take the next message."""
+        ...
+
+    def flush(self) -> list[Item]:
+        """Return the items that still wait at the end of the log."""
+        ...
+
+
+def items_of(log: Any, damage: PrintedDamage, reader: MessageReader[Item]) -> Iterator[Item]:
     """Read the whole log; a message that cannot be decoded is counted.
 
     Of an intact log only the needed messages are decoded. The index of a damaged one ends at the
@@ -453,20 +521,21 @@ def _lines_of(log: Any, names: set[str]) -> int:
     return sum(log.counts.get(name, 0) for name in names | odd)
 
 
-def _remarks(log: Any, damage: _PrintedDamage, reader: ArdupilotReader) -> Iterator[str]:
+def remarks_of(log: Any, damage: PrintedDamage, clock: LogClock[Any]) -> Iterator[str]:
+    """Yield remarks for the user about a log that was read."""
     yield from damage.before.remarks
     if damage.bytes:
         yield f"is damaged: left out {counted(damage.bytes, 'byte')} without a message"
     if log.offset < log.data_len:
         yield f"ends within a message: left out {counted(log.data_len - log.offset, 'byte')}"
-    if broken := reader.dropped + damage.messages:
+    if broken := clock.dropped + damage.messages:
         yield f"is damaged: left out {counted(broken, 'message')} that cannot be understood"
-    if reader.leaps:
-        yield f"its clock jumped forward {counted(reader.leaps, 'time')}"
-    if reader.restarts:
-        yield f"the autopilot restarted {counted(reader.restarts, 'time')}; its times run on"
-    if reader.is_rolled_over:
+    if clock.leaps:
+        yield f"its clock jumped forward {counted(clock.leaps, 'time')}"
+    if clock.restarts:
+        yield f"the autopilot restarted {counted(clock.restarts, 'time')}; its times run on"
+    if clock.is_rolled_over:
         yield "its GPS receiver counts 1024 weeks too few; its dates are corrected"
-    if reader.is_beyond_leaps:
+    if clock.is_beyond_leaps:
         known = datetime.fromtimestamp(LEAPS_KNOWN_UNTIL_US / US_PER_S, UTC)
         yield f"its dates assume no leap second since {known:%d %B %Y}"

@@ -33,6 +33,7 @@ from gateway.recordings.columns import LARGEST_WHOLE, Imported, RowBuilder, Tabl
 from gateway.recordings.files import (
     ULOG_BEGIN,
     ULOG_HEAD,
+    Before,
     FlightError,
     name_of,
     read_chunks,
@@ -93,6 +94,36 @@ Instance = tuple[str, int]
 """Name of a topic, and which of its instances it is, counted from 0."""
 
 
+def in_order(topic: Topic) -> tuple[Topic, int]:
+    """Sort by time, and leave out rows without one, or with one far from those around it."""
+    time_us = topic["timestamp"].astype(np.int64)
+    sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
+    if len(time_us) >= AROUND:
+        around = np.median(sliding_window_view(time_us, AROUND), axis=1)
+        early_us = np.pad(around, AROUND // 2, mode="edge") - time_us
+        far_us = np.full((2, len(time_us)), FAR_US)
+        far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = AT_ENDS_US
+        sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
+    order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
+    return {name: column[order] for name, column in topic.items()}, int(np.count_nonzero(~sound))
+
+
+def unix_us_at_boot(gps: Topic) -> int | None:
+    """Return the civil time at zero of the autopilot's clock, by its fixes; None without one."""
+    if "time_utc_usec" not in gps:
+        return None
+    behind = gps.get("timestamp_time_relative", np.zeros(len(gps["timestamp"]), np.int64))
+    times = zip(
+        gps["time_utc_usec"].tolist(), gps["timestamp"].tolist(), behind.tolist(), strict=True
+    )
+    found = [
+        int(utc_us) - int(time_us) - int(relative_us)
+        for utc_us, time_us, relative_us in times
+        if FIRST_CIVIL_US < utc_us < LARGEST_WHOLE
+    ]
+    return median_low(found) if found else None
+
+
 class Px4Log:
     """The topics of one log."""
 
@@ -140,12 +171,8 @@ class Px4Log:
     @property
     def unix_us_at_zero(self) -> int | None:
         """Civil time of the records' time zero, by GPS; None if GPS never had it."""
-        found = [
-            row["time_utc_usec"] - row["timestamp"] - row.get("timestamp_time_relative", 0)
-            for row in self._rows("GPS")
-            if FIRST_CIVIL_US < row.get("time_utc_usec", 0) < LARGEST_WHOLE
-        ]
-        return self._zero_us + median_low(found) if found else None
+        boot_us = unix_us_at_boot(self._topics.get("GPS", {}))
+        return None if boot_us is None else self._zero_us + boot_us
 
     def records(self) -> Iterator[Imported]:
         """Yield all records in the order of time, which begins at 0."""
@@ -153,18 +180,9 @@ class Px4Log:
         return heapq.merge(*streams, key=lambda record: (record.time_us, ORDER[type(record)]))
 
     def _in_order(self, topic: Topic) -> Topic:
-        """Sort by time, and leave out rows without one, or with one far from those around it."""
-        time_us = topic["timestamp"].astype(np.int64)
-        sound = (time_us > 0) & (time_us < LARGEST_WHOLE)
-        if len(time_us) >= AROUND:
-            around = np.median(sliding_window_view(time_us, AROUND), axis=1)
-            early_us = np.pad(around, AROUND // 2, mode="edge") - time_us
-            far_us = np.full((2, len(time_us)), FAR_US)
-            far_us[0, : AROUND // 2] = far_us[1, -(AROUND // 2) :] = AT_ENDS_US
-            sound &= (early_us < far_us[0]) & (-early_us < far_us[1])
-        self.dropped += int(np.count_nonzero(~sound))
-        order = np.flatnonzero(sound)[np.argsort(time_us[sound], kind="stable")]
-        return {name: column[order] for name, column in topic.items()}
+        ordered, dropped = in_order(topic)
+        self.dropped += dropped
+        return ordered
 
     def _rows(self, kind: str) -> Iterator[Row]:
         """Yield the rows of the topic with a kind of data."""
@@ -401,21 +419,16 @@ class _Content(io.BufferedReader):
 
 def read(path: Path, options: ReadOptions) -> RecordedTable:
     """Open a ULog as a flight; raises FlightError if there is none in it."""
-    whole = read_chunks(path, options.progress, options.unpacked_limit)
-    rest, before = skip_to(ULOG_BEGIN, whole)
-    with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:
-        log, unread = _load(path, name_of(content))
+    log, unread, before = load(path, options, list(TOPICS))
     topics = {(data.name, data.multi_id): data.data for data in reversed(log.data_list)}
-    known = log.initial_parameters.get(SYSTEM_ID, 1)
-    is_id = isinstance(known, int) and 1 <= known <= 255
-    vehicle_id = options.system_id or (known if is_id else 1)
+    vehicle_id = options.system_id or system_id_of(log)
     try:
         flight = Px4Log(topics, vehicle_id, dict(options.sensors))
     except ValueError as error:
         if lost := log._missing_message_ids:  # noqa: SLF001
             lost = f", and the formats of {counted(len(lost), 'topic')} are lost"
         why = f"{path}: {error}{lost or ''}"
-        raise FlightError("; it ".join([why, *_damage(log, unread)])) from error
+        raise FlightError("; it ".join([why, *damage_of(log, unread)])) from error
 
     def rows() -> Iterator[TableRow]:
         builder = RowBuilder()
@@ -424,7 +437,7 @@ def read(path: Path, options: ReadOptions) -> RecordedTable:
         yield from builder.flush()
 
     table = table_of_rows(rows(), options, vehicle_id, flight.unix_us_at_zero)
-    remarks = [*before.remarks, *_damage(log, unread), *_remarks(log, flight)]
+    remarks = [*before.remarks, *damage_of(log, unread), *_remarks(flight)]
     table.remarks += [f"{path}: {remark}" for remark in remarks]
     return table
 
@@ -444,7 +457,21 @@ def _lost_head(rest: Iterator[bytes], before: bytes) -> Iterator[bytes]:
     yield first
 
 
-def _load(path: Path, copy: str) -> tuple[Any, int]:
+def load(path: Path, options: ReadOptions, topics: list[str] | None) -> tuple[Any, int, Before]:
+    """Read a log, of which some or all topics; also the bytes at its ends that were left out."""
+    whole = read_chunks(path, options.progress, options.unpacked_limit)
+    rest, before = skip_to(ULOG_BEGIN, whole)
+    with temporary_copy(path, chain(_lost_head(rest, before.text), rest)) as content:
+        return *_load(path, name_of(content), topics), before
+
+
+def system_id_of(log: Any) -> int:
+    """Return the system id among the parameters; 1 if there is no valid one."""
+    known = log.initial_parameters.get(SYSTEM_ID, 1)
+    return known if isinstance(known, int) and 1 <= known <= 255 else 1
+
+
+def _load(path: Path, copy: str, topics: list[str] | None) -> tuple[Any, int]:
     """Return the log, and how many bytes at its end could not be read."""
     # Damage that it prints to the terminal is reported as remarks.
     with contextlib.redirect_stdout(io.StringIO()):
@@ -452,7 +479,7 @@ def _load(path: Path, copy: str) -> tuple[Any, int]:
             with _Content(copy) as head:
                 _check_formats(ULog(head, parse_header_only=True).message_formats)
             with _Content(copy) as file:
-                log = ULog(file, list(TOPICS))
+                log = ULog(file, topics)
         except (ULogException, *BROKEN) as error:
             raise FlightError(f"{path}: cannot be read as a ULog: {error}") from error
     return log, file.unread
@@ -471,19 +498,20 @@ def _check_formats(formats: dict[str, Any]) -> None:
             raise ValueError(f"{name} has more values than a message can hold")
 
 
-def _damage(log: Any, unread: int) -> Iterator[str]:
+def damage_of(log: Any, unread: int) -> Iterator[str]:
+    """Yield remarks for the user about damage and gaps of a log."""
     if log.file_corruption:
         yield "is damaged; what is sound of it was read"
     if unread:
         yield f"left out {counted(unread, 'byte')} at its end that cannot be read"
-
-
-def _remarks(log: Any, flight: Px4Log) -> Iterator[str]:
-    yield from flight.chosen
     if log.dropouts:
         lost_s = sum(dropout.duration for dropout in log.dropouts) / MS_PER_S
         slow = counted(len(log.dropouts), "time")
         yield f"its logger was too slow {slow}, {lost_s:.1f} s are not in it"
+
+
+def _remarks(flight: Px4Log) -> Iterator[str]:
+    yield from flight.chosen
     if flight.left_out:
         yield f"lacks fields that PX4 documents for {', '.join(flight.left_out)}; left out"
     if flight.dropped:

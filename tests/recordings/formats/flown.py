@@ -200,8 +200,10 @@ DATAFLASH = {
     "POS": (136, "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
     "XKF1": (137, "QBccCfff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD"),
 }  # fmt: skip
-CODES = {"B": "B", "n": "4s", "N": "16s", "Z": "64s", "Q": "Q", "f": "f", "I": "I", "H": "H"} | {
-    "h": "h", "c": "h", "C": "H", "e": "i", "L": "i",
+Format = tuple[int, str, str]
+CODES = {
+    "B": "B", "M": "B", "b": "b", "n": "4s", "N": "16s", "Z": "64s", "Q": "Q", "f": "f",
+    "d": "d", "I": "I", "H": "H", "h": "h", "c": "h", "C": "H", "e": "i", "L": "i",
 }  # fmt: skip
 SCALES = {"c": 100, "C": 100, "e": 100, "L": 1e7}
 
@@ -259,8 +261,10 @@ def make_dataflash(seconds: float = DURATION_S) -> bytes:
     return b"".join(packed(name, values) for name, values in dataflash_rows(seconds))
 
 
-def packed(name: str, values: Sequence[float | bytes]) -> bytes:
-    number, form, _ = DATAFLASH[name]
+def packed(
+    name: str, values: Sequence[float | bytes], formats: dict[str, Format] = DATAFLASH
+) -> bytes:
+    number, form, _ = formats[name]
     scaled = [
         round(value * SCALES[letter])
         if letter in SCALES and not isinstance(value, bytes)
@@ -269,6 +273,16 @@ def packed(name: str, values: Sequence[float | bytes]) -> bytes:
     ]
     codes = "".join(CODES[letter] for letter in form)
     return b"\xa3\x95" + struct.pack("<B" + codes, number, *scaled)
+
+
+def dataflash_of(formats: dict[str, Format], rows: Sequence[Row]) -> bytes:
+    """Write messages of any formats; each row is a name and its values in the format's units."""
+    known = {"FMT": DATAFLASH["FMT"]} | formats
+    heads = [
+        ("FMT", (number, dataflash_size(form), name.encode(), form.encode(), columns.encode()))
+        for name, (number, form, columns) in known.items()
+    ]
+    return b"".join(packed(name, values, known) for name, values in [*heads, *rows])
 
 
 def make_dataflash_text(seconds: float = DURATION_S) -> bytes:

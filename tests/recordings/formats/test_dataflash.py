@@ -25,7 +25,7 @@ def records_at(*times_us: int) -> tuple[list[int], ArdupilotReader]:
 def test_damaged_time_drops_only_its_message(off_us: int) -> None:
     found, reader = records_at(*SECOND[:50], off_us, *SECOND[50:])
     assert found == SECOND
-    assert (reader.dropped, reader.leaps) == (1, 0)
+    assert (reader.clock.dropped, reader.clock.leaps) == (1, 0)
 
 
 @pytest.mark.parametrize("leap_us", [7_200_000_000, -5_000_000_000])
@@ -34,8 +34,8 @@ def test_jump_of_the_clock_is_followed(leap_us: int) -> None:
     found, reader = records_at(
         *(begin_us + t for t in SECOND), *(begin_us + leap_us + t for t in SECOND)
     )
-    assert (reader.leaps, reader.restarts) == ((1, 0) if leap_us > 0 else (0, 1))
-    assert reader.dropped == 0
+    assert (reader.clock.leaps, reader.clock.restarts) == ((1, 0) if leap_us > 0 else (0, 1))
+    assert reader.clock.dropped == 0
     assert len(found) == 2 * len(SECOND)
     assert found == sorted(found)
     assert found[-1] - found[len(SECOND)] == SECOND[-1] - SECOND[0]

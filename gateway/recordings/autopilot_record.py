@@ -1,0 +1,415 @@
+"""The record of an autopilot, a DataFlash log or a ULog, as the MAVLink of its vehicle.
+
+The messages of its table follow its rows; HEARTBEAT, SYS_STATUS, HOME_POSITION and SYSTEM_TIME are
+repeated. Before them are the modes, parameters and missions, as if a station had asked for them.
+"""
+
+import math
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.message_table import (
+    MAX_AGE_US,
+    BoundMessage,
+    MessageRow,
+    MessageTable,
+    Values,
+)
+from gateway.recordings.tlog import Stamper, TlogRecord
+from gateway.records import NAN
+from gateway.units import DEGE7_PER_DEG, US_PER_S
+from gateway.vehicle.encoding import Encoder
+
+UINT32: Final = 0xFFFFFFFF
+BEAT_US: Final = US_PER_S
+TEXT_BYTES: Final = 50
+LASTING: Final = frozenset({"HOME", "home_position"})
+"""Topics whose rows are valid until the next one."""
+MAX_NAMES: Final = 1 << 14
+"""Parameters, and items of a mission, that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogRow:
+    """One row of a log, or a change of the vehicle's state."""
+
+    time_us: int
+    """Since the begin of the log."""
+    own_us: int
+    """On the autopilot's clock."""
+    topic: str
+    instance: int
+    values: Values
+
+
+@dataclass(frozen=True, slots=True)
+class Armed:
+    """The vehicle was armed or disarmed."""
+
+    is_armed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """The vehicle changed its mode."""
+
+    custom_mode: int
+
+
+@dataclass(frozen=True, slots=True)
+class Text:
+    """A text of the autopilot."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedParameter:
+    """A parameter and its value, a float or a whole number of 32 bits."""
+
+    name: str
+    value: float | int
+
+
+@dataclass(frozen=True, slots=True)
+class LoggedItem:
+    """An item of a mission."""
+
+    seq: int
+    count: int
+    frame: int
+    command: int
+    params: tuple[float, float, float, float]
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Current:
+    """The vehicle began with an item of its mission."""
+
+    seq: int
+
+
+Event = Armed | Mode | Text | LoggedParameter | LoggedItem | Current
+Entry = LogRow | tuple[int, Event]
+"""A row, or an event and the time since the begin of the log."""
+
+
+@dataclass(slots=True)
+class AutopilotLog:
+    """The record of one autopilot, opened."""
+
+    table: MessageTable
+    entries: Iterator[Entry]
+    """In the order of time."""
+    vehicle_id: int
+    autopilot: int
+    """MAV_AUTOPILOT."""
+    mav_type: int
+    kind: str
+    present: frozenset[str]
+    """Topics with rows, by the names of the table."""
+    counts: Mapping[str, int]
+    """Rows by the log's own topics."""
+    unix_us_at_zero: int | None = None
+    units: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    """Of the log itself, by topic and field."""
+    primary: Mapping[str, int] = field(default_factory=dict)
+    """The instance of a topic that is used where one is needed, if it is not the first."""
+    parameters: Mapping[str, float | int] = field(default_factory=dict)
+    """Those at its begin."""
+    modes: Mapping[int, str] = field(default_factory=dict)
+    """Names of the custom modes."""
+    mission: tuple[LoggedItem, ...] = ()
+    """That at its begin."""
+    is_armed: bool = False
+    """At its begin."""
+    custom_mode: int = 0
+    remarks: list[str] = field(default_factory=list)
+    """Complete once the entries are read."""
+
+    def unit(self, topic: str, name: str) -> str | None:
+        """Return the unit that the log itself states; None without one."""
+        return self.units.get((topic, name))
+
+    @property
+    def without_counterpart(self) -> dict[str, int]:
+        """Rows by topic that become no MAVLink."""
+        used = self.table.topics
+        return {name: n for name, n in sorted(self.counts.items()) if n and name not in used}
+
+    @property
+    def lacks(self) -> str:
+        """The same as text for the user; empty if there are none."""
+        listed = ", ".join(f"{name} {n}" for name, n in self.without_counterpart.items())
+        return listed and f"messages without a counterpart in MAVLink: {listed}"
+
+
+class _Newest:
+    """The newest rows of a log, as a message of its table sees them."""
+
+    def __init__(self, log: AutopilotLog) -> None:
+        self.kind = log.kind
+        self.now_us = 0
+        self.instance: int | None = None
+        """Of the message; None for that of the primary sensors."""
+        self.parameters = dict(log.parameters)
+        self._log = log
+        self._rows: dict[tuple[str, int], LogRow] = {}
+        self._firsts = dict(log.primary)
+        self._seen: set[str] = set()
+
+    def add(self, row: LogRow) -> None:
+        """Take in the next row."""
+        self.now_us = row.time_us
+        self._rows[row.topic, row.instance] = row
+        self._seen.add(row.topic)
+        self._firsts.setdefault(row.topic, row.instance)
+
+    def has(self, topic: str) -> bool:
+        """Return whether there was a row of a topic."""
+        return topic in self._seen
+
+    def primary(self, topic: str) -> int:
+        """Return the instance of a topic that is used."""
+        where = self._log.table.lanes.get(topic)
+        if where is not None:
+            name, _, column = where.partition(".")
+            row = self._rows.get((name, self._firsts.get(name, 0)))
+            lane = None if row is None else row.values.get(column)
+            if isinstance(lane, int):
+                return lane
+        return self._firsts.get(topic, 0)
+
+    def value(self, topic: str, name: str) -> float:
+        """Return a field of the newest row; see `Context`."""
+        if topic == "PARM":
+            number = self.instance or 0
+            found = self.parameters.get(name.replace("#", str(number + 1) if number else ""), NAN)
+            return float(found)
+        if topic == "SENSORS":
+            return float(self._sensors(only_healthy=name == "healthy"))
+        instance = self.primary(topic) if self.instance is None else self.instance
+        if name == "instance":
+            return float(instance)
+        row = self._rows.get((topic, instance))
+        if row is None or (self.now_us - row.time_us > MAX_AGE_US and topic not in LASTING):
+            return NAN
+        value = row.values.get(name, NAN)
+        return value if isinstance(value, int | float) else NAN
+
+    def _sensors(self, *, only_healthy: bool) -> int:
+        bits = 0
+        for (topic, _), row in self._rows.items():
+            if not only_healthy or self.now_us - row.time_us <= MAX_AGE_US:
+                bits |= self._log.table.health.get(topic, 0)
+        return bits
+
+
+class RecordTranslator:
+    """Turn the entries of a log into the frames of its vehicle."""
+
+    def __init__(self, log: AutopilotLog, system_id: int | None = None) -> None:
+        self._log = log
+        self._encoder = Encoder(system_id or log.vehicle_id)
+        self._newest = _Newest(log)
+        self._bound: dict[tuple[str, int], BoundMessage] = {}
+        self._by_topic: dict[str, list[MessageRow]] = {}
+        self._repeated: list[tuple[MessageRow, BoundMessage]] = []
+        for row in log.table.messages:
+            first = next((topic for topic in row.of if topic in log.present), None)
+            if row.every_s is not None:
+                if not row.of or first is not None:
+                    bound = log.table.bind(row, row.name, log, log.kind)
+                    self._repeated.append((row, bound))
+            elif first is not None:
+                self._by_topic.setdefault(first, []).append(row)
+        self._due_us = dict.fromkeys(range(len(self._repeated)), 0)
+        self._beat_us: int | None = None
+        self._own_us = 0
+        self._is_armed, self._mode = log.is_armed, log.custom_mode
+        self._mission: dict[int, LoggedItem] = {item.seq: item for item in log.mission}
+        self._numbers: dict[str, int] = {name: n for n, name in enumerate(log.parameters)}
+        self._texts = 0
+
+    def frames(self) -> Iterator[TlogRecord]:
+        """Yield the frames at civil times, or without one at times since the begin."""
+        stamper = Stamper(self._log.unix_us_at_zero or 0)
+        entries = self._log.entries
+        first = next(entries, None)
+        if first is None:
+            return
+        begin_us = first.time_us if isinstance(first, LogRow) else first[0]
+        for message in self._introduction():
+            yield TlogRecord(stamper.stamp(begin_us), self._encoder.encode(message).frame)
+        for entry in chain([first], entries):
+            time_us = entry.time_us if isinstance(entry, LogRow) else entry[0]
+            for message in self._messages(entry, time_us):
+                yield TlogRecord(stamper.stamp(time_us), self._encoder.encode(message).frame)
+
+    def _messages(self, entry: Entry, time_us: int) -> Iterator[Any]:
+        if not isinstance(entry, LogRow):
+            yield from self._event(entry[1])
+            return
+        self._own_us = entry.own_us
+        self._newest.add(entry)
+        yield from self._repeat(time_us)
+        for row in self._by_topic.get(entry.topic, ()):
+            bound = self._bound_for(row, entry)
+            if bound is not None:
+                self._newest.instance = entry.instance if row.each is not None else None
+                yield bound.packer(*bound.values(self._newest, self._times()))
+        self._newest.instance = None
+
+    def _bound_for(self, row: MessageRow, entry: LogRow) -> BoundMessage | None:
+        """Return the message for a row; None if another instance is the one that counts."""
+        if row.each is None:
+            if entry.instance != self._newest.primary(entry.topic):
+                return None
+            name = row.name
+        elif row.each:
+            if not 0 <= entry.instance < len(row.each):
+                return None
+            name = row.each[entry.instance]
+        else:
+            name = row.name
+        key = (row.name, entry.instance)
+        if key not in self._bound:
+            self._bound[key] = self._log.table.bind(row, name, self._log, self._log.kind)
+        return self._bound[key]
+
+    def _times(self) -> dict[str, int]:
+        return {"time_boot_ms": self._own_us // 1000, "time_usec": self._own_us}
+
+    def _repeat(self, time_us: int) -> Iterator[Any]:
+        """Yield the messages that are due at intervals; none for a gap in the log."""
+        if self._beat_us is None or time_us >= self._beat_us:
+            yield self._heartbeat()
+            yield self._system_time(time_us)
+            before_us = time_us if self._beat_us is None else self._beat_us
+            self._beat_us = max(before_us + BEAT_US, time_us)
+        for number, (row, bound) in enumerate(self._repeated):
+            if time_us < self._due_us[number] or not self._has_rows(row):
+                continue
+            interval_us = round((row.every_s or 1.0) * US_PER_S)
+            self._due_us[number] = max(self._due_us[number] + interval_us, time_us)
+            yield bound.packer(*bound.values(self._newest, self._times()))
+
+    def _has_rows(self, row: MessageRow) -> bool:
+        return not row.of or any(self._newest.has(topic) for topic in row.of)
+
+    def _event(self, event: Event) -> Iterator[Any]:
+        match event:
+            case Armed():
+                if event.is_armed != self._is_armed:
+                    self._is_armed = event.is_armed
+                    yield self._heartbeat()
+            case Mode():
+                if event.custom_mode != self._mode:
+                    self._mode = event.custom_mode
+                    yield self._heartbeat()
+                    yield self._current_mode()
+            case Text():
+                yield from self._text(event)
+            case LoggedParameter():
+                yield from self._change(event)
+            case LoggedItem():
+                yield from self._item(event)
+            case Current():
+                total = len(self._mission) or 0xFFFF
+                yield mavlink.MAVLink_mission_current_message(event.seq, total)
+
+    def _change(self, event: LoggedParameter) -> Iterator[Any]:
+        """Yield a parameter that has another value than before."""
+        if self._newest.parameters.get(event.name) == event.value:
+            return
+        self._newest.parameters[event.name] = event.value
+        if len(self._numbers) < MAX_NAMES:
+            self._numbers.setdefault(event.name, len(self._numbers))
+        yield self._parameter(event.name, event.value)
+
+    def _heartbeat(self) -> Any:
+        armed = mavlink.MAV_MODE_FLAG_SAFETY_ARMED if self._is_armed else 0
+        state = mavlink.MAV_STATE_ACTIVE if self._is_armed else mavlink.MAV_STATE_STANDBY
+        custom = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+        return mavlink.MAVLink_heartbeat_message(
+            self._log.mav_type, self._log.autopilot, custom | armed, self._mode, state, 3
+        )
+
+    def _system_time(self, time_us: int) -> Any:
+        zero_us = self._log.unix_us_at_zero
+        unix_us = 0 if zero_us is None else zero_us + time_us
+        return mavlink.MAVLink_system_time_message(unix_us, self._own_us // 1000 & UINT32)
+
+    def _current_mode(self) -> Any:
+        return mavlink.MAVLink_current_mode_message(0, self._mode, 0)
+
+    def _introduction(self) -> Iterator[Any]:
+        yield self._heartbeat()
+        names = self._log.modes
+        for number, (mode, name) in enumerate(names.items(), 1):
+            yield mavlink.MAVLink_available_modes_message(
+                len(names), number, 0, mode, 0, name.encode()
+            )
+        for name, value in self._log.parameters.items():
+            yield self._parameter(name, value)
+        if self._log.mission:
+            yield from self._whole_mission()
+
+    def _parameter(self, name: str, value: float) -> Any:
+        """Encode a parameter; a whole number by its bytes, as PX4 does."""
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        if isinstance(value, int):
+            kind = mavlink.MAV_PARAM_TYPE_INT32
+            value = struct.unpack("<f", struct.pack("<i", value))[0]
+        return mavlink.MAVLink_param_value_message(
+            name.encode()[:16], value, kind, len(self._numbers), self._numbers.get(name, 0xFFFF)
+        )
+
+    def _text(self, event: Text) -> Iterator[Any]:
+        """Encode a text, in pieces if it is long."""
+        data = event.text.encode()
+        pieces = [data[at : at + TEXT_BYTES] for at in range(0, len(data), TEXT_BYTES)]
+        if len(pieces) <= 1:
+            yield mavlink.MAVLink_statustext_message(event.severity, data)
+            return
+        self._texts = self._texts % 0xFFFF + 1
+        # A text whose last piece is full is ended by an empty one.
+        ended = [*pieces, b""] if len(pieces[-1]) == TEXT_BYTES else pieces
+        for number, piece in enumerate(ended):
+            yield mavlink.MAVLink_statustext_message(event.severity, piece, self._texts, number)
+
+    def _item(self, event: LoggedItem) -> Iterator[Any]:
+        """Take in an item of a new mission, or of the one that is there; yield a complete one."""
+        if self._mission.get(event.seq) == event:
+            return
+        if event.seq == 0 or any(item.count != event.count for item in self._mission.values()):
+            self._mission = {}
+        if len(self._mission) < MAX_NAMES:
+            self._mission[event.seq] = event
+        wanted = range(event.count)
+        if event.count and all(seq in self._mission for seq in wanted):
+            self._mission = {seq: self._mission[seq] for seq in wanted}
+            yield from self._whole_mission()
+
+    def _whole_mission(self) -> Iterator[Any]:
+        items = self._mission.values()
+        yield mavlink.MAVLink_mission_count_message(0, 0, len(items), 0)
+        for item in items:
+            yield mavlink.MAVLink_mission_item_int_message(
+                0, 0, item.seq, item.frame, item.command, 0, 1, *item.params,
+                _whole(item.lat_deg * DEGE7_PER_DEG), _whole(item.lon_deg * DEGE7_PER_DEG),
+                item.alt_m, 0,
+            )  # fmt: skip
+
+
+def _whole(value: float) -> int:
+    return round(value) if math.isfinite(value) else 0

@@ -1,0 +1,333 @@
+"""A DataFlash log as the record of its autopilot: rows and events for `dataflash.toml`."""
+
+import contextlib
+import math
+import re
+from collections.abc import Iterator
+from functools import cache
+from importlib.resources import files
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+from pymavlink.DFReader import DFReader_text
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.recordings.autopilot_record import (
+    Armed,
+    AutopilotLog,
+    Current,
+    Entry,
+    Event,
+    LoggedItem,
+    LoggedParameter,
+    LogRow,
+    Mode,
+    Text,
+)
+from gateway.recordings.files import FlightError
+from gateway.recordings.formats.dataflash import (
+    KINDS,
+    LogClock,
+    Message,
+    PrintedDamage,
+    items_of,
+    open_log,
+    own_us_of,
+    remarks_of,
+    sensors_of,
+    system_id_of,
+    unix_us_at,
+)
+from gateway.recordings.message_table import MessageTable, read_table
+from gateway.recordings.reading import ReadOptions
+from gateway.records import NAN
+from gateway.units import US_PER_S
+
+ARMED, DISARMED = 10, 11
+"""Ids of EV."""
+ORIGIN, HOME = 0, 1
+"""Types of ORGN."""
+INSTANCES: Final = ("I", "C", "Instance", "Inst", "IMU")
+"""Columns with the number of a sensor, filter or battery."""
+EVENTS: Final = frozenset({"PARM", "MODE", "ARM", "EV", "STAT", "MSG", "CMD"})
+"""Messages with events at the begin of a log."""
+EARLY_US: Final = US_PER_S
+"""A mode or armed state that is logged so soon holds from the begin of the log."""
+GLOBAL_RELATIVE: Final = mavlink.MAV_FRAME_GLOBAL_RELATIVE_ALT
+_FIRMWARE: Final = re.compile(r"(Copter|Plane|Rover|Sub|Blimp|Tracker)\s*V\d", re.IGNORECASE)
+_FRAME_TYPES: Final = {
+    1: mavlink.MAV_TYPE_QUADROTOR, 2: mavlink.MAV_TYPE_HEXAROTOR, 3: mavlink.MAV_TYPE_OCTOROTOR,
+    4: mavlink.MAV_TYPE_OCTOROTOR, 5: mavlink.MAV_TYPE_HEXAROTOR, 6: mavlink.MAV_TYPE_HELICOPTER,
+    7: mavlink.MAV_TYPE_TRICOPTER, 8: mavlink.MAV_TYPE_COAXIAL, 9: mavlink.MAV_TYPE_COAXIAL,
+    11: mavlink.MAV_TYPE_HELICOPTER, 12: mavlink.MAV_TYPE_DODECAROTOR,
+    13: mavlink.MAV_TYPE_HELICOPTER,
+}  # fmt: skip
+"""MAV_TYPE by FRAME_CLASS of a copter."""
+_SECOND: Final = 2
+"""AHRS_EKF_TYPE of the second Kalman filter."""
+_BOAT: Final = 2
+"""FRAME_CLASS of a rover that is a boat."""
+
+
+@cache
+def table() -> MessageTable:
+    """Return the table of DataFlash."""
+    return read_table((files("gateway.recordings.formats") / "dataflash.toml").read_bytes())
+
+
+def topic_of(known: Any) -> tuple[str, int]:
+    """Return topic and instance of a format: CURR of volts and amperes is BAT by its old name."""
+    topic, instance = table().aliases.get(known.name, (known.name, 0))
+    if topic == "CURR" and "Volt" in known.columns:
+        is_scaled = known.format[known.columns.index("Volt")] != "f"
+        topic = topic if is_scaled else "BAT"
+    return topic, instance
+
+
+def instance_of(name: str, message: Message) -> int:
+    """Return the number of the sensor, filter or battery that a message is about, from 0."""
+    columns = {message.fmt.instance_field, *INSTANCES} & {*message.fmt.columns}
+    found = (getattr(message, column) for column in columns)
+    number = next((value for value in found if isinstance(value, int)), 0)
+    return number or table().aliases.get(name, ("", 0))[1]
+
+
+class RowReader:
+    """Turn the messages of a log into rows and events."""
+
+    def __init__(self, unused: frozenset[str]) -> None:
+        self.clock: LogClock[tuple[str, Message]] = LogClock()
+        self._columns: dict[str, set[str]] = {}
+        self._own_us = 0
+        self._unused = unused
+        for source in table().sources:
+            self._columns.setdefault(source.topic, set()).add(source.name)
+        for where in table().lanes.values():
+            topic, _, name = where.partition(".")
+            self._columns.setdefault(topic, set()).add(name)
+        self._items: dict[int, LoggedItem] = {}
+
+    @property
+    def names(self) -> set[str]:
+        """Names of the messages that are used."""
+        return {*table().topics, "ORGN", *KINDS}
+
+    def feed(self, name: str, message: Message) -> list[Entry]:
+        """Take the next message."""
+        timed = own_us_of(name, message) if _has_time(name, message) else None
+        return [
+            entry
+            for time_us, (kind, one) in self.clock.feed(timed, (name, message))
+            for entry in self._entries(time_us, kind, one)
+        ]
+
+    def flush(self) -> list[Entry]:
+        """Return what still waits at the end of the log."""
+        held = self.clock.flush()
+        return [entry for time_us, one in held for entry in self._entries(time_us, *one)]
+
+    def _entries(self, time_us: int, name: str, message: Message) -> Iterator[Entry]:
+        if _has_time(name, message):
+            self._own_us = own_us_of(name, message)
+        if (event := self._event(name, message)) is not None:
+            yield time_us, event
+            if not isinstance(event, LoggedItem):
+                return
+        if name == "GPS":
+            self.clock.utc_us(message)
+        topic = topic_of(message.fmt)[0]
+        if name == "ORGN":
+            topic = "HOME" if message.Type == HOME else name
+        if name == "CMD" and message.CNum == 0 and message.Lat:
+            topic = "HOME"
+        wanted = self._columns.get(topic)
+        if wanted and topic not in self._unused:
+            values = {key: getattr(message, key) for key in message.fmt.columns if key in wanted}
+            yield LogRow(time_us, self._own_us, topic, instance_of(name, message), values)
+
+    def _event(self, name: str, m: Message) -> Event | None:
+        match name:
+            case "PARM":
+                return LoggedParameter(str(m.Name), float(m.Value))
+            case "MODE":
+                mode = _mode_of(m)
+                return None if mode is None else Mode(mode)
+            case "ARM":
+                return Armed(bool(m.ArmState))
+            case "EV" if m.Id in (ARMED, DISARMED):
+                return Armed(m.Id == ARMED)
+            case "STAT" if "Armed" in m.fmt.columns:
+                return Armed(bool(m.Armed))
+            case "MSG":
+                return Text(mavlink.MAV_SEVERITY_INFO, str(m.Message))
+            case "ERR":
+                why = f"Error of subsystem {m.Subsys}: code {m.ECode}"
+                return Text(mavlink.MAV_SEVERITY_WARNING, why)
+            case "CMD":
+                return self._item(m)
+            case "MISE":
+                return Current(int(m.CNum))
+        return None
+
+    def _item(self, m: Message) -> Event:
+        """Return an item; where it is in the mission already, the vehicle begins with it."""
+        item = _item_of(m)
+        if self._items.get(item.seq) == item and len(self._items) == item.count:
+            return Current(item.seq)
+        if len(self._items) >= item.count:
+            self._items = {}
+        self._items[item.seq] = item
+        return item
+
+
+def _has_time(name: str, message: Message) -> bool:
+    columns = message.fmt.columns
+    return (
+        "TimeUS" in columns or "TimeMS" in columns or (KINDS.get(name) == "GPS" and "T" in columns)
+    )
+
+
+def _mode_of(m: Message) -> int | None:
+    for name in ("ModeNum", "Mode"):
+        value = getattr(m, name, None)
+        if isinstance(value, int):
+            return value
+        if isinstance(value, str) and value.isdigit():
+            return int(value)
+    return None
+
+
+def _item_of(m: Message) -> LoggedItem:
+    def get(name: str) -> float:
+        # One NaN is equal to itself alone.
+        value = float(getattr(m, name, 0.0))
+        return NAN if math.isnan(value) else value
+
+    return LoggedItem(
+        int(m.CNum), int(m.CTot), int(getattr(m, "Frame", GLOBAL_RELATIVE)), int(m.CId),
+        (get("Prm1"), get("Prm2"), get("Prm3"), get("Prm4")), get("Lat"), get("Lng"), get("Alt"),
+    )  # fmt: skip
+
+
+def open_record(path: Path, options: ReadOptions) -> AutopilotLog:
+    """Open a DataFlash log as the record of its autopilot; raises FlightError if it is empty."""
+    damage = PrintedDamage()
+    log = open_log(path, options, damage)
+    counts = _counts_of(log)
+    present = {topic_of(known)[0] for known in log.formats.values() if counts.get(known.name)}
+    unused = _other_filter(log, present)
+    found = AutopilotLog(
+        table=table(),
+        entries=iter(()),
+        vehicle_id=options.system_id or system_id_of(log.params),
+        autopilot=mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA,
+        mav_type=mavlink.MAV_TYPE_GENERIC,
+        kind="",
+        present=frozenset(present - unused | {"PARM", "SENSORS", "HOME"}),
+        counts=counts,
+        units=_units_of(log),
+        primary=sensors_of(log, damage) | dict(options.sensors),
+    )
+    _set_begin(path, found, _begin_of(log, damage))
+    reader = RowReader(frozenset(unused))
+
+    # Not the record itself: nothing must keep the log open in a cycle.
+    remarks = found.remarks
+
+    def entries() -> Iterator[Entry]:
+        with contextlib.closing(log):
+            yield from items_of(log, damage, reader)
+            remarks.extend(f"{path}: {text}" for text in remarks_of(log, damage, reader.clock))
+
+    stream = entries()
+    head: list[Entry] = []
+    for entry in stream:
+        head.append(entry)
+        if isinstance(entry, LogRow):
+            break
+    if not head or not present & {"ATT", "IMU", "POS", "GPS"}:
+        raise FlightError(f"{path}: has no ATT, POS, GPS or IMU, so there is nothing to play")
+    found.unix_us_at_zero = unix_us_at(log, reader.clock.zero_us or 0)
+    found.entries = chain(head, stream)
+    return found
+
+
+def _counts_of(log: Any) -> dict[str, int]:
+    if isinstance(log, DFReader_text):
+        return {name: n for name, n in log.counts.items() if name in log.formats}
+    return {name: log.counts[kind] for name, kind in log.name_to_id.items()}
+
+
+def _units_of(log: Any) -> dict[tuple[str, str], str]:
+    """Return the units that FMTU states, by topic and field."""
+    found = {}
+    for known in log.formats.values():
+        topic = topic_of(known)[0]
+        for name, unit in zip(known.columns, known.units or (), strict=False):
+            if unit:
+                found[topic, name] = unit
+    return found
+
+
+def _other_filter(log: Any, present: set[str]) -> set[str]:
+    """Return the topics of the Kalman filter that runs next to the one that is used."""
+    second = {name for name in present if name.startswith("NKF")}
+    third = {name for name in present if name.startswith("XKF")}
+    if not second or not third:
+        return set()
+    return third if log.params.get("AHRS_EKF_TYPE") == _SECOND else second
+
+
+def _begin_of(log: Any, damage: PrintedDamage) -> list[tuple[int, Event]]:
+    """Read the events of a log up to the first damage, and go back to the begin."""
+    reader, entries = RowReader(frozenset(table().topics)), []
+    log.type_list = None
+    try:
+        while message := damage.counting(lambda: log.recv_match(type=set(EVENTS), strict=True)):
+            entries += reader.feed(message.get_type(), message)
+    except Exception:  # noqa: BLE001 - as for `open_log`
+        entries += reader.flush()
+    finally:
+        log._rewind(keep_messages=True)  # noqa: SLF001 - the public one clears the parameters
+    return [entry for entry in entries if not isinstance(entry, LogRow)]
+
+
+def _set_begin(path: Path, found: AutopilotLog, entries: list[tuple[int, Event]]) -> None:
+    """Set the parameters, the mission, the type and the state at the begin of a log."""
+    begin_us = entries[0][0] if entries else 0
+    early_us = begin_us + EARLY_US
+    parameters: dict[str, float | int] = {}
+    items: dict[int, dict[int, LoggedItem]] = {}
+    for _, event in entries:
+        if isinstance(event, LoggedParameter):
+            parameters.setdefault(event.name, event.value)
+        elif isinstance(event, LoggedItem):
+            items.setdefault(event.count, {}).setdefault(event.seq, event)
+    found.parameters = parameters
+    whole = (known for count, known in items.items() if len(known) == count)
+    mission = next(whole, {})
+    found.mission = tuple(mission[seq] for seq in sorted(mission))
+    modes = [event for time_us, event in entries if isinstance(event, Mode) and time_us <= early_us]
+    found.custom_mode = modes[0].custom_mode if modes else 0
+    armed = [(time_us, event) for time_us, event in entries if isinstance(event, Armed)]
+    if armed:
+        found.is_armed = armed[0][1].is_armed == (armed[0][0] <= early_us)
+    else:
+        found.is_armed = True
+        found.remarks.append(
+            f"{path}: does not hold whether it was armed; taken to be armed throughout"
+        )
+    _find_type(found, [event.text for _, event in entries if isinstance(event, Text)])
+
+
+def _find_type(found: AutopilotLog, texts: list[str]) -> None:
+    firmware = next((known[1].lower() for text in texts if (known := _FIRMWARE.search(text))), "")
+    found.kind, frame = firmware, int(found.parameters.get("FRAME_CLASS", 0))
+    kind = table().vehicle_types.get(firmware, mavlink.MAV_TYPE_GENERIC)
+    if firmware == "copter":
+        kind = _FRAME_TYPES.get(frame, kind)
+    elif firmware == "rover" and frame == _BOAT:
+        kind = mavlink.MAV_TYPE_SURFACE_BOAT
+    found.mav_type = kind
+    found.modes = {int(mode): name for mode, name in table().modes.get(firmware, {}).items()}

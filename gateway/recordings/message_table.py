@@ -1,0 +1,333 @@
+"""From the fields of an autopilot's own log to those of MAVLink messages, by a table.
+
+The tables are `formats/dataflash.toml` and `formats/ulog.toml`. A message of them:
+
+    [messages.VFR_HUD]
+    of = ["POS", "GPS"]
+    groundspeed = ["hypot(XKF1.VN m/s, XKF1.VE m/s)", "GPS.Spd m/s", 0]
+
+is sent for each row of the first topic of `of` that the log has. A field takes the first of its
+values that is known: `TOPIC.FIELD unit`, a function of such values, or a number. Units become
+those of the MAVLink definition; the unit that a log itself states goes before the table's.
+`*100` instead of a unit multiplies, `copter: ` before a value restricts it to a kind of vehicle,
+and `PARM.NAME` is a parameter, where `#` is the number of the instance, from 2 on.
+
+With `each` a message is sent for every instance of its topic, by the names in that list, or by its
+own name if the list is empty. With `every_s` it is repeated at that interval, from the newest rows.
+"""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from gateway.geometry.quaternion import from_euler, to_euler
+from gateway.records import NAN
+from gateway.units import RAD_PER_DEG, STANDARD_GRAVITY_MPS2
+from gateway.vehicle.encoding import MessagePacker
+from gateway.wire.mavlink_messages import DEFINITIONS, MESSAGE_IDS
+
+UNITS: Final[dict[str, tuple[str, float]]] = {
+    "rad": ("angle", 1.0), "deg": ("angle", RAD_PER_DEG), "cdeg": ("angle", RAD_PER_DEG * 1e-2),
+    "degE7": ("angle", RAD_PER_DEG * 1e-7), "degE5": ("angle", RAD_PER_DEG * 1e-5),
+    "degheading": ("angle", RAD_PER_DEG), "deglatitude": ("angle", RAD_PER_DEG),
+    "deglongitude": ("angle", RAD_PER_DEG),
+    "rad/s": ("rate", 1.0), "deg/s": ("rate", RAD_PER_DEG), "mrad/s": ("rate", 1e-3),
+    "m": ("length", 1.0), "cm": ("length", 1e-2), "mm": ("length", 1e-3),
+    "m/s": ("speed", 1.0), "cm/s": ("speed", 1e-2), "mm/s": ("speed", 1e-3),
+    "m/s/s": ("acceleration", 1.0), "mG": ("acceleration", STANDARD_GRAVITY_MPS2 * 1e-3),
+    "V": ("voltage", 1.0), "cV": ("voltage", 1e-2), "mV": ("voltage", 1e-3),
+    "A": ("current", 1.0), "cA": ("current", 1e-2), "mA": ("current", 1e-3),
+    "Ah": ("charge", 1.0), "mAh": ("charge", 1e-3),
+    "W.h": ("energy", 1.0), "hJ": ("energy", 100.0 / 3600.0),
+    "Pa": ("pressure", 1.0), "hPa": ("pressure", 100.0),
+    "degC": ("temperature", 1.0), "cdegC": ("temperature", 1e-2),
+    "Gauss": ("field", 1.0), "gauss": ("field", 1.0), "mGauss": ("field", 1e-3),
+    "mgauss": ("field", 1e-3),
+    "s": ("time", 1.0), "ms": ("time", 1e-3), "us": ("time", 1e-6), "µs": ("time", 1e-6),
+    "ratio": ("share", 1.0), "%": ("share", 1e-2), "d%": ("share", 1e-3), "c%": ("share", 1e-4),
+}  # fmt: skip
+"""Quantity of a unit, and its factor to SI, by its name in MAVLink or in the logs."""
+TURN: Final = 2.0 * math.pi
+MAX_AGE_US: Final = 3_000_000
+"""A row that is older than this at the time of a message is not used for it."""
+_EKF_FLAGS: Final = 0x3FF
+"""Bits of ArduPilot's filter status that EKF_STATUS_REPORT has in the same places."""
+_LANDED, _IN_AIR = 1, 2
+"""MAV_LANDED_STATE."""
+
+
+def _quaternion(part: int) -> Callable[..., float]:
+    def read(roll: float, pitch: float, yaw: float) -> float:
+        q = from_euler(roll, pitch, yaw)
+        return math.copysign(q[part], q[part] * q[0]) if part else abs(q[0])
+
+    return read
+
+
+def _euler(part: int) -> Callable[..., float]:
+    return lambda w, x, y, z: to_euler((w, x, y, z))[part]
+
+
+FUNCTIONS: Final[dict[str, Callable[..., float]]] = {
+    "up": lambda down: -down,
+    "hypot": math.hypot,
+    "north": lambda speed, course: speed * math.cos(course),
+    "east": lambda speed, course: speed * math.sin(course),
+    "compass": lambda angle: angle % TURN,
+    "signed": lambda angle: math.remainder(angle, TURN),
+    "course": lambda north, east: math.atan2(east, north) % TURN,
+    "from": lambda north, east: math.atan2(-east, -north),
+    "q1": _quaternion(0), "q2": _quaternion(1), "q3": _quaternion(2), "q4": _quaternion(3),
+    "roll": _euler(0), "pitch": _euler(1), "yaw": _euler(2),
+    "heading": lambda w, x, y, z: to_euler((w, x, y, z))[2] % TURN,
+    "remaining": lambda used, capacity: max(1 - used / capacity, 0) if capacity > 0 else NAN,
+    "ekf_flags": lambda status: int(status) & _EKF_FLAGS,
+    "landed": lambda landed: _LANDED if landed else _IN_AIR,
+    "measured": lambda value: value if value >= 0 else NAN,
+    "known": lambda value: value if value > 0 else NAN,
+    "minus": lambda value, other: value - other,
+}  # fmt: skip
+"""Of values in SI; `compass`, `course` and `heading` are angles from north, from 0 to a turn."""
+WRAPPED: Final = frozenset({"compass", "course", "heading"})
+
+Values = Mapping[str, Any]
+
+
+class Context(Protocol):
+    """The newest rows of a log, and its facts, as far as a message needs them."""
+
+    kind: str
+    """Of the vehicle, as in the table: copter, plane, rover …; empty if it is not known."""
+
+    def value(self, topic: str, name: str) -> float:
+        """Return a field of the newest row of a topic; NaN if there is none, or it is too old."""
+        ...
+
+
+class LogFacts(Protocol):
+    """A log, as far as a table is bound to it."""
+
+    @property
+    def present(self) -> frozenset[str]:
+        """Topics with rows."""
+        ...
+
+    def unit(self, topic: str, name: str) -> str | None:
+        """Return the unit that the log itself states; None without one."""
+        ...
+
+
+Read = Callable[[Context], float]
+
+_CALL: Final = re.compile(r"(?:(?P<kind>\w+): )?(?:(?P<function>\w+)\()?(?P<values>[^()]*)\)?")
+_VALUE: Final = re.compile(
+    r"(?P<topic>\w+)\.(?P<name>[\w\[\].#]+)(?: (?:\*(?P<factor>[-\d.e]+)|(?P<unit>\S+)))?"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LogField:
+    """A field of a log's topic, and its unit by the table."""
+
+    topic: str
+    name: str
+    quantity: str
+    factor: float
+    """To SI, or to the field's own scale where it has no unit."""
+
+    @classmethod
+    def parse(cls, text: str) -> "LogField":
+        """Parse `TOPIC.FIELD unit`; raises ValueError if it is none."""
+        found = _VALUE.fullmatch(text)
+        if found is None or (found["unit"] or "ratio") not in UNITS:
+            raise ValueError(f"{text!r} is not TOPIC.FIELD with a known unit")
+        quantity, factor = UNITS[found["unit"]] if found["unit"] else ("", 1.0)
+        return cls(found["topic"], found["name"], quantity, float(found["factor"] or factor))
+
+    def factor_in(self, log: LogFacts) -> float:
+        """Return the factor to SI for the unit that a log states, or else for the table's."""
+        stated = UNITS.get(log.unit(self.topic, self.name) or "")
+        is_same = stated is not None and stated[0] == self.quantity
+        return stated[1] if stated is not None and is_same else self.factor
+
+
+@dataclass(frozen=True, slots=True)
+class Value:
+    """One of the values of a field: a number, a source, or a function of sources."""
+
+    sources: tuple[LogField, ...] = ()
+    function: str = ""
+    kind: str = ""
+    """Kind of vehicle that it is restricted to."""
+    number: float = 0.0
+
+    @classmethod
+    def parse(cls, given: str | float) -> "Value":
+        """Parse a value; raises ValueError if it is none."""
+        if not isinstance(given, str):
+            return cls(number=given)
+        found = _CALL.fullmatch(given)
+        function = (found and found["function"]) or ""
+        if found is None or (function and function not in FUNCTIONS):
+            raise ValueError(f"{given!r} is no value")
+        texts = [text for text in found["values"].split(", ") if text]
+        return cls(tuple(map(LogField.parse, texts)), function, found["kind"] or "")
+
+    def bind(self, log: LogFacts, kind: str, factor: float) -> Read | None:
+        """Return its reader for a field with a factor to SI; None if the log cannot have it."""
+        if self.kind not in ("", kind):
+            return None
+        if not self.sources:
+            return lambda _: self.number
+        if any(one.topic not in log.present for one in self.sources):
+            return None
+        parts = [(one.topic, one.name, one.factor_in(log)) for one in self.sources]
+        if not self.function:
+            ((topic, name, scale),) = parts
+            scale /= factor if self.sources[0].quantity else 1.0
+            return lambda context: context.value(topic, name) * scale
+        return _call(FUNCTIONS[self.function], parts, factor, wraps=self.function in WRAPPED)
+
+
+def _call(
+    function: Callable[..., float],
+    parts: Sequence[tuple[str, str, float]],
+    factor: float,
+    *,
+    wraps: bool,
+) -> Read:
+    turn = round(TURN / factor) if wraps else 0
+
+    def read(context: Context) -> float:
+        values = [context.value(topic, name) * scale for topic, name, scale in parts]
+        if not all(map(math.isfinite, values)):
+            return NAN
+        found = function(*values) / factor
+        # Half a unit before the full turn is rounded to it.
+        return found - turn if turn and turn > 1 and round(found) >= turn else found
+
+    return read
+
+
+class MessageRow(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A message of a table."""
+
+    name: str
+    of: tuple[str, ...]
+    each: tuple[str, ...] | None
+    every_s: float | None
+    fields: dict[str, tuple[Value, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class BoundMessage:
+    """A message of a table for one log and one instance: how each of its elements is read."""
+
+    name: str
+    packer: MessagePacker
+    reads: tuple[tuple[bool, tuple[Read, ...]], ...]
+    """By element in the order of the definition: whether it is a whole number, and its readers."""
+
+    def values(self, context: Context, times: Mapping[str, int]) -> list[float]:
+        """Return the values of all elements; unknown ones are NaN, and 0 of whole numbers."""
+        found: list[float] = []
+        for is_whole, reads in self.reads:
+            value = NAN if reads else 0.0
+            for read in reads:
+                value = read(context)
+                if math.isfinite(value):
+                    break
+            if is_whole:
+                value = round(value) if math.isfinite(value) else 0
+            found.append(value)
+        for at, name, greatest in self.timed:
+            found[at] = times[name] & greatest
+        return found
+
+    timed: tuple[tuple[int, str, int], ...] = ()
+    """Places of the fields with the time of the row, and the greatest value of their types."""
+
+
+UINT32, UINT64 = (1 << 32) - 1, (1 << 64) - 1
+TIMES: Final = ("time_boot_ms", "time_usec")
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTable:
+    """The table of one autopilot."""
+
+    messages: tuple[MessageRow, ...]
+    aliases: dict[str, tuple[str, int]] = field(default_factory=dict)
+    """Topic and instance of topics by other names."""
+    lanes: dict[str, str] = field(default_factory=dict)
+    """Topics of several filters, and where the number of the one that is used is found."""
+    health: dict[str, int] = field(default_factory=dict)
+    """Bits of MAV_SYS_STATUS_SENSOR by topic."""
+    known: frozenset[str] = frozenset()
+    """Topics that are used otherwise than for a field: modes, texts, parameters."""
+    modes: dict[str, dict[str, str]] = field(default_factory=dict)
+    """Names by kind of vehicle and custom mode."""
+    vehicle_types: dict[str, int] = field(default_factory=dict)
+    nav_states: dict[str, tuple[str, int, int]] = field(default_factory=dict)
+    """Of PX4: name, main mode and sub mode."""
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """All topics that are used, by the names of the log."""
+        used = {t for one in self.messages for t in one.of} | self.known | {*self.health}
+        used |= {source.topic for source in self.sources}
+        used |= {where.partition(".")[0] for where in self.lanes.values()}
+        return frozenset(used | {old for old, (new, _) in self.aliases.items() if new in used})
+
+    @property
+    def sources(self) -> Iterator[LogField]:
+        """All fields that are used."""
+        for one in self.messages:
+            for values in one.fields.values():
+                for value in values:
+                    yield from value.sources
+
+    def bind(self, row: MessageRow, name: str, log: LogFacts, kind: str) -> BoundMessage:
+        """Bind a message to a log, under a name for an instance."""
+        definition: Any = DEFINITIONS[MESSAGE_IDS[name]]
+        lengths = dict(zip(definition.ordered_fieldnames, definition.array_lengths, strict=True))
+        types = dict(zip(definition.fieldnames, definition.fieldtypes, strict=True))
+        reads: list[tuple[bool, tuple[Read, ...]]] = []
+        timed: list[tuple[int, str, int]] = []
+        for one in definition.fieldnames:
+            unit = definition.fieldunits_by_name.get(one, "")
+            factor = UNITS[unit][1] if unit in UNITS else 1.0
+            if one in TIMES and one not in row.fields:
+                timed.append((len(reads), one, UINT32 if types[one] == "uint32_t" else UINT64))
+            for number in range(lengths[one] or 1):
+                given = row.fields.get(f"{one}.{number}", ()) + row.fields.get(one, ())
+                bound = tuple(read for v in given if (read := v.bind(log, kind, factor)))
+                reads.append((types[one] != "float", bound))
+        return BoundMessage(name, MessagePacker(definition), tuple(reads), tuple(timed))
+
+
+def read_table(text: bytes) -> MessageTable:
+    """Read a table; raises ValueError if it has an error."""
+    raw = msgspec.toml.decode(text)
+    messages = tuple(_message(name, dict(row)) for name, row in raw["messages"].items())
+    aliases = {old: (topic, int(n)) for old, (topic, n) in raw.get("aliases", {}).items()}
+    lanes = {topic: where for where, topics in raw.get("lanes", {}).items() for topic in topics}
+    return MessageTable(
+        messages, aliases, lanes, raw.get("health", {}), frozenset(raw.get("also_used", ())),
+        raw.get("modes", {}), raw.get("vehicle_types", {}),
+        {state: tuple(given) for state, given in raw.get("nav_states", {}).items()},
+    )  # fmt: skip
+
+
+def _message(name: str, row: dict[str, Any]) -> MessageRow:
+    of, each, every_s = row.pop("of", []), row.pop("each", None), row.pop("every_s", None)
+    fields = {}
+    for key, given in row.items():
+        parts = given if isinstance(given, list) else [given]
+        fields[key] = tuple(map(Value.parse, parts))
+    of = [of] if isinstance(of, str) else of
+    return MessageRow(name, tuple(of), None if each is None else tuple(each), every_s, fields)
