@@ -10,7 +10,7 @@ running gateway, and adds to the registries; docs/extend.md shows how.
 """
 
 import logging
-from importlib.metadata import EntryPoint, entry_points
+from importlib import metadata
 from typing import Final
 
 from gateway.printable import UserError
@@ -18,7 +18,7 @@ from gateway.printable import UserError
 log = logging.getLogger(__name__)
 
 GROUP: Final = "mavgate.extensions"
-SHIPPED: Final = EntryPoint("outputs", "gateway.outputs:extend", GROUP)
+SHIPPED: Final = metadata.EntryPoint("outputs", "gateway.outputs:extend", GROUP)
 """The kinds of endpoint that are not MAVLink are added as those of other packages are."""
 
 
@@ -32,7 +32,7 @@ def load_extensions() -> tuple[str, ...]:
     Raises ExtensionError if one cannot be imported, or an addition is refused.
     """
     found = []
-    for entry in (SHIPPED, *entry_points(group=GROUP)):
+    for entry in (SHIPPED, *metadata.entry_points(group=GROUP)):
         try:
             entry.load()()
         except (ImportError, AttributeError, TypeError, ValueError) as error:

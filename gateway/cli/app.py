@@ -10,7 +10,7 @@ import io
 import logging
 import os
 import sys
-from functools import cache, partial
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Annotated, Any, Final, cast
@@ -19,7 +19,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from gateway import __version__
-from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG
+from gateway.cli.support.options import CONFIG, SOCKET, USER_CONFIG, extend
 from gateway.cli.support.terminal import in_words, refuse, refusing
 from gateway.live.log_limit import LogLimit
 from gateway.printable import PrintableFormatter, printable, reason_of
@@ -123,10 +123,14 @@ MOVED: Final = {
 """Former names of commands, with those that do their work now."""
 
 
+SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
+"""Commands that mostly ask a gateway: the extensions are loaded if one reads the settings."""
+
+
 def load_command(name: str) -> Any:
     """Import the file of a command and create it."""
-    if name not in MODULES["live.clients"]:
-        _load_extensions()
+    if name not in SMALL:
+        extend()
     module = next(module for module, names in MODULES.items() if name in names)
     group = typer.main.get_group(import_module(f"gateway.cli.{module}").app)
     gc.enable()
@@ -191,15 +195,6 @@ def hoisted(words: list[str]) -> list[str]:
         (moved if name in HOISTED else left).extend(words[at : at + size])
         at += size
     return [*moved, *left, *words[end:]]
-
-
-@cache
-def _load_extensions() -> None:
-    """Load the extensions, or end the command; one that only asks a gateway does not need them."""
-    # Imported late, because the search for installed packages takes 20 ms.
-    from gateway.extensions import load_extensions
-
-    load_extensions()
 
 
 def group_of(name: str) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from contextvars import ContextVar
 from enum import StrEnum
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -35,10 +36,20 @@ class RadioName(StrEnum):
     SX1276 = "sx1276"
 
 
+@cache
+def extend() -> None:
+    """Load the extensions, or end the command; they may add kinds of endpoints to the settings."""
+    # Imported late, because the search for installed packages takes 20 ms.
+    from gateway.extensions import load_extensions
+
+    load_extensions()
+
+
 def read_settings(file: Path | None = None) -> GatewaySettings:
     """Load the given settings, those that the user has named, the user's own, or the defaults."""
     from gateway.config import GatewaySettings, load
 
+    extend()
     file = file or CONFIG.get()
     if file is None and not settings_file().exists():
         return GatewaySettings()
