@@ -131,7 +131,9 @@ class Router:
             self.counters.unroutable += 1
             return
         table = self._table if client.trusted else self._untrusted
-        path = table.register(client.client_id, origin, now_us)
+        # A gateway that has received no vehicle answers as system 0, to which nothing is sent.
+        is_nobody = measures and origin[0] == NOBODY
+        path = None if is_nobody else table.register(client.client_id, origin, now_us)
         if path is not None and frame.message_id == HEARTBEAT_ID:
             path.is_station = frame.is_station_heartbeat
         if round_trip_us is not None:
