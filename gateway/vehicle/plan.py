@@ -20,6 +20,9 @@ from gateway.units import DEG_PER_DEGE7, DEGE7_PER_DEG
 
 MAX_LAT_DEG: Final = 90.0
 MAX_LON_DEG: Final = 180.0
+MIN_ALT_M: Final = -1000.0
+MAX_ALT_M: Final = 50_000.0
+"""Heights above mean sea level: below the Dead Sea, and above every balloon."""
 
 ABSOLUTE_FRAMES: Final = frozenset({mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT})
 RELATIVE_FRAMES: Final = frozenset(
@@ -61,11 +64,14 @@ class Location:
     """NaN if unknown."""
 
     def fault(self) -> str:
-        """Return what is wrong with the coordinates; an empty text for a location on the earth."""
+        """Return what is wrong with the coordinates or the height; an empty text if nothing is."""
         if not abs(self.lat_deg) <= MAX_LAT_DEG:
             return f"latitude must be between -90 and 90, not {self.lat_deg}"
         if not abs(self.lon_deg) <= MAX_LON_DEG:
             return f"longitude must be between -180 and 180, not {self.lon_deg}"
+        if self.alt_amsl_m < MIN_ALT_M or self.alt_amsl_m > MAX_ALT_M:
+            bounds = f"{MIN_ALT_M:.0f} and {MAX_ALT_M:.0f} m"
+            return f"height must be between {bounds}, not {self.alt_amsl_m}"
         return ""
 
 
@@ -100,7 +106,7 @@ class HomeParameters(Settings, frozen=True):
     ] = 0.0
     lon_deg: Annotated[float, setting("Longitude of home.", "deg", ge=-180.0, le=180.0)] = 0.0
     alt_m: Annotated[
-        float, setting("Height of home above mean sea level.", "m", ge=-1000.0, le=50000.0)
+        float, setting("Height of home above mean sea level.", "m", ge=MIN_ALT_M, le=MAX_ALT_M)
     ] = 0.0
 
 

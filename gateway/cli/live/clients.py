@@ -285,13 +285,24 @@ def _clients(clients: Sequence[Record], now_us: int) -> Table:
     for client in clients:
         heard_us, trip_us = client["heard_us"], client["round_trip_us"]
         table.add_row(
-            " ".join([client["name"], *(f"{s}.{c}" for s, c in client["systems"])]),
+            " ".join([client["name"], *_first_systems(client["systems"])]),
             client["state"],
             *(str(client[key]) for key in ("sent", "dropped", "queued", "received")),
             figure(None if heard_us is None else (now_us - heard_us) / US_PER_S, ".1f"),
             figure(None if trip_us is None else trip_us / US_PER_MS, ".1f"),
         )
     return table
+
+
+MOST_SYSTEMS: Final = 8
+"""Shown of a client; one that floods may send as thousands."""
+
+
+def _first_systems(systems: Sequence[tuple[int, int]]) -> list[str]:
+    """Return system and component ids as text, and how many more there are."""
+    named = [f"{system}.{component}" for system, component in systems[:MOST_SYSTEMS]]
+    more = len(systems) - len(named)
+    return [*named, f"and {more} more"] if more else named
 
 
 def _position(lat_deg: float | None, lon_deg: float | None) -> str:

@@ -12,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from gateway.cli.live import clients
+from gateway.cli.live.clients import _first_systems
 from gateway.config import load
 from gateway.hub.stats import HubCounters, ListenerStats
 from gateway.live.control_socket import ControlError, ControlServer, Verbs, socket_path
@@ -147,6 +148,12 @@ async def test_clients_are_listed_added_and_removed(asked: list[object]) -> None
     reported = "observers: Address already in use; trying again until it works"
     assert reported in (await run("clients", "add", CLOSED.endpoint))
     assert "no endpoint is called 'phone'" in await run("clients", "remove", "phone", code=2)
+
+
+def test_many_systems_of_a_client_are_summed_up() -> None:
+    few, many = [[1, 1], [255, 190]], [[n, 1] for n in range(1, 250)]
+    assert _first_systems(few) == ["1.1", "255.190"]
+    assert _first_systems(many)[-2:] == ["8.1", "and 241 more"]
 
 
 def test_client_fits_on_one_line_of_a_narrow_terminal() -> None:

@@ -97,12 +97,21 @@ def test_command_with_extreme_parameters_is_acknowledged_once(
         assert answered.count(number) == 1
 
 
-@pytest.mark.parametrize("coordinates", [(90.1, 0.0), (0.0, 180.1), (math.nan, 8.0)])
-def test_mark_with_invalid_coordinates_raises_value_error(
-    vehicle: Vehicle, coordinates: tuple[float, float]
+@pytest.mark.parametrize(
+    "location",
+    [
+        (90.1, 0.0, 0.0),
+        (0.0, 180.1, 0.0),
+        (math.nan, 8.0, 0.0),
+        (47.0, 8.0, 1e30),
+        (47.0, 8.0, -1001),
+    ],
+)
+def test_mark_with_invalid_coordinates_or_height_raises_value_error(
+    vehicle: Vehicle, location: tuple[float, float, float]
 ) -> None:
     with pytest.raises(ValueError, match="must be between"):
-        vehicle.put_mark(Location(*coordinates, 0.0), 0)
+        vehicle.put_mark(Location(*location), 0)
 
 
 def test_mark_of_the_command_line_is_announced_and_sent(station: GroundStation) -> None:
