@@ -10,7 +10,11 @@ import msgspec
 from gateway.fleet.session import FleetSession, NoAnswerError, QueryRefusedError, key_pattern
 from gateway.hub.endpoint import SITE_NAME
 from gateway.hub.transports.zenoh.session import off_loop, recordings_key
-from gateway.hub.transports.zenoh.site_queries import RecordingQuery, RemoteRecording
+from gateway.hub.transports.zenoh.site_queries import (
+    DIGEST_TIMEOUT_S,
+    RecordingQuery,
+    RemoteRecording,
+)
 from gateway.live.control_socket import ControlError, Verbs
 from gateway.recordings.index import check_name, is_file_name
 
@@ -19,8 +23,6 @@ log = logging.getLogger(__name__)
 LIST_TIMEOUT_S: Final = 5.0
 PIECE_TIMEOUT_S: Final = 8.0
 """4 KiB on a line of 10 kbit/s; less than the timeout of the control socket's client."""
-DIGEST_TIMEOUT_S: Final = 300.0
-"""Gigabytes on a slow card."""
 
 
 class RemoteRecordings:

@@ -281,6 +281,13 @@ class TestAnswers:
         whole = hashlib.sha256(CONTENT[:1000]).hexdigest().encode()
         assert ask(size=1000, digest=True) == whole
 
+    def test_digest_stops_when_its_query_has_timed_out(self, folder: Path) -> None:
+        times_s = iter([0.0, site_queries.DIGEST_TIMEOUT_S + 0.1])
+        answer = RecordingAnswers(folder, lambda: next(times_s))
+        asked = json.dumps({"file": NAME, "size": SIZE, "digest": True}).encode()
+        with pytest.raises(RefusedQueryError, match="no digest within 300 s"):
+            answer(asked)
+
 
 class Site:
     """The answers of a site that has one file, without a network."""

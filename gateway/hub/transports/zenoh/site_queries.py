@@ -9,6 +9,7 @@ import logging
 import os
 import stat
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
@@ -34,6 +35,8 @@ MAX_LIST: Final = 256 << 10
 """Bytes of a list of recordings, some 2500; beyond, the oldest are left out."""
 MAX_FILE: Final = 1 << 60
 """Bytes of a file: far beyond any disk, and within the range of a seek."""
+DIGEST_TIMEOUT_S: Final = 300.0
+"""Longest time of a digest, of gigabytes on a slow card: whoever asks waits no longer."""
 READ_SIZE: Final = 1 << 20
 """Bytes read at once for a digest."""
 
@@ -122,8 +125,9 @@ class QueryAnswers:
 class RecordingAnswers:
     """Answer queries for the recordings in a folder; every call waits for the disk."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._folder = folder
+        self._clock_s = clock_s
 
     def __call__(self, asked: bytes) -> bytes:
         """Answer one query.
@@ -166,8 +170,12 @@ class RecordingAnswers:
 
     def _digest(self, query: RecordingQuery) -> bytes:
         digest, left = hashlib.sha256(), query.size
+        until_s = self._clock_s() + DIGEST_TIMEOUT_S
         with self._open(query.file) as file:
             while left > 0 and (piece := file.read(min(left, READ_SIZE))):
+                if self._clock_s() > until_s:
+                    text = f"no digest within {DIGEST_TIMEOUT_S:.0f} s"
+                    raise RefusedQueryError(f"{query.file}: {text}")
                 digest.update(piece)
                 left -= len(piece)
         return digest.hexdigest().encode()
