@@ -56,6 +56,7 @@ constexpr uint8_t HIGH_BW_OPTIMIZE_2 = 0x3A;
 constexpr uint8_t DIO_MAPPING_1 = 0x40;
 constexpr uint8_t PA_DAC = 0x4D;
 constexpr uint8_t WRITE = 0x80;
+constexpr uint8_t WRITE_FIFO = WRITE;  // the FIFO has the address 0
 
 // RegOpMode: LoRa, registers of the high or the low bands, and the mode.
 constexpr uint8_t MODE_LORA = 0x80;
@@ -269,7 +270,7 @@ RadioTiming radio_timing() { return timing; }
 void radio_send(const uint8_t *payload, uint8_t size, uint16_t) {
     write_register(FIFO_ADDR_PTR, TX_BASE);
     write_register(FIFO, own_prefix);
-    access(WRITE | FIFO, payload, nullptr, size);
+    access(WRITE_FIFO, payload, nullptr, size);
     write_register(PAYLOAD_LENGTH, static_cast<uint8_t>(size + 1));
     busy = true;
     detect();

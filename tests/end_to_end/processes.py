@@ -99,6 +99,15 @@ class Client:
     def send(self, message: mavlink.MAVLink_message, port: int) -> None:
         self.sock.sendto(message.pack(self.mavlink), ("127.0.0.1", port))
 
+    def introduce(self, port: int) -> None:
+        """Show a listening port that this client receives: request something of what it sent."""
+        request = mavlink.MAVLink_command_long_message(
+            1, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, mavlink.MAVLINK_MSG_ID_HEARTBEAT, *[0] * 6
+        )
+        for _ in range(2):
+            self.send(request, port)
+            self.receive()
+
 
 class MavProxy:
     """MAVProxy without its windows, driven as by keyboard."""

@@ -174,6 +174,7 @@ def test_recording_is_accepted_only_when_it_runs(
     # Commands reach a vehicle from its first heartbeat on.
     connect(gateway.port).until(lambda seen: "HOME_POSITION" in seen)
     client = connect()
+    client.introduce(gateway.listen_port)
     in_progress = mavlink.MAV_RESULT_IN_PROGRESS
 
     def order() -> list[int]:
@@ -184,7 +185,7 @@ def test_recording_is_accepted_only_when_it_runs(
         results: list[int] = []
         while results in ([], [in_progress]):
             found = (m for m in client.receive() if m.get_type() == "COMMAND_ACK")
-            results += [m.result for m in found]
+            results += [m.result for m in found if m.command == number]
         return results
 
     def is_reported(seen: dict[str, mavlink.MAVLink_message]) -> bool:

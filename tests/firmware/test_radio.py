@@ -163,8 +163,8 @@ def test_packets_that_overlap_destroy_each_other() -> None:
     heard: list[bytes] = []
 
     class Ear:
-        def listens(self, channel: int, kbps: int, start_ps: int) -> bool:
-            return channel == 76
+        def listens(self, packet: Packet, start_ps: int) -> bool:
+            return packet.channel == 76
 
         def hear(self, packet: Packet) -> None:
             heard.append(packet.payload)

@@ -43,7 +43,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("mcap")
     log = flown.write(folder / "flight.ulg", flown.make_ulog())
     out = folder / "flight.mcap"
-    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS))))
+    out.write_bytes(b"".join(WRITERS[".mcap"](FlightToWrite([log], OPTIONS, fuse=True))))
     return out
 
 
