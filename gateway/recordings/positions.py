@@ -172,7 +172,7 @@ RESTART_US: Final = 5 * US_PER_S
 """Time since boot that falls by more is a restart; two links may be out of order by less."""
 JUMP_M: Final = 200.0
 JUMP_MPS: Final = 400.0
-"""A step that is longer than `JUMP_M`, and faster than any vehicle here, is no way."""
+"""A step that is longer than `JUMP_M` and faster than this is a jump, not a motion."""
 
 
 class Continuity:

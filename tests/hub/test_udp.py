@@ -239,7 +239,7 @@ async def test_answer_and_requested_interval_concern_one_client(rig: Any) -> Non
     assert second.is_empty()
 
 
-async def test_a_burst_is_read_at_once(rig: Any) -> None:
+async def test_burst_is_read_by_one_call(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0")
     station = await rig.call(hub)
     (client,) = hub._clients.values()
