@@ -4,6 +4,7 @@ import json
 import signal
 import socket
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -113,10 +114,10 @@ def converted(files: list[Path], target: Path, *options: str) -> Path:
 
 
 def test_recording_holds_what_the_outputs_must_bear(tlog: Path) -> None:
-    log = mavutil.mavlink_connection(str(tlog), dialect="all")
     found = set()
-    while (message := log.recv_msg()) is not None:
-        found.add((message.get_srcSystem(), message.get_srcComponent(), message.get_type()))
+    with closing(mavutil.mavlink_connection(str(tlog), dialect="all")) as log:
+        while (message := log.recv_msg()) is not None:
+            found.add((message.get_srcSystem(), message.get_srcComponent(), message.get_type()))
     assert {(1, 1, "GLOBAL_POSITION_INT"), (2, 1, "GLOBAL_POSITION_INT")} <= found
     assert {(255, 190, "MISSION_COUNT"), (1, 191, "STATUSTEXT")} <= found
     assert {"UNKNOWN_300", f"UNKNOWN_{PRIVATE_ID}"} <= {kind for *_, kind in found}
