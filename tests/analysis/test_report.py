@@ -12,8 +12,10 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from gateway.analysis.case import make_case
 from gateway.analysis.reporting import style
 from gateway.analysis.reporting.compose import make_report
+from gateway.analysis.reporting.estimators import estimators
 from gateway.analysis.reporting.page import Report, ReportTable, prose, write_report
 from gateway.analysis.reporting.raw_sensors import EXCERPT_S, liveliest, loss_table
 from gateway.analysis.reporting.style import CSS_NAMES
@@ -41,6 +43,13 @@ def test_excerpt_is_where_acceleration_changes_most() -> None:
     accel = np.zeros_like(flight.imu.accel_b_mps2)
     accel[2 * count : 3 * count, 1] = np.resize([1.0, -1.0], count)
     assert liveliest(with_imu(flight, accel_b_mps2=accel), 1) == slice(2 * count, 3 * count)
+
+
+def test_flight_without_a_sample_that_counts_has_no_comparison_of_estimators() -> None:
+    flight = short_flight(12.0)
+    assert estimators(make_case(flight)) is not None
+    unsettled = replace(flight, scored=np.zeros_like(flight.scored))
+    assert estimators(make_case(unsettled)) is None
 
 
 def drawn() -> str:

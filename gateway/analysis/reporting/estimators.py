@@ -74,7 +74,7 @@ TILT: Final = "Tilt is the part of the attitude error about a horizontal axis. "
 
 
 def estimators(case: Case) -> Section | None:
-    """Build the section; None without a reference."""
+    """Build the section; None without a reference, or where no sample counts."""
     reference = _reference(case)
     if reference is None:
         return None
@@ -89,6 +89,8 @@ def estimators(case: Case) -> Section | None:
         drift = {name: outage_error_m(case, name) for name in case.tracks}
         table[DRIFT] = table["estimator"].map(drift)
     table = table.dropna(axis="columns", how="all")
+    if not any(column in table for column in BARS):
+        return None
     return Section(
         "Estimators compared",
         DESCRIPTION.format(reference.description) + _smoothed_description(case),
