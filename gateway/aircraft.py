@@ -39,7 +39,7 @@ from gateway.sensing.calibration import NodeCalibration
 from gateway.sensing.chain import SensorChain
 from gateway.settings import Settings
 from gateway.vehicle.plan import Home, Location, StoredPlan
-from gateway.vehicle.requests import (
+from gateway.vehicle.service import (
     WARNING,
     Action,
     CalibrationMeasured,

@@ -31,7 +31,8 @@ from gateway.records import (
 from gateway.sources.source import SourceInput
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location, StoredPlan
-from gateway.vehicle.requests import BAD_SIGNATURE, StatusText
+from gateway.vehicle.request_reader import BAD_SIGNATURE
+from gateway.vehicle.service import StatusText
 from gateway.wire.link import Link
 from gateway.wire.mavlink_signing import (
     FrameSigner,

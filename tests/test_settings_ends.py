@@ -16,7 +16,7 @@ from gateway.records import BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeId, RawRecord
 from gateway.sensing.calibrating import IN_BODY_AXES
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Field, Settings, fields_of
-from gateway.vehicle.requests import CalibrationMeasured, SettingsChange
+from gateway.vehicle.service import CalibrationMeasured, SettingsChange
 from tests.kit.ground_station import decode
 from tests.kit.records import FIX
 

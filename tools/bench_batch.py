@@ -51,7 +51,7 @@ from gateway.batch.tasks import (
     run_season,
 )
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
 from gateway.simulator.flight import SimulatedAircraft
 from gateway.simulator.simulator_settings import SimulatorSettings

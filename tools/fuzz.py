@@ -49,7 +49,8 @@ from gateway.recordings.formats.maps import (
 from gateway.recordings.formats.ulog import TOPICS
 from gateway.recordings.moment import parse_moment
 from gateway.recordings.positions import ORIGIN_ID, POSITION_SOURCES
-from gateway.recordings.reading import ReadOptions, has_record, open_record
+from gateway.recordings.reading import has_record, open_record
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.senders import ATTITUDE_ID, ATTITUDE_QUATERNION_ID, Senders
 from gateway.recordings.status_texts import STATUSTEXT_ID
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line

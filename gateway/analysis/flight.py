@@ -30,14 +30,10 @@ from gateway.recordings.fuse import (
     samples_of,
     with_estimator,
 )
-from gateway.recordings.reading import (
-    ReadOptions,
-    RecordedTable,
-    is_table,
-    joined_tables,
-    open_rows,
-)
+from gateway.recordings.joining import joined_tables
+from gateway.recordings.reading import is_table, open_rows
 from gateway.recordings.recorded_fusion import aircraft_for, check_latency
+from gateway.recordings.recorded_table import ReadOptions, RecordedTable
 from gateway.recordings.table import TableBlock
 from gateway.records import BaroSample, GpsFix, NavFlags
 from gateway.sensing.calibration import IDENTITY3, Correction, NodeCalibration, new_field_ut

@@ -34,8 +34,8 @@ from gateway.output import write_new
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import fuse
 from gateway.recordings.index import as_text, recording_name
-from gateway.recordings.reading import ReadOptions
 from gateway.recordings.recorded_fusion import fused_lines, header_of_states
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.summary import describe
 
 HELD: Final = "held_m"

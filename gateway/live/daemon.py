@@ -27,16 +27,16 @@ from gateway.live.control_verbs import ImuTap, RecorderVerbs, SerialVerbs, clien
 from gateway.live.kept_files import PlanFiles, TimestampFile, begin_worker
 from gateway.live.metrics_server import MetricsServer
 from gateway.live.other_gateways import conflicts, identity_verb, log_other_gateways
-from gateway.live.part import RecordingBudget
 from gateway.live.pty_port import PtyPort
 from gateway.live.recorder import Recorder
+from gateway.live.recording_budget import RecordingBudget
 from gateway.live.serial_port import NO_RECEIVER, SerialPort
 from gateway.live.service import LoopLag, ServiceNotifier, set_realtime_priority
 from gateway.live.session import SessionState
 from gateway.live.source_port import SourcePort, read_map
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.printable import reason_of
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableHeader
 from gateway.recordings.tlog import UNRECORDED
 from gateway.records import RECORDED_ONLY, ClientInterval, FusedSample, Incoming, Outgoing
@@ -48,7 +48,7 @@ from gateway.sources.source import SourceInput
 from gateway.status import Snapshot, status_of
 from gateway.units import US_PER_S
 from gateway.vehicle.plan import Location
-from gateway.vehicle.requests import (
+from gateway.vehicle.service import (
     INFO,
     WARNING,
     Action,

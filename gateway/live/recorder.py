@@ -23,17 +23,9 @@ from pathlib import Path
 import msgspec
 
 from gateway.live.kept_files import begin_worker, done_by
-from gateway.live.part import (
-    PENDING_LIMIT,
-    DiskState,
-    Part,
-    PartFiles,
-    Restamper,
-    clear_copies,
-    close_behind,
-    free_bytes_near,
-    reason_of,
-)
+from gateway.live.part import PENDING_LIMIT, Part
+from gateway.live.part_files import DiskState, PartFiles, close_behind, free_bytes_near, reason_of
+from gateway.live.restamper import Restamper, clear_copies
 from gateway.live.session import (
     Announce,
     ClosePart,

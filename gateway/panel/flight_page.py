@@ -34,7 +34,7 @@ from gateway.recordings.convert import FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.fuse import with_estimator
 from gateway.recordings.positions import Continuity, GroundDistance
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.units import US_PER_S
 from gateway.wire.mavlink_messages import MESSAGE_IDS

@@ -29,31 +29,27 @@ from gateway.recordings.formats.maps import (
     tracks_of_messages,
     tracks_of_table,
 )
+from gateway.recordings.joining import joined_tables
 from gateway.recordings.merging import batched
 from gateway.recordings.moment import time_us_of
 from gateway.recordings.reading import (
-    NOTHING_WITHIN,
-    Limits,
-    ReadOptions,
-    RecordedTable,
-    aircraft_of,
     beside_id,
     check_vehicle,
     estimates_of,
     import_format,
     is_table,
-    joined_tables,
     open_record,
     open_rows,
     recorded_frames,
-    trimmed,
 )
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.recorded_table import ReadOptions, RecordedTable, aircraft_of
 from gateway.recordings.selection import message_ids_of
 from gateway.recordings.senders import Senders
 from gateway.recordings.table import encode_block, encode_head
 from gateway.recordings.tlog import Batch, Stamper, TlogRecord
 from gateway.recordings.tlog_editing import TlogEditor, TlogEdits, first_position
+from gateway.recordings.trimming import NOTHING_WITHIN, Limits, trimmed
 from gateway.recordings.vehicle_reader import VehicleMessage, VehicleReader
 
 

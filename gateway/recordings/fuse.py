@@ -50,7 +50,7 @@ from gateway.recordings.columns import (
     FloatArray,
     has_group,
 )
-from gateway.recordings.reading import settings_of
+from gateway.recordings.recorded_table import settings_of
 from gateway.recordings.table import NO_ROWS, TableBlock, TableComment, TableHeader
 from gateway.recordings.tlog import ORDER_US
 from gateway.records import BaroSample, FusionState, GpsFix, GpsFixType, NavFlags

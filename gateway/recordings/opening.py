@@ -29,8 +29,9 @@ from gateway.recordings.files import (
 )
 from gateway.recordings.index import parts_together
 from gateway.recordings.play import Source, Track
-from gateway.recordings.reading import ReadOptions, beside_id, estimates_of, open_record
+from gateway.recordings.reading import beside_id, estimates_of, open_record
 from gateway.recordings.recorded_fusion import RecordedFusion, end_of
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.senders import FIRST_GROUND_STATION
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.recordings.tlog_index import TlogIndex

@@ -53,16 +53,14 @@ from gateway.recordings.fuse import (
     with_estimator,
     with_reference,
 )
-from gateway.recordings.reading import (
+from gateway.recordings.joining import joined_tables
+from gateway.recordings.reading import csv_reader, is_table, open_rows
+from gateway.recordings.recorded_table import (
     Line,
     ReadOptions,
     RecordedTable,
     aircraft_of,
-    csv_reader,
     header_for,
-    is_table,
-    joined_tables,
-    open_rows,
     settings_of,
 )
 from gateway.recordings.table import (
@@ -77,7 +75,7 @@ from gateway.recordings.table import (
 from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray
-from gateway.vehicle.requests import INFO, StatusText
+from gateway.vehicle.service import INFO, StatusText
 
 PIECE: Final = 200
 """Rows that are fused at once for a playback: some milliseconds, in which it sends nothing."""

@@ -48,7 +48,7 @@ from gateway.units import DEG_PER_DEGE7, US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES
 
 if TYPE_CHECKING:
-    from gateway.recordings.reading import ReadOptions
+    from gateway.recordings.recorded_table import ReadOptions
 
 
 GAP_US: Final = 2 * US_PER_S
@@ -334,7 +334,8 @@ def describe(file: Path, progress: Progress | None, options: Callable[[], ReadOp
 
 def _describe_by_rows(file: Path, kind: str, options: ReadOptions) -> FileInfo:
     # They import every stage, which a summary of a recording of our own does not need.
-    from gateway.recordings.reading import has_record, is_table, open_record, open_rows, shifted
+    from gateway.recordings.joining import shifted
+    from gateway.recordings.reading import has_record, is_table, open_record, open_rows
 
     recorded, table = open_rows(file, options), TableSummary()
     own = is_table(file)

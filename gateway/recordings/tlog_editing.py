@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from gateway.recordings.anonymising import Anonymity
 from gateway.recordings.files import NO_RECORDING, FlightError, Progress, TlogSource
 from gateway.recordings.merging import WINDOW_US, Alignment, Copies, batched, by_time
-from gateway.recordings.reading import NOTHING_WITHIN, Limits
 from gateway.recordings.selection import FrameChoice, while_armed, within
 from gateway.recordings.senders import Senders
 from gateway.recordings.tlog import Batch, encode_record
+from gateway.recordings.trimming import NOTHING_WITHIN, Limits
 from gateway.recordings.vehicle_reader import VehicleReader
 from gateway.units import US_PER_S, counted
 from gateway.wire.mavlink_messages import MESSAGE_NAMES

@@ -26,16 +26,9 @@ from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_COMPONENT_METADATA, Encoder
 from gateway.vehicle.plan import KINDS, MISSION, read_item
-from gateway.vehicle.requests import (
-    NOTICE,
-    UNANSWERED,
-    Answer,
-    Reply,
-    Request,
-    RequestReader,
-    Service,
-    StatusText,
-)
+from gateway.vehicle.request_log import UNANSWERED
+from gateway.vehicle.request_reader import RequestReader
+from gateway.vehicle.service import NOTICE, Answer, Reply, Request, Service, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -27,18 +27,17 @@ from gateway.vehicle.encoding import (
     Encoder,
 )
 from gateway.vehicle.plan import Home, Location, StoredPlan, distance_and_bearing
-from gateway.vehicle.requests import (
+from gateway.vehicle.request_log import UNANSWERED, RequestLog
+from gateway.vehicle.request_reader import RequestReader
+from gateway.vehicle.service import (
     INFO,
     NOTICE,
-    UNANSWERED,
     WARNING,
     Action,
     Answer,
     LogWarning,
     Reply,
     Request,
-    RequestLog,
-    RequestReader,
     Service,
     SettingsChange,
     StatusText,

@@ -28,7 +28,7 @@ from gateway.batch.tasks import (
     without_secrets,
 )
 from gateway.pipeline import PipelineSettings
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from tests.kit.cli import invoke
 
 pytestmark = pytest.mark.io

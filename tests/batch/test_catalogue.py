@@ -30,7 +30,7 @@ from gateway.batch.executors import LocalProcesses, ThisProcess
 from gateway.batch.facts import FlightFacts, FlightTally, simplified
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.positions import TrackPoint
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.tlog import TlogRecord, TlogScanner, encode_record
 from gateway.units import US_PER_S
 from tests.batch.season_flights import DURATION_S, OUTAGE_S, simulated, write_flight

@@ -16,8 +16,8 @@ from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import TableRow
 from gateway.recordings.opening import TlogFile
 from gateway.recordings.play import Player, Track
-from gateway.recordings.reading import ReadOptions, header_for
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableReader
 from gateway.recordings.tlog import TlogScanner
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, NavState

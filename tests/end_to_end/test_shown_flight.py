@@ -13,7 +13,7 @@ from gateway.aircraft import Aircraft
 from gateway.recordings.answers import ANSWERS, VehicleAnswers
 from gateway.recordings.opening import lay_out, open_flights
 from gateway.recordings.play import AS_FAST_AS_POSSIBLE, Player
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.recordings.tlog import UNRECORDED, TlogScanner
 from gateway.records import RECORDED_ONLY, Incoming, Outgoing
 from gateway.vehicle.recorded_vehicle import RecordedVehicle

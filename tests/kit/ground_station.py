@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gateway.records import ClientInterval, Incoming, Outgoing
 from gateway.vehicle.recorded_vehicle import RecordedVehicle
-from gateway.vehicle.requests import Action
+from gateway.vehicle.service import Action
 from gateway.vehicle.services.ftp import ACK, Opcode, Packet, decode_packet
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock

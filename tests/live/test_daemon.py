@@ -18,9 +18,9 @@ from gateway.clock import unix_time_us
 from gateway.config import GatewaySettings
 from gateway.hub.settings import HubSettings
 from gateway.live.daemon import Daemon
-from gateway.live.part import BURST_S, UNTRUSTED_RATE
+from gateway.live.recording_budget import BURST_S, UNTRUSTED_RATE
 from gateway.records import BaroRaw, Incoming, NodeId, Outgoing
-from gateway.vehicle.requests import Request, SaveSettings
+from gateway.vehicle.service import Request, SaveSettings
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import EPOCH_2015_US, key_from_passphrase
 from gateway.wire.mavlink_splitter import MavFrame

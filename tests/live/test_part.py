@@ -6,15 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.live.part import (
-    BURST_S,
-    STEP,
-    TRUSTED_RATE,
-    UNTRUSTED_RATE,
-    RecordingBudget,
-    Restamper,
-    clear_copies,
-)
+from gateway.live.recording_budget import BURST_S, TRUSTED_RATE, UNTRUSTED_RATE, RecordingBudget
+from gateway.live.restamper import STEP, Restamper, clear_copies
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.recordings.tlog import TlogScanner
 from tests.recordings.frames import START_US, make_records, make_tlog

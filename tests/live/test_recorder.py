@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gateway.live.part import PENDING_LIMIT, PartFiles
+from gateway.live.part import PENDING_LIMIT
+from gateway.live.part_files import PartFiles
 from gateway.live.recorder import Recorder
 from gateway.live.session import RETRY_US, RecordingSettings
 from gateway.recordings.columns import TableRow

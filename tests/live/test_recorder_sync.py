@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.live.part import PartFiles
+from gateway.live.part_files import PartFiles
 from gateway.live.session import RETRY_US, ClosePart, CorrectTimes, OpenPart, SessionAction
 from tests.conftest import ManualClock
 from tests.live.test_recorder import FRAMES, NAME, Bench, frames_of

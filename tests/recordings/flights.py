@@ -10,7 +10,7 @@ from gateway.config import GatewaySettings
 from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
-from gateway.recordings.reading import ReadOptions, header_for
+from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, TableReader, encode_head, encode_line
 from gateway.records import (
     BaroRaw,

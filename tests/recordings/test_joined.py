@@ -5,7 +5,8 @@ import pytest
 
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.files import FlightError
-from gateway.recordings.reading import RecordedTable, joined_tables
+from gateway.recordings.joining import joined_tables
+from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableBlock, TableHeader, TableMark
 
 SECOND_US = 1_000_000

@@ -14,8 +14,9 @@ from gateway.cli.support.recording_options import load_flight
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import ReadOptions, open_rows, settings_of
+from gateway.recordings.reading import open_rows
 from gateway.recordings.recorded_fusion import RecordedFusion, aircraft_for
+from gateway.recordings.recorded_table import ReadOptions, settings_of
 from tests.kit.cli import invoke
 from tests.recordings.flights import OPTIONS
 

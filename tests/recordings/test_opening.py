@@ -13,7 +13,7 @@ from gateway.recordings.answers import VehicleAnswers
 from gateway.recordings.columns import row_to_line
 from gateway.recordings.files import FlightError
 from gateway.recordings.opening import PlayedFlight, lay_out, open_flights
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.recordings.tlog import TlogRecord
 from tests.recordings.flights import OPTIONS, fly, make_flight, read

@@ -14,8 +14,8 @@ from gateway.estimation.paper import PaperSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import GPS_CODEC, RowBuilder, TableRow, row_to_line
 from gateway.recordings.fuse import Fusion, interpolated_positions
-from gateway.recordings.reading import header_for, settings_of
 from gateway.recordings.recorded_fusion import Replay
+from gateway.recordings.recorded_table import header_for, settings_of
 from gateway.recordings.table import (
     TableEvent,
     TableHeader,
@@ -27,7 +27,7 @@ from gateway.recordings.table import (
 )
 from gateway.records import BaroRaw, FusedSample, GpsFix, NavState
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.requests import SettingsChange
+from gateway.vehicle.service import SettingsChange
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.recordings.flights import (
     fly,

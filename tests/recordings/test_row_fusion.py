@@ -11,8 +11,8 @@ from gateway.estimation.select import EstimationSettings
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import RowBuilder, TableRow, row_to_line
 from gateway.recordings.fuse import Fusion
-from gateway.recordings.reading import Line, header_for
 from gateway.recordings.recorded_fusion import Replay
+from gateway.recordings.recorded_table import Line, header_for
 from gateway.recordings.table import TableEvent, TableHeader, TableMark, block_of
 from gateway.records import BaroRaw, FusedSample, FusionState, GpsFix, ImuRaw
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -11,8 +11,8 @@ from gateway.estimation.columns import NAV_ALT, NAV_ATTITUDE_STD, NAV_FLAGS, NAV
 from gateway.estimation.record import FloatArray, IntArray
 from gateway.recordings.columns import NAV, has_group, row_to_line
 from gateway.recordings.files import FlightError
-from gateway.recordings.reading import header_for
 from gateway.recordings.recorded_fusion import RecordedFusion
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head, encode_line
 from gateway.records import NavFlags
 from tests.kit.cli import invoke

@@ -6,7 +6,7 @@ import pytest
 from gateway.config import GatewaySettings
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.flown import open_flown
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.records import NAN, BaroRaw, GpsFix, ImuFlags, ImuRaw, NodeStatus, RawRecord
 from gateway.simulator.recorded import RecordedFlight, in_rounds, replay
 from gateway.simulator.simulator_settings import SimulatorSettings

@@ -7,7 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.plan import Location, StoredPlan
-from gateway.vehicle.requests import SavePlan, SettingsChange
+from gateway.vehicle.service import SavePlan, SettingsChange
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from gateway.vehicle.requests import NOT_TRUSTED
+from gateway.vehicle.request_reader import NOT_TRUSTED
 from gateway.vehicle.services.ftp import Opcode
 from tests.kit.ground_station import FtpClient, GroundStation, load_parameters, of_kind, texts
 

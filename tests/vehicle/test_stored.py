@@ -10,7 +10,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.vehicle.plan import MAX_ITEMS, Item, Location, StoredPlan, decode_plan, encode_plan
-from gateway.vehicle.requests import SavePlan
+from gateway.vehicle.service import SavePlan
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

@@ -7,7 +7,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import ImuFlags, NavFlags, Outgoing
 from gateway.vehicle.plan import Location, StoredPlan
-from gateway.vehicle.requests import INFO
+from gateway.vehicle.service import INFO
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.conftest import ManualClock

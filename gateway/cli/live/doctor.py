@@ -36,7 +36,7 @@ from gateway.extras import how_to_add, missing
 from gateway.hub.endpoint import LISTENING, Endpoint, EndpointKind, parse_endpoint
 from gateway.hub.transports.ws_protocol import valid_until_s
 from gateway.live.control_socket import live_sockets
-from gateway.live.part import free_bytes_near
+from gateway.live.part_files import free_bytes_near
 from gateway.live.serial_port import PortNotFoundError, fitting_ports, list_serial_ports
 from gateway.output import PRIVATE, write_new
 from gateway.printable import reason_of

@@ -36,7 +36,7 @@ from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
-    from gateway.recordings.reading import ReadOptions
+    from gateway.recordings.recorded_table import ReadOptions
 
 app = typer.Typer()
 

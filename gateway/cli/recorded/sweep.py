@@ -46,7 +46,7 @@ from gateway.config import GatewaySettings, render
 from gateway.output import check_output, write_new
 from gateway.printable import figure
 from gateway.recordings.fuse import FusionSettings
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import counted
 
 if TYPE_CHECKING:

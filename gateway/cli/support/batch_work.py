@@ -18,7 +18,7 @@ from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.extras import require
 from gateway.printable import printable
 from gateway.recordings.files import SettingsChoice
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 
 SchedulerOption = Annotated[
     str | None,

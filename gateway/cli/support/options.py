@@ -19,7 +19,7 @@ from gateway.output import check_ending
 
 if TYPE_CHECKING:
     from gateway.config import GatewaySettings
-    from gateway.recordings.reading import ReadOptions
+    from gateway.recordings.recorded_table import ReadOptions
 
 USER_CONFIG: Final = Path("~/.config/mavgate/gateway.toml")
 
@@ -81,7 +81,8 @@ def read_options(settings: GatewaySettings, columns: Path | None = None, **how: 
     """Return how flights are read: by a column map, the limits of the settings, and `how`."""
     from gateway.config import load_aircraft
     from gateway.pipeline import PipelineSettings
-    from gateway.recordings.reading import ReadOptions, read_column_map
+    from gateway.recordings.reading import read_column_map
+    from gateway.recordings.recorded_table import ReadOptions
 
     return ReadOptions(
         PipelineSettings(settings.default_aircraft, load_aircraft(settings)),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from gateway.analysis.flight import Flight
     from gateway.config import GatewaySettings
     from gateway.recordings.fuse import FusionSettings
-    from gateway.recordings.reading import ReadOptions
+    from gateway.recordings.recorded_table import ReadOptions
 
 Files = Annotated[list[Path], typer.Argument(help="Recordings.", show_default=False)]
 SmoothOption = Annotated[

@@ -33,7 +33,7 @@ from gateway.recordings.files import (
     temporary_copy,
 )
 from gateway.recordings.formats.mavlink import MILLI, VELOCITY_AGE_US, autopilot_state
-from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_rows
+from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_rows
 from gateway.records import (
     NAN,
     UNKNOWN_VEC3,

@@ -40,7 +40,7 @@ from gateway.recordings.formats.dataflash import (
     unix_us_at,
 )
 from gateway.recordings.message_table import MessageTable, read_table
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.records import NAN
 from gateway.units import US_PER_S
 

@@ -17,7 +17,7 @@ from gateway.geometry.quaternion import to_euler
 from gateway.recordings.answers import HOME_POSITION_ID
 from gateway.recordings.columns import TableRow
 from gateway.recordings.positions import Continuity, TrackPoint, named_position
-from gateway.recordings.reading import RecordedTable
+from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import REMARK, TableMark
 from gateway.recordings.vehicle_reader import VehicleMessage
 from gateway.records import FusionState, GpsFix, NavFlags, Quat

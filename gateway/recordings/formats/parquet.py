@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 from gateway.recordings.columns import COLUMNS, TRUTHS, WHOLE_COLUMNS, TableRow, cells_of, unit_of
 from gateway.recordings.convert import FlightToWrite, Pieces
 from gateway.recordings.files import FlightError, is_packed, read_chunks, temporary_copy
-from gateway.recordings.reading import ReadOptions, RecordedTable, table_of_blocks
+from gateway.recordings.recorded_table import ReadOptions, RecordedTable, table_of_blocks
 from gateway.recordings.status_texts import text_of
 from gateway.recordings.table import (
     FORMAT_LINE,

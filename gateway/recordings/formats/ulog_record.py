@@ -31,7 +31,7 @@ from gateway.recordings.formats.ulog import (
     unix_us_at_boot,
 )
 from gateway.recordings.message_table import MessageTable, read_table
-from gateway.recordings.reading import ReadOptions
+from gateway.recordings.recorded_table import ReadOptions
 from gateway.units import counted
 
 ARMED: Final = 2

@@ -41,7 +41,7 @@ from gateway.sensing.calibrating import (
 )
 from gateway.sensing.calibration import NodeCalibration
 from gateway.units import US_PER_S
-from gateway.vehicle.requests import INFO, Answer, CalibrationMeasured, Service, StatusText
+from gateway.vehicle.service import INFO, Answer, CalibrationMeasured, Service, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

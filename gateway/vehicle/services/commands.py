@@ -25,7 +25,7 @@ from gateway.records import ClientInterval
 from gateway.units import DEGE7_PER_DEG, NS_PER_US, US_PER_S
 from gateway.vehicle.encoding import MAVLINK_MSG_ID_PROTOCOL_VERSION
 from gateway.vehicle.plan import GLOBAL_FRAMES
-from gateway.vehicle.requests import Answer, RecordingRequest, Reply, Request, Service
+from gateway.vehicle.service import Answer, RecordingRequest, Reply, Request, Service
 from gateway.vehicle.telemetry.streams import OFF, Stream
 from gateway.vehicle.telemetry.telemetry import CARRIED_MESSAGES, Telemetry
 

@@ -19,7 +19,8 @@ from typing import Final, NamedTuple
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from gateway.vehicle.requests import Answer, Reply, Request, TransferService
+from gateway.vehicle.service import Answer, Reply, Request
+from gateway.vehicle.services.transfers import TransferService
 
 HEADER: Final = struct.Struct("<HBBBBBxI")
 PAYLOAD_BYTES: Final = 251

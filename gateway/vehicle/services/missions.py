@@ -55,7 +55,7 @@ from gateway.vehicle.plan import (
     read_item,
     write_item,
 )
-from gateway.vehicle.requests import Answer, Reply, Request, Service
+from gateway.vehicle.service import Answer, Reply, Request, Service
 
 REPEAT_US: Final = 400_000
 GIVE_UP_US: Final = 5 * US_PER_S

@@ -41,7 +41,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import ControlStatus
-from gateway.vehicle.requests import Answer, Reply, Request, Service
+from gateway.vehicle.service import Answer, Reply, Request, Service
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -13,14 +13,7 @@ from typing import Any, Final, Generic, TypeVar
 from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import RECORDED_ONLY
-from gateway.vehicle.requests import (
-    Answer,
-    Reply,
-    Request,
-    SaveSettings,
-    SettingsChange,
-    TransferService,
-)
+from gateway.vehicle.service import Answer, Reply, Request, SaveSettings, SettingsChange
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     IN_PROGRESS,
@@ -36,6 +29,7 @@ from gateway.vehicle.services.parameters import (
     packed_parameters,
 )
 from gateway.vehicle.services.plan_service import PlanService
+from gateway.vehicle.services.transfers import TransferService
 
 MAX_LISTENERS: Final = 512
 """Clients that are sent changes."""

@@ -33,7 +33,7 @@ from gateway.vehicle.plan import (
     is_on_earth,
     location_of,
 )
-from gateway.vehicle.requests import INFO, Answer, SavePlan, StatusText
+from gateway.vehicle.service import INFO, Answer, SavePlan, StatusText
 from gateway.vehicle.services.commands import (
     ACCEPTED,
     DENIED,

@@ -21,7 +21,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from gateway.records import ImuFlags, ImuSample, LinkReport, NavFlags, NavState
 from gateway.units import US_PER_S
-from gateway.vehicle.requests import CRITICAL, INFO, NOTICE, WARNING, Answer, Reply, StatusText
+from gateway.vehicle.service import CRITICAL, INFO, NOTICE, WARNING, Answer, Reply, StatusText
 from gateway.vehicle.telemetry.health import GPS, Finding, Health, status_text
 
 HOLD_US: Final = 5 * US_PER_S

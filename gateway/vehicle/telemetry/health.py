@@ -43,7 +43,7 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle import encoding
 from gateway.vehicle.plan import is_3d
-from gateway.vehicle.requests import INFO, WARNING, StatusText
+from gateway.vehicle.service import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.reported import Reported, battery_status, whole_or_unknown
 
 HYSTERESIS_V: Final = 0.1

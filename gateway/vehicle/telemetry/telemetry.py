@@ -39,7 +39,7 @@ from gateway.records import (
 from gateway.units import US_PER_S
 from gateway.vehicle.encoding import AUTOPILOTS, CUSTOM_MODES, MODE_NAME
 from gateway.vehicle.plan import Home, Location, is_good_enough, location_of
-from gateway.vehicle.requests import Answer, Reply
+from gateway.vehicle.service import Answer, Reply
 from gateway.vehicle.telemetry import messages
 from gateway.vehicle.telemetry.health import GPS, Health
 from gateway.vehicle.telemetry.messages import high_latency2

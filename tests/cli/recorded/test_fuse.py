@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gateway.recordings.columns import TableRow, row_to_line
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableReader, encode_head, encode_line
 from tests.kit.cli import invoke
 from tests.kit.cli import run as run_words

@@ -13,7 +13,7 @@ from gateway.estimation.select import EstimationSettings
 from gateway.recordings import recorded_fusion as log_facts
 from gateway.recordings.columns import TableRow, row_to_line
 from gateway.recordings.files import TABLE, FlightError
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import encode_head
 from gateway.records import ImuCalibrated, ImuFlags, NodeId
 

@@ -13,7 +13,7 @@ import pytest
 
 from gateway.aircraft import AircraftSettings
 from gateway.recordings.columns import COLUMNS
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import FORMAT_LINE, encode_head
 from gateway.records import NavFlags
 from tests.kit.cli import run

@@ -21,7 +21,8 @@ from gateway.recordings.columns import TableRow
 from gateway.recordings.files import TLOG, FlightError, format_of
 from gateway.recordings.flown import open_flown
 from gateway.recordings.opening import open_flights
-from gateway.recordings.reading import RecordedTable, open_rows
+from gateway.recordings.reading import open_rows
+from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableReader
 from gateway.records import BaroRaw, GpsFix, ImuCalibrated
 from tests.kit.cli import run

@@ -26,7 +26,7 @@ from gateway.recordings.formats.maps import (
     tracks_of_table,
 )
 from gateway.recordings.positions import TrackPoint
-from gateway.recordings.reading import RecordedTable
+from gateway.recordings.recorded_table import RecordedTable
 from gateway.recordings.table import TableMark, block_of
 from gateway.recordings.tlog import TlogRecord
 from gateway.records import NavFlags

@@ -12,7 +12,7 @@ from gateway.config import GatewaySettings
 from gateway.recordings.columns import COLUMNS
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.formats import parquet as parquet_file
-from gateway.recordings.reading import header_for
+from gateway.recordings.recorded_table import header_for
 from gateway.recordings.table import TableMark, encode_line
 from tests.kit.cli import run
 from tests.recordings.flights import OPTIONS, fly, make_flight

@@ -26,7 +26,8 @@ from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
 from gateway.recordings.formats import parquet
 from gateway.recordings.formats.maps import tracks_of_messages, tracks_of_table
-from gateway.recordings.reading import aircraft_of, header_for, open_rows
+from gateway.recordings.reading import open_rows
+from gateway.recordings.recorded_table import aircraft_of, header_for
 from gateway.recordings.table import TableMark, encode_line
 from gateway.recordings.tlog import TlogRecord, encode_record
 from gateway.records import NodeId, NodeStatus

@@ -10,7 +10,7 @@ from gateway.geometry.quaternion import from_euler, rotate_inverse
 from gateway.records import Outgoing, Vec3
 from gateway.sensing.calibrating import fit_sphere
 from gateway.sensing.calibration import NodeCalibration
-from gateway.vehicle.requests import CalibrationMeasured
+from gateway.vehicle.service import CalibrationMeasured
 from gateway.vehicle.services.calibrator import FIXED_MAG_CAL_YAW
 from tests.kit.ground_station import GroundStation, of_kind, results, texts
 from tests.kit.records import sample_at, state_at

@@ -11,7 +11,9 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from gateway.vehicle.plan import Location
-from gateway.vehicle.requests import MAX_ENTRIES, NOT_TRUSTED, RecordingRequest
+from gateway.vehicle.request_log import MAX_ENTRIES
+from gateway.vehicle.request_reader import NOT_TRUSTED
+from gateway.vehicle.service import RecordingRequest
 from gateway.vehicle.services.commands import MAX_WAITING, RECORDER_TIMEOUT_US
 from gateway.vehicle.vehicle import Vehicle
 from tests.conftest import ManualClock

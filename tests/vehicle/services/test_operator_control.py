@@ -4,7 +4,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.records import Incoming
-from gateway.vehicle.requests import NOT_TRUSTED
+from gateway.vehicle.request_reader import NOT_TRUSTED
 from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from tests.conftest import ManualClock

@@ -11,7 +11,8 @@ from gateway.config import GatewaySettings
 from gateway.records import RECORDED_ONLY
 from gateway.sensing.calibration import NodeCalibration
 from gateway.settings import Settings, fields_of, setting
-from gateway.vehicle.requests import NOT_TRUSTED, SaveSettings, SettingsChange
+from gateway.vehicle.request_reader import NOT_TRUSTED
+from gateway.vehicle.service import SaveSettings, SettingsChange
 from gateway.vehicle.services.parameters import ParameterTable, decode_value, parameter_name
 from gateway.vehicle.vehicle_settings import RateSettings, VehicleSettings
 from tests.kit.ground_station import GroundStation, kinds, load_parameters, of_kind, results, texts

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.recordings.status_texts import TextJoiner
 from gateway.records import NodeId, PipeCounters, ReceiverStatus
-from gateway.vehicle.requests import INFO, WARNING, StatusText
+from gateway.vehicle.service import INFO, WARNING, StatusText
 from gateway.vehicle.telemetry.announcements import BUCKET, HOLD_US, Announcer
 from gateway.vehicle.telemetry.health import QUIET_REPORTS, RADIO_SPAN_US, Finding, Health
 from gateway.vehicle.vehicle import Vehicle

@@ -1,0 +1,44 @@
+"""Quotas of the bytes of each client that are recorded."""
+
+from typing import Final
+
+from gateway.hub.limits import TokenBucket
+
+TRUSTED_RATE: Final = 64_000
+"""Bytes a second for each client that may change things: more than any ground station sends."""
+UNTRUSTED_RATE: Final = 4_000
+"""Bytes a second for all others together."""
+BURST_S: Final = 16
+"""Length of a burst: a ground station requests much when it connects, then little."""
+
+
+class RecordingBudget:
+    """Quotas of bytes that are recorded of each client; an unknown client is untrusted."""
+
+    def __init__(self) -> None:
+        self._untrusted = _bucket(UNTRUSTED_RATE, 0)
+        self._trusted: dict[int, TokenBucket] = {}
+
+    def note(self, client_id: int, now_us: int, *, trusted: bool) -> None:
+        """Note whether a client may change things."""
+        if not trusted:
+            self._trusted.pop(client_id, None)
+        elif client_id not in self._trusted:
+            self._trusted[client_id] = _bucket(TRUSTED_RATE, now_us)
+
+    def remove_client(self, client_id: int) -> None:
+        """Discard the quota of a client that has gone."""
+        self._trusted.pop(client_id, None)
+
+    def takes(self, client_id: int, size: int, now_us: int) -> bool:
+        """Return whether a frame from a client, or to it alone, is recorded."""
+        bucket = self._trusted.get(client_id, self._untrusted)
+        bucket.refill(now_us)
+        if bucket.level < size:
+            return False
+        bucket.level -= size
+        return True
+
+
+def _bucket(rate: int, now_us: int) -> TokenBucket:
+    return TokenBucket(rate, rate * BURST_S, rate * BURST_S, now_us)

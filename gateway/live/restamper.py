@@ -1,0 +1,117 @@
+"""Finished files get their true times once GPS has provided them.
+
+A part may be larger than the memory and the disk slow, so a file is copied in small steps, between
+which the present recording is synced. The copy replaces the file in one step: a power cut leaves
+either.
+"""
+
+import contextlib
+import errno
+import logging
+import os
+from collections import deque
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import BinaryIO, Final
+
+import msgspec
+
+from gateway.live.part import TLOG
+from gateway.live.part_files import free_bytes_near
+from gateway.output import sync_folder
+from gateway.recordings.table import HEADER_PREFIX, TableHeader, encode_line
+from gateway.recordings.tlog import TlogScanner
+
+log = logging.getLogger(__name__)
+
+STEP: Final = 1 << 16
+"""Bytes in one step: a millisecond's work."""
+NEW: Final = ".new"
+
+
+class Restamper:
+    """Shift the times of files, one after the other."""
+
+    def __init__(self, free_floor: int) -> None:
+        self._free_floor = free_floor
+        self._waiting: deque[tuple[Path, Iterator[None]]] = deque()
+
+    def add(self, path: Path, shift_us: int) -> None:
+        """Queue a file whose times are to be shifted."""
+        if shift_us:
+            self._waiting.append((path, self._steps(path, shift_us)))
+
+    async def run(self, on_disk: Callable[[Callable[[], bool]], Awaitable[bool]]) -> None:
+        """Process the queue, running each step in the thread that syncs."""
+        while await on_disk(self.step):
+            pass
+
+    def finish(self) -> None:
+        """Process the queue at once."""
+        while self.step():
+            pass
+
+    def step(self) -> bool:
+        """Do one step; return whether there is more to do."""
+        if not self._waiting:
+            return False
+        path, steps = self._waiting[0]
+        try:
+            next(steps)
+        except StopIteration:
+            self._waiting.popleft()
+        except OSError as error:
+            log.warning("%s keeps the times it was written with: %s", path, error.strerror)
+            self._waiting.popleft()
+        return True
+
+    def _steps(self, path: Path, shift_us: int) -> Iterator[None]:
+        temporary = path.with_name(path.name + NEW)
+        if free_bytes_near(path.parent) < path.stat().st_size + self._free_floor:
+            raise OSError(errno.ENOSPC, "the disk is too full for a copy")
+        shifted = _shifted_tlog if path.suffix == TLOG else _shifted_table
+        try:
+            with path.open("rb") as file, temporary.open("wb") as copy:
+                for data in shifted(file, shift_us):
+                    copy.write(data)
+                    yield
+                copy.flush()
+                os.fsync(copy.fileno())
+            # If it was deleted meanwhile, it must not come back.
+            if path.exists():
+                temporary.replace(path)
+                sync_folder(path.parent)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def clear_copies(folder: Path) -> None:
+    """Remove the copies that a power cut has left behind."""
+    with contextlib.suppress(OSError):
+        for ending in (TLOG, ".csv"):
+            for path in folder.glob(f"*{ending}{NEW}"):
+                path.unlink()
+
+
+def _shifted_tlog(file: BinaryIO, shift_us: int) -> Iterator[bytes]:
+    scanner = TlogScanner()
+    while data := file.read(STEP):
+        yield scanner.feed(data).shifted(shift_us)
+    yield scanner.feed(b"", final=True).shifted(shift_us)
+
+
+def _shifted_table(file: BinaryIO, shift_us: int) -> Iterator[bytes]:
+    """Yield a table with shifted heads; rows are on the gateway's clock and stay."""
+    while lines := file.readlines(STEP):
+        yield b"".join([_shifted_line(line, shift_us) for line in lines])
+
+
+def _shifted_line(line: bytes, shift_us: int) -> bytes:
+    if not line.startswith(HEADER_PREFIX.encode()):
+        return line
+    try:
+        header = msgspec.json.decode(line[len(HEADER_PREFIX) :], type=TableHeader)
+    except msgspec.DecodeError:
+        return line
+    zero_us = (header.unix_us_at_zero or 0) + shift_us
+    return encode_line(msgspec.structs.replace(header, unix_us_at_zero=zero_us)).encode()

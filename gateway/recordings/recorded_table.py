@@ -1,0 +1,144 @@
+"""A recorded flight as rows with a head, and the settings to fuse it with."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gateway import __version__
+from gateway.aircraft import AircraftSettings, migrate_sections
+from gateway.pipeline import PipelineSettings
+from gateway.recordings.columns import TableRow
+from gateway.recordings.files import MAX_UNPACKED, FlightError, Position, Progress, SettingsChoice
+from gateway.recordings.formats.csv import ColumnMap
+from gateway.recordings.table import (
+    BLOCK_ROWS,
+    HEAD_LINES,
+    TableBlock,
+    TableFault,
+    TableHeader,
+    TableMark,
+    TableReader,
+    block_of,
+)
+from gateway.records import FusionState, NodeStatus
+from gateway.sensing.calibration import NodeCalibration
+
+Line = TableRow | TableHeader | TableMark | FusionState | NodeStatus
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How to read and fuse flights."""
+
+    current: PipelineSettings
+    """The settings of today."""
+    choice: SettingsChoice = "recorded"
+    """Settings to fuse a table with; the current ones if it has none."""
+    position: Position = "causal"
+    columns: ColumnMap | None = None
+    """For a CSV that is not ours; by default those of a tracker log."""
+    system_id: int | None = None
+    """The vehicle of a tlog to take."""
+    progress: Progress | None = None
+    sensors: tuple[tuple[str, int], ...] = ()
+    """Which of several sensors of a kind to take: ("GPS", 1) is the second."""
+    unpacked_limit: int = MAX_UNPACKED
+    """Maximum unpacked size of a packed file that is read as a whole, in bytes."""
+
+
+@dataclass(slots=True)
+class RecordedTable:
+    """Rows with their head."""
+
+    header: TableHeader
+    blocks: Iterator[TableBlock]
+    """A header among the rows is a change of settings in flight, a state is that of the fusion at
+    this row, and a mark is a remark of the operator."""
+    remarks: list[str] = field(default_factory=list)
+    """Remarks about the file for the user; complete once the rows are read."""
+
+    @property
+    def rows(self) -> Iterator[Line]:
+        """The same one by one, but for faults."""
+        events = (e for block in self.blocks for e in block.events(self.header.vehicle_id))
+        return (event for event in events if isinstance(event, Line))
+
+    @property
+    def plain_rows(self) -> Iterator[TableRow]:
+        """The rows only."""
+        return (row for row in self.rows if isinstance(row, TableRow))
+
+
+def header_for(aircraft: AircraftSettings, vehicle_id: int) -> TableHeader:
+    """Return the header that a table needs to be fused again."""
+    sections: dict[str, Any] = msgspec.to_builtins(aircraft)
+    sections["vehicle"].pop("signing_passphrase")
+    calibration = sections.pop("calibration")
+    return TableHeader(
+        mavgate_version=__version__,
+        vehicle_id=vehicle_id,
+        settings=sections,
+        calibration=calibration,
+    )
+
+
+def settings_of(header: TableHeader) -> AircraftSettings:
+    """Return the settings with which a table was recorded."""
+    sections = {**header.settings, "calibration": header.calibration}
+    return msgspec.convert(migrate_sections(sections)[0], AircraftSettings)
+
+
+def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
+    """Choose the settings for one table: its own, or those of today."""
+    if options.choice == "current" or not table.header.settings:
+        return options.current.aircraft.get(table.header.vehicle_id, options.current.default)
+    try:
+        return settings_of(table.header)
+    except msgspec.ValidationError as error:
+        raise FlightError(
+            f"the recorded settings are of another version ({error}); "
+            "use the current ones: --fuse-with current"
+        ) from error
+
+
+def table_of_blocks(path: Path, reader: TableReader, blocks: Iterator[TableBlock]) -> RecordedTable:
+    """Begin to read a table; raises FlightError if its head is damaged, or there is no row."""
+    head: list[TableBlock] = []
+    for block in blocks:
+        head.append(block)
+        for _, comment in block.comments:
+            if isinstance(comment, TableFault) and comment.line <= HEAD_LINES:
+                raise FlightError(
+                    f"{path}: line {comment.line}: {comment.reason}; `mavgate recover` writes the "
+                    "rows that are sound"
+                )
+        if len(block):
+            return RecordedTable(reader.header or TableHeader(), chain(head, blocks))
+    raise FlightError(f"{path}: contains no row")
+
+
+def table_of_rows(
+    rows: Iterator[TableRow],
+    options: ReadOptions,
+    vehicle_id: int = 1,
+    unix_us_at_zero: int | None = None,
+) -> RecordedTable:
+    """Give rows of another program the head of a table, with the current settings."""
+    header = header_of_today(options, vehicle_id, unix_us_at_zero)
+    blocks = (block_of(some) for some in iter(lambda: [*islice(rows, BLOCK_ROWS)], []))
+    return RecordedTable(header, blocks)
+
+
+def header_of_today(
+    options: ReadOptions, vehicle_id: int, unix_us_at_zero: int | None
+) -> TableHeader:
+    """Return the head of a table of calibrated values, with the current settings."""
+    current = options.current.aircraft.get(vehicle_id, options.current.default)
+    # Its values are calibrated already, whatever the calibration of the aircraft of that number.
+    calibrated = msgspec.structs.replace(current, calibration=NodeCalibration())
+    known = header_for(calibrated, vehicle_id)
+    return msgspec.structs.replace(known, unix_us_at_zero=unix_us_at_zero)

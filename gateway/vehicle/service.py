@@ -1,0 +1,144 @@
+"""One request of a client, its answers, and the interface of the services that give them."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import msgspec
+from pymavlink.dialects.v20 import all as mavlink
+
+from gateway.records import ClientInterval, Outgoing
+from gateway.sensing.calibration import NodeCalibration
+from gateway.settings import Settings
+from gateway.vehicle.plan import StoredPlan
+
+
+class Reply(msgspec.Struct, frozen=True, gc=False):
+    """A message before it is encoded: to the client that asked, or to all."""
+
+    message: Any
+    client_id: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One checked message of a client to this vehicle."""
+
+    client_id: int
+    system_id: int
+    component_id: int
+    message: Any
+    may_change: bool
+    """Whether the client may change state: trusted, and signed where a key is set."""
+    reason: str = ""
+    """Why it may not, and the remedy."""
+    is_rejected: bool = False
+    """Whether its signature is wrong, so that it is not handled at all."""
+
+    def reply(self, message: Any) -> Reply:
+        """Answer the client that asked."""
+        return Reply(message, self.client_id)
+
+
+CRITICAL: Final = mavlink.MAV_SEVERITY_CRITICAL
+WARNING: Final = mavlink.MAV_SEVERITY_WARNING
+NOTICE: Final = mavlink.MAV_SEVERITY_NOTICE
+INFO: Final = mavlink.MAV_SEVERITY_INFO
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """A text and its severity."""
+
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SettingsChange:
+    """A section of this vehicle's settings has a new, already checked value: apply it live."""
+
+    section: str
+    """Key of the section, as it was given to the vehicle."""
+    settings: Settings
+
+
+@dataclass(frozen=True, slots=True)
+class SaveSettings:
+    """Store what differs from the settings file, and report the outcome to the vehicle."""
+
+    vehicle_id: int
+    request: Request
+    """Who waits for the outcome."""
+
+
+@dataclass(frozen=True, slots=True)
+class SavePlan:
+    """Keep missions, mark and home for the next start."""
+
+    vehicle_id: int
+    plan: StoredPlan
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingRequest:
+    """Start or stop the recording."""
+
+    start: bool
+
+
+@dataclass(frozen=True, slots=True)
+class LogWarning:
+    """Write a line to the log."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationMeasured:
+    """A calibration of the calibrated samples, which the aircraft's own is then joined with."""
+
+    correction: NodeCalibration
+    """In body axes; see `gateway.sensing.calibrating.corrected_by`."""
+
+
+Action = (
+    Outgoing
+    | ClientInterval
+    | SettingsChange
+    | SaveSettings
+    | SavePlan
+    | RecordingRequest
+    | LogWarning
+    | CalibrationMeasured
+)
+Answer = Reply | Action
+
+
+class Service:
+    """One group of requests; by default it changes nothing and sends nothing by itself."""
+
+    types: ClassVar[tuple[str, ...]] = ()
+    """Names of the messages that it handles."""
+
+    def changes_state(self, _request: Request) -> bool:
+        """Return whether only a trusted client may send this request."""
+        return False
+
+    def handle(self, _request: Request, _now_us: int) -> list[Answer]:
+        """Answer a request."""
+        return []
+
+    def refuse(self, _request: Request, _result: int) -> list[Answer]:
+        """Answer a client that may not send this request; the result is a command's."""
+        return []
+
+    def poll(self, _now_us: int) -> list[Answer]:
+        """Return what is due by time."""
+        return []
+
+    def next_due_us(self) -> int | None:
+        """Return when `poll` has something to do."""
+        return None
+
+    def remove_client(self, client_id: int) -> None:
+        """Discard what was kept for a client that has gone."""
