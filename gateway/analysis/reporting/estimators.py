@@ -78,7 +78,6 @@ def estimators(case: Case) -> Section | None:
     reference = _reference(case)
     if reference is None:
         return None
-    turns = bool(np.isfinite(reference.track.q_nb).any())
     tracks = dict(case.tracks)
     if case.flight.recorded is not None:
         tracks["recorded in flight"] = case.flight.recorded
@@ -101,7 +100,7 @@ def estimators(case: Case) -> Section | None:
                 "Above, the errors that matter, RMS: of the position as it is live, and of the "
                 f"position after {OUTAGE_S:.0f} s in which the estimator is given no GPS. Below, "
                 "the error over the flight. "
-                + (TILT if turns else "")
+                + (TILT if np.isfinite(reference.track.q_nb).any() else "")
                 + "Without GPS the position drifts until it is back; its scale is logarithmic. "
                 "The first seconds, in which every estimator converges, do not count.",
             )
