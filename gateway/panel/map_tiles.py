@@ -42,7 +42,7 @@ from starlette.responses import Response
 from gateway import __version__
 from gateway.panel.access import MAPS
 from gateway.panel.panel_settings import MapStyle, PanelSettings
-from gateway.panel.recording_files import answer_upload, open_regular
+from gateway.panel.recording_transfer import answer_upload, open_regular
 
 log = logging.getLogger(__name__)
 

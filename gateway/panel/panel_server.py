@@ -32,7 +32,8 @@ from gateway.panel.open_pages import OpenPages
 from gateway.panel.page import build_page
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.pointing_api import pointing_router
-from gateway.panel.recording_files import RecordingJobs, add_recording_files
+from gateway.panel.recording_jobs import RecordingJobs
+from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory

@@ -41,7 +41,7 @@ from gateway.panel.map_tiles import MapTiles
 from gateway.panel.open_pages import OpenPages
 from gateway.panel.panel_settings import PanelSettings
 from gateway.panel.playback import Playback
-from gateway.panel.recording_files import RecordingJobs
+from gateway.panel.recording_jobs import RecordingJobs
 from gateway.panel.state.fields import FieldHistory
 from gateway.panel.state.fleet import FleetState, SampleMemory, VehicleState
 from gateway.panel.uplink import READING, ControlClient, GatewayWatch, Uplink

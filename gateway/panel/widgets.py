@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from gateway.clock import unix_time_us
 from gateway.live.control_socket import ControlError
 from gateway.panel.playback import PlaybackError
-from gateway.panel.recording_files import ExportError
+from gateway.panel.recording_jobs import ExportError
 from gateway.panel.state.fields import FloatArray, IntArray, fields_csv, shown_unit
 from gateway.panel.uplink import CommandFailedError
 from gateway.panel.view_context import WEB, NotAllowedError, ViewContext

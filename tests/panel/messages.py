@@ -65,3 +65,13 @@ def flight_frames(seconds: int, hz: int = 10) -> Iterator[tuple[int, bytes]]:
             messages.append(mavlink.MAVLink_statustext_message(2, text))
         for message in messages:
             yield time_us, bytes(message.pack(sender))
+
+
+def short_tlog() -> bytes:
+    """Return a tlog of five heartbeats, one a second."""
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    frame = mavlink.MAVLink_heartbeat_message(1, 0, 0, 0, 4, 3).pack(sender)
+    return b"".join(
+        (1_700_000_000_000_000 + second * 1_000_000).to_bytes(8, "big") + frame
+        for second in range(5)
+    )

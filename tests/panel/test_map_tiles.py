@@ -22,7 +22,7 @@ from pmtiles.writer import Writer
 from gateway.panel.access import Role
 from gateway.panel.map_tiles import MAX_FILES, MAX_TILE, MapTiles, tidy
 from gateway.panel.panel_settings import MapStyle, PanelSettings
-from tests.panel.test_recording_files import client_as
+from tests.panel.web_client import client_as
 
 pytestmark = pytest.mark.io
 

@@ -18,8 +18,8 @@ from tests.panel.browsing import (
     open_page,
     show,
 )
+from tests.panel.messages import short_tlog
 from tests.panel.scripted_vehicle import HOSTILE_MARKUP, HOSTILE_NAMES, ScriptedVehicle
-from tests.panel.test_recording_files import flight
 
 pytestmark = [pytest.mark.io, pytest.mark.slow, needs_chromium]
 expect.set_options(timeout=WAIT_MS)
@@ -78,7 +78,7 @@ def page(
     (folder / "recordings").mkdir()
     for name in HOSTILE_NAMES:
         with contextlib.suppress(OSError):
-            (folder / "recordings" / f"{name.replace('/', '')}_01.tlog").write_bytes(flight())
+            (folder / "recordings" / f"{name.replace('/', '')}_01.tlog").write_bytes(short_tlog())
     connect = f"udp-listen:127.0.0.1:{vehicle.port}"
     panel = Process(folder, "panel", "--connect", connect, config=CONFIG_WITHOUT_MAP)
     opened = open_page(browser, panel.link(), script=LISTEN)

@@ -16,7 +16,7 @@ from starlette.websockets import WebSocket
 from gateway.clock import GatewayClock
 from gateway.panel.map_tiles import MapTiles
 from gateway.panel.panel_settings import PanelSettings
-from gateway.panel.recording_files import add_recording_files
+from gateway.panel.recording_transfer import add_recording_files
 from gateway.panel.rest_api import RestApi
 from gateway.panel.state.fleet import FleetState
 from gateway.panel.telemetry_feed import GRANTS, MAX_HISTORY, TelemetryFeed, add_tracks

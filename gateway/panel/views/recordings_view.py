@@ -11,7 +11,8 @@ from nicegui import ui
 from gateway.batch.catalogue import FlightFigures
 from gateway.panel.access import RECORDINGS
 from gateway.panel.player_bar import open_playback
-from gateway.panel.recording_files import FORMATS, RecordingFacts
+from gateway.panel.recording_jobs import FORMATS
+from gateway.panel.recording_search import RecordingFacts
 from gateway.panel.view_context import ViewContext
 from gateway.panel.widgets import (
     Cells,

@@ -1,0 +1,172 @@
+"""Exports of recordings by other commands, and the update of the catalogue."""
+
+import asyncio
+import tempfile
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from gateway.batch.catalogue import FlightFigures
+from gateway.panel import recording_jobs
+from gateway.panel.admission import Holder, Role
+from gateway.panel.recording_jobs import FORMATS, ExportError, RecordingJobs
+from gateway.panel.recording_search import RecordingFacts
+from gateway.recordings.index import RecordingError, list_recordings
+from gateway.recordings.tlog import encode_record
+from tests.panel.messages import flight_frames
+
+pytestmark = pytest.mark.io
+
+NAME = "a day's --flight"
+
+
+@pytest.fixture
+def exported(tmp_path: Path) -> Path:
+    path = tmp_path / 'with "quotes"'
+    path.mkdir()
+    (path / f"{NAME}_01.tlog").write_bytes(b"".join(encode_record(*f) for f in flight_frames(40)))
+    return path
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "begin"), [("gpx", b"<?xml"), ("page", b"<!doctype html>")])
+async def test_export_is_fetched_under_an_unguessable_address(
+    exported: Path, kind: str, begin: bytes
+) -> None:
+    jobs, app = RecordingJobs(), FastAPI()
+    jobs.serve(app)
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+        url = await jobs.export(exported, NAME, kind)
+        answer = await client.get(url)
+        assert answer.content.startswith(begin)
+        assert FORMATS[kind][2] in answer.headers["content-disposition"]
+        assert (await client.get("/exports/guessed")).status_code == 404
+        jobs.close()
+        assert (await client.get(url)).status_code == 404
+
+
+@pytest.mark.slow
+async def test_failed_export_reports_the_reason_and_leaves_no_file(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (exported / "broken_01.tlog").write_bytes(b"no recording at all\n" * 10)
+    jobs = RecordingJobs()
+    with pytest.raises(ExportError, match="broken_01"):
+        await jobs.export(exported, "broken", "kml")
+    with pytest.raises(RecordingError):
+        await jobs.export(exported, "../../etc/passwd", "kml")
+    monkeypatch.setattr(recording_jobs, "EXPORT_S", 0.05)
+    with pytest.raises(ExportError, match=r"not finished after .* another format"):
+        await jobs.export(exported, NAME, "report")
+    cancelled = asyncio.create_task(jobs.export(exported, NAME, "page"))
+    # Its command runs as soon as its folder holds the settings.
+    async with asyncio.timeout(60.0):
+        while not list(tmp_path.glob("mavgate-export-*/*/settings.toml")):
+            await asyncio.sleep(0)
+    cancelled.cancel()
+    await asyncio.wait([cancelled])
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    jobs.close()
+    assert list(tmp_path.glob("mavgate-export-*")) == []
+
+
+async def test_export_that_writes_too_much_is_stopped_and_deleted(
+    exported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(recording_jobs, "MAX_EXPORT", 1_000_000)
+    endless = 'head -c 1100000 /dev/zero > "$TMPDIR/part"; exec sleep 600'
+    monkeypatch.setattr(recording_jobs, "own_command", lambda _: ["sh", "-c", endless])
+    jobs = RecordingJobs()
+    with pytest.raises(ExportError, match="larger than 1 MB, and stopped: choose a shorter"):
+        await jobs.export(exported, NAME, "csv")
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    jobs.close()
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Exports are made at once, and listed."""
+    names: list[str] = []
+
+    async def make(folder: Path, work: Path, name: str, kind: str) -> Path:
+        names.append(kind)
+        target = work / f"{name}.{kind}"
+        target.write_bytes(bytes(1000))
+        return target
+
+    monkeypatch.setattr(recording_jobs, "_make", make)
+    return names
+
+
+VIEWER = Holder(Role.VIEWER, "session", "10.0.0.1")
+
+
+async def test_exports_of_a_viewer_keep_no_operator_waiting(
+    exported: Path, made: list[str]
+) -> None:
+    jobs = RecordingJobs()
+    async with asyncio.timeout(60.0), jobs._exporting[Role.VIEWER]:
+        waiting = [
+            asyncio.create_task(jobs.export(exported, NAME, kind, VIEWER))
+            for kind in ("kml", "gpx")
+        ]
+        await asyncio.sleep(0)
+        with pytest.raises(ExportError, match="other exports"):
+            await jobs.export(exported, NAME, "csv", VIEWER)
+        await jobs.export(exported, NAME, "csv")
+    await asyncio.gather(*waiting)
+    assert made == ["csv", "kml", "gpx"]
+    jobs.close()
+
+
+async def test_equal_export_is_made_once_and_deleted_after_the_last_fetch(
+    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    jobs, app = RecordingJobs(), FastAPI()
+    jobs.serve(app)
+    first, second = await asyncio.gather(
+        *(jobs.export(exported, NAME, "kml", VIEWER) for _ in range(2))
+    )
+    assert (first, made) == (second, ["kml"])
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://panel") as client:
+        assert [(await client.get(first)).status_code for _ in range(3)] == [200, 200, 404]
+    assert list(tmp_path.glob("mavgate-export-*/*")) == []
+    jobs.close()
+
+
+async def test_bytes_of_exports_are_bounded(
+    exported: Path, made: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(recording_jobs, "MAX_EXPORTED", 2500)
+    jobs = RecordingJobs()
+    for kind in ("csv", "kml", "gpx", "page"):
+        await jobs.export(exported, NAME, kind, VIEWER)
+    kept = sorted(file.suffix for file in tmp_path.glob("mavgate-export-*/*/*"))
+    assert kept == [".gpx", ".page"]
+    jobs.close()
+
+
+@pytest.mark.slow
+async def test_indexed_recording_has_facts_and_a_track(exported: Path) -> None:
+    jobs, facts = RecordingJobs(), RecordingFacts()
+    jobs.index(exported, list_recordings(exported))
+    assert jobs._indexing is not None
+    await jobs._indexing
+    facts.look(exported)
+    figures = facts.of(NAME)
+    assert isinstance(figures, FlightFigures)
+    assert figures.duration == pytest.approx(39.9, abs=0.5)
+    corners = [tuple(map(float, corner.split(","))) for corner in facts.track(NAME).split()]
+    assert len(corners) > 5
+    assert all(0 <= x <= 46 and 0 <= y <= 24 for x, y in corners)
+    jobs.index(exported, list_recordings(exported))
+    assert not jobs.is_indexing
+    jobs.close()

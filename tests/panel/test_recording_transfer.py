@@ -1,0 +1,129 @@
+"""Recordings to the browser and from it."""
+
+import os
+import tempfile
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+from io import BytesIO
+from pathlib import Path
+from zipfile import ZipFile
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from gateway.panel.admission import Role
+from gateway.panel.recording_transfer import CHUNK, add_recording_files, zip_stream
+from tests.panel.messages import short_tlog
+from tests.panel.web_client import client_as
+
+pytestmark = pytest.mark.io
+
+
+def client_of(folder: Path, role: Role = Role.OPERATOR) -> httpx.AsyncClient:
+    app = FastAPI()
+    add_recording_files(app, lambda: folder)
+    return client_as(role, app)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "secret_01.tlog").write_bytes(short_tlog())
+    (tmp_path / "recordings").mkdir()
+    return tmp_path / "recordings"
+
+
+@pytest.fixture
+async def client(folder: Path) -> AsyncIterator[httpx.AsyncClient]:
+    async with client_of(folder) as opened:
+        yield opened
+
+
+async def test_uploaded_recording_can_be_downloaded(
+    client: httpx.AsyncClient, folder: Path
+) -> None:
+    answer = await client.put("/recordings/day one", content=short_tlog())
+    assert answer.status_code == HTTPStatus.CREATED
+    assert (folder / "day one_01.tlog").read_bytes() == short_tlog()
+    answer = await client.get("/recordings/day one")
+    with ZipFile(BytesIO(answer.content)) as packed:
+        assert packed.namelist() == ["day one_01.tlog"]
+        assert packed.read("day one_01.tlog") == short_tlog()
+
+
+@pytest.mark.parametrize(
+    "name", ["../secret", "..%2Fsecret", "%2e%2e/secret", "/etc/passwd", "%2Fetc%2Fpasswd", ".."]
+)
+async def test_name_outside_the_folder_is_refused(
+    client: httpx.AsyncClient, folder: Path, name: str
+) -> None:
+    before = sorted(folder.parent.rglob("*"))
+    assert (await client.get(f"/recordings/{name}")).status_code >= HTTPStatus.BAD_REQUEST
+    answer = await client.put(f"/recordings/{name}", content=short_tlog())
+    assert answer.status_code >= HTTPStatus.BAD_REQUEST
+    assert sorted(folder.parent.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"a text\n", b"a,b,c\n1,2,3\n", bytes(range(256)) * 40, short_tlog()[:12]]
+)
+async def test_invalid_upload_leaves_no_file(
+    client: httpx.AsyncClient, folder: Path, content: bytes
+) -> None:
+    answer = await client.put("/recordings/upload", content=content)
+    assert (answer.status_code, list(folder.iterdir())) == (HTTPStatus.BAD_REQUEST, [])
+    assert "unknown file format" in answer.text
+
+
+async def test_upload_under_an_existing_name_is_refused(
+    client: httpx.AsyncClient, folder: Path
+) -> None:
+    (folder / "day_01.tlog").write_bytes(b"first")
+    answer = await client.put("/recordings/day", content=short_tlog())
+    assert answer.status_code == HTTPStatus.BAD_REQUEST
+    assert (folder / "day_01.tlog").read_bytes() == b"first"
+
+
+async def test_viewer_may_download_but_not_upload(folder: Path) -> None:
+    (folder / "day_01.tlog").write_bytes(short_tlog())
+    async with client_of(folder, Role.VIEWER) as viewer:
+        assert (await viewer.get("/recordings/day")).status_code == HTTPStatus.OK
+        answer = await viewer.put("/recordings/other", content=short_tlog())
+    assert answer.status_code == HTTPStatus.FORBIDDEN
+    assert [file.name for file in folder.iterdir()] == ["day_01.tlog"]
+
+
+async def test_mode_of_uploads_follows_the_umask(client: httpx.AsyncClient, folder: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        await client.put("/recordings/day", content=short_tlog())
+    finally:
+        os.umask(before)
+    assert (folder / "day_01.tlog").stat().st_mode & 0o777 == 0o640
+
+
+async def test_links_and_pipes_are_not_downloaded(client: httpx.AsyncClient, folder: Path) -> None:
+    (folder / "link_01.tlog").symlink_to(folder.parent / "secret_01.tlog")
+    answer = await client.get("/recordings/link")
+    assert answer.status_code == HTTPStatus.FORBIDDEN
+    os.mkfifo(folder / "pipe_01.tlog")
+    assert (await client.get("/recordings/pipe")).status_code == HTTPStatus.NOT_FOUND
+    (folder / "link_02.tlog").write_bytes(short_tlog())
+    with ZipFile(BytesIO((await client.get("/recordings/link")).content)) as packed:
+        assert packed.namelist() == ["link_02.tlog"]
+
+
+def test_archive_is_packed_piece_by_piece_without_a_file_or_an_open_descriptor(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    large = tmp_path / "large_01.tlog"
+    large.write_bytes(os.urandom(4 * CHUNK))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "none"))
+    before = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    stream = zip_stream([large, tmp_path / "gone_01.tlog"])
+    first = next(stream)
+    assert 0 < len(first) < 2 * CHUNK
+    stream.close()
+    assert sum(1 for _ in Path("/proc/self/fd").iterdir()) == before
+    with ZipFile(BytesIO(b"".join(zip_stream([large])))) as packed:
+        assert packed.read("large_01.tlog") == large.read_bytes()
