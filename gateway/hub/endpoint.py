@@ -183,6 +183,8 @@ OWN_OPTIONS: Final[dict[str, frozenset[str]]] = {
     EndpointKind.ZENOH: frozenset({"site", "keys", "config"}),
 }
 """Options that only some kinds have."""
+PARTS: Final = frozenset({"site", "vehicle"})
+"""Options that distinguish endpoints of one address: sites of a router, vehicles of an output."""
 HOSTED: Final = LISTENING | {EndpointKind.UDP, EndpointKind.TCP, EndpointKind.WS, EndpointKind.WSS}
 """Kinds whose frames go to hosts by their addresses, one by one."""
 
@@ -227,7 +229,7 @@ class Endpoint:
     port: int
     """Port number; the baud rate of a serial port; 0 of an added kind."""
     location: str
-    """The URL in our own spelling and without options; no two endpoints share one."""
+    """The URL in our own spelling and without options but `PARTS`; no two endpoints share one."""
     name: str
     """The name given by the operator; the location by default."""
     allow: frozenset[int] = frozenset()
@@ -298,16 +300,16 @@ def parse_endpoint(url: str) -> Endpoint:
         added_kind = ADDED_KINDS.get(kind, AddedKind())
         added = {key: options.pop(key) for key in added_kind.options & options.keys()}
         site, keys = options.get("site", ""), options.get("keys", SITE_KEYS)
-        if kind == EndpointKind.ZENOH:
-            _check_fleet(site, keys)
+        _check_fleet(kind, site, keys)
+        parts = (f"{key}={value}" for key, value in (options | added).items() if key in PARTS)
+        location = "?".join([f"{kind}:{rest}", *parts])
         endpoint = Endpoint(
             url=url,
             kind=kind,
             host=host,
             port=port,
-            # One router serves several sites.
-            location=f"{kind}:{rest}?site={site}" if site else f"{kind}:{rest}",
-            name=name_from(options.get("name", f"{kind}:{rest}")),
+            location=location,
+            name=name_from(options.get("name", location)),
             allow=messages_from(options.get("allow", "")),
             deny=messages_from(options.get("deny", "")),
             systems=system_filter_from(*(options.get(key, "") for key in FILTER_OPTIONS)),
@@ -426,7 +428,9 @@ def _origins(text: str) -> frozenset[str]:
     return origins
 
 
-def _check_fleet(site: str, keys: str) -> None:
+def _check_fleet(kind: str, site: str, keys: str) -> None:
+    if kind != EndpointKind.ZENOH:
+        return
     if keys not in (SITE_KEYS, RAW_KEYS, JSON_KEYS):
         raise ValueError(unknown_choice("keys", keys, (SITE_KEYS, RAW_KEYS, JSON_KEYS)))
     if keys == SITE_KEYS and not SITE_NAME.fullmatch(site):

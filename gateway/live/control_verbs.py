@@ -10,6 +10,7 @@ from typing import Annotated, Final
 
 import msgspec
 
+from gateway.compiled.entry_point import LibraryError, load_entry_points
 from gateway.hub.endpoint import EndpointKind, parse_endpoint
 from gateway.hub.hub import Hub
 from gateway.live.control_socket import ControlError, Verbs
@@ -128,6 +129,10 @@ class SerialVerbs:
         ports = await asyncio.to_thread(list_serial_ports)
         # The one of the settings may be chosen even if this machine does not list it.
         check_listed(port, {"auto", self._own, *(each.device for each in ports)})
+        try:
+            load_entry_points()
+        except LibraryError as error:
+            raise ControlError(str(error)) from error
         await self._port.connect(port)
         return self._port.status(ports)
 

@@ -14,6 +14,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from pynmeagps import NMEAReader
 
 from gateway.hub.endpoint import parse_endpoint
+from gateway.hub.settings import HubSettings
 from gateway.outputs import extend
 from gateway.outputs.carrier import MAX_WAITING_BYTES
 from gateway.recordings.newest import POSITION_OLD_US
@@ -209,6 +210,16 @@ def test_wrong_urls_are_refused_with_the_reason(url: str, reason: str) -> None:
     extend()
     with pytest.raises(ValueError, match=reason):
         parse_endpoint(url)
+
+
+def test_outputs_of_two_vehicles_to_one_address_are_distinguished_by_name() -> None:
+    extend()
+    urls = tuple(f"nmea:udp:h:1?vehicle={vehicle}&rate=2" for vehicle in (1, 2))
+    assert HubSettings(endpoints=urls).endpoints == urls
+    assert [parse_endpoint(url).name for url in urls] == [
+        "nmea:udp:h:1?vehicle=1",
+        "nmea:udp:h:1?vehicle=2",
+    ]
 
 
 @pytest.mark.io

@@ -20,6 +20,7 @@ from gateway.config import ConfigError, GatewaySettings, load_aircraft
 from gateway.extras import require
 from gateway.live.daemon import Daemon
 from gateway.live.other_gateways import conflicts
+from gateway.live.serial_port import NO_RECEIVER
 from gateway.live.service import run_event_loop
 from gateway.live.terminal import Keyboard, detached_output, on_end_signals
 from gateway.sources.settings import SourceSettings
@@ -83,7 +84,9 @@ def run_gateway(
         require("--panel", "panel")
     aircraft = load_aircraft(settings)
     page = launched_panel(wanted=panel or settings.panel.enabled)
-    load_entry_points()
+    if settings.serial.port != NO_RECEIVER or settings.sources:
+        # A router has no estimator, and its hub forwards without them, too.
+        load_entry_points()
     daemon = serve(lambda: Daemon(settings, aircraft, read), plain=plain, panel=page)
     run_event_loop(daemon, settings.hub.event_loop)
 

@@ -13,9 +13,10 @@ from typing import Any
 
 import pytest
 
-from gateway.cli.live import demo
+from gateway.cli.live import demo, run
 from gateway.cli.live.demo import made_ahead
 from gateway.cli.live.run import serve
+from gateway.compiled.entry_point import LibraryError
 from gateway.config import GatewaySettings, aircraft_folder
 from gateway.simulator.receiver import simulate
 from gateway.simulator.simulator_settings import SimulatorSettings
@@ -132,3 +133,19 @@ async def test_objects_loaded_at_the_start_are_excluded_from_garbage_collection(
     daemon: Any = Daemon()
     await serve(lambda: daemon, plain=True)
     assert daemon.is_collected is False
+
+
+@pytest.mark.parametrize(("port", "starts"), [("none", True), ("auto", False)])
+def test_only_a_router_starts_without_the_kernels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: str, starts: bool
+) -> None:
+    def load() -> None:
+        raise LibraryError(Path("kernels.so"), "is missing")
+
+    file, started = tmp_path / "gateway.toml", list[str]()
+    file.write_text(f'[serial]\nport = "{port}"\n')
+    monkeypatch.setattr(run, "load_entry_points", load)
+    monkeypatch.setattr(run, "serve", lambda *_, **__: None)
+    monkeypatch.setattr(run, "run_event_loop", lambda _, event_loop: started.append(event_loop))
+    result = invoke("run", "--config", file)
+    assert (result.exit_code == 0, bool(started)) == (starts, starts), result.output
