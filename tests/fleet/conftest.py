@@ -78,7 +78,7 @@ class World:
     async def until(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(LIMIT_S):
             while not condition():
-                self.rig.clock.us += 100_000
+                self.rig.clock.now_us += 100_000
                 self.exchange()
                 await asyncio.sleep(0.01)
 

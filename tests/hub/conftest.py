@@ -22,20 +22,13 @@ from gateway.vehicle.vehicle import Vehicle
 from gateway.vehicle.vehicle_settings import VehicleSettings
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
+from tests.conftest import ManualClock
 from tests.kit.mavlink import STATION, Sender, outgoing
 from tests.kit.records import sample_at, state_at
 from tests.ports import free_port
 
 LIMIT_S = 60.0
 """Time limit of a test: its events take a moment, on a busy machine some seconds."""
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.us = 0
-
-    def __call__(self) -> int:
-        return self.us
 
 
 class Station:
@@ -137,7 +130,7 @@ class Rig:
     """A hub, the frames it received, its vehicle, and the stations; all closed at the end."""
 
     def __init__(self) -> None:
-        self.clock = Clock()
+        self.clock = ManualClock()
         self.incoming: list[Incoming] = []
         self.foreign: list[bytes] = []
         self.vehicle = Sender(1, 1)

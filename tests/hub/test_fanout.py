@@ -10,7 +10,7 @@ from gateway.records import ClientInterval
 from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavFrame, frame_of
 from tests.hub.conftest import KeepingClient
-from tests.kit.mavlink import Sender
+from tests.kit.mavlink import Sender, signer
 
 ATTITUDE_ID = 30
 
@@ -81,13 +81,7 @@ def test_clients_get_frames_from_add_to_remove(fanout: Fanout, vehicle: Sender) 
 
 
 def test_clients_with_the_same_number_share_one_signed_copy(vehicle: Sender) -> None:
-    class Clock:
-        def timestamp(self, now_us: int) -> int:
-            return 1000
-
-    signer = FrameSigner(Clock())
-    signer.keys[1] = bytes(32)
-    fanout = Fanout(signer)
+    fanout = Fanout(signer())
     peers = [Peer(fanout, client_id, "?deny=0") for client_id in range(1, 4)]
     publish(fanout, vehicle.heartbeat())
     publish(fanout, vehicle.attitude())

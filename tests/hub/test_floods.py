@@ -74,7 +74,7 @@ async def test_untrusted_clients_share_one_read_rate(rig: Any, kind: str) -> Non
         # Each of the two may have been reading when the last was spent.
         limit = UNTRUSTED_READ_BURST + len(floods) * (READ_BYTES + MAX_DATAGRAM)
         assert UNTRUSTED_READ_BURST <= taken() < limit
-        rig.clock.us += 2_000_000
+        rig.clock.now_us += 2_000_000
         await flood_until(UNTRUSTED_READ_BURST + UNTRUSTED_READ_RATE)
         assert taken() < limit + 2 * UNTRUSTED_READ_RATE
 

@@ -190,7 +190,7 @@ class World:
             self.sources[number].send(data[begin : begin + 25])
 
     async def wait(self, _: int) -> None:
-        self.rig.clock.us += self.rng.choice([1000, 90_000, 400_000, 2_000_000])
+        self.rig.clock.now_us += self.rng.choice([1000, 90_000, 400_000, 2_000_000])
         self.rig.tick(self.hub)
 
     async def add_or_remove(self, _: int) -> None:

@@ -96,7 +96,7 @@ async def test_hundreds_of_short_visits_cost_others_no_frame(rig: Any, room: int
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as newcomer:
             newcomer.sendto(rig.sender(1 + visit % 200, 190).heartbeat(), target)
         if visit % 10 == 0:
-            rig.clock.us += 1_000_000
+            rig.clock.now_us += 1_000_000
             caller = flight.stations[-1]
             caller.send(caller.sender.heartbeat())
         await flight.fly(1)
@@ -157,12 +157,12 @@ class TestLinkThatRaises:
             radio = hub.clients()[0]
             assert (radio.state, radio.reason[:14]) == ("unreachable", "signed integer")
             for _ in range(3):
-                rig.clock.us += 1_000_000
+                rig.clock.now_us += 1_000_000
                 rig.tick(hub)
             assert "radio is closed and opened again" in caplog.text
             assert hub.clients()[1].state == "open", "the other one is open again"
             assert not hub._timer.cancelled()
-        rig.clock.us += 1_000_000
+        rig.clock.now_us += 1_000_000
         rig.tick(hub)
         assert hub.clients()[0].state == "open"
 
@@ -176,7 +176,7 @@ class TestLinkThatRaises:
             patched.setattr(type(listener), "tick", lambda *_: 1 // 0)
             rig.tick(hub)
             assert hub.listeners()[0].state == "closed"
-        rig.clock.us += 2_000_000
+        rig.clock.now_us += 2_000_000
         rig.tick(hub)
         assert hub.listeners()[0].state == "open"
 
@@ -224,6 +224,6 @@ async def test_unlimited_new_clients_do_not_flood_the_log(
     assert len(caplog.messages) == CONNECTIONS_IN_FULL
     hub.add("udp:127.0.0.1:9")
     assert caplog.messages[-1].endswith("127.0.0.1:9"), "a configured client is always named"
-    rig.clock.us += WINDOW_US
+    rig.clock.now_us += WINDOW_US
     rig.tick(hub)
     assert "10 more connects and disconnects at listening ports" in caplog.messages

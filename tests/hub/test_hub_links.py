@@ -37,7 +37,7 @@ class Joined:
 
     async def run(self, seconds: float) -> None:
         for step in range(round(seconds * 1e6 / STEP_US)):
-            self.rig.clock.us += STEP_US
+            self.rig.clock.now_us += STEP_US
             self.first.fly()
             self.second.fly()
             if step % 12 == 0:
@@ -87,7 +87,7 @@ async def test_two_stations_with_one_id_are_both_answered(rig: Any) -> None:
     gateway.fly()
     answers = [0, 0]
     for step in range(10):
-        rig.clock.us += 100_000
+        rig.clock.now_us += 100_000
         for twin in twins:
             if step % 10 == 0:
                 twin.send(twin.sender.heartbeat())

@@ -4,51 +4,29 @@ import asyncio
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
 
 from gateway.hub.round_trip import PROBE_COMPONENT
 from gateway.records import ClientInterval
-from gateway.wire.mavlink_signing import FrameSigner
 from gateway.wire.mavlink_splitter import MavlinkSplitter, frame_of, message_id_of
 from tests.hub.conftest import LIMIT_S
-from tests.kit.mavlink import frames_of
+from tests.kit.mavlink import KEY, frames_of, signer, strict
 
 pytestmark = pytest.mark.io
 
-OLD, NEW = bytes(32), bytes(range(32))
-TIMESTAMP = 30_000_000_000_000
+OTHER_KEY = bytes(range(32))
 
 
-class Strict:
-    """A receiver that takes nothing unsigned, by pymavlink."""
-
-    def __init__(self, key: bytes = OLD) -> None:
-        self.mav: Any = mavlink.MAVLink(None)
-        self.mav.signing.timestamp = TIMESTAMP
-        self.mav.signing.secret_key = key
-
-    def read(self, frame: bytes) -> tuple[str, int, int]:
-        message = self.mav.decode(bytearray(frame))
-        assert message.get_signed()
-        return message.get_type(), message.get_srcComponent(), message.get_seq()
-
-
-class Clock:
-    def timestamp(self, now_us: int) -> int:
-        return TIMESTAMP
-
-
-def signer() -> FrameSigner:
-    signer = FrameSigner(Clock())
-    signer.keys[1] = OLD
-    return signer
+def read(receiver: Any, frame: bytes) -> tuple[str, int, int]:
+    message = receiver.decode(bytearray(frame))
+    assert message.get_signed()
+    return message.get_type(), message.get_srcComponent(), message.get_seq()
 
 
 async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0?rate=RAW_IMU:1", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
     hub.send(rig.out(rig.vehicle.home()))
-    station, receiver = rig.station(hub.listening_ports()[0]), Strict()
+    station, receiver = rig.station(hub.listening_ports()[0]), strict()
     station.send(station.sender.heartbeat())
     await rig.until(lambda: len(hub.clients()) == 1)
     (client,) = hub.clients()
@@ -58,11 +36,11 @@ async def test_greetings_requests_answers_and_limited_telemetry_are_signed(rig: 
         hub.send(rig.out(rig.vehicle.raw_imu()))
         hub.send(rig.out(rig.vehicle.attitude()))
     hub.send(rig.out(rig.vehicle.home(), client.client_id))
-    rig.clock.us += 5_000_000
+    rig.clock.now_us += 5_000_000
     hub.send(rig.out(rig.vehicle.heartbeat()))
     rig.tick(hub)
     while ("TIMESYNC", PROBE_COMPONENT) not in [kind[:2] for kind in got]:
-        got.append(receiver.read(await station.receive()))
+        got.append(read(receiver, await station.receive()))
     assert [kind for kind, component, _ in got if component == 1] == [
         *("HEARTBEAT", "HOME_POSITION", "RAW_IMU", "HOME_POSITION", "HEARTBEAT"),
     ]
@@ -84,10 +62,10 @@ async def test_timestamps_follow_the_order_in_which_frames_leave_a_queue(rig: An
     for _ in range(50):
         hub.send(rig.out(rig.vehicle.raw_imu()))
         hub.send(rig.out(rig.vehicle.attitude()))
-    splitter, receiver, kinds = MavlinkSplitter(), Strict(), []
+    splitter, receiver, kinds = MavlinkSplitter(), strict(), []
     while hub.clients()[0].queued or kinds.count("ATTITUDE") < 50:
         data = await asyncio.wait_for(loop.sock_recv(client, 65536), LIMIT_S)
-        kinds += [receiver.read(frame)[0] for frame in frames_of(splitter.feed(data))]
+        kinds += [read(receiver, frame)[0] for frame in frames_of(splitter.feed(data))]
     assert "RAW_IMU" in kinds[kinds.index("ATTITUDE") :], "some were overtaken"
 
 
@@ -95,7 +73,7 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=signer())
     hub.send(rig.out(rig.vehicle.heartbeat()))
     port = hub.listening_ports()[0]
-    source, station, receiver = rig.station(port), rig.station(port), Strict()
+    source, station, receiver = rig.station(port), rig.station(port), strict()
     station.send(station.sender.heartbeat())
     autopilots = [rig.sender(40), rig.sender(41, signed=True), rig.sender(1, 100)]
     for sent in [pilot.heartbeat() for pilot in autopilots]:
@@ -114,7 +92,7 @@ async def test_frames_of_others_are_unchanged(rig: Any) -> None:
     while not got or (got[-1][5:7], message_id_of(got[-1])) != (b"\1\1", 27):
         got.append(await station.receive())
         if got[-1][5:7] == b"\1\1":
-            receiver.read(got[-1])
+            read(receiver, got[-1])
     assert [frame for frame in got if frame in sent] == sent
 
 
@@ -123,13 +101,13 @@ async def test_changed_key_applies_from_the_next_frame_on(rig: Any) -> None:
     hub = rig.hub("udp-listen:127.0.0.1:0", signer=keys)
     hub.send(rig.out(rig.vehicle.heartbeat()))
     station = await rig.call(hub)
-    for key in (OLD, NEW):
+    for key in (KEY, OTHER_KEY):
         keys.keys[1] = key
         hub.send(rig.out(rig.vehicle.heartbeat()))
-        receiver = Strict(key)
-        if key is OLD:
-            receiver.read(await station.receive())
-        receiver.read(await station.receive())
+        receiver = strict(key)
+        if key is KEY:
+            read(receiver, await station.receive())
+        read(receiver, await station.receive())
     del keys.keys[1]
     hub.send(rig.out(rig.vehicle.heartbeat()))
     assert not frame_of(await station.receive()).signed

@@ -117,7 +117,7 @@ class HubMachine(RuleBasedStateMachine):
 
     async def _second(self) -> None:
         """Let a second pass in which vehicle, autopilot and good client send."""
-        self.rig.clock.us += 1_000_000
+        self.rig.clock.now_us += 1_000_000
         self.gateway.fly()
         beat = self.autopilot.sender.heartbeat()
         self.telemetry.append(beat)
@@ -169,7 +169,7 @@ class HubMachine(RuleBasedStateMachine):
     def fly(self, count: int) -> None:
         async def steps() -> None:
             for _ in range(count):
-                self.rig.clock.us += 5_000
+                self.rig.clock.now_us += 5_000
                 self.gateway.fly()
                 self.telemetry.append(self.autopilot.sender.attitude())
                 self.autopilot.send(self.telemetry[-1])

@@ -81,7 +81,7 @@ async def test_forged_stations_displace_no_other_client(world: Any) -> None:
         forged = world.sender(1 + number % 200, 1 + number // 200)
         forged.is_station = True
         await send_untrusted(world, forged.heartbeat())
-        world.clock.us += 10_000
+        world.clock.now_us += 10_000
     late = world.station(world.world.listening_ports()[0])
     late.sender = world.sender(253, 190)
     heartbeat = late.sender.heartbeat()

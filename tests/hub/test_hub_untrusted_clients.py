@@ -67,7 +67,7 @@ class Gateway(FlyingHub):
         super().__init__(rig, 1, *endpoints, max_clients=MAX_CLIENTS, idle_timeout_s=5.0)
 
     def fly(self) -> list[Any]:
-        self.clock.us += STEP_US
+        self.clock.now_us += STEP_US
         found = super().fly()
         self.attitudes += sum(a.message_id == 31 for a in found if isinstance(a, Outgoing))
         return found

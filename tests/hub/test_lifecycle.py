@@ -23,6 +23,8 @@ from tests.ports import free_port
 
 pytestmark = pytest.mark.io
 
+RAW_IMU, ATTITUDE = 27, 30
+
 
 class Far:
     """The far end of one endpoint: reads without blocking, writes, breaks and returns."""
@@ -33,6 +35,8 @@ class Far:
         self.rig = rig
         self.splitter = MavlinkSplitter()
         self.frames: list[bytes] = []
+        self.sizes: list[int] = []
+        """Of the datagrams, messages or chunks that were read."""
         self.open()
         rig.closing.append(self.shut)
 
@@ -70,6 +74,7 @@ class UdpFar(Far):
 
     def read(self) -> bytes:
         data, self.target = self.socket.recvfrom(65535)
+        self.sizes.append(len(data))
         return data
 
     def write(self, data: bytes) -> None:
@@ -159,6 +164,7 @@ class WebFar(TcpFar):
                 if isinstance(event, Request):
                     self.peer.send(self.web.send(AcceptConnection()))
                 elif isinstance(event, BytesMessage):
+                    self.sizes.append(len(event.data))
                     payload += event.data
         return payload
 
@@ -208,17 +214,19 @@ KINDS: dict[str, type[Far]] = {
     "ws-listen": WebCaller,
     "serial": SerialFar,
 }
-LISTENING = {"udp-listen", "tcp-listen", "ws-listen"}
+LISTENING = ("udp-listen", "tcp-listen", "ws-listen")
+STREAMS = ("tcp", "tcp-listen", "ws", "ws-listen")
+PACKING = ("udp", "udp-listen", "udp-broadcast", "ws", "ws-listen")
 NOTICES_THE_END = set(KINDS) - {"udp-broadcast"}
 
 
 class Link:
     """One endpoint of a hub with its far end."""
 
-    def __init__(self, rig: Rig, kind: str) -> None:
+    def __init__(self, rig: Rig, kind: str, options: str = "", **settings: object) -> None:
         self.rig, self.kind = rig, kind
         self.far = KINDS[kind](rig)
-        self.hub = rig.hub(self.far.url, ping_interval_s=0.0)
+        self.hub = rig.hub(self.far.url + options, ping_interval_s=0.0, **settings)
         self.hub.send(rig.out(rig.vehicle.heartbeat()))
 
     async def until_open(self) -> None:
@@ -232,12 +240,16 @@ class Link:
 
         def is_so() -> bool:
             self.far.poll()
-            self.rig.clock.us += 2000
+            self.rig.clock.now_us += 2000
             # By hand: its own timer runs on the machine's clock, far behind the manual one.
             self.rig.tick(self.hub)
             return condition()
 
         await self.rig.until(is_so)
+
+    def numbers(self, message_id: int) -> list[int]:
+        """Return the sequence numbers of the received messages of a kind."""
+        return [frame[4] for frame in self.far.frames if frame[7] == message_id]
 
     async def is_sent(self, frame: bytes) -> None:
         self.hub.send(self.rig.out(frame))
@@ -279,9 +291,9 @@ async def test_changed_filter_applies_to_the_open_client(link: Link) -> None:
     link.hub.apply(type(settings)(endpoints=changed, ping_interval_s=0.0))
     link.hub.send(link.rig.out(link.rig.vehicle.raw_imu()))
     link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
-    await link.until(lambda: 30 in {frame[7] for frame in link.far.frames})
+    await link.until(lambda: bool(link.numbers(ATTITUDE)))
     assert [client.client_id for client in link.hub.clients()] == [before]
-    assert 27 not in {frame[7] for frame in link.far.frames}
+    assert not link.numbers(RAW_IMU)
 
 
 async def test_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link) -> None:
@@ -291,7 +303,7 @@ async def test_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link
 
     def is_noticed() -> bool:
         link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
-        link.rig.clock.us += 100_000
+        link.rig.clock.now_us += 100_000
         return [client.state for client in link.hub.clients()] != ["open"]
 
     await link.until(is_noticed)
@@ -299,16 +311,75 @@ async def test_ended_peer_is_noticed_and_served_again_when_it_returns(link: Link
     link.far.frames.clear()
     link.far.open()
     link.far.arrive(link.hub)
-    link.rig.clock.us += 2_000_000
+    link.rig.clock.now_us += 2_000_000
 
     def is_served() -> bool:
         link.hub.send(link.rig.out(link.rig.vehicle.attitude()))
-        link.rig.clock.us += 100_000
+        link.rig.clock.now_us += 100_000
         # Any of them: while the kernel passes no bytes on, a queue drops old frames and renumbers
         # those that follow.
         return 30 in {frame[7] for frame in link.far.poll()}
 
     await link.until(is_served)
+
+
+@pytest.mark.parametrize("kind", STREAMS)
+async def test_stalled_peer_loses_only_its_own_oldest_telemetry(rig: Rig, kind: str) -> None:
+    link, lively = Link(rig, kind, queue_bytes=4096), rig.station()
+    await link.until_open()
+    await link.is_sent(rig.vehicle.attitude())
+    link.hub.add(f"udp:127.0.0.1:{lively.port}")
+    await rig.until_open(link.hub)
+    before, frames, got = link.hub.clients()[0], list[bytes](), list[bytes]()
+    while link.hub.clients()[0].dropped < 500:
+        for _ in range(50):
+            frames.append(rig.vehicle.raw_imu())
+            link.hub.send(rig.out(frames[-1]))
+        await asyncio.sleep(0)
+        got += lively.received()
+    await rig.until(lambda: bool(got.extend(lively.received()) or len(got) >= len(frames)))
+    assert got == frames
+    await link.until(lambda: link.hub.clients()[0].queued == 0)
+    slow, fast = link.hub.clients()
+    assert (fast.sent, fast.dropped) == (len(frames), 0)
+    passed = slow.sent - before.sent
+    assert passed + slow.dropped - before.dropped == len(frames)
+    await link.until(lambda: len(link.numbers(RAW_IMU)) == passed)
+    first = link.numbers(RAW_IMU)[0]
+    assert link.numbers(RAW_IMU) == [first + n & 255 for n in range(passed)], "without a gap"
+
+
+@pytest.mark.parametrize("kind", PACKING)
+async def test_packed_frames_share_datagrams_or_messages(rig: Rig, kind: str) -> None:
+    link = Link(rig, kind, "?pack=200")
+    await link.until_open()
+    link.far.sizes.clear()
+    frames = [rig.vehicle.raw_imu() for _ in range(9)]
+    for frame in frames:
+        link.hub.send(rig.out(frame))
+    await link.until(lambda: link.far.frames[-9:] == frames)
+    assert len(link.far.sizes) <= 3
+    assert max(link.far.sizes) <= 200
+
+
+@pytest.mark.parametrize("kind", LISTENING)
+async def test_taken_port_is_reported_once_and_opens_when_it_is_free(
+    rig: Rig, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    taken = rig.station(kind=socket.SOCK_DGRAM if kind == "udp-listen" else socket.SOCK_STREAM)
+    if kind != "udp-listen":
+        taken.socket.listen()
+    hub = rig.hub(f"{kind}:127.0.0.1:{taken.port}?name=here")
+    for _ in range(4):
+        rig.tick(hub)
+        rig.clock.now_us += 2_000_000
+    (port,) = hub.listeners()
+    assert (port.state, port.reason, port.port) == ("closed", "Address already in use", 0)
+    assert caplog.text.count("Address already in use; trying again") == 1
+    taken.socket.close()
+    rig.tick(hub)
+    (port,) = hub.listeners()
+    assert (port.state, port.reason, port.port) == ("open", "", taken.port)
 
 
 async def test_removed_endpoint_closes_and_nothing_is_sent(link: Link) -> None:
@@ -333,7 +404,7 @@ async def test_unexpected_error_closes_the_client_and_the_next_tick_opens_it(
     assert client.reason == "unexpected"
 
     def is_open() -> bool:
-        link.rig.clock.us += 100_000
+        link.rig.clock.now_us += 100_000
         return client.state == "open"
 
     await link.until(is_open)

@@ -50,7 +50,7 @@ async def test_client_that_only_sends_version_1_gets_it_after_a_probe(rig: Any) 
     station.send(heartbeat(0))
     await rig.until(lambda: len(hub.clients()) == 1)
     assert (await next_attitude(rig, hub, station))[0] == V2
-    rig.clock.us += PROBE_US
+    rig.clock.now_us += PROBE_US
     count = len(rig.incoming)
     station.send(heartbeat(1))
     await rig.until(lambda: len(rig.incoming) > count)
@@ -60,7 +60,7 @@ async def test_client_that_only_sends_version_1_gets_it_after_a_probe(rig: Any) 
     await rig.until(lambda: len(rig.incoming) > count)
     assert (await next_attitude(rig, hub, station))[0] == V2
     station.send(heartbeat(2))
-    rig.clock.us += PROBE_US
+    rig.clock.now_us += PROBE_US
     station.send(heartbeat(3))
     await rig.quiet()
     assert (await next_attitude(rig, hub, station))[0] == V2, "it has shown that it knows both"
@@ -72,5 +72,5 @@ async def test_option_of_version_2_is_kept_for_a_client_that_sends_version_1(rig
     for sequence in range(3):
         station.send(heartbeat(sequence))
         await rig.until(lambda count=sequence: len(rig.incoming) > count)
-        rig.clock.us += PROBE_US
+        rig.clock.now_us += PROBE_US
     assert (await next_attitude(rig, hub, station))[0] == V2

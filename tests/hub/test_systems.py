@@ -276,7 +276,7 @@ class TestHub:
     async def test_clash_of_ids_is_reported_with_the_option_that_solves_it(self, rig: Any) -> None:
         hub, first, second, _ = await self.open(rig, "", "name=radio")
         for number in range(30):
-            rig.clock.us += 100_000
+            rig.clock.now_us += 100_000
             await self.say(rig, (first, attitude(60_000 + 100 * number), 1, 1))
             await self.say(rig, (second, attitude(500_000 + 100 * number), 1, 1))
         notes = [client.note for client in hub.clients()]
@@ -284,14 +284,14 @@ class TestHub:
         assert notes[0] == notes[2] == ""
         assert notes[1].endswith(f"; write {url}")
         hub.apply(type(hub.settings)(endpoints=(*hub.settings.endpoints[::2], url)))
-        rig.clock.us += 40_000_000
+        rig.clock.now_us += 40_000_000
         await self.say(rig, (first, attitude(), 1, 1), (second, heartbeat(), 1, 1))
         assert [client.note for client in hub.clients()] == ["", "", ""]
 
     async def test_two_links_to_one_vehicle_are_no_clash(self, rig: Any) -> None:
         hub, first, second, _ = await self.open(rig, "", "")
         for number in range(30):
-            rig.clock.us += 100_000
+            rig.clock.now_us += 100_000
             for each in (first, second):
                 # Each port of an autopilot has frames and sequence numbers of its own.
                 await self.say(rig, (each, attitude(60_000 + 100 * number + (each is first)), 1, 1))

@@ -42,7 +42,7 @@ class Port:
     async def fly(self, seconds: float) -> None:
         """Let time pass, in steps of the vehicle's samples."""
         for _ in range(round(seconds * 20)):
-            self.rig.clock.us += 50_000
+            self.rig.clock.now_us += 50_000
             self.gateway.fly()
             self.rig.tick(self.gateway.hub)
             await self.rig.quiet_some()
@@ -69,7 +69,7 @@ def answer_of_ping(port: Port) -> bytes:
 
 
 def guessed_answer(port: Port) -> bytes:
-    guess_ns = (port.rig.clock.us + 1) * 1000
+    guess_ns = (port.rig.clock.now_us + 1) * 1000
     return port.station.sender.pack(mavlink.MAVLink_timesync_message(1, guess_ns))
 
 

@@ -155,7 +155,7 @@ async def until(rig: Rig, hub: Any, condition: Callable[[], bool]) -> None:
     """Let the hub tick until something holds: Zenoh's own threads take their time."""
     async with asyncio.timeout(LIMIT_S):
         while not condition():
-            rig.clock.us += 100_000
+            rig.clock.now_us += 100_000
             rig.tick(hub)
             await asyncio.sleep(0.01)
 

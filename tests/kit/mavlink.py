@@ -5,12 +5,15 @@ from typing import Any
 from pymavlink.dialects.v20 import common as dialect
 
 from gateway.records import Outgoing
+from gateway.wire.mavlink_signing import EPOCH_2015_US, TICK_US, FrameSigner, SigningClock
 from gateway.wire.mavlink_splitter import Event, MavFrame, frame_of, message_id_of, split_datagram
 
 STATION = 190
 """Component id of a ground station."""
 KEY = bytes(32)
 """Signing key of a signed sender."""
+TIMESTAMP = 30_000_000_000_000
+"""Signing timestamp at which the time of `signer` begins, and that of `strict` ends."""
 
 
 def packed(
@@ -75,6 +78,20 @@ class Sender:
 
     def ack(self) -> bytes:
         return self.pack(dialect.MAVLink_command_ack_message(512, 0))
+
+
+def signer(key: bytes = KEY) -> FrameSigner:
+    """Return a signer of system 1."""
+    signer = FrameSigner(SigningClock(EPOCH_2015_US + TIMESTAMP * TICK_US))
+    signer.keys[1] = key
+    return signer
+
+
+def strict(key: bytes = KEY) -> Any:
+    """Return a receiver by pymavlink that accepts only frames signed with a key."""
+    receiver = dialect.MAVLink(None)
+    receiver.signing.secret_key, receiver.signing.timestamp = key, TIMESTAMP
+    return receiver
 
 
 def outgoing(frame: bytes, client_id: int | None = None) -> Outgoing:

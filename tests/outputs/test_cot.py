@@ -31,7 +31,7 @@ async def event(outputs: OutputRig, options: str, *messages: Any) -> Any:
     station = outputs.station()
     output = await outputs.output(f"cot:udp:127.0.0.1:{station.port}{options}")
     outputs.hear(*messages)
-    outputs.clock.us = US_PER_S // 2
+    outputs.clock.now_us = US_PER_S // 2
     outputs.turn(output)
     return await station.receive()
 
@@ -90,7 +90,7 @@ async def test_each_vehicle_with_a_valid_position_has_an_event(outputs: OutputRi
     found = [read(await station.receive()) for _ in range(2)]
     assert [each.detail.contact.callsign for each in found] == ["<A& 1", "<A& 3"]
     assert found[0].staleTime - found[0].sendTime == 30_000
-    outputs.clock.us = 6 * US_PER_S
+    outputs.clock.now_us = 6 * US_PER_S
     outputs.turn(output)
     await outputs.quiet()
     assert station.is_empty(), "old"

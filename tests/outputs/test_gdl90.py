@@ -118,7 +118,7 @@ async def test_heartbeat_contains_validity_and_time_of_day(outputs: OutputRig) -
     output, station = await gdl90(outputs)
     outputs.hear(beat(), at())
     for seconds, is_valid in ((0, True), (6, False), (10 * 3600, False)):
-        outputs.clock.us = seconds * US_PER_S
+        outputs.clock.now_us = seconds * US_PER_S
         outputs.hear(beat())
         message = (await taken(outputs, output, station))[0]
         _, first, second, low, _ = struct.unpack("<BBBHH", message)
@@ -132,7 +132,7 @@ async def test_attitude_is_sent_at_its_rate_and_the_rest_once_a_second(outputs: 
     for _ in range(10):
         outputs.hear(beat(), at(), ATTITUDE)
         seen += await taken(outputs, output, station)
-        outputs.clock.us += US_PER_S // 5
+        outputs.clock.now_us += US_PER_S // 5
     assert (seen.count(257), seen.count(0), seen.count(10)) == (10, 2, 2)
 
 
@@ -142,7 +142,7 @@ async def test_attitude_contains_known_angles_only(outputs: OutputRig) -> None:
     outputs.hear(beat(), at(), ATTITUDE, hud)
     message = (await taken(outputs, output, station))[257]
     assert struct.unpack(">BBhhHHH", message) == (0x65, 1, 125, -73, 905, 39, 0xFFFF)
-    outputs.clock.us = 6 * US_PER_S
+    outputs.clock.now_us = 6 * US_PER_S
     outputs.hear(at(hdg=65535))
     message = (await taken(outputs, output, station))[257]
     assert struct.unpack(">BBhhHHH", message)[2:] == (0x7FFF, 0x7FFF, 0xFFFF, 0xFFFF, 0xFFFF)

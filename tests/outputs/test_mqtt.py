@@ -90,7 +90,7 @@ async def test_messages_of_all_systems_have_topics(
     assert output.state == "open", output.reason
     assert await next_of(client) == ("mavgate/status", "online", False)
     for seconds in (0.0, 0.5, 1.0):
-        outputs.clock.us = round(seconds * US_PER_S)
+        outputs.clock.now_us = round(seconds * US_PER_S)
         for system in (1, 255):
             outputs.hear(at(), system=system)
     for _ in range(2):
@@ -120,8 +120,8 @@ async def test_presence_is_retained_and_the_last_will_ends_it(
     output.carrier.client._client.socket().shutdown(socket.SHUT_RDWR)
     assert await next_of(client) == ("field/7/status", "offline", False)
     await outputs.until(lambda: output.state == "unreachable")
-    outputs.clock.us += 2 * US_PER_S
-    output.tick(outputs.clock.us)
+    outputs.clock.now_us += 2 * US_PER_S
+    output.tick(outputs.clock.now_us)
     assert await next_of(client) == ("field/7/status", "online", False)
     await client.__aexit__(None, None, None)
 

@@ -46,7 +46,7 @@ async def udp_output(outputs: OutputRig, options: str = "") -> tuple[Any, Statio
 async def test_sentences_contain_position_motion_and_heading(outputs: OutputRig) -> None:
     output, station = await udp_output(outputs)
     outputs.hear(beat(), at(), gps())
-    outputs.clock.us = US_PER_S // 2
+    outputs.clock.now_us = US_PER_S // 2
     found = await sentences(outputs, output, station)
     assert list(found) == ["GGA", "RMC", "VTG", "HDT"]
     gga, rmc, vtg, hdt = found.values()
@@ -83,7 +83,7 @@ async def test_position_is_void_unless_valid_and_new(
 ) -> None:
     output, station = await udp_output(outputs)
     outputs.hear(beat(), *messages)
-    outputs.clock.us = age_us
+    outputs.clock.now_us = age_us
     found = await sentences(outputs, output, station)
     gga, rmc = found["GGA"], found["RMC"]
     assert (gga.quality > 0, rmc.status == "A", "VTG" in found) == (is_valid,) * 3
@@ -175,8 +175,8 @@ async def test_broken_connection_is_made_again(outputs: OutputRig) -> None:
             await outputs.until(lambda: output.state == "open")
             connection.close()
             await outputs.until(lambda: output.state == "unreachable")
-            outputs.clock.us += 2 * US_PER_S
-            output.tick(outputs.clock.us)
+            outputs.clock.now_us += 2 * US_PER_S
+            output.tick(outputs.clock.now_us)
         output._timer.cancel()
 
 
@@ -255,7 +255,7 @@ async def first_fix(outputs: OutputRig, output: Any, port: int) -> Any:
     reading = asyncio.get_running_loop().create_task(reader.readline())
     try:
         while True:
-            outputs.clock.us += US_PER_S
+            outputs.clock.now_us += US_PER_S
             outputs.hear(beat(), at(), gps())
             outputs.turn(output)
             done, _ = await asyncio.wait([reading], timeout=0.05)

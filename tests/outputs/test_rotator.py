@@ -116,7 +116,7 @@ async def test_station_is_a_place_the_home_or_another_system(outputs: OutputRig,
         outputs.hear(beat(), at(*south), system=9)
     outputs.turn(output)
     assert await station.receive() == b"P 0.0 45.0\n"
-    outputs.clock.us = 6_000_000
+    outputs.clock.now_us = 6_000_000
     outputs.turn(output)
     await outputs.quiet()
     assert station.is_empty(), "old"
