@@ -1,8 +1,8 @@
 """Measure work on many recordings: one after the other, in processes, on a Dask cluster.
 
     python tools/bench_batch.py                        # all of it, in some 20 minutes
-    python tools/bench_batch.py fuse --flights 24      # or report, sweep: serial and in processes
-    python tools/bench_batch.py dask --flights 24      # fuse: a cluster of two, and processes
+    python tools/bench_batch.py judge --flights 24     # or report, sweep: serial and in processes
+    python tools/bench_batch.py dask --flights 24      # judge: a cluster of two, and processes
     python tools/bench_batch.py growth --flights 200   # cost and memory against the number of files
     python tools/bench_batch.py catalogue --files 10000   # a catalogue: index, index again, ask
     python tools/bench_batch.py --quick                # all of it with few, short flights
@@ -41,15 +41,7 @@ from gateway.analysis.sweep import parse_axis
 from gateway.batch.catalogue import CATALOGUE_NAME, find_flights, geojson_of, index_folder
 from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import items_of
-from gateway.batch.tasks import (
-    LOOKING,
-    FlightTask,
-    FuseTask,
-    ReportTask,
-    ResultFolder,
-    SweepTask,
-    run_season,
-)
+from gateway.batch.tasks import LOOKING, FlightTask, JudgeTask, ResultFolder, SweepTask, run_season
 from gateway.pipeline import PipelineSettings
 from gateway.recordings.recorded_table import ReadOptions, header_for
 from gateway.recordings.table import TableHeader, encode_head
@@ -74,14 +66,14 @@ QUERIES = (
     "gps_outages > 0 or faults > 0",
     "error is not null",
 )
-SHARE = {"fuse": 1, "report": 16, "sweep": 4}
+SHARE = {"judge": 1, "report": 16, "sweep": 4}
 """Of the flights that are fused, `all` reports and sweeps one in so many."""
 BROKEN = 100
 """One file in so many of the catalogue is broken."""
 ROW = "{:<8} {:<10} {:>7} {:>7} {:>8} {:>8} {:>9} {:>9} {:>9} {:>8}"
 HEAD = ("part", "by", "flights", "failed", "start, s", "wall, s", "s/flight", "CPU, s", "worker MB",
         "here MB")  # fmt: skip
-PARTS = ("all", "make", "fuse", "report", "sweep", "dask", "growth", "catalogue")
+PARTS = ("all", "make", "judge", "report", "sweep", "dask", "growth", "catalogue")
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
@@ -134,16 +126,16 @@ def work(folder: Path, part: str, flights: int) -> None:
                 f"as one after the other (goal 1.8), CPU {pool.cpu_s / serial.cpu_s:.2f} times"
             )
     if part in ("all", "dask"):
-        pool, dask = cost("fuse", "processes", flights), cost("fuse", "dask", flights)
+        pool, dask = cost("judge", "processes", flights), cost("judge", "dask", flights)
         compared.append(
-            f"fuse on a cluster of {WORKERS}: {100 * (dask.wall_s / pool.wall_s - 1):+.1f} % wall "
+            f"judge on a cluster of {WORKERS}: {100 * (dask.wall_s / pool.wall_s - 1):+.1f} % wall "
             f"relative to the local processes (goal below +15 %)"
         )
     if part in ("all", "growth"):
         counts = sorted({max(flights // share, 1) for share in (8, 4, 2, 1)})
-        least, *_, most = (cost("fuse", "processes", count) for count in counts)
+        least, *_, most = (cost("judge", "processes", count) for count in counts)
         compared.append(
-            f"fuse of {counts[-1]} flights relative to {counts[0]}: "
+            f"judge of {counts[-1]} flights relative to {counts[0]}: "
             f"{most.wall_s / counts[-1] / (least.wall_s / counts[0]):.2f} times the wall a flight, "
             f"largest worker {most.worker_mb - least.worker_mb:+.0f} MB, "
             f"this process {most.here_mb - least.here_mb:+.0f} MB"
@@ -193,7 +185,7 @@ def task_of(part: str) -> FlightTask:
     if part == "sweep":
         axes = tuple(parse_axis(name, "0.1,0.5,0.9") for name in ("alpha", "beta"))
         return SweepTask(OPTIONS, axes, "held_m", 5, 0.0)
-    return FuseTask(OPTIONS) if part == "fuse" else ReportTask(OPTIONS)
+    return JudgeTask(OPTIONS, pages=part == "report")
 
 
 Used = Callable[[], tuple[float, float]]

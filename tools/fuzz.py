@@ -430,7 +430,7 @@ COMMANDS: Final = (
     ("info", "--json"),
     ("recover", "--force", "-o", "OUT.csv"),
     *(("convert", "--force", "-o", f"OUT{end}") for end in (".csv", ".tlog", ".kml", ".gpx")),
-    ("convert", "--force", "--fuse", "--from", "1", "-o", "OUT.csv"),
+    ("fuse", "--force", "--from", "1", "-o", "OUT.csv"),
     ("fuse", "--force", "--estimator", "complementary", "-o", "OUT.csv"),
     ("check-config",),
 )

@@ -14,7 +14,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 from typer.testing import CliRunner
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
@@ -84,7 +83,10 @@ def fused(log: Path, estimator: str) -> list[str]:
         if result.exit_code != 0:
             raise RuntimeError(result.output)
         lines = [line for line in out.read_text().splitlines() if not line.startswith("#")]
-    return [lines[0], *np.array(lines[1:])[::EVERY].tolist()]
+    names, *rows = csv.reader(lines)
+    kept = [k for k, name in enumerate(names) if name == "time_us" or name.startswith("nav_")]
+    states = [row for row in rows if row[names.index("nav_time_us")]]
+    return [",".join(row[k] for k in kept) for row in [names, *states[::EVERY]]]
 
 
 def main() -> None:

@@ -67,14 +67,12 @@ def without_user(url: str) -> str:
     return _USER.sub("", url)
 
 
-def items_of(names: Sequence[str], *, each_file: bool = False) -> list[BatchItem]:
+def items_of(names: Sequence[str]) -> list[BatchItem]:
     """Find the recordings that are meant.
 
     Raises StorageError if there is nothing of a name, or its storage cannot be reached.
     """
     locations = list(dict.fromkeys(location for name in names for location in _locations(name)))
-    if each_file:
-        return [BatchItem((_plain(location),)) for location in locations]
     by_path = {Path(location): location for location in locations}
     with_table = {_series(path) for path in by_path if _ending(path) == ".csv"}
     wanted = [p for p in by_path if _ending(p) == ".csv" or _series(p) not in with_table]

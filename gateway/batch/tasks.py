@@ -36,7 +36,6 @@ from gateway.recordings.fuse import fuse
 from gateway.recordings.index import as_text, recording_name
 from gateway.recordings.recorded_fusion import fused_lines, header_of_states
 from gateway.recordings.recorded_table import ReadOptions
-from gateway.recordings.summary import describe
 
 HELD: Final = "held_m"
 """Errors at the withheld fixes, by estimator."""
@@ -104,38 +103,39 @@ class FlightTask(ABC):
 
 
 @dataclass(frozen=True)
-class FuseTask(FlightTask):
-    """Fuse with every estimator, judge each by withheld fixes, write the settings' own states."""
+class JudgeTask(FlightTask):
+    """Judge every estimator by withheld fixes, write the settings' own states, and a page."""
 
-    name: ClassVar[str] = "fuse"
-
-    def do(self, files: list[Path], name: str) -> Worked:
-        """See `FlightTask`."""
-        read, case = _judged(files, self.options, name)
-        states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
-        lines = fused_lines(read.header, read.flight.time_us, states)
-        fused = {f"fused/{name}.csv": b"".join(lines)}
-        return Worked(read.vehicle, read.began, _figures(case), fused)
-
-
-@dataclass(frozen=True)
-class ReportTask(FlightTask):
-    """Make the page of each flight."""
-
+    pages: bool
     name: ClassVar[str] = "report"
 
+    @property
+    def fingerprint(self) -> bytes:
+        """See `FlightTask`."""
+        return super().fingerprint + msgspec.json.encode(self.pages)
+
     def do(self, files: list[Path], name: str) -> Worked:
         """See `FlightTask`."""
-        # They need the extra plot, and take a second to import.
-        from gateway.analysis.reporting.compose import make_report
-        from gateway.analysis.reporting.page import write_report
-
-        read, case = _judged(files, self.options, name)
-        with TemporaryDirectory(prefix="mavgate-") as folder:
-            write_report(make_report(case), Path(folder), jobs=1)
-            pages = sorted(Path(folder).iterdir())
-            made = {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
+        read = read_season_flight(files, self.options, name)
+        case = make_case(read.flight)
+        states = fuse(read.flight.samples, estimator_of(read.flight, case.fusion)).states
+        lines = fused_lines(read.header, read.flight.time_us, states)
+        made = {f"fused/{name}.csv": b"".join(lines)}
+        if self.pages:
+            made |= _page_of(case, name)
         return Worked(read.vehicle, read.began, _figures(case), made)
+
+
+def _page_of(case: Case, name: str) -> Files:
+    """Make the page of a flight."""
+    # They need the extra plot, and take a second to import.
+    from gateway.analysis.reporting.compose import make_report
+    from gateway.analysis.reporting.page import write_report
+
+    with TemporaryDirectory(prefix="mavgate-") as folder:
+        write_report(make_report(case), Path(folder), jobs=1)
+        pages = sorted(Path(folder).iterdir())
+        return {f"reports/{name}/{page.name}": page.read_bytes() for page in pages}
 
 
 @dataclass(frozen=True)
@@ -170,24 +170,6 @@ class SweepTask(FlightTask):
         base = score_of(contest, flight.fusion)[self.metric_column]
         values = [None if score != score else score for score in (base, *scores)]
         return Worked(read.vehicle, read.began, {"base": values[0], "scores": values[1:]})
-
-
-@dataclass(frozen=True)
-class InfoTask(FlightTask):
-    """Describe the content of each file."""
-
-    name: ClassVar[str] = "info"
-
-    def do(self, files: list[Path], name: str) -> Worked:  # noqa: ARG002
-        """See `FlightTask`."""
-        (file,) = files
-        found = describe(file, self.options.progress, lambda: self.options)
-        zero_us = 0 if found.header is None else found.header.unix_us_at_zero
-        first_us = found.first_us
-        began = None if zero_us is None or first_us is None else zero_us + first_us
-        vehicle = found.vehicles[0].system_id if found.vehicles else None
-        figures = msgspec.to_builtins(replace(found, header=None))
-        return Worked(vehicle, began_text(began), figures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,12 +248,6 @@ def name_of(item: BatchItem) -> str:
     for ending in (".gz", ".csv", ".tlog"):
         name = name.removesuffix(ending)
     return name
-
-
-def _judged(files: Sequence[Path], options: ReadOptions, name: str) -> tuple[ReadFlight, Case]:
-    """Read a flight, and fuse it with every estimator."""
-    read = read_season_flight(files, options, name)
-    return read, make_case(read.flight)
 
 
 def _figures(case: Case) -> dict[str, Any]:

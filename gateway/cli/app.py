@@ -49,7 +49,6 @@ MODULES: Final = {
 }
 """The commands of each module below `gateway.cli`, which its `app` contains."""
 
-JUDGING: Final = ("fuse", "report", "sweep")
 HELP: Final = {"help_option_names": ["-h", "--help"]}
 GROUPS: Final = {
     "Fly": {
@@ -62,11 +61,12 @@ GROUPS: Final = {
         "clear it.",
     },
     "Recordings": {
-        "record": "Start, stop, name, list and delete recordings.",
+        "record": "Start, stop, name and delete recordings, and add remarks.",
         "play": "Play recordings to the ground stations, several at once if you like.",
         "seek": "Seek in the running player.",
         "player": "Control the running player.",
-        "info": "Show what a recording holds: duration, vehicles, rates, gaps, distance, damage.",
+        "info": "Show what recordings hold: duration, vehicles, rates, gaps, distance, damage; "
+        "or list all.",
         "page": "Make one HTML file of a flight, which opens offline in any browser.",
         "convert": "Convert, trim, join, merge and edit recordings.",
         "diff": "Compare recordings or parameter files: parameters, missions, figures, texts.",
@@ -81,9 +81,11 @@ GROUPS: Final = {
     },
     "Analysis": {
         "report": "Make a page of figures and tables of a flight, those of the paper included.",
-        "fuse": "Re-run the estimator on a log and write one row per IMU sample.",
+        "fuse": "Re-run the estimator on recordings, and write them with the new states in any "
+        "format.",
         "sweep": "Try settings on one flight or many, and write the best as a settings file.",
-        "batch": "Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+        "batch": "Judge every estimator, or try settings, on many recordings at once, here or on "
+        "a cluster.",
         "catalogue": "Index all recordings under a folder, and list and search what is in them.",
     },
     "Set-up": {
@@ -105,22 +107,27 @@ HOISTED: Final = frozenset({"--config", "-c", "--socket"})
 """Options of `mavgate` itself that may follow the command, too."""
 EPILOG: Final = "`mavgate --help` lists the options of all commands: --config, --socket, --verbose."
 FORMER: Final[dict[str, dict[str, str]]] = {
-    "convert": {"--out": "--output", "--settings": "--fuse-with"},
+    "convert": {"--out": "--output"},
     "fuse": {"--out": "--output", "--settings": "--fuse-with"},
     "recover": {"--out": "--output"},
     "map get": {"--from": "--source"},
     "fleet recordings get": {"--to": "--output"},
     **{
         words: {"--settings": "--fuse-with"}
-        for words in ("play", "page", "report", "sweep", *(f"batch {name}" for name in JUDGING))
+        for words in ("play", "page", "report", "sweep", "batch report", "batch sweep")
     },
 }
 """Former names of options, by command; for one release each leads to its present name."""
 MOVED: Final = {
     "record save": "record rename",
+    "record list": "info",
     "catalogue show": "info",
+    "batch info": "catalogue",
+    "batch fuse": "batch report",
+    **{f"convert {option}": "fuse" for option in ("--fuse", "--smooth", "--beside", "--position")},
+    "convert --fuse-with": "fuse",
 }
-"""Former names of commands, with those that do their work now."""
+"""Former commands and options, with the commands that do their work now, for one release."""
 
 
 SMALL: Final = frozenset({"ports", "flash", "record", *MODULES["live.clients"]})
@@ -151,36 +158,27 @@ def tidied(command: Any, words: str = "") -> Any:
             parameter.metavar = ""
     if words:
         command.epilog = EPILOG
-    if former := FORMER.get(words):
         parse = command.parse_args
-        command.parse_args = lambda ctx, args: parse(ctx, [_present(a, former) for a in args])
-    if (below := getattr(command, "commands", None)) is not None:
-        for moved, name in MOVED.items():
-            if moved.rpartition(" ")[0] == words and words:
-                below[moved.rpartition(" ")[2]] = _pointer(moved, name)
-        for name, each in below.items():
-            tidied(each, f"{words} {name}".strip())
+        command.parse_args = lambda ctx, args: parse(ctx, _present(words, args))
+    for name, each in getattr(command, "commands", {}).items():
+        tidied(each, f"{words} {name}".strip())
     return command
 
 
-def _present(word: str, former: dict[str, str]) -> str:
-    """Return the present name of an option, with a message if it had another."""
-    name, equals, value = word.partition("=")
-    if (present := former.get(name)) is None:
-        return word
-    typer.echo(f"{name} is called {present} now; the former name works until version 0.2", err=True)
-    return f"{present}{equals}{value}"
-
-
-def _pointer(moved: str, name: str) -> TyperCommand:
-    """Return a command that ends with the name of its successor."""
-
-    def point() -> None:
-        refuse(f"`mavgate {moved}` was replaced: use `mavgate {name}`")
-
-    any_words = {"ignore_unknown_options": True, "allow_extra_args": True}
-    text = f"Former name of `mavgate {name}`."
-    return TyperCommand(moved, callback=point, help=text, hidden=True, context_settings=any_words)
+def _present(command: str, words: list[str]) -> list[str]:
+    """Replace former names of options, with a message; what has moved ends the command."""
+    found = list[str]()
+    for at, word in enumerate(words):
+        name, equals, value = word.partition("=")
+        moved = f"{command} {name}"
+        if moved in MOVED and (at == 0 or name.startswith("--")):
+            refuse(f"`mavgate {moved}` was replaced: use `mavgate {MOVED[moved]}`")
+        present = FORMER.get(command, {}).get(name, name)
+        if present != name:
+            text = f"{name} is called {present} now; the former name works until version 0.2"
+            typer.echo(text, err=True)
+        found.append(f"{present}{equals}{value}")
+    return found
 
 
 def hoisted(words: list[str]) -> list[str]:

@@ -4,6 +4,7 @@ import heapq
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -69,11 +70,16 @@ class FlightToWrite:
         fuse: bool = False,
         smooth: bool = False,
         both: bool = False,
+        estimator: str | None = None,
+        latency_s: float | None = None,
         message: str | None = None,
         edits: TlogEdits | None = None,
     ) -> None:
         self.files, self.options, self.title, self.message = files, options, title, message
-        self._limits, self._smooth = limits, smooth
+        self._limits = limits
+        self._fusion_of = partial(
+            RecordedFusion, smooth=smooth, estimator=estimator, latency_s=latency_s
+        )
         self._edits = edits or TlogEdits()
         kinds = {format_of(file) for file in files}
         if len(kinds) > 1:
@@ -83,7 +89,9 @@ class FlightToWrite:
         """Whether the frames are the recorded ones, and the rows are derived from them."""
         self._estimates = estimates_of(files, fuse=fuse, both=both)
         self._as_recorded = not fuse and all(is_table(file) for file in files)
-        self._sources: list[RecordedFusion | RecordedTable] = []
+        self.fusions: list[RecordedFusion] = []
+        """Those that were made to write it."""
+        self._tables: list[RecordedTable] = []
         self._logs: list[AutopilotLog] = []
         self._remarks: list[str] = []
         self.senders = Senders()
@@ -149,7 +157,7 @@ class FlightToWrite:
         """Return the rows: as recorded, or fused again from the start and then cut."""
         if self._as_recorded:
             table = joined_tables([open_rows(file, self.options) for file in self.files])
-            self._sources.append(table)
+            self._tables.append(table)
         else:
             table = self.fused().table()
         return trimmed(table, self._limits)
@@ -180,8 +188,9 @@ class FlightToWrite:
     @property
     def remarks(self) -> list[str]:
         """Remarks for the user, complete once all is written."""
-        sources = [*self._logs, *self._sources]
-        return [*self._remarks, *(remark for source in sources for remark in source.remarks)]
+        read: list[AutopilotLog | RecordedTable] = [*self._logs, *self._tables]
+        found = [*read, *self.fusions]
+        return [*self._remarks, *(remark for source in found for remark in source.remarks)]
 
     def lacks(self, ending: str) -> str:
         """Return the content that a format cannot hold, once all is written; empty for none."""
@@ -196,8 +205,8 @@ class FlightToWrite:
 
     def fused(self) -> RecordedFusion:
         """Return these files fused again."""
-        fusion = RecordedFusion(self.files, self.options, smooth=self._smooth)
-        self._sources.append(fusion)
+        fusion = self._fusion_of(self.files, self.options)
+        self.fusions.append(fusion)
         return fusion
 
     def _sent(self) -> Iterator[TlogRecord]:

@@ -297,6 +297,8 @@ class Fusion:
         self._follow = follow
         self._played = played
         self._correct = correct
+        self.time_us: list[IntArray] = []
+        """Times of the IMU samples that were fused."""
         self.refused: list[str] = []
         """Why states of the file were not restored; then the estimator starts cold."""
 
@@ -339,6 +341,7 @@ class Fusion:
         has_counts, holds = has_group(cells, RAW), has_sample(cells)
         samples = samples_of_cells(cells, self._aircraft.chain)
         log, played, estimator = samples.imu, self._played, self._aircraft.estimator
+        self.time_us.append(log.time_us)
 
         def on_fix() -> None:
             if played is not None:

@@ -25,7 +25,6 @@ from gateway.estimation.select import make_estimator
 from gateway.pipeline import Pipeline, PipelineSettings
 from gateway.recordings.columns import (
     GPS,
-    NAV,
     NAV_COLUMNS,
     WHOLE_COLUMNS,
     FloatArray,
@@ -75,6 +74,7 @@ from gateway.recordings.table import (
 from gateway.recordings.tlog import UNRECORDED, Stamper, TlogRecord
 from gateway.records import RECORDED_ONLY, FusionState, NodeStatus
 from gateway.sensing.chain import IntArray
+from gateway.units import US_PER_S, counted
 from gateway.vehicle.service import INFO, StatusText
 
 PIECE: Final = 200
@@ -261,6 +261,8 @@ def fused_lines(header: TableHeader, time_us: IntArray, states: FloatArray) -> I
         yield write_lines(table[begin : begin + LINES], IS_WHOLE)
 
 
+LEAST_RATE_HZ: Final = 10.0
+"""A hand-held or flying tracker turns within a tenth of a second."""
 NOT_RESTORED: Final = "the state stored at the start is not used: {}; the estimator has to converge"
 
 
@@ -275,7 +277,6 @@ class RecordedFusion:
         smooth: bool = False,
         estimator: str | None = None,
         latency_s: float | None = None,
-        states_only: bool = False,
     ) -> None:
         self._table = table = joined_tables([open_rows(file, options) for file in files])
         self.aircraft = aircraft_for(files, table, options, latency_s)
@@ -283,19 +284,21 @@ class RecordedFusion:
         if smooth or estimator is not None:
             name = SMOOTHED_ESTIMATOR if smooth or estimator is None else estimator
             self.aircraft = with_estimator(self.aircraft, name)
-        self._follow = options.choice == "recorded" and is_table(files[0])
-        self._smoothed: tuple[IntArray, FloatArray] | None = None
+        is_own = options.choice == "recorded" and is_table(files[0])
+        self._follow = is_own and estimator is None and latency_s is None
         self._correct: Correct | None = None
         if smooth:
-            blocks = table.blocks if states_only else _blocks_of(files, options)
-            self._smoothed = self._smooth(blocks, files[0])
-            self._correct = smoothed_states(*self._smoothed)
+            smoothed = self._smooth(_blocks_of(files, options), files[0])
+            self._correct = smoothed_states(*smoothed)
         elif options.position == "interpolated":
             latency_s = self.aircraft.estimation.reference.gps_latency_s
             cells = (block.cells for block in _blocks_of(files, options))
             fixes = [some[has_group(some, GPS), GPS] for some in cells]
             self._correct = interpolated_positions(np.concatenate(fixes), latency_s)
         self._refused: list[str] = []
+        self._time_us: list[IntArray] = []
+        self._name = self.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
+        self._files = files
 
     def _smooth(self, blocks: Iterable[TableBlock], file: Path) -> tuple[IntArray, FloatArray]:
         """Smooth the rows; a remark states a latency that is not the one that is set."""
@@ -319,30 +322,45 @@ class RecordedFusion:
     @property
     def remarks(self) -> list[str]:
         """Remarks about the states for the user, as far as the rows were read."""
-        return [*map(NOT_RESTORED.format, self._refused), *self._table.remarks]
+        return [*map(NOT_RESTORED.format, self._refused), *self._table.remarks, *self._of_rate()]
 
     @property
-    def header(self) -> TableHeader:
-        """The head of a table of the states alone."""
-        return header_of_states(self._table.header, self.aircraft)
+    def summary(self) -> str:
+        """Count and rate of the samples that were fused, and the estimator."""
+        count = counted(sum(map(len, self._time_us)), "sample")
+        return f"{count} at {self._rate_hz():.3g} Hz fused by {self._name}"
+
+    def _of_rate(self) -> Iterator[str]:
+        if 0.0 < (rate_hz := self._rate_hz()) < LEAST_RATE_HZ:
+            yield (
+                f"{self._files[0]}: its IMU samples come at {rate_hz:.2g} Hz; below "
+                f"{LEAST_RATE_HZ:.0f} Hz the turns between them are not seen, so attitude and "
+                "position may be wrong"
+            )
+
+    def _rate_hz(self) -> float:
+        """Return the rate of samples by their median interval; 0 of a single one."""
+        intervals_us = np.diff(np.concatenate([np.empty(0, np.int64), *self._time_us]))
+        intervals_us = intervals_us[intervals_us > 0]
+        return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0
 
     def introduction(self) -> Iterator[bytes]:
         """Yield the frames with the vehicle's version and the parameters that it is fused with."""
         vehicle = Aircraft(self._table.header.vehicle_id, self.aircraft).vehicle
         return (sent.frame for sent in vehicle.introduction())
 
-    def _fusion(self, *, follow: bool, played: FusedStates | None = None) -> Fusion:
+    def _fusion(self, played: FusedStates | None = None) -> Fusion:
         vehicle_id = self._table.header.vehicle_id
         fusion = Fusion(
-            vehicle_id, self.aircraft, follow=follow, played=played, correct=self._correct
+            vehicle_id, self.aircraft, follow=self._follow, played=played, correct=self._correct
         )
-        self._refused = fusion.refused
+        self._refused, self._time_us = fusion.refused, fusion.time_us
         return fusion
 
     def frames(self) -> Iterator[TlogRecord]:
         """Yield the MAVLink that the gateway would have sent, at civil times."""
         header, states = self._table.header, FusedStates()
-        fusion = self._fusion(follow=self._follow, played=states)
+        fusion = self._fusion(played=states)
         zero_us = header.unix_us_at_zero or 0
         settings = PipelineSettings(self.aircraft, {}, zero_us, states)
         replay, stamper = Replay(Pipeline(settings), follow=self._follow), Stamper(zero_us)
@@ -357,7 +375,7 @@ class RecordedFusion:
 
     def table(self) -> RecordedTable:
         """Return the rows with the new states, under a head that says how they were fused."""
-        blocks = map(self._fusion(follow=self._follow).block, self._table.blocks)
+        blocks = map(self._fusion().block, self._table.blocks)
         # The first may hold nothing but the head of the file.
         first = next((block for block in blocks if len(block) or block.comments), None)
         at_begin = [] if first is None else [c for row, c in first.comments if row == 0]
@@ -367,24 +385,6 @@ class RecordedFusion:
             old = msgspec.structs.replace(old, settings=new.settings, calibration=new.calibration)
         header = msgspec.structs.replace(old, mavgate_version=__version__, cold_start=begins_cold)
         return RecordedTable(header, chain([] if first is None else [first], blocks))
-
-    def states(self) -> tuple[IntArray, FloatArray]:
-        """Return times and states of the IMU samples, all with the settings of the head.
-
-        They begin with the state at the begin of the table, where there is one that fits.
-        """
-        if self._smoothed is not None:
-            return self._smoothed
-        fusion = self._fusion(follow=False)
-        rows = []
-        for number, block in enumerate(self._table.blocks):
-            # Of the lines between rows only a state at the very begin.
-            begin = block.comments[:1] if number == 0 else ()
-            kept = tuple((k, c) for k, c in begin if k == 0 and isinstance(c, FusionState))
-            rows.append(fusion.block(TableBlock(block.cells, kept)).cells)
-        cells = np.concatenate(rows)
-        cells = cells[has_group(cells, NAV)]
-        return cells[:, 0].astype(np.int64), cells[:, NAV][:, 1:]
 
 
 def header_of_states(known: TableHeader, aircraft: AircraftSettings) -> TableHeader:

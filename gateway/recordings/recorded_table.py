@@ -101,7 +101,7 @@ def aircraft_of(table: RecordedTable, options: ReadOptions) -> AircraftSettings:
     except msgspec.ValidationError as error:
         raise FlightError(
             f"the recorded settings are of another version ({error}); "
-            "use the current ones: --fuse-with current"
+            "`fuse`, `play` and `report` use the current ones with --fuse-with current"
         ) from error
 
 

@@ -26,7 +26,7 @@ def address() -> Iterator[str]:
 
 def _run(season: Path, out: Path, *more: str) -> tuple[int, str]:
     files = [season / name for name in ("alpha_01_v1.csv", "gamma_01_v2.csv", "broken.csv")]
-    done = invoke("batch", "fuse", *files, "-o", out, *more)
+    done = invoke("batch", "report", "--no-pages", *files, "-o", out, *more)
     return done.exit_code, done.output
 
 

@@ -84,7 +84,7 @@ def test_single_day_cannot_be_separated_from_chance() -> None:
 
 def flight(location: str, vehicle: int, **held_m: float) -> FlightResult:
     return FlightResult(
-        location=location, digest=location, key="", task="fuse", version="", vehicle=vehicle,
+        location=location, digest=location, key="", task="report", version="", vehicle=vehicle,
         began="2026-06-01 10:00:00", figures={"held_m": held_m},
     )  # fmt: skip
 

@@ -120,7 +120,7 @@ def test_former_command_ends_with_its_successor(words: str, present: str) -> Non
 @pytest.mark.parametrize(
     ("words", "endings"),
     [
-        ("fuse x -o x.kml", ".csv"),
+        ("fuse x -o x.pdf", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
         ("convert x -o x.doc", ".tlog, .csv, .kml, .gpx, .geojson, .mcap, .parquet"),
         ("recover x -o x.kml", ".tlog, .csv"),
         ("page x -o page.pdf", ".html"),
@@ -191,5 +191,5 @@ def test_user_without_a_home_gets_defaults_and_a_warning(
 
     monkeypatch.setattr("pwd.getpwuid", unknown)
     monkeypatch.delenv("HOME")
-    assert "no recordings in /mavgate/recordings" in run("record", "list")
+    assert "no recordings in /mavgate/recordings" in run("info")
     assert "HOME is not set" in caplog.text

@@ -203,12 +203,6 @@ def test_catalogue_is_read_by_sqlite_and_agrees_with_the_summary(folder: Path, t
     )  # fmt: skip
 
 
-def test_batch_command_describes_the_folder(folder: Path, tmp_path: Path) -> None:
-    done = invoke("batch", "info", folder, "-o", tmp_path / "info", "--jobs", 1, code=0)
-    assert "_01.tlog" in done.output
-    assert any(path.is_file() for path in (tmp_path / "info").rglob("*"))
-
-
 def test_tables_are_fused_again_and_recovered(folder: Path, tlog: Path, tmp_path: Path) -> None:
     (table,) = folder.glob("*_01_v1.csv")
     invoke("fuse", table, "-o", tmp_path / "fused.csv", code=0)
@@ -228,8 +222,8 @@ def test_sweep_of_the_seconds_before_the_take_off_teaches_nothing(
     assert f"{table.name}: at rest throughout" in done.output
 
 
-def test_folder_is_fused_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
-    invoke("batch", "fuse", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
+def test_folder_is_judged_by_the_batch_command(folder: Path, tmp_path: Path) -> None:
+    invoke("batch", "report", "--no-pages", folder, "-o", tmp_path / "out", "--jobs", 1, code=0)
     page = (tmp_path / "out" / "index.html").read_text()
     assert all(table.name in page for table in folder.glob("*_01_v?.csv"))
 

@@ -179,7 +179,7 @@ folder = "FOLDER"
     assert "BAD_DATA" not in dumped.stdout
     table, *_ = sorted(tmp_path.glob("*_v1.csv"))
     again = tmp_path / "again.csv"
-    done = invoke("convert", table, "--fuse", "-o", again)
+    done = invoke("fuse", table, "-o", again)
     assert done.exit_code == 0, done.output
     assert again.read_bytes() == table.read_bytes()
 

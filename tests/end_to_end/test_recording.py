@@ -156,6 +156,6 @@ async def test_table_alone_gives_recorded_states_bit_for_bit(
     assert repr(again) == repr(rows)
     # A later part alone begins in flight, and goes on from what the fusion remembered there.
     out = folder / "again.csv"
-    done = invoke("convert", paths[-1], "--fuse", "-o", out)
+    done = invoke("fuse", paths[-1], "-o", out)
     assert done.exit_code == 0, done.output
     assert out.read_bytes() == paths[-1].read_bytes()

@@ -334,21 +334,21 @@ def test_convert_lists_rows_without_counterpart(tmp_path: Path) -> None:
     assert "without a counterpart in MAVLink: ODD 40" in output
 
 
-def test_convert_writes_own_estimates_fused_ones_or_both(tmp_path: Path) -> None:
+def test_tlog_has_own_estimates_fused_ones_or_both(tmp_path: Path) -> None:
     path = flown.write(tmp_path / "flight.bin", flown.make_dataflash(20.0))
     origins = {}
-    for option in ("", "--fuse", "--beside"):
-        out = tmp_path / f"out{option}.tlog"
-        run("convert", path, "-o", out, *([option] if option else []))
+    for words in ("convert", "fuse", "fuse --beside"):
+        out = tmp_path / f"{words}.tlog"
+        run(*words.split(), path, "-o", out)
         data = out.read_bytes()
         batch = TlogScanner().feed(data, final=True)
-        origins[option] = {int(one) for one in batch.origins}
+        origins[words] = {int(one) for one in batch.origins}
         attitudes = (batch.message_ids == MESSAGE_IDS["ATTITUDE"]).sum()
         assert attitudes > 0
     assert origins == {
-        "": {9 << 8 | 1},
-        "--fuse": {9 << 8 | 1},
-        "--beside": {9 << 8 | 1, 10 << 8 | 1},
+        "convert": {9 << 8 | 1},
+        "fuse": {9 << 8 | 1},
+        "fuse --beside": {9 << 8 | 1, 10 << 8 | 1},
     }
 
 

@@ -63,7 +63,7 @@ def test_recording_fused_with_another_latency_is_reported(
 ) -> None:
     own, config = tmp_path / "own.csv", tmp_path / "c.toml"
     config.write_text(f"[estimation.reference]\ngps_latency_s = {set_s}\n")
-    convert = ["convert", str(without_latency), "-o", str(own), "--fuse", "--config", str(config)]
+    convert = ["fuse", str(without_latency), "-o", str(own), "--config", str(config)]
     invoke(*convert, code=0)
     assert load_flight(own, TODAY, read_options(TODAY)).latency_s == set_s
     words = " ".join(capsys.readouterr().err.split())

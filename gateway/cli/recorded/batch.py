@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
-from gateway.batch.tasks import FlightResult, FuseTask, InfoTask, ReportTask, read_results
+from gateway.batch.tasks import FlightResult, JudgeTask, read_results
 from gateway.cli.support.batch_work import (
     HoldOutOption,
     IntervalOption,
@@ -42,7 +42,8 @@ Metric = Literal["held", "interpolated", "reference", "attitude"]
 
 app = typer.Typer()
 group = typer.Typer(
-    help="Fuse, report, sweep or sum up many recordings at once, here or on a cluster.",
+    help="Judge every estimator, or try settings, on many recordings at once, here or on a "
+    "cluster.",
     no_args_is_help=True,
 )
 app.add_typer(group, name="batch")
@@ -59,65 +60,27 @@ AgainstOption = Annotated[
 ]
 
 
-def _add_judging(name: Literal["fuse", "report"], text: str) -> None:
-    """Add a command that judges every estimator on every flight; they differ in what they write."""
-
-    @group.command(name, help=text)
-    def judge(
-        files: SeasonFiles,
-        *,
-        output: OutputOption,
-        against: AgainstOption = None,
-        columns: ColumnsOption = None,
-        fuse_with: FuseWithOption = "recorded",
-        jobs: JobsOption = None,
-        scheduler: SchedulerOption = None,
-    ) -> None:
-        if name == "report":
-            require("a report", "plot")
-        work = SeasonWork(files, jobs, scheduler)
-        task = {"fuse": FuseTask, "report": ReportTask}[name]
-        options = season_options(columns, fuse_with)
-        _finish(work.run(task(options), work.items(), output), output, against)
-
-
-_add_judging(
-    "fuse",
-    "Fuse many recordings with every estimator, judge each by withheld fixes, make one page.",
-)
-_add_judging("report", "Make the page of each of many recordings, and one of the season.")
-
-
 @group.command()
-def info(
+def report(
     files: SeasonFiles,
     *,
     output: OutputOption,
+    pages: Annotated[
+        bool,
+        typer.Option("--pages/--no-pages", help="Make a page of each flight, which takes longer."),
+    ] = True,
+    against: AgainstOption = None,
     columns: ColumnsOption = None,
+    fuse_with: FuseWithOption = "recorded",
     jobs: JobsOption = None,
     scheduler: SchedulerOption = None,
 ) -> None:
-    """Describe many files, one by one, as `mavgate info` does."""
-    from gateway.batch.statistics import flight_table
-
+    """Judge every estimator on every flight by withheld fixes; make a page of each, and of all."""
+    if pages:
+        require("a report", "plot")
     work = SeasonWork(files, jobs, scheduler)
-    task = InfoTask(season_options(columns, "recorded"))
-    results = work.run(task, work.items(each_file=True), output)
-    grid = table_of("recording", "aircraft", "began (UTC)", "s", "km", "gaps", "damaged", left=1)
-    for result in results:
-        figures = result.figures
-        if result.error is not None:
-            continue
-        km = sum(vehicle["distance_m"] or 0.0 for vehicle in figures["vehicles"]) / 1000.0
-        grid.add_row(
-            result.location.rsplit("/", 1)[-1], str(result.vehicle or "?"), result.began or "",
-            figure(figures["duration_s"], ".0f"), figure(km, ".2f"), str(len(figures["gaps"])),
-            str(figures["damaged_bytes"]),
-        )  # fmt: skip
-    console_of().print(grid)
-    rows = flight_table(results).to_csv(index=False).encode()
-    write_new(output / FLIGHTS_CSV, [rows], overwrite=True)
-    _end(results)
+    task = JudgeTask(season_options(columns, fuse_with), pages)
+    _finish(work.run(task, work.items(), output), output, against)
 
 
 @group.command()

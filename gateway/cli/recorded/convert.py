@@ -6,7 +6,6 @@ from datetime import date
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-import numpy as np
 import typer
 
 from gateway.aircraft import DEPRECATED
@@ -21,6 +20,7 @@ from gateway.cli.support.recording_options import (
     PositionOption,
     SensorOption,
     SmoothOption,
+    SystemOption,
     ToOption,
     print_remarks,
     progress_of,
@@ -29,16 +29,13 @@ from gateway.cli.support.recording_options import (
     recorded_files,
 )
 from gateway.cli.support.terminal import console_of, refuse, table_of
-from gateway.estimation.record import IntArray
 from gateway.estimation.select import ESTIMATORS
-from gateway.output import check_output, write_new
+from gateway.output import write_new
 from gateway.recordings.anonymising import MAX_PLACE_DEG, Anonymiser, Anonymity
 from gateway.recordings.convert import WRITERS, FlightToWrite
 from gateway.recordings.files import FlightError
-from gateway.recordings.recorded_fusion import RecordedFusion, fused_lines
 from gateway.recordings.selection import MAX_MARGIN_S, FrameChoice, message_ids_of
 from gateway.recordings.tlog_editing import Renumbering, TlogEdits
-from gateway.units import US_PER_S, counted
 from gateway.wire.system_ids import LAST_ID
 
 app = typer.Typer()
@@ -67,14 +64,6 @@ def convert(
     end: ToOption = None,
     columns: ColumnsOption = None,
     sensor: SensorOption = None,
-    fuse: Annotated[
-        bool,
-        typer.Option("--fuse", help="Fuse again instead of using the recorded states."),
-    ] = False,
-    both: BesideOption = False,
-    smooth: SmoothOption = False,
-    fuse_with: FuseWithOption = "recorded",
-    position: PositionOption = "causal",
     system: Annotated[
         list[int] | None,
         typer.Option(
@@ -135,48 +124,52 @@ def convert(
 
     Convert between tlogs and tables, or to a track for a map, MCAP for Foxglove, or Parquet. Logs
     of other autopilots (tlog, ULog, DataFlash) become tables that can be fused, and so does a CSV
-    of another program, by its column map. A tlog of a DataFlash log or ULog holds the estimates
-    and messages of its autopilot; with --fuse mavgate's, with --beside both.
+    of another program, by its column map. States are the recorded ones, and a tlog of a DataFlash
+    log or ULog holds the estimates and messages of its autopilot: `mavgate fuse` makes the same
+    files of states that it computes from the samples.
     """
-    if smooth and not fuse:
-        refuse("--smooth smooths what --fuse fuses: give both")
     edits = _read_edits(
         system, component, message, without, merge=merge, rename=rename,
         margin_s=margin_s if while_state else None,
         anonymity=_read_anonymity(place, day, keep_unknown=keep_unknown, wanted=anonymise),
     )  # fmt: skip
     _check_edits(edits, output, message or [], system or [])
-    of_tlogs = not fuse and (output.suffix in FROM_TLOGS or message)
+    of_tlogs = output.suffix in FROM_TLOGS or message
     files = recorded_files(files, "tlogs" if of_tlogs else "tables")
+    how = {"system_id": system[0] if system else None, "sensors": read_sensors(sensor)}
+    flight = _write(
+        files, output, columns, how, force=force, limits=read_range(begin, end),
+        message=message[0] if message else None,
+        edits=edits if output.suffix in (".tlog", ".csv") else None,
+    )  # fmt: skip
+    if flight.anonymiser is not None:
+        _print_changes(flight.anonymiser)
+
+
+def _write(
+    files: Sequence[Path],
+    output: Path,
+    columns: Path | None,
+    how: dict[str, Any],
+    *,
+    force: bool,
+    **parts: Any,
+) -> FlightToWrite:
+    """Write a flight in the format of the ending, and print the remarks and the size.
+
+    `how` are options of reading, `parts` arguments of `FlightToWrite`.
+    """
     with progress_of(files) as advance:
-        options = read_options(
-            read_settings(),
-            columns,
-            choice=fuse_with,
-            position=position,
-            system_id=system[0] if system else None,
-            sensors=read_sensors(sensor),
-            progress=advance,
-        )
-        flight = FlightToWrite(
-            files,
-            options,
-            limits=read_range(begin, end),
-            title=output.stem,
-            fuse=fuse,
-            smooth=smooth,
-            both=both,
-            message=message[0] if message else None,
-            edits=edits if output.suffix in (".tlog", ".csv") else None,
-        )
+        options = read_options(read_settings(), columns, progress=advance, **how)
+        flight = FlightToWrite(files, options, title=output.stem, **parts)
         inputs = [*files, columns, CONFIG.get()]
         size = write_new(output, WRITERS[output.suffix](flight), overwrite=force, inputs=inputs)
     print_remarks(flight.remarks)
-    if flight.anonymiser is not None:
-        _print_changes(flight.anonymiser)
-    if (lacks := flight.lacks(output.suffix)) and message is None:
+    if (lacks := flight.lacks(output.suffix)) and flight.message is None:
         print_remarks([f"Dropped: {lacks}"])
-    console_of().print(f"{output}: {size / 1e6:.3f} MB")
+    by = "".join(f"; {fusion.summary}" for fusion in flight.fusions)
+    console_of().print(f"{output}: {size / 1e6:.3f} MB{by}")
+    return flight
 
 
 def _read_edits(
@@ -263,10 +256,6 @@ def _check_edits(edits: TlogEdits, output: Path, message: list[str], system: lis
         refuse(f"the options under {PANEL!r} in the help are for an output that ends in .tlog")
 
 
-LEAST_RATE_HZ: Final = 10.0
-"""A hand-held or flying tracker turns within a tenth of a second."""
-
-
 def _known_estimator(name: str | None) -> str | None:
     if name in DEPRECATED:
         name, former = DEPRECATED[name], name
@@ -278,72 +267,44 @@ def _known_estimator(name: str | None) -> str | None:
 
 @app.command("fuse")
 def fuse_log(
-    file: Annotated[Path, typer.Argument(help="Recording, by name or file, or log; also gzipped.")],
+    files: Files,
     *,
-    output: Annotated[Path, output_file("CSV to write.", (".csv",))],
+    output: Annotated[Path, output_file("Output; its ending selects the format.", WRITERS)],
     estimator: Annotated[
         str | None,
         typer.Option("--estimator", help="Instead of the settings'.", callback=_known_estimator),
     ] = None,
-    columns: ColumnsOption = None,
-    sensor: SensorOption = None,
     gps_latency_s: Annotated[
         float | None,
         typer.Option("--gps-latency", min=0.0, max=2.0, help="Instead of the settings', s."),
     ] = None,
     fuse_with: FuseWithOption = "recorded",
+    position: PositionOption = "causal",
     smooth: SmoothOption = False,
+    both: BesideOption = False,
+    begin: FromOption = None,
+    end: ToOption = None,
+    columns: ColumnsOption = None,
+    sensor: SensorOption = None,
+    system: SystemOption = None,
     force: ForceOption = False,
 ) -> None:
-    """Re-run the estimator on a log and write one row per IMU sample.
+    """Re-run the estimator on recordings, and write them with the new states in any format.
 
-    The columns are those of a recording's table, so every command accepts the file as one.
     Reads mavgate's own recordings, autopilots' logs (tlog, ULog, DataFlash), and CSV files with
     the columns time_s, ax, ay, az, gx, gy, gz, mx, baro_alt_m, gps_time_s, gps_lat and so on, or
-    others by a column map.
+    others by a column map. With --from the estimator runs from the start, and what follows that
+    time is written.
     Where the settings leave them at their defaults, gps_latency_s and declination_deg of such a
     file's # lines are used; a latency that is not given there either is estimated from its
     manoeuvres, or the default is assumed, with a message.
     """
-    current = read_settings()
-    files = recorded_files([file], "tables")
-    inputs = [*files, columns, CONFIG.get()]
-    check_output(output, inputs, overwrite=force)
-    with progress_of(files) as advance:
-        options = read_options(
-            current,
-            columns,
-            choice=fuse_with if CONFIG.get() is None else "current",
-            progress=advance,
-            sensors=read_sensors(sensor),
-        )
-        fusion = RecordedFusion(
-            files, options, smooth=smooth, estimator=estimator, latency_s=gps_latency_s,
-            states_only=True,
-        )  # fmt: skip
-        time_us, states = fusion.states()
-        lines = fused_lines(fusion.header, time_us, states)
-        write_new(output, lines, overwrite=force, inputs=inputs)
-    print_remarks(fusion.remarks)
-    name = fusion.aircraft.estimation.estimator + (" and smoothed" if smooth else "")
-    _report(file, time_us, f"{output}: ", f" fused by {name}")
-
-
-def _report(file: Path, time_us: IntArray, before: str, behind: str) -> None:
-    """Print count and rate of the samples, and warn if they are too few."""
-    console, rate_hz = console_of(stderr=True), _rate_hz(time_us)
-    count = counted(len(time_us), "sample")
-    console.print(f"{before}{count} at {rate_hz:.3g} Hz{behind}")
-    if 0.0 < rate_hz < LEAST_RATE_HZ:
-        console.print(
-            f"{file}: its IMU samples come at {rate_hz:.2g} Hz; below {LEAST_RATE_HZ:.0f} Hz the "
-            "turns between them are not seen, so attitude and position may be wrong",
-            style="yellow",
-        )
-
-
-def _rate_hz(time_us: IntArray) -> float:
-    """Return the rate of samples by their median interval; 0 of a single one."""
-    intervals_us = np.diff(time_us)
-    intervals_us = intervals_us[intervals_us > 0]
-    return US_PER_S / float(np.median(intervals_us)) if len(intervals_us) else 0.0
+    files = recorded_files(files, "tables")
+    how = {
+        "choice": fuse_with, "position": position, "system_id": system,
+        "sensors": read_sensors(sensor),
+    }  # fmt: skip
+    _write(
+        files, output, columns, how, force=force, limits=read_range(begin, end), fuse=True,
+        smooth=smooth, both=both, estimator=estimator, latency_s=gps_latency_s,
+    )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`mavgate info` and `mavgate recover`: summarise a recording, and repair a damaged one."""
+"""`mavgate info` and `mavgate recover`: summarise recordings, and repair a damaged one."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
+import msgspec
 import typer
 from pymavlink.dialects.v20 import all as mavlink
 from rich.table import Table
 
+from gateway.cli.support.control import recordings_folder
 from gateway.cli.support.options import output_file, read_options, read_settings
 from gateway.cli.support.recording_options import (
     ColumnsOption,
@@ -17,8 +19,9 @@ from gateway.cli.support.recording_options import (
     progress_of,
     recorded_files,
 )
-from gateway.cli.support.terminal import console_of, print_json, refuse, table_of
+from gateway.cli.support.terminal import console_of, duration_text, print_json, refuse, table_of
 from gateway.output import write_new
+from gateway.printable import UNKNOWN, figure
 from gateway.recordings.files import (
     CSV,
     NO_RECORDING,
@@ -29,6 +32,7 @@ from gateway.recordings.files import (
     open_tlog,
     read_blocks,
 )
+from gateway.recordings.index import Recording, list_recordings
 from gateway.recordings.moment import civil_time
 from gateway.recordings.summary import MENDED, FileInfo, VehicleInfo, describe
 from gateway.recordings.table import TableFault, TableHeader, TableReader, encode_block, encode_head
@@ -36,6 +40,7 @@ from gateway.recordings.tlog import encode_record
 from gateway.units import US_PER_S, counted
 
 if TYPE_CHECKING:
+    from gateway.batch.catalogue import FlightFigures
     from gateway.recordings.recorded_table import ReadOptions
 
 app = typer.Typer()
@@ -51,16 +56,23 @@ Report = Callable[[str], None]
 
 @app.command()
 def info(
-    file: Annotated[
-        Path, typer.Argument(help="Recording, by its name or a file.", show_default=False)
-    ],
+    files: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Recordings, by name or file; without one, all recordings are listed.",
+            show_default=False,
+        ),
+    ] = None,
     *,
     columns: ColumnsOption = None,
     json: Annotated[bool, typer.Option("--json", help="For programs: one line per file.")] = False,
 ) -> None:
-    """Show what a recording holds: duration, vehicles, rates, gaps, distance, damage."""
+    """Show what recordings hold: duration, vehicles, rates, gaps, distance, damage; or list all."""
+    if not files:
+        _list_all(json=json)
+        return
     # A file needs no settings, which would import every stage.
-    files = recorded_files([file], "all")
+    files = recorded_files(files, "all")
     with progress_of(files) as advance:
 
         def options() -> ReadOptions:
@@ -73,6 +85,25 @@ def info(
         else:
             print(end="\n" if number else "")
             _show(each, info_of_file)
+
+
+def _list_all(*, json: bool) -> None:
+    """List the recordings, the newest last."""
+    folder = recordings_folder()
+    found = list_recordings(folder)
+    figures = _figures(found) if found else {}
+    if json:
+        listed = [
+            {"duration_s": _length_s(flown), "vehicles": sorted(flown)}
+            | msgspec.to_builtins(recording, enc_hook=str)
+            for recording in found
+            for flown in [figures.get(recording.name, {})]
+        ]
+        print_json(listed)
+    elif found:
+        _show_list(found, figures)
+    else:
+        console_of().print(f"no recordings in {folder}")
 
 
 @app.command()
@@ -228,3 +259,66 @@ def _when(found: FileInfo) -> str:
         if moment is None
         else f", from {moment:%Y-%m-%d %H:%M:%S} UTC"
     )
+
+
+def _figures(recordings: list[Recording]) -> dict[str, dict[int, FlightFigures]]:
+    """Bring the catalogue of the recordings up to date, and take their figures from it."""
+    from gateway.batch.catalogue import CatalogueError, figures_of, find_flights, index_folder
+    from gateway.batch.executors import ThisProcess
+
+    folder = recordings[0].files[0].parent
+    console = console_of(stderr=True)
+    with console.status("reading new recordings") as shown:
+
+        def show(done: int, total: int) -> None:
+            shown.update(f"reading new recordings: {done} of {total} files")
+
+        try:
+            index_folder(folder, read_options(read_settings()), ThisProcess(), show)
+            found = figures_of(find_flights(folder))
+            return {
+                str(path): {vehicle: one for vehicle, one in flown.items() if vehicle is not None}
+                for path, flown in found.items()
+            }
+        except (CatalogueError, OSError) as error:
+            console.print(f"no figures of the flights: {error}")
+            return {}
+
+
+def _show_list(recordings: list[Recording], figures: dict[str, dict[int, FlightFigures]]) -> None:
+    grid = table_of(
+        "recording", "length", "vehicles", "km", "height, m", "loss", "MB", "last written (UTC)",
+        "path",
+    )  # fmt: skip
+    for recording in recordings:
+        flown = figures.get(recording.name, {})
+        each = [flown[system_id] for system_id in sorted(flown)]
+        when, length_s = civil_time(recording.modified_s * US_PER_S), _length_s(flown)
+        grid.add_row(
+            recording.name,
+            UNKNOWN if length_s is None else duration_text(length_s),
+            " ".join(map(str, sorted(flown))) or UNKNOWN,
+            _each(each, lambda f: figure(f.distance and f.distance / 1000, ".2f")),
+            _each(each, lambda f: figure(f.highest, ".0f")),
+            _each(each, lambda f: figure(f.loss, ".1%")),
+            f"{recording.size / 1e6:.2f}",
+            UNKNOWN if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+            _path(recording),
+        )
+    console_of().print(grid)
+
+
+def _length_s(flown: dict[int, FlightFigures]) -> float | None:
+    """Return the length of a recording, given the figures of its vehicles; None if unknown."""
+    return max((figures.duration for figures in flown.values()), default=None)
+
+
+def _each(figures: list[FlightFigures], text: Callable[[FlightFigures], str]) -> str:
+    """Write one figure for each vehicle."""
+    return " ".join(map(text, figures)) or UNKNOWN
+
+
+def _path(recording: Recording) -> str:
+    """Return a shell pattern of all its files."""
+    first = str(recording.files[0])
+    return first if len(recording.files) == 1 else f"{recording.files[0].parent / recording.name}_*"

@@ -13,7 +13,7 @@ from gateway.batch.executors import DaskCluster, Executor, LocalProcesses
 from gateway.batch.storage import BatchItem, is_url, items_of
 from gateway.batch.tasks import FlightResult, FlightTask, ResultFolder, run_season, without_secrets
 from gateway.cli.support.options import read_options, read_settings
-from gateway.cli.support.recording_options import Wanted, recorded_files
+from gateway.cli.support.recording_options import recorded_files
 from gateway.cli.support.terminal import console_of, progress_bar, refuse
 from gateway.extras import require
 from gateway.printable import printable
@@ -58,7 +58,7 @@ class SeasonWork:
     jobs: int | None = None
     scheduler: str | None = None
 
-    def items(self, *, each_file: bool = False) -> list[BatchItem]:
+    def items(self) -> list[BatchItem]:
         """Find the recordings; what is not there ends the command."""
         if any(map(is_url, self.names)):
             require("a URL", "batch")
@@ -66,15 +66,14 @@ class SeasonWork:
             # Storages log each connection.
             if log.level == logging.INFO:
                 log.setLevel(logging.WARNING)
-        wanted: Wanted = "all" if each_file else "tables"
         names: list[str] = []
         for name in self.names:
             if is_url(name):
                 names.append(name)
                 continue
-            names += map(str, recorded_files([Path(name).expanduser()], wanted))
+            names += map(str, recorded_files([Path(name).expanduser()], "tables"))
         try:
-            items = items_of(names, each_file=each_file)
+            items = items_of(names)
         except OSError as error:
             refuse(str(error))
         if not items:

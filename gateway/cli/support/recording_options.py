@@ -151,7 +151,7 @@ def _files_of(name: Path, folder: Path, wanted: Wanted) -> list[Path]:
     except RecordingError as error:
         raise FlightError(
             f"{name}: no such file, and no recording of that name in {folder}; "
-            "`mavgate record list` shows them"
+            "`mavgate info` lists them"
         ) from error
     if wanted == "all":
         return files

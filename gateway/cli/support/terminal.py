@@ -74,6 +74,12 @@ def table_of(*columns: str, left: int = 1) -> Table:
     return table
 
 
+def duration_text(seconds: float) -> str:
+    """Write a duration as hours, minutes and whole seconds."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
 def progress_bar(*columns: ProgressColumn, auto_refresh: bool = False) -> Progress:
     """Make a progress bar on stderr, which is hidden where that is no terminal.
 

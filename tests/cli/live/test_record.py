@@ -36,7 +36,8 @@ async def gateway(
 
 
 async def run(*args: str, code: int = 0) -> str:
-    result = await asyncio.to_thread(invoke, "record", *args)
+    words = args if args[0] == "info" else ("record", *args)
+    result = await asyncio.to_thread(invoke, *words)
     assert result.exit_code == code, result.output
     return result.output
 
@@ -54,11 +55,11 @@ async def test_recording_is_started_renamed_stopped_listed_and_deleted(gateway: 
     assert "Stopped: first, " in await run("status")
     assert "in no file: nothing is recorded" in await run("note", "over the lake", code=2)
     # The folder is the one of the gateway that runs, whatever the user's settings say.
-    [listed] = [line for line in (await run("list")).splitlines() if "first" in line]
+    [listed] = [line for line in (await run("info")).splitlines() if "first" in line]
     assert re.search(r" 20\d\d-\d\d-\d\d \d\d:\d\d:\d\d ", listed), listed
-    assert '"name":"first"' in await run("list", "--json")
+    assert '"name":"first"' in await run("info", "--json")
     assert "first_01.tlog" in await run("delete", "first", "--yes")
-    assert f"no recordings in {gateway.recorder.folder}" in await run("list")
+    assert f"no recordings in {gateway.recorder.folder}" in await run("info")
     assert [path.name for path in gateway.recorder.folder.iterdir()] == [CATALOGUE_NAME]
 
 

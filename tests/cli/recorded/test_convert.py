@@ -90,7 +90,7 @@ def test_existing_output_is_overwritten_only_with_force(tlog: Path, tmp_path: Pa
 
 def test_table_fused_again_is_identical(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.csv"
-    run("convert", table, "-o", out, "--fuse")
+    run("fuse", table, "-o", out)
     assert out.read_bytes() == table.read_bytes()
 
 
@@ -98,7 +98,7 @@ def test_table_fused_with_other_settings_has_other_states(table: Path, tmp_path:
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     out = tmp_path / "again.csv"
-    run("convert", table, "-o", out, "--fuse", "--fuse-with", "current", "--config", config)
+    run("fuse", table, "-o", out, "--fuse-with", "current", "--config", config)
     (_, before), (_, after) = read_table(table), read_table(out)
     assert [row.raw for row in after] == [row.raw for row in before]
     assert after[-1].state != before[-1].state
@@ -106,7 +106,7 @@ def test_table_fused_with_other_settings_has_other_states(table: Path, tmp_path:
 
 def test_interpolated_positions_lie_on_lines_between_fixes(table: Path, tmp_path: Path) -> None:
     out = tmp_path / "again.csv"
-    run("convert", table, "-o", out, "--fuse", "--position", "interpolated")
+    run("fuse", table, "-o", out, "--position", "interpolated")
     _, rows = read_table(out)
     fixes = [(row.gps.time_us, row.gps.alt_amsl_m) for row in rows if row.gps]
     latency_us = round(1e6 * GatewaySettings().default_aircraft.estimation.reference.gps_latency_s)
@@ -168,7 +168,7 @@ def test_tlog_of_an_autopilot_is_converted_to_a_fused_table(tmp_path: Path) -> N
     assert len(states) == 1000
     assert states[-1].lat_deg == pytest.approx(47.1, abs=1e-6)
     again = tmp_path / "again.csv"
-    run("convert", out, "-o", again, "--fuse")
+    run("fuse", out, "-o", again)
     assert again.read_bytes() == out.read_bytes()
 
 
@@ -296,7 +296,7 @@ def test_recover_keeps_rows_of_a_table_without_its_head(table: Path, tmp_path: P
     header, rows = read_table(tmp_path / "flight.recovered.csv")
     assert header.settings == {}
     assert len(rows) == whole.count(b"\n") - 3
-    run("convert", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv", "--fuse")
+    run("fuse", tmp_path / "flight.recovered.csv", "-o", tmp_path / "x.csv")
 
 
 def test_recover_to_another_format_is_refused(tlog: Path, table: Path, tmp_path: Path) -> None:
@@ -312,7 +312,7 @@ def test_recover_to_another_format_is_refused(tlog: Path, table: Path, tmp_path:
 def test_trimmed_flight_is_fused_from_its_begin(table: Path, tmp_path: Path) -> None:
     plain, fused = tmp_path / "plain.csv", tmp_path / "fused.csv"
     run("convert", table, "-o", plain, "--from", "5", "--to", "10")
-    run("convert", table, "-o", fused, "--from", "5", "--to", "10", "--fuse")
+    run("fuse", table, "-o", fused, "--from", "5", "--to", "10")
     assert fused.read_bytes() == plain.read_bytes()
     header, rows = read_table(fused)
     assert not header.cold_start
@@ -325,8 +325,8 @@ def test_head_of_a_fused_table_has_the_settings_of_its_fusion(table: Path, tmp_p
     config = tmp_path / "other.toml"
     config.write_text('[estimation]\nestimator = "paper"\n')
     again, twice = tmp_path / "again.csv", tmp_path / "twice.csv"
-    run("convert", table, "-o", again, "--fuse", "--fuse-with", "current", "--config", config)
-    run("convert", again, "-o", twice, "--fuse")
+    run("fuse", table, "-o", again, "--fuse-with", "current", "--config", config)
+    run("fuse", again, "-o", twice)
     assert twice.read_bytes() == again.read_bytes() != table.read_bytes()
 
 
@@ -349,7 +349,7 @@ def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     folder.mkdir()
     (folder / "a_01.tlog").write_bytes(make_tlog(RECORDS))
     assert "nothing runs" in run("record", "start", code=2)
-    listed = msgspec.json.decode(run("record", "list", "--json", "-c", config))
+    listed = msgspec.json.decode(run("info", "--json", "-c", config))
     assert [recording["name"] for recording in listed] == ["a"]
     run("record", "rename", "first flight", "-c", config)
     assert "aborted" in run("record", "delete", "last", "-c", config, code=1).lower()
@@ -358,14 +358,14 @@ def test_record_commands_manage_files_without_a_gateway(tmp_path: Path) -> None:
     assert list(folder.glob("*.tlog")) == []
 
 
-@pytest.mark.parametrize("options", [[], ["--fuse"]])
-def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, options: list[str]) -> None:
+@pytest.mark.parametrize("command", ["convert", "fuse"])
+def test_marks_stay_between_their_rows(table: Path, tmp_path: Path, command: str) -> None:
     mark = '# mark: {"time_us":123456,"text":"over the wood"}'
     lines = table.read_text().splitlines()
     lines.insert(len(lines) // 2, mark)
     table.write_text("\n".join(lines) + "\n")
     out = tmp_path / "again.csv"
-    run("convert", table, "-o", out, *options)
+    run(command, table, "-o", out)
     assert out.read_text().splitlines().index(mark) == lines.index(mark)
     run("convert", table, "-o", tmp_path / "again.tlog")
     log = mavutil.mavlogfile(str(tmp_path / "again.tlog"))

@@ -1,4 +1,4 @@
-"""Every command on recordings accepts the names that `record list` shows."""
+"""Every command on recordings accepts the names that `info` lists."""
 
 import gzip
 import json
@@ -54,14 +54,14 @@ def run(*arguments: object, code: int = 0) -> str:
 
 
 def test_list_contains_length_vehicles_size_and_path(config: Path) -> None:
-    lines = run("record", "list", "--config", config).splitlines()
+    lines = run("info", "--config", config).splitlines()
     (alps,) = (line.split() for line in lines if line.strip().startswith("alps"))
     assert alps[1:3] == ["0:01:20", "1"]
     assert alps[-1] == str(config.parent / "recordings" / "alps_*")
     (lake,) = (line.split() for line in lines if line.strip().startswith("lake"))
     assert lake[1:3] == ["0:00:01", "7"]
     assert lake[-1].endswith("lake_01.tlog")
-    listed = {one["name"]: one for one in json.loads(run("record", "list", "--json", "-c", config))}
+    listed = {one["name"]: one for one in json.loads(run("info", "--json", "-c", config))}
     assert listed["lake"]["vehicles"] == [7]
     assert listed["alps"]["duration_s"] == pytest.approx((COUNT - 1) * STEP_US / 1e6)
 
@@ -137,7 +137,7 @@ def test_demo_flies_the_named_recording(config: Path) -> None:
 
 def test_unknown_name_is_refused(config: Path) -> None:
     result = invoke("info", "sea", "--config", config, code=2)
-    assert "record list" in result.output
+    assert "`mavgate info` lists them" in result.output
 
 
 def test_existing_path_takes_precedence_over_a_name(tmp_path: Path) -> None:

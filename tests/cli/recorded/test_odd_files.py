@@ -63,7 +63,7 @@ def test_lines_with_impossible_values_are_left_out(tmp_path: Path, odd: dict[str
     # Of a line with an impossible fix only that is left out.
     unit, kept = ("cells", 100) if "gps_lat" in odd else ("lines", 90)
     assert f"left out 10 {unit} that cannot be read (line 7: " in printed
-    assert f"out.csv: {kept} samples" in printed
+    assert f"; {kept} samples at" in printed
 
 
 @pytest.mark.parametrize("height", ["44331", "99999", "1e308", "inf"])
